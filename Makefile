@@ -1,0 +1,51 @@
+# Everything from a bare checkout, with only Python 3.11+ and make.
+#   make demo    install, then the whole path on a virtual toy (a simulation)
+#   make test    install, then all tests
+#   make check   formatting, lint, types, layers
+
+PYTHON ?= python3
+VENV ?= .venv
+DEMO_OUT ?= plushsense-demo
+ifeq ($(OS),Windows_NT)
+BIN := $(VENV)/Scripts
+else
+BIN := $(VENV)/bin
+endif
+PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt
+
+.PHONY: demo test check setup clean
+
+$(VENV)/.python:
+	@$(PYTHON) -c "import sys; sys.exit(0 if sys.version_info >= (3, 11) else 'PlushSense needs Python 3.11 or newer, this is ' + sys.version.split()[0] + ': run  make PYTHON=/path/to/python3.11 ...')"
+	$(PYTHON) -m venv $(VENV)
+	@touch $@
+
+$(VENV)/.train: $(VENV)/.python pyproject.toml constraints.txt
+	@echo "Installing PlushSense and PyTorch (once, a few minutes) ..."
+	$(PIP) torch==$(TORCH)
+	$(PIP) -e '.[train]'
+	@touch $@
+
+$(VENV)/.dev: $(VENV)/.train
+	$(PIP) -e '.[train,baselines,dev]'
+	@touch $@
+
+# The registry's plain `torch` brings gigabytes of CUDA; an exact version takes a CPU build where one is at hand.
+TORCH := $(shell sed -n 's/^torch==//p' constraints.txt)
+
+setup: $(VENV)/.dev
+
+demo: $(VENV)/.train
+	$(BIN)/plushsense demo --out $(DEMO_OUT) $(DEMO_FLAGS)
+
+test: $(VENV)/.dev
+	$(BIN)/python -m pytest -n auto $(PYTEST_FLAGS)
+
+check: $(VENV)/.dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+clean:
+	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

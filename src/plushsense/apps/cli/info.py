@@ -1,0 +1,41 @@
+"""``plushsense info DATASET|BUNDLE``"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from plushsense.apps.cli.output import emit, table
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("path", help="a data set folder or a .plush bundle")
+
+
+def run(args: argparse.Namespace) -> int:
+    if Path(args.path).suffix == ".plush":
+        return _bundle(args)
+    from plushsense.dataset.index import open_dataset
+
+    dataset = open_dataset(args.path)
+    summary = dataset.summary()
+    rows = [(g["label"], g["affect"], g["recordings"], g["subjects"], g["median_s"]) for g in summary["gestures"]]
+    emit(
+        args,
+        summary,
+        f"{dataset!r}\nlayout {summary['layout']}, {summary['located_in_stream']} recordings located in a stream, "
+        f"{summary['with_warnings']} with warnings, {summary['excluded']} excluded\nhash {summary['hash']}\n\n"
+        + table(("gesture", "affect", "recordings", "people", "median s"), rows),
+    )
+    return 0
+
+
+def _bundle(args: argparse.Namespace) -> int:
+    from plushsense.apps.cli.arch import describe
+    from plushsense.models.bundle import Bundle
+
+    bundle = Bundle.load(args.path)
+    result = {**describe(bundle.arch), "gestures": list(bundle.gestures.labels), "layout": bundle.layout.name}
+    result["provenance"] = bundle.provenance
+    emit(args, result, [f"{key:<20}{value}" for key, value in result.items()])
+    return 0

@@ -1,0 +1,52 @@
+"""``plushsense live --device URL --model BUNDLE``"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+
+from plushsense.apps.cli.output import say
+from plushsense.core.errors import ConfigError
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--device",
+        required=True,
+        metavar="URL",
+        help="serial:///dev/ttyUSB0, tcp://host:port, replay:///path/stream.csv?speed=0, virtual://?person=7",
+    )
+    parser.add_argument("--model", required=True, metavar="BUNDLE", help="a .plush bundle")
+    parser.add_argument("--engine", default="float", choices=("float", "int8"), help="float (int8 is not built yet)")
+    parser.add_argument("--seconds", type=float, help="stop after so much time on the device's clock")
+    parser.add_argument("--smoothing", type=float, metavar="S", help="time constant of the smoothing (the bundle's)")
+
+
+def run(args: argparse.Namespace) -> int:
+    from plushsense.devices.opening import open_device
+    from plushsense.live.decide import DecideSpec
+    from plushsense.live.loop import run as run_loop
+    from plushsense.live.stream import StreamClassifier
+    from plushsense.models.bundle import Bundle
+
+    if args.engine == "int8":
+        raise ConfigError("The int8 engine is not built yet: use --engine float.")
+    bundle = Bundle.load(args.model)
+    decide = DecideSpec(args.smoothing) if args.smoothing is not None else None
+    classifier = StreamClassifier(bundle, decide)
+    with open_device(args.device, bundle.layout) as device:
+        say(
+            f"reading {args.device}; {bundle.arch.symbol}, a decision every "
+            f"{classifier.step_s * 1000:.0f} ms; Ctrl-C ends"
+        )
+        live = run_loop(device, classifier, seconds=args.seconds)
+        try:
+            for decision in live:
+                sys.stdout.write(json.dumps(decision.to_dict(), ensure_ascii=False) + "\n")
+                sys.stdout.flush()
+        except KeyboardInterrupt:
+            pass
+        finally:
+            say(json.dumps(live.summary().to_dict()))
+    return 0

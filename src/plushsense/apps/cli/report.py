@@ -1,0 +1,28 @@
+"""``plushsense report OUT.html --dataset DS [--evaluation DIR …] [--model FILE …]``"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from plushsense.apps.cli.output import emit
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("out", metavar="OUT.html", help="the page to write")
+    parser.add_argument("--dataset", required=True, help="data set folder")
+    parser.add_argument(
+        "--evaluation", action="append", metavar="DIR", help="what evaluate wrote (default: all of DATASET/evaluations)"
+    )
+    parser.add_argument("--model", action="append", metavar="FILE", default=[], help="a bundle, for its model card")
+    parser.add_argument("--title", help="heading of the page")
+
+
+def run(args: argparse.Namespace) -> int:
+    from plushsense.apps.api import write_report
+
+    folder = Path(args.dataset) / "evaluations"
+    found = args.evaluation or [str(p.parent) for p in sorted(folder.glob("*/evaluation.json"))]
+    path = write_report(args.out, args.dataset, found, args.model, args.title)
+    emit(args, {"report": str(path), "evaluations": len(found), "models": len(args.model)}, str(path))
+    return 0

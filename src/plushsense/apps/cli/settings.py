@@ -1,0 +1,96 @@
+"""The options that train and evaluate share, and the settings they make."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from plushsense.apps.cli.output import say
+
+if TYPE_CHECKING:
+    from plushsense.apps.config import RunConfig
+
+
+def add_settings(parser: argparse.ArgumentParser) -> None:
+    """Network, training and windows. Nothing given: the preset's, or the configuration file's."""
+    parser.add_argument("--arch", help="architecture symbol (14d1_19d2_19d4)")
+    parser.add_argument("--filters", help="filters by layer (8,12,16)")
+    parser.add_argument("--padding", help="stream (default), causal or mirror (the preset paper's)")
+    parser.add_argument("--norm", help="batch (default) or layer")
+    parser.add_argument("--preset", help="people (default), loso, paper or search")
+    parser.add_argument("--context", help="what a short gesture's window holds before it: stream (default) or loop")
+    parser.add_argument("--classes", help="shared (default), all, or labels joined by commas")
+    parser.add_argument("--epochs", type=int, help="epochs at most")
+    parser.add_argument("--batch", type=int, help="windows a batch")
+    parser.add_argument("--seed", type=int, help="seed of the split and of the training (0)")
+    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), help="where to train (auto)")
+    parser.add_argument("--config", help="TOML file with the tables windows, model, training, evaluation, live")
+
+
+def settings(args: argparse.Namespace, **evaluation: Any) -> RunConfig:
+    """The resolved settings of a command."""
+    from plushsense.apps.config import resolve
+
+    return resolve(
+        args.config,
+        windows={"context": args.context},
+        model={"arch": args.arch, "filters": args.filters, "padding": args.padding, "norm": args.norm},
+        training={
+            "preset": args.preset,
+            "epochs": args.epochs,
+            "batch": args.batch,
+            "seed": args.seed,
+            "device": args.device,
+        },
+        evaluation={"classes": args.classes, "seed": args.seed, **evaluation},
+    )
+
+
+def warn(sentence: str) -> None:
+    """A warning, on standard error."""
+    say(f"warning: {sentence}")
+
+
+def epochs_shown(what: str = "training") -> Callable[[int, int, dict[str, Any]], None]:
+    """Progress of one training: a line that is rewritten on a terminal, else a line every tenth epoch."""
+    rewritten = sys.stderr.isatty()
+
+    def show(epoch: int, epochs: int, row: dict[str, Any]) -> None:
+        text = f"{what}: epoch {epoch} of {epochs}, loss {row['train_loss']:.3f}"
+        if row["validation_accuracy"] is not None:
+            text += f", validation accuracy {row['validation_accuracy']:.3f}"
+        if rewritten:
+            sys.stderr.write("\r\x1b[K" + text + ("\n" if epoch == epochs else ""))
+            sys.stderr.flush()
+        elif epoch == 1 or epoch % 10 == 0 or epoch == epochs:
+            say(text)
+
+    return show
+
+
+def folds_shown(what: str) -> Callable[[Any], None]:
+    """Progress of a cross-validation, from `plushsense.evaluation.crossval.FoldProgress`."""
+    import time
+
+    rewritten = sys.stderr.isatty()
+    began = time.monotonic()
+    told = -1
+
+    def show(at: Any) -> None:
+        nonlocal told
+        fresh = at.done - at.resumed
+        left = (time.monotonic() - began) / fresh * (at.folds - at.done) if fresh else 0.0
+        text = f"{what}: {at.done} of {at.folds} folds"
+        text += f" ({at.resumed} from before)" if at.resumed else ""
+        text += f", about {left / 60:.0f} min left" if left > 60 else f", about {left:.0f} s left" if left else ""
+        if rewritten:
+            now = f", {at.fold} epoch {at.epoch}" if at.epoch else ""
+            sys.stderr.write("\r\x1b[K" + text + now + ("\n" if at.done == at.folds else ""))
+            sys.stderr.flush()
+        elif at.done != told:
+            told = at.done
+            say(text)
+
+    return show

@@ -1,0 +1,74 @@
+"""``plushsense toy --serial-pty | --tcp PORT``"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from plushsense.apps.cli.output import emit, say
+from plushsense.core.errors import ConfigError
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    where = parser.add_mutually_exclusive_group(required=True)
+    where.add_argument("--serial-pty", action="store_true", help="a pseudo terminal that looks like a serial port")
+    where.add_argument("--tcp", type=int, metavar="PORT", help="a port of 127.0.0.1; 0 takes a free one")
+    parser.add_argument("--person", type=int, default=101, help="which virtual person plays (101: in no data set)")
+    parser.add_argument("--seed", type=int, default=1, help="same seed, same bytes (1)")
+    parser.add_argument("--speed", type=float, default=1.0, help="1: real time")
+    parser.add_argument("--layout", default="plush-15", help="firmware: plush-15 (default) or plush-14")
+    parser.add_argument("--gestures", help="labels joined by commas, over and over (default: all, at random)")
+    parser.add_argument("--lost", type=float, help="share of lines that are lost, 0 to 0.9")
+    parser.add_argument("--garbled", type=float, help="share of lines that are garbled, 0 to 0.9")
+    parser.add_argument("--seconds", type=float, default=0.0, help="stop after so much of the toy's time (0: never)")
+    parser.add_argument("--truth", metavar="FILE", help="append what is performed, as JSON lines")
+
+
+def run(args: argparse.Namespace) -> int:
+    from plushsense.core.signal import load_layout
+    from plushsense.devices.toy import ToyCounters, serve_pty, serve_tcp
+    from plushsense.devices.virtual.stream import Performed, ToySpec
+
+    gestures = tuple(g.strip() for g in args.gestures.split(",")) if args.gestures else ()
+    spec = ToySpec(args.person, args.seed, lost=args.lost, garbled=args.garbled, gestures=gestures)
+    try:
+        truth = Path(args.truth).open("a", encoding="utf-8") if args.truth else None
+    except OSError as cause:
+        raise ConfigError(f"The truth cannot be written to '{args.truth}': {cause.strerror}.") from None
+
+    def ready(url: str) -> None:
+        emit(args, {"url": url}, url)
+        say(f"virtual toy, person {args.person}; read it with  plushsense live --device {url} --model ...; Ctrl-C ends")
+
+    def performed(gesture: Performed) -> None:
+        say(f"{gesture.start_ms / 1000:9.1f} s  {gesture.label}")
+        if truth is not None:
+            truth.write(json.dumps(gesture.to_dict(), ensure_ascii=False) + "\n")
+            truth.flush()
+
+    layout = load_layout(args.layout)
+    counters = ToyCounters()
+    try:
+        if args.serial_pty:
+            counters = serve_pty(
+                spec, layout=layout, speed=args.speed, seconds=args.seconds, on_ready=ready, on_performed=performed
+            )
+        else:
+            counters = serve_tcp(
+                args.tcp,
+                spec,
+                layout=layout,
+                speed=args.speed,
+                seconds=args.seconds,
+                on_ready=ready,
+                on_performed=performed,
+            )
+    except KeyboardInterrupt:
+        say("stopped")
+        return 0
+    finally:
+        if truth is not None:
+            truth.close()
+    say(f"sent {counters.sent} lines, {counters.dropped} found no reader")
+    return 0

@@ -1,0 +1,39 @@
+"""``plushsense train DATASET --arch SPEC --filters …``"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from plushsense.apps.cli.output import emit
+from plushsense.apps.cli.settings import add_settings, epochs_shown, settings, warn
+from plushsense.core.errors import ConfigError
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("dataset", metavar="DATASET", help="data set folder")
+    parser.add_argument("--out", metavar="FILE", default="model.plush", help="the bundle (model.plush)")
+    parser.add_argument("--force", action="store_true", help="replace a bundle that is already there")
+    add_settings(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    from plushsense.apps.api import train
+
+    if Path(args.out).exists() and not args.force:
+        raise ConfigError(f"'{args.out}' is already there: choose another --out, or --force to replace it.")
+    done = train(args.dataset, settings(args), progress=epochs_shown(), warn=warn)
+    bundle = done.save(args.out)
+    scores = done.scores
+    mark = "  [SIMULATION]" if scores["simulated"] else ""
+    emit(
+        args,
+        {"bundle": str(bundle), "history": done.history, "scores": scores},
+        [
+            f"{bundle}: {done.bundle.arch.symbol}, {done.bundle.arch.parameters:,} parameters, "
+            f"epoch {scores['best_epoch']} of {len(done.history)} kept{mark}",
+            f"accuracy {scores['accuracy']:.3f}, macro-F1 {scores['macro_f1']:.3f} on {scores['windows']} windows of "
+            f"{scores['said']}.",
+        ],
+    )
+    return 0

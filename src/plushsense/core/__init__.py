@@ -1,0 +1,1 @@
+"""The words that every other room speaks: errors, signals, gestures, recording files."""

@@ -1,0 +1,78 @@
+"""The exceptions of PlushSense, as one tree.
+
+    PlushSenseError
+    ├── BadInput                something the user gave cannot be used
+    │   ├── ArchError           an architecture symbol
+    │   ├── LayoutError         a sensor layout
+    │   ├── GestureError        a gesture set
+    │   ├── FileFormatError     a recording file
+    │   ├── DatasetError        a data set folder
+    │   ├── BundleError         a model bundle
+    │   └── ConfigError         a setting, a flag, a configuration file
+    ├── DeviceError             a toy that cannot be opened or went away
+    ├── TrainingError           a training run that cannot start or go on
+    └── MissingExtraError       an optional package that is not installed
+
+Every message is one sentence for the person who reads it: what is wrong, where, what is accepted, what to do.
+The command line prints it and exits with status 2.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class PlushSenseError(Exception):
+    """Anything that PlushSense refuses, said in one sentence."""
+
+
+class BadInput(PlushSenseError):
+    """Something the user gave cannot be used."""
+
+
+class ArchError(BadInput):
+    """An architecture symbol that does not parse or does not fit."""
+
+
+class LayoutError(BadInput):
+    """A sensor layout that is unknown or inconsistent."""
+
+
+class GestureError(BadInput):
+    """A gesture or gesture set that is unknown or inconsistent."""
+
+
+class FileFormatError(BadInput):
+    """A recording file that cannot be read."""
+
+
+class DatasetError(BadInput):
+    """A data set folder that cannot be opened, made or used as asked."""
+
+
+class BundleError(BadInput):
+    """A model bundle that cannot be read or does not fit."""
+
+
+class ConfigError(BadInput):
+    """A setting that is unknown or out of range."""
+
+
+class DeviceError(PlushSenseError):
+    """A toy that cannot be opened, or that went away."""
+
+
+class TrainingError(PlushSenseError):
+    """A training run that cannot start or cannot go on."""
+
+
+class MissingExtraError(PlushSenseError):
+    """An optional package that is not installed."""
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """A suggestion to end an error with: ``" Did you mean 'x'?"``, or nothing when no known word is close."""
+    lowered = {k.lower(): k for k in known}
+    found = difflib.get_close_matches(word.lower(), list(lowered), n=1, cutoff=0.6)
+    return f" Did you mean '{lowered[found[0]]}'?" if found else ""

@@ -1,0 +1,142 @@
+"""What people do with the toy: gestures, their affect and family, and the set that fixes their class order."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from plushsense.core.errors import GestureError, nearest
+from plushsense.core.tomlfile import builtin_names, read_named, refuse_unknown
+
+AFFECTS = ("positive", "neutral", "negative", "none")
+NOBODY = "none"
+
+
+@dataclass(frozen=True)
+class Gesture:
+    """One gesture: its label, the affect it carries ("none" where nobody said), and its family of look-alikes.
+
+    ``free_choice`` marks a label under which everybody did something else; ``nobody`` one that is recorded without a
+    person (the toy at rest).
+    """
+
+    label: str
+    affect: str = "none"
+    family: str = ""
+    free_choice: bool = False
+    nobody: bool = False
+    description: str = ""
+
+    def __post_init__(self) -> None:
+        if self.affect not in AFFECTS:
+            raise GestureError(
+                f"Gesture '{self.label}' has the affect '{self.affect}'; accepted are {', '.join(AFFECTS)}."
+                f"{nearest(self.affect, AFFECTS)}"
+            )
+        if not self.family:
+            object.__setattr__(self, "family", self.label)
+
+
+def _plain(label: str) -> str:
+    return " ".join(label.replace("_", " ").split()).casefold()
+
+
+@dataclass(frozen=True)
+class GestureSet:
+    """An ordered set of gestures; the order is the class index."""
+
+    name: str
+    gestures: tuple[Gesture, ...]
+    inferred: bool = False
+
+    def __post_init__(self) -> None:
+        plain = [_plain(g.label) for g in self.gestures]
+        doubled = sorted({g.label for g in self.gestures if plain.count(_plain(g.label)) > 1})
+        if doubled:
+            raise GestureError(f"Gesture set '{self.name}' holds '{doubled[0]}' twice: labels must differ.")
+
+    def __len__(self) -> int:
+        return len(self.gestures)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Labels in class order."""
+        return tuple(g.label for g in self.gestures)
+
+    @property
+    def affects(self) -> tuple[str, ...]:
+        """Affect of each class."""
+        return tuple(g.affect for g in self.gestures)
+
+    @property
+    def families(self) -> tuple[str, ...]:
+        """Family of each class."""
+        return tuple(g.family for g in self.gestures)
+
+    def find(self, label: str) -> Gesture | None:
+        """The gesture of a label, ignoring case and ``_`` against space; None when it is not in the set."""
+        wanted = _plain(label)
+        return next((g for g in self.gestures if _plain(g.label) == wanted), None)
+
+    def get(self, label: str) -> Gesture:
+        """The gesture of a label; GestureError with the nearest one when it is not in the set."""
+        found = self.find(label)
+        if found is None:
+            raise GestureError(
+                f"'{label}' is not in the gesture set '{self.name}', which holds: {', '.join(self.labels)}."
+                f"{nearest(label, self.labels)}"
+            )
+        return found
+
+    def index(self, label: str) -> int:
+        """Class index of a label."""
+        return self.gestures.index(self.get(label))
+
+    def subset(self, labels: Iterable[str]) -> GestureSet:
+        """The gestures of ``labels``, in this set's order."""
+        wanted = {self.get(label) for label in labels}
+        return GestureSet(self.name, tuple(g for g in self.gestures if g in wanted), self.inferred)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, ready for JSON."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, table: dict[str, Any], where: str = "gesture set") -> GestureSet:
+        """A gesture set from plain values (a TOML file, a bundle)."""
+        refuse_unknown(table, cls.__dataclass_fields__, where, GestureError)
+        gestures = []
+        try:
+            for entry in table["gestures"]:
+                refuse_unknown(entry, Gesture.__dataclass_fields__, f"{where}, gestures", GestureError)
+                gestures.append(Gesture(**entry))
+            return cls(str(table["name"]), tuple(gestures), bool(table.get("inferred", False)))
+        except KeyError as missing:
+            raise GestureError(f"The {where} lacks the key {missing}: add it.") from None
+        except TypeError as cause:
+            raise GestureError(f"The {where} holds an entry that does not fit: {cause}.") from None
+
+    @classmethod
+    def infer(cls, labels: Iterable[str], name: str = "inferred") -> GestureSet:
+        """The set that a folder of recordings implies: its labels in alphabetical order, affect unknown.
+
+        ``Custom`` is the GestureRecorder's own word for a gesture of the recorder's choice: free choice.
+        """
+        return cls(
+            name,
+            tuple(Gesture(label, free_choice=_plain(label) == "custom") for label in sorted(set(labels))),
+            inferred=True,
+        )
+
+
+def gesture_set_names() -> tuple[str, ...]:
+    """Names of the built-in gesture sets."""
+    return builtin_names("gestures")
+
+
+def load_gestures(name_or_path: str | Path) -> GestureSet:
+    """A built-in gesture set by name, or one of the user's own by the path of its TOML file."""
+    table, source = read_named(name_or_path, "gestures", "gesture set", GestureError)
+    return GestureSet.from_dict(table, f"gesture set '{source}'")

@@ -1,0 +1,217 @@
+"""What a toy measures: channels, and the layout in which they stand on a line, in a file and before a network."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import LayoutError, nearest
+from plushsense.core.tomlfile import builtin_names, read_named, refuse_unknown
+
+DEVICE_MS = "device_ms"
+DELAY_MS = "delay_ms"
+HOST_MS = "host_ms"
+MAGNITUDE_FRACTION_BITS = 4
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One measured quantity.
+
+    A raw value is what the toy sends. ``physical = (raw - offset) * scale`` in ``unit``; the integer that everything
+    downstream computes with is ``round(raw / step)``. Raw values outside ``[valid_min, valid_max]`` are sensor garbage.
+    """
+
+    name: str
+    unit: str
+    kind: str
+    offset: float = 0.0
+    scale: float = 1.0
+    valid_min: float = -2147483648.0
+    valid_max: float = 2147483647.0
+    step: float = 1.0
+
+
+@dataclass(frozen=True)
+class Derived:
+    """A channel computed from others; ``magnitude`` is √(Σ v²) in integers with 4 fraction bits."""
+
+    name: str
+    kind: str
+    of: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class CsvFormat:
+    """How the authors' recorder writes this layout: column keys in file order, header texts, separator."""
+
+    columns: tuple[str, ...]
+    header: tuple[str, ...]
+    separator: str
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The channels of a toy, their order on the wire and in files, and what a network reads (``inputs``).
+
+    ``vectors`` names triples of channels that are the axes of one vector (an accelerometer), which turn with the toy.
+    ``wire`` names channels plus ``device_ms`` (the device clock) and ``delay_ms`` (since the frame before).
+    """
+
+    name: str
+    title: str
+    rate_hz: float
+    channels: tuple[Channel, ...]
+    wire: tuple[str, ...]
+    derived: tuple[Derived, ...]
+    inputs: tuple[str, ...]
+    csv: CsvFormat
+    gap_ms: int = 100
+    vectors: tuple[tuple[str, ...], ...] = ()
+
+    def __post_init__(self) -> None:
+        names = [c.name for c in self.channels] + [d.name for d in self.derived]
+        if len(set(names)) != len(names):
+            raise LayoutError(f"Layout '{self.name}' names a channel twice: {', '.join(names)}.")
+        for where, used, extra in (
+            ("wire", self.wire, (DEVICE_MS, DELAY_MS)),
+            ("inputs", self.inputs, tuple(d.name for d in self.derived)),
+            ("csv.columns", self.csv.columns, (DEVICE_MS, DELAY_MS, HOST_MS, "label")),
+        ):
+            known = tuple(c.name for c in self.channels) + extra
+            for name in used:
+                if name not in known:
+                    raise LayoutError(
+                        f"Layout '{self.name}': {where} names '{name}'; known are {', '.join(known)}."
+                        f"{nearest(name, known)}"
+                    )
+        missing = [c.name for c in self.channels if c.name not in self.wire]
+        if missing:
+            raise LayoutError(f"Layout '{self.name}': wire does not carry {', '.join(missing)}.")
+        if DEVICE_MS not in self.wire and DELAY_MS not in self.wire:
+            raise LayoutError(f"Layout '{self.name}': wire carries no clock; add {DEVICE_MS} or {DELAY_MS}.")
+        if not self.inputs:
+            raise LayoutError(f"Layout '{self.name}' gives a network nothing to read: fill in inputs.")
+        if not 1.0 <= self.rate_hz <= 10_000.0:
+            raise LayoutError(f"Layout '{self.name}': rate_hz is {self.rate_hz}; accepted are 1 to 10000.")
+        for derived in self.derived:
+            if derived.kind != "magnitude":
+                raise LayoutError(
+                    f"Layout '{self.name}': derived channel '{derived.name}' is of kind '{derived.kind}'; "
+                    "accepted is magnitude."
+                )
+            for name in derived.of:
+                self.index(name)
+        for vector in self.vectors:
+            if len(vector) != 3:
+                raise LayoutError(f"Layout '{self.name}': a vector has three axes, not {len(vector)}.")
+            for name in vector:
+                self.index(name)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Channel names in order."""
+        return tuple(c.name for c in self.channels)
+
+    @property
+    def n_channels(self) -> int:
+        """Measured channels, C."""
+        return len(self.channels)
+
+    @property
+    def n_inputs(self) -> int:
+        """Channels a network reads, F."""
+        return len(self.inputs)
+
+    @property
+    def period_us(self) -> int:
+        """Time between two even samples in whole microseconds."""
+        return round(1_000_000 / self.rate_hz)
+
+    @property
+    def valid_min_int(self) -> NDArray[np.int64]:
+        """Smallest valid integer of each channel, (C,)."""
+        return np.array([np.ceil(c.valid_min / c.step) for c in self.channels], dtype=np.int64)
+
+    @property
+    def valid_max_int(self) -> NDArray[np.int64]:
+        """Largest valid integer of each channel, (C,)."""
+        return np.array([np.floor(c.valid_max / c.step) for c in self.channels], dtype=np.int64)
+
+    def index(self, name: str) -> int:
+        """Position of a channel; LayoutError with the nearest known name when there is none."""
+        if name not in self.names:
+            raise LayoutError(
+                f"Layout '{self.name}' has no channel '{name}'; it has {', '.join(self.names)}."
+                f"{nearest(name, self.names)}"
+            )
+        return self.names.index(name)
+
+    def samples(self, seconds: float) -> int:
+        """Whole samples in a duration, at least one."""
+        return max(1, round(seconds * self.rate_hz))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, ready for JSON."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, table: dict[str, Any], where: str = "layout") -> Layout:
+        """A layout from plain values (a TOML file, a bundle).
+
+        Raises:
+            LayoutError: for an unknown or missing key, or a value that does not fit.
+        """
+        refuse_unknown(table, cls.__dataclass_fields__, where, LayoutError)
+        try:
+            channels = []
+            for entry in table["channels"]:
+                refuse_unknown(entry, Channel.__dataclass_fields__, f"{where}, channels", LayoutError)
+                channels.append(Channel(**entry))
+            derived = []
+            for entry in table.get("derived", ()):
+                refuse_unknown(entry, Derived.__dataclass_fields__, f"{where}, derived", LayoutError)
+                derived.append(Derived(entry["name"], entry["kind"], tuple(entry["of"])))
+            names = tuple(c.name for c in channels)
+            csv = dict(table.get("csv", {}))
+            refuse_unknown(csv, CsvFormat.__dataclass_fields__, f"{where}, csv", LayoutError)
+            columns = tuple(csv.get("columns", (HOST_MS, DEVICE_MS, *names)))
+            return cls(
+                name=str(table["name"]),
+                title=str(table.get("title", table["name"])),
+                rate_hz=float(table["rate_hz"]),
+                channels=tuple(channels),
+                wire=tuple(table["wire"]),
+                derived=tuple(derived),
+                inputs=tuple(table.get("inputs", names)),
+                csv=CsvFormat(
+                    columns,
+                    tuple(csv.get("header", columns)),
+                    str(csv.get("separator", ", ")),
+                ),
+                gap_ms=int(table.get("gap_ms", 100)),
+                vectors=tuple(tuple(v) for v in table.get("vectors", ())),
+            )
+        except KeyError as missing:
+            raise LayoutError(f"The {where} lacks the key {missing}: add it.") from None
+        except (TypeError, ValueError) as cause:
+            raise LayoutError(f"The {where} holds a value that does not fit: {cause}.") from None
+
+
+def layout_names() -> tuple[str, ...]:
+    """Names of the built-in layouts."""
+    return builtin_names("layouts")
+
+
+def load_layout(name_or_path: str | Path) -> Layout:
+    """A built-in layout by name, or one of the user's own by the path of its TOML file.
+
+    Raises:
+        LayoutError: for an unknown name or an unusable file.
+    """
+    table, source = read_named(name_or_path, "layouts", "layout", LayoutError)
+    return Layout.from_dict(table, f"layout '{source}'")

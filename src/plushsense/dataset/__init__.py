@@ -1,0 +1,1 @@
+"""What was recorded: the folder, the importers, the checks at the door."""

@@ -1,0 +1,316 @@
+"""A data set folder: what is in it, and reading it.
+
+dataset.toml                 version, name, licence, consent statement; the layout and gesture set in full
+recordings/<subject>/*.csv   raw recordings, never rewritten
+streams/<subject>/*.csv      raw session streams; a file with a label on every row is a stream too
+marks.jsonl                  trim, exclude: who and why, append-only
+recordings.csv, streams.csv  the index: rebuilt from the above, replaced atomically
+cache/                       can be deleted
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import html
+import io
+import json
+import os
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Self, TypeVar
+
+import tomli_w
+
+from plushsense.core.errors import DatasetError
+from plushsense.core.gestures import NOBODY, GestureSet
+from plushsense.core.recfile import Frames, read_recording, read_stream
+from plushsense.core.signal import Layout
+from plushsense.core.tomlfile import read_toml, refuse_unknown
+
+FORMAT_VERSION = 1
+HEAD = "dataset.toml"
+RECORDINGS = "recordings"
+STREAMS = "streams"
+UNKNOWN_SUBJECT = "unknown"
+
+
+@dataclass(frozen=True)
+class _Row:
+    """A row of an index file; plain text there, typed here."""
+
+    @classmethod
+    def from_text(cls, row: dict[str, str], where: str) -> Self:
+        try:
+            values: dict[str, Any] = {}
+            for f in fields(cls):
+                text = row[f.name]
+                kind = str(f.type)
+                values[f.name] = (
+                    int(text)
+                    if kind == "int"
+                    else float(text)
+                    if kind == "float"
+                    else text == "yes"
+                    if kind == "bool"
+                    else tuple(t for t in text.split(" | ") if t)
+                    if kind.startswith("tuple")
+                    else text
+                )
+            return cls(**values)
+        except (KeyError, ValueError, TypeError) as cause:
+            raise DatasetError(
+                f"The index '{where}' is damaged ({cause}): delete it, it is rebuilt from the recordings."
+            ) from None
+
+    def to_text(self) -> dict[str, str]:
+        out = {}
+        for name, value in asdict(self).items():
+            out[name] = (
+                ("yes" if value else "no")
+                if isinstance(value, bool)
+                else " | ".join(value)
+                if isinstance(value, tuple)
+                else f"{value:.3f}"
+                if isinstance(value, float)
+                else str(value)
+            )
+        return out
+
+
+@dataclass(frozen=True)
+class RecordingInfo(_Row):
+    """One recording of the index.
+
+    Its rows are ``first_row`` to ``first_row + rows`` of ``file``; ``start`` to ``stop`` of these remain after
+    trimming. In ``stream`` they begin at ``stream_row`` (−1: not found there). ``start_ms`` is the device clock at the
+    first row, ``epoch_ms`` the wall clock.
+    """
+
+    id: str
+    subject: str
+    session: str
+    gesture: str
+    file: str
+    first_row: int
+    rows: int
+    start: int
+    stop: int
+    stream: str
+    stream_row: int
+    start_ms: int
+    epoch_ms: int
+    rate_hz: float
+    excluded: bool
+    flags: tuple[str, ...]
+    sha256: str
+
+
+@dataclass(frozen=True)
+class StreamInfo(_Row):
+    """One session stream of the index."""
+
+    id: str
+    subject: str
+    session: str
+    file: str
+    rows: int
+    seconds: float
+    restarts: int
+    flags: tuple[str, ...]
+    sha256: str
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Replace a text file in one step: readers see the old one or the new one."""
+    part = path.with_name(path.name + ".part")
+    part.write_text(text, encoding="utf-8", newline="\n")
+    os.replace(part, path)
+
+
+def write_index(path: Path, rows: Iterable[_Row], kind: type[_Row]) -> None:
+    """Write an index file atomically."""
+    out = io.StringIO()
+    writer = csv.DictWriter(out, [f.name for f in fields(kind)], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(row.to_text() for row in rows)
+    write_atomically(path, out.getvalue())
+
+
+R = TypeVar("R", bound=_Row)
+
+
+def read_index(path: Path, kind: type[R]) -> list[R]:
+    """The rows of an index file."""
+    with path.open(encoding="utf-8", newline="") as file:
+        return [kind.from_text(row, path.name) for row in csv.DictReader(file)]
+
+
+@dataclass(frozen=True)
+class DatasetHead:
+    """What ``dataset.toml`` says."""
+
+    name: str
+    layout: Layout
+    gestures: GestureSet
+    version: str = "1.0.0"
+    licence: str = ""
+    consent: str = ""
+    source: str = ""
+    simulated: bool = False
+
+    def to_toml(self) -> str:
+        """The file's text."""
+        table = {
+            "format": FORMAT_VERSION,
+            "name": self.name,
+            "version": self.version,
+            "licence": self.licence,
+            "consent": self.consent,
+            "source": self.source,
+            "simulated": self.simulated,
+            "layout": self.layout.to_dict(),
+            "gesture_set": self.gestures.to_dict(),
+        }
+        return tomli_w.dumps(json.loads(json.dumps(table)))
+
+    @classmethod
+    def read(cls, folder: Path) -> DatasetHead:
+        """The head of the data set in ``folder``.
+
+        Raises:
+            DatasetError: when the folder is not there or is no data set.
+        """
+        path = folder / HEAD
+        if not folder.is_dir():
+            raise DatasetError(f"There is no folder '{folder}': give the folder of a data set.")
+        if not path.is_file():
+            raise DatasetError(
+                f"'{folder}' is not a data set (it has no {HEAD}): make one with  plushsense import SRC {folder}"
+            )
+        table = read_toml(path, "data set", DatasetError)
+        version = table.pop("format", None)
+        if version != FORMAT_VERSION:
+            raise DatasetError(f"'{path}' has the format {version}; this version reads {FORMAT_VERSION}.")
+        known = ("name", "version", "licence", "consent", "source", "simulated", "layout", "gesture_set")
+        refuse_unknown(table, known, f"'{path}'", DatasetError)
+        try:
+            layout = Layout.from_dict(table.pop("layout"), f"layout in '{path}'")
+            gestures = GestureSet.from_dict(table.pop("gesture_set"), f"gesture set in '{path}'")
+            return cls(layout=layout, gestures=gestures, **table)
+        except (KeyError, TypeError) as cause:
+            raise DatasetError(f"'{path}' lacks something: {cause}.") from None
+
+
+class Dataset:
+    """A data set, opened for reading."""
+
+    def __init__(self, path: Path, head: DatasetHead, recordings: list[RecordingInfo], streams: list[StreamInfo]):
+        self.path = path
+        self.head = head
+        self.recordings = recordings
+        self.streams = streams
+
+    @property
+    def layout(self) -> Layout:
+        """The sensor layout of every recording."""
+        return self.head.layout
+
+    @property
+    def gestures(self) -> GestureSet:
+        """All gestures of the data set, in class order."""
+        return self.head.gestures
+
+    @property
+    def subjects(self) -> list[str]:
+        """Codes of the people, sorted; nobody and the unknown are not people."""
+        people = {r.subject for r in self.recordings} - {NOBODY, UNKNOWN_SUBJECT}
+        return sorted(people)
+
+    @property
+    def used(self) -> list[RecordingInfo]:
+        """Recordings that are not excluded by a mark."""
+        return [r for r in self.recordings if not r.excluded]
+
+    def read(self, recording: RecordingInfo) -> Frames:
+        """The rows of one recording that remain after trimming."""
+        if self.layout.csv.columns[-1] == "label":
+            return self.read_stream(recording.stream).slice(
+                recording.first_row + recording.start, recording.first_row + recording.stop
+            )
+        frames = read_recording(self.path / recording.file, self.layout).frames
+        return frames.slice(recording.start, recording.stop)
+
+    def read_stream(self, stream: str) -> Frames:
+        """The rows of one session stream; the last one read is kept, since its recordings come in a row."""
+        if self._cached is None or self._cached[0] != stream:
+            info = self._streams_by_id.get(stream)
+            if info is None:
+                raise DatasetError(f"Data set '{self.head.name}' has no stream '{stream}'.")
+            self._cached = (stream, read_stream(self.path / info.file, self.layout).frames)
+        return self._cached[1]
+
+    _cached: tuple[str, Frames] | None = None
+
+    @cached_property
+    def _streams_by_id(self) -> dict[str, StreamInfo]:
+        return {s.id: s for s in self.streams}
+
+    @cached_property
+    def hash(self) -> str:
+        """SHA-256 over the layout and every used recording: content, person, gesture, trim."""
+        digest = hashlib.sha256(json.dumps(self.layout.to_dict(), sort_keys=True).encode())
+        for r in sorted(self.used, key=lambda r: r.id):
+            digest.update(
+                repr((r.id, r.subject, r.gesture, r.sha256, r.first_row, r.start, r.stop, r.stream_row)).encode()
+            )
+        for s in sorted(self.streams, key=lambda s: s.id):
+            digest.update(repr((s.id, s.sha256)).encode())
+        return digest.hexdigest()
+
+    def summary(self) -> dict[str, Any]:
+        """Counts for a report: people, recordings, streams, duration by gesture."""
+        by_gesture = []
+        for gesture in self.gestures.gestures:
+            mine = [r for r in self.used if r.gesture == gesture.label]
+            seconds = sorted((r.stop - r.start) / r.rate_hz for r in mine if r.rate_hz > 0)
+            by_gesture.append(
+                {
+                    "label": gesture.label,
+                    "affect": gesture.affect,
+                    "recordings": len(mine),
+                    "subjects": len({r.subject for r in mine} - {NOBODY, UNKNOWN_SUBJECT}),
+                    "median_s": round(seconds[len(seconds) // 2], 2) if seconds else None,
+                }
+            )
+        return {
+            "name": self.head.name,
+            "licence": self.head.licence or None,
+            "layout": self.layout.name,
+            "simulated": self.head.simulated,
+            "recordings": len(self.recordings),
+            "excluded": len(self.recordings) - len(self.used),
+            "subjects": len(self.subjects),
+            "streams": len(self.streams),
+            "located_in_stream": sum(r.stream_row >= 0 for r in self.recordings),
+            "with_warnings": sum(bool(r.flags) for r in self.recordings),
+            "gestures": by_gesture,
+            "hash": self.hash,
+        }
+
+    def __repr__(self) -> str:
+        return (
+            f"Dataset({self.head.name!r}: {len(self.recordings)} recordings, {len(self.subjects)} people, "
+            f"{len(self.gestures)} gestures, {len(self.streams)} streams)"
+        )
+
+    def _repr_html_(self) -> str:
+        rows = "".join(
+            f"<tr><td>{html.escape(str(g['label']))}</td><td>{g['affect']}</td><td>{g['recordings']}</td>"
+            f"<td>{g['subjects']}</td><td>{g['median_s']}</td></tr>"
+            for g in self.summary()["gestures"]
+        )
+        head = "".join(f"<th>{h}</th>" for h in ("gesture", "affect", "recordings", "people", "median s"))
+        return f"<p>{html.escape(repr(self))}</p><table><tr>{head}</tr>{rows}</table>"

@@ -1,0 +1,134 @@
+"""A toy is a URL: `open_device` turns one into an open device."""
+
+from __future__ import annotations
+
+import importlib
+import math
+import os
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from urllib.parse import unquote
+
+from plushsense.core.errors import ConfigError, DeviceError, nearest
+from plushsense.core.signal import Layout, load_layout
+from plushsense.devices.base import Device
+
+DEFAULT_LAYOUT = "plush-15"
+
+SCHEMES: dict[str, str] = {
+    "serial": "plushsense.devices.serial",
+    "tcp": "plushsense.devices.tcp",
+    "replay": "plushsense.devices.replay",
+    "virtual": "plushsense.devices.virtual.device",
+}
+"""Scheme to the room with its ``open_url(address, layout) -> Device``; imported when it is needed."""
+
+EXAMPLES = (
+    "serial:///dev/ttyUSB0?baud=115200, serial://COM3, tcp://host:port, replay:///path/stream.csv, virtual://?person=7"
+)
+
+
+@dataclass
+class Address:
+    """A device URL taken apart: ``place`` stands between ``scheme://`` and ``?``, ``query`` has the settings."""
+
+    url: str
+    scheme: str
+    place: str
+    query: dict[str, str] = field(default_factory=dict)
+
+    def check_keys(self, known: Iterable[str]) -> None:
+        """Refuse settings that the scheme does not know, with the nearest known one."""
+        accepted = ("layout", *known)
+        for key in self.query:
+            if key not in accepted:
+                raise ConfigError(
+                    f"'{self.url}': {self.scheme}:// knows no setting '{key}'; "
+                    f"it knows {', '.join(accepted)}.{nearest(key, accepted)}"
+                )
+
+    def whole(self, key: str, default: int, low: int = 0, high: int = 2**31 - 1) -> int:
+        """A setting that is a whole number."""
+        text = self.query.get(key)
+        if text is None:
+            return default
+        if not re.fullmatch(r"\d{1,10}", text, re.ASCII) or not low <= int(text) <= high:
+            raise ConfigError(f"'{self.url}': {key} is '{text}'; accepted is a whole number, {low} to {high}.")
+        return int(text)
+
+    def number(self, key: str, default: float, low: float = 0.0, high: float = 1e6) -> float:
+        """A setting that is a number."""
+        text = self.query.get(key)
+        if text is None:
+            return default
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not low <= value <= high:
+            raise ConfigError(f"'{self.url}': {key} is '{text}'; accepted is a number, {low:g} to {high:g}.")
+        return value
+
+
+def parse_url(url: str) -> Address:
+    """Take a device URL apart. A path without a scheme is a replay; so is a Windows path like ``C:\\x.csv``.
+
+    Raises:
+        ConfigError: for an unknown scheme or a setting that is no ``key=value``.
+    """
+    text = os.fspath(url).strip()
+    if not text:
+        raise ConfigError(f"No device URL was given; accepted are {EXAMPLES}.")
+    match = re.match(r"([A-Za-z][A-Za-z0-9+.\-]+):(//)?", text)
+    if match is None or (match[2] is None and match[1].lower() not in SCHEMES):
+        if Path(text).is_file():
+            return Address(text, "replay", text)
+        place, query = _split_query(text, text)
+        return Address(text, "replay", place, query)
+    scheme = match[1].lower()
+    if scheme not in SCHEMES:
+        raise ConfigError(
+            f"'{text}': there is no scheme '{scheme}'; accepted are {', '.join(SCHEMES)}, as in {EXAMPLES}."
+            f"{nearest(scheme, SCHEMES)}"
+        )
+    place, query = _split_query(text[match.end() :], text)
+    return Address(text, scheme, place, query)
+
+
+def _split_query(rest: str, url: str) -> tuple[str, dict[str, str]]:
+    place, mark, tail = rest.partition("?")
+    query: dict[str, str] = {}
+    for part in tail.split("&") if mark else ():
+        if not part:
+            continue
+        key, equals, value = part.partition("=")
+        if not equals or not key:
+            raise ConfigError(f"'{url}': '{part}' is no setting; write key=value, joined by &.")
+        if key in query:
+            raise ConfigError(f"'{url}': the setting '{key}' stands there twice; leave one.")
+        query[key] = unquote(value.replace("+", " "))
+    return place, query
+
+
+def open_device(url: str | os.PathLike[str], layout: Layout | str | None = None) -> Device:
+    """Open a toy by its URL.
+
+    ``serial:///dev/ttyUSB0?baud=115200``, ``serial://COM3``, ``tcp://host:port``,
+    ``replay:///path/stream.csv?speed=1``, ``virtual://?person=7&seed=1&speed=1``; a bare path is a replay.
+    ``?layout=`` goes on any of them and wins over the argument; the default is plush-15.
+
+    Raises:
+        ConfigError: for a scheme or setting that is unknown or out of range.
+        LayoutError: for an unknown layout.
+        DeviceError: for a port, host or file that is not there.
+    """
+    address = parse_url(os.fspath(url))
+    chosen: Layout | str = address.query.get("layout") or layout or DEFAULT_LAYOUT
+    resolved = chosen if isinstance(chosen, Layout) else load_layout(chosen)
+    room = importlib.import_module(SCHEMES[address.scheme])
+    device = room.open_url(address, resolved)
+    if not isinstance(device, Device):
+        raise DeviceError(f"'{address.url}': the scheme {address.scheme} opened nothing that is a toy.")
+    return device

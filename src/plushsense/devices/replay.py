@@ -1,0 +1,90 @@
+"""A recording or a whole session's stream, played back as if the toy were there."""
+
+from __future__ import annotations
+
+import re
+import time
+from pathlib import Path
+from urllib.parse import unquote
+
+import numpy as np
+
+from plushsense.core.errors import DeviceError, FileFormatError
+from plushsense.core.recfile import Frames, parse_name, read_recording, read_stream
+from plushsense.core.signal import Layout
+from plushsense.devices.base import Device, Frame, LossMeter, Pacer, now_ms
+from plushsense.devices.opening import Address
+
+_BLOCK = 500
+
+
+class ReplayDevice(Device):
+    """Frames of a file, at the pace of the device clock (``speed`` 1), faster, or without waiting (0).
+
+    ``host_ms`` is the one in the file where there is one. ``warnings`` says what was odd about the file.
+    """
+
+    def __init__(self, url: str, layout: Layout, path: Path, speed: float = 1.0) -> None:
+        super().__init__(url, layout)
+        try:
+            result = (read_recording if parse_name(path.name) else read_stream)(path, layout)
+        except FileFormatError as cause:
+            raise DeviceError(f"'{url}' cannot be replayed: {cause}") from None
+        self.path = path
+        self.warnings = result.warnings
+        self.counters.malformed = result.malformed
+        self._frames: Frames = result.frames
+        self._at = 0
+        self._loss = LossMeter()
+        self._pacer = Pacer(speed)
+        self._wait_s: float | None = None
+        low, high = layout.valid_min_int, layout.valid_max_int
+        self._garbage = np.any((result.frames.values < low) | (result.frames.values > high), axis=1)
+
+    def read(self) -> list[Frame] | None:
+        """The frames that are due, waiting at most about 0.1 s; None at the end of the file."""
+        frames: list[Frame] = []
+        until = time.monotonic() + 0.1
+        while len(frames) < _BLOCK and not self.closed:
+            if self._at >= len(self._frames):
+                return frames or None
+            device_ms = int(self._frames.device_ms[self._at])
+            if self._wait_s is None:
+                self._wait_s = time.monotonic() + self._pacer.due_s(device_ms)
+            wait = self._wait_s - time.monotonic()
+            if wait > 0.0:
+                if frames:
+                    break
+                time.sleep(min(wait, max(0.0, until - time.monotonic())))
+                if time.monotonic() >= until:
+                    break
+                continue
+            self._wait_s = None
+            host = now_ms() if self._frames.host_ms is None else int(self._frames.host_ms[self._at])
+            frames.append(Frame(host, device_ms, tuple(self._frames.values[self._at].tolist())))
+            self.counters.frames += 1
+            self.counters.garbage += int(self._garbage[self._at])
+            self.counters.lost += self._loss.push(device_ms)
+            self._at += 1
+        return frames
+
+
+def _path(place: str) -> Path:
+    """The path in a URL: ``/C:/x.csv`` is a Windows path, ``%20`` a space unless a file is called so."""
+    text = place[1:] if re.match(r"/[A-Za-z]:[\\/]", place) else place
+    return Path(text if Path(text).exists() else unquote(text)).expanduser()
+
+
+def open_url(address: Address, layout: Layout) -> ReplayDevice:
+    """Open ``replay:///path?speed=1``; a folder stands for the stream in it."""
+    address.check_keys(("speed",))
+    speed = address.number("speed", 1.0)
+    path = _path(address.place)
+    if path.is_dir() and address.place:
+        path = path / "fulldatastream.csv"
+    if not address.place or not path.is_file():
+        raise DeviceError(
+            f"'{address.url}': there is no file '{path if address.place else ''}' to replay; "
+            "give the path of a recording or of a fulldatastream.csv."
+        )
+    return ReplayDevice(address.url, layout, path, speed)

@@ -1,0 +1,93 @@
+"""``virtual://``: the virtual toy in this process, through the same bytes and the same parser as a real one."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from plushsense.core.signal import Layout
+from plushsense.devices.base import Device, Frame, Pacer, now_ms
+from plushsense.devices.opening import Address
+from plushsense.devices.virtual.stream import Line, Performed, ToySpec, ToyStream
+from plushsense.devices.wire import LineParser
+
+_BLOCK = 200
+
+
+class VirtualDevice(Device):
+    """A virtual toy. ``on_performed`` may be set to hear what its person does; ``performed`` lists it all.
+
+    Args:
+        speed: 1 real time, 0 as fast as frames are taken.
+        seconds: of device time after which the frames end; 0: never.
+    """
+
+    def __init__(self, url: str, layout: Layout, spec: ToySpec, speed: float = 1.0, seconds: float = 0.0) -> None:
+        super().__init__(url, layout)
+        self.spec = spec
+        self.performed: list[Performed] = []
+        self.on_performed: Callable[[Performed], None] | None = None
+        self._lines = iter(ToyStream(spec, layout))
+        self._parser = LineParser(layout, self.counters)
+        self._pacer = Pacer(speed)
+        self._seconds = seconds
+        self._first_ms: int | None = None
+        self._next: Line | None = None
+        self._due = 0.0
+
+    @property
+    def first_ms(self) -> int | None:
+        """The device clock at the first line, the zero of a live run's times; None before it."""
+        return self._first_ms
+
+    def read(self) -> list[Frame] | None:
+        """The frames that are due, waiting at most about 0.1 s; None after ``seconds``."""
+        until = time.monotonic() + 0.1
+        data = bytearray()
+        count = 0
+        while count < _BLOCK and not self.closed:
+            if self._next is None:
+                self._next = next(self._lines)
+                self._due = time.monotonic() + self._pacer.due_s(self._next.device_ms)
+            line = self._next
+            if self._first_ms is None:
+                self._first_ms = line.device_ms
+            if self._seconds and line.device_ms - self._first_ms >= self._seconds * 1000.0:
+                if not data:
+                    self._parser.finish()
+                    return None
+                break
+            wait = self._due - time.monotonic()
+            if wait > 0.0:
+                if data:
+                    break
+                time.sleep(min(wait, max(0.0, until - time.monotonic())))
+                if time.monotonic() >= until:
+                    break
+                continue
+            self._next = None
+            count += 1
+            data += line.data
+            if line.begins is not None:
+                self.performed.append(line.begins)
+                if self.on_performed is not None:
+                    self.on_performed(line.begins)
+        host = now_ms()
+        return [Frame(host, p.device_ms, p.values) for p in self._parser.feed(bytes(data))]
+
+
+def open_url(address: Address, layout: Layout) -> VirtualDevice:
+    """Open ``virtual://?person=7&seed=1&speed=1``; also session, lost, garbled, seconds, gestures (with commas)."""
+    address.check_keys(("person", "seed", "session", "speed", "lost", "garbled", "seconds", "gestures"))
+    text = address.query.get("gestures", "")
+    spec = ToySpec(
+        person=address.whole("person", 1),
+        seed=address.whole("seed", 1),
+        session=address.whole("session", 1000),
+        lost=address.number("lost", 0.0, 0.0, 0.9) if "lost" in address.query else None,
+        garbled=address.number("garbled", 0.0, 0.0, 0.9) if "garbled" in address.query else None,
+        gestures=tuple(g.strip() for g in text.split(",") if g.strip()),
+    )
+    return VirtualDevice(
+        address.url, layout, spec, address.number("speed", 1.0), address.number("seconds", 0.0, 0.0, 1e9)
+    )

@@ -1,0 +1,227 @@
+"""A person and the toy over time: waiting, picking it up, gestures, putting it down; what the sensors send meanwhile.
+
+A session is made of episodes. Each begins and ends with the toy on the table and no hand near, so that episodes can
+be joined without an end; the samples, the device clock and the room's drift go on from one to the next.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import ConfigError, nearest
+from plushsense.devices.virtual.canvas import RATE_HZ, Canvas, Climate, Floats, sense
+from plushsense.devices.virtual.holding import APPROACH_S, PICK_S, PUT_S, Hands, Plan, samples
+from plushsense.devices.virtual.motions import AT_REST, DURATIONS, MOTIONS, Trial, split_label
+from plushsense.devices.virtual.people import Person, draw_person
+from plushsense.devices.virtual.world import WORLD, Pair, World
+
+GESTURES = (
+    "Back stroke 1", "Back stroke 2", "Ear scratch 1", "Ear scratch 2", "Head stroke 1", "Head stroke 2",
+    "Hold in hands", "Hold strong", "Neck scratch 1", "Neck scratch 2", "Tail hit 1", "Tail hit 2", "Tail pull",
+    "Tail scratch 1", "Tail scratch 2", "Tail tap 1", "Tail tap 2",
+)  # fmt: skip
+"""The 17 gestures of the paper that a person makes, in class order."""
+
+_POSTURES = np.array([(0, 0, 1.0), (0, 0, -1.0), (0, 1.0, 0.1), (0, -1.0, 0.1), (1.0, 0, 0.2), (-1.0, 0, 0.2)])
+
+
+@dataclass(frozen=True)
+class Mark:
+    """One performed gesture, in samples of the session: the hand works from ``start`` to ``stop``; a recorder that
+    somebody starts and stops by hand would hold ``record_start`` to ``record_stop``."""
+
+    label: str
+    record_start: int
+    start: int
+    stop: int
+    record_stop: int
+
+
+@dataclass(frozen=True)
+class Episode:
+    """A piece of a session: ``first`` sample number, raw ``values`` (n, 13) in the order of `CHANNELS`,
+    ``device_ms`` (n,), ``delay_ms`` (n,), and the gestures performed in it."""
+
+    first: int
+    values: NDArray[np.int64]
+    device_ms: NDArray[np.int64]
+    delay_ms: NDArray[np.int64]
+    marks: tuple[Mark, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.device_ms)
+
+
+@dataclass
+class Session:
+    """One person's time with the toy. The same person, seed and number give the same session.
+
+    Args:
+        person: who; None for recordings of nobody (somebody turns the toy over and goes away).
+        seed: of the population and everything in it.
+        number: which session of this person.
+        wait_s: seconds between two gestures (low, high); the default is the recorder's countdown.
+    """
+
+    person: Person | None
+    seed: int = 1
+    number: int = 0
+    world: World = WORLD
+    wait_s: Pair | None = None
+    samples: int = field(default=0, init=False)
+    clock_ms: int = field(default=0, init=False)
+
+    def __post_init__(self) -> None:
+        key = 10**9 + 1 if self.person is None else self.person.number
+        self._rng = np.random.default_rng([self.seed, key, 0xA1, self.number])
+        self._who = draw_person(0, self.seed, self.world) if self.person is None else self.person
+        self._hands = Hands(self._who, self.world, self._rng)
+        spread = self.world.rest_humidity if self.person is None else 1.0
+        self._climate = Climate.draw(self._rng, self.world, spread)
+        self._down: Floats = self._hands.upright()
+        self.clock_ms = int(self._rng.integers(5_000, 60_000))
+
+    # What happens ---------------------------------------------------------------------------------------------
+
+    def perform(self, label: str, repetitions: int = 1) -> Episode:
+        """A gesture of plush-18, made some times; "At rest" turns the toy over and leaves it alone."""
+        if label == AT_REST:
+            return self._rest(repetitions)
+        family, in_hands = split_label(label)
+        if label not in GESTURES:
+            raise ConfigError(
+                f"The virtual toy's people know no gesture '{label}'; they know {AT_REST}, {', '.join(GESTURES)}."
+                f"{nearest(label, (AT_REST, *GESTURES))}"
+            )
+        rng, who, world = self._rng, self._who, self.world
+        plans, at, picked_once = [], samples(0.6), in_hands and family != "Hold in hands"
+        first_pick = at
+        at += samples(PICK_S) if picked_once else 0
+        for _ in range(repetitions):
+            at += self._wait()
+            plan = self._plan(family, at)
+            plans.append(plan)
+            at = plan.record_stop
+            if family == "Hold in hands":
+                at += samples(PUT_S + 0.4)
+        put = at + samples(0.3)
+        n = put + samples(PUT_S + 0.6 if in_hands else 0.5)
+        canvas = Canvas(n, self._down)
+        if picked_once:
+            share = world.grip_tail if family.startswith("Tail") else 1.0
+            self._down = self._hands.hold(canvas, first_pick, put, plans, share)
+        for plan in plans:
+            trial = Trial(
+                person=who,
+                family=family,
+                in_hands=in_hands,
+                at=plan.at,
+                n=plan.n,
+                force=who.force * math.exp(world.force_trial_log * rng.standard_normal()),
+                tempo=math.exp(world.tempo_trial_log * rng.standard_normal()),
+                shift=world.place_trial * rng.standard_normal(),
+            )
+            if family == "Hold in hands":
+                self._down = self._hands.hold(canvas, plan.at, plan.record_stop + samples(0.2), [plan], 1.0)
+            elif family != "Hold strong":
+                self._hands.approach(canvas, plan)
+            if plan.steadied and not in_hands:
+                self._hands.steady(canvas, plan)
+            MOTIONS[family](canvas, trial, rng, world)
+        at = self.samples
+        marks = [Mark(label, at + p.record_start, at + p.at, at + p.at + p.n, at + p.record_stop) for p in plans]
+        return self._sense(canvas, tuple(marks))
+
+    def idle(self, seconds: float) -> Episode:
+        """The toy stands on the table and nobody touches it."""
+        return self._sense(Canvas(max(1, samples(seconds)), self._down), ())
+
+    def handle(self) -> Episode:
+        """Somebody takes the toy up, turns it and puts it down: no gesture."""
+        n_hold = samples(0.6 + 1.2 * self._rng.random())
+        start = samples(0.4)
+        put = start + samples(PICK_S) + n_hold
+        canvas = Canvas(put + samples(PUT_S + 0.5), self._down)
+        self._down = self._hands.hold(canvas, start, put, [], 1.0)
+        return self._sense(canvas, ())
+
+    def play(self, gestures: Iterable[str] | None = None) -> Iterator[Episode]:
+        """Episodes without end: idle, now and then handling, and gestures at random, or those given, over and over."""
+        script = tuple(gestures or ())
+        turn = 0
+        while True:
+            yield self.idle(0.6 + 2.0 * self._rng.random())
+            if self._rng.random() < 0.12:
+                yield self.handle()
+            label = script[turn % len(script)] if script else GESTURES[int(self._rng.integers(len(GESTURES)))]
+            turn += 1
+            yield self.perform(label)
+
+    # How it happens -------------------------------------------------------------------------------------------
+
+    def _wait(self) -> int:
+        low, high = self.wait_s or (self.world.countdown_s + 0.5, self.world.countdown_s + 2.0)
+        return samples(low + (high - low) * self._rng.random())
+
+    def _plan(self, family: str, record_start: int) -> Plan:
+        rng, who, world = self._rng, self._who, self.world
+        median, spread = getattr(world, DURATIONS[family])
+        latency = max(0.1, who.latency_s + 0.5 * world.latency_s[1] * rng.standard_normal())
+        active = max(0.5, median * who.pace * math.exp(spread * rng.standard_normal()))
+        stop = max(0.05, world.stop_s[0] + world.stop_s[1] * rng.standard_normal())
+        at = record_start + samples(latency + APPROACH_S)
+        n = samples(active)
+        blur = world.blur_head if family == "Head stroke" else 1.0
+        blur = world.blur_tail if family.startswith("Tail") else blur
+        blur = world.blur_hit if family == "Tail hit" else blur
+        lap, steadied = rng.random() < blur * who.lap, rng.random() < blur * who.steadies
+        return Plan(record_start, at, n, at + n + samples(stop), lap, steadied, self._hands.light())
+
+    def _rest(self, repetitions: int) -> Episode:
+        """Somebody lays the toy down in another way each time, and leaves."""
+        rng, world = self._rng, self.world
+        pieces, marks = [], []
+        for _ in range(repetitions):
+            pieces.append(self._lay(_POSTURES[int(rng.integers(len(_POSTURES)))]))
+            pieces.append(self.idle(self._wait() / RATE_HZ))
+            seconds = max(3.0, world.rest_s[0] * math.exp(world.rest_s[1] * rng.standard_normal()))
+            start = self.samples
+            pieces.append(self.idle(seconds))
+            marks.append(Mark(AT_REST, start, start, self.samples, self.samples))
+        return Episode(
+            pieces[0].first,
+            np.concatenate([p.values for p in pieces]),
+            np.concatenate([p.device_ms for p in pieces]),
+            np.concatenate([p.delay_ms for p in pieces]),
+            tuple(marks),
+        )
+
+    def _lay(self, posture: Floats) -> Episode:
+        """Somebody takes the toy up and lays it down with gravity along ``posture``."""
+        start = samples(0.3)
+        put = start + samples(1.4)
+        canvas = Canvas(put + samples(PUT_S + 0.6), self._down)
+        self._hands.hold(canvas, start, put, [], 1.0)
+        self._down = posture + 0.15 * self._rng.standard_normal(3)
+        canvas.turn(put, samples(PUT_S), self._down)
+        return self._sense(canvas, ())
+
+    def _sense(self, canvas: Canvas, marks: tuple[Mark, ...]) -> Episode:
+        rng, world, n = self._rng, self.world, len(canvas)
+        first = self.samples
+        values = sense(canvas, first, self._climate, self._who.coupling, rng, world)
+        nonsense = np.flatnonzero(rng.random(n) < world.glitch)
+        if len(nonsense):
+            values[nonsense, rng.integers(0, 10, len(nonsense))] = -rng.integers(2001, 32000, len(nonsense))
+        draw = rng.random(n)
+        late, early = draw > 1.0 - world.delay_jitter, draw < world.delay_jitter
+        delay = 10 + late.astype(np.int64) - early.astype(np.int64)
+        clock = self.clock_ms + np.cumsum(delay)
+        self.samples += n
+        self.clock_ms = int(clock[-1])
+        return Episode(first, values, clock, delay, marks)

@@ -1,0 +1,142 @@
+"""The virtual toy as a byte stream: lines in the wire format, some lost, some garbled, and what is being performed."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from plushsense.core.errors import ConfigError, nearest
+from plushsense.core.signal import DELAY_MS, DEVICE_MS, Layout
+from plushsense.devices.virtual.motions import AT_REST
+from plushsense.devices.virtual.people import draw_person
+from plushsense.devices.virtual.session import GESTURES, Episode, Session
+from plushsense.devices.virtual.world import CHANNELS, WORLD, World
+
+_ALIASES = {"x": "acc_x", "y": "acc_y", "z": "acc_z"}
+_NOISE = bytes(range(128, 256)) + b"#?~\x00\x7f"
+_LIVE_WAIT_S = (0.4, 1.6)
+
+
+@dataclass(frozen=True)
+class Performed:
+    """The truth about one gesture: its label, and from when to when on the device clock the hand works."""
+
+    label: str
+    start_ms: int
+    end_ms: int
+
+    def to_dict(self) -> dict[str, str | int]:
+        """Plain values, ready for a JSON line."""
+        return dataclasses.asdict(self)
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line as it leaves the toy: its bytes (empty when lost), its time, and the gesture that begins with it."""
+
+    data: bytes
+    device_ms: int
+    begins: Performed | None = None
+
+
+@dataclass(frozen=True)
+class ToySpec:
+    """Which virtual toy: its person and what it performs.
+
+    Attributes:
+        person, seed, session: the same numbers give the same bytes.
+        lost, garbled: share of the lines, 0 to 1; None is the world's own.
+        gestures: performed over and over in this order; none: all of the paper's at random.
+    """
+
+    person: int = 1
+    seed: int = 1
+    session: int = 1000
+    lost: float | None = None
+    garbled: float | None = None
+    gestures: tuple[str, ...] = ()
+    world: World = WORLD
+
+    def __post_init__(self) -> None:
+        for name, value in (("lost", self.lost), ("garbled", self.garbled)):
+            if value is not None and not 0.0 <= value <= 0.9:
+                raise ConfigError(f"The virtual toy's {name} is {value}; a share from 0 to 0.9 is accepted.")
+        known = (AT_REST, *GESTURES)
+        for label in self.gestures:
+            if label not in known:
+                raise ConfigError(
+                    f"The virtual toy's people know no gesture '{label}'; they know {', '.join(known)}."
+                    f"{nearest(label, known)}"
+                )
+
+
+def channel_columns(layout: Layout) -> list[int]:
+    """Where each channel of the layout stands in what the virtual toy measures.
+
+    Raises:
+        ConfigError: for a layout with other sensors than the plush toy's.
+    """
+    columns = []
+    for name in layout.names:
+        name = _ALIASES.get(name, name)
+        if name not in CHANNELS:
+            raise ConfigError(
+                f"The virtual toy has no sensor '{name}' of layout '{layout.name}'; "
+                "it speaks plush-15, plush-14 and accel-3."
+            )
+        columns.append(CHANNELS.index(name))
+    return columns
+
+
+def _garble(line: bytes, rng: np.random.Generator) -> bytes:
+    """A line spoilt on the way, so that it is no frame any more: cut, noisy, or glued to the next."""
+    at = int(rng.integers(1, max(2, len(line) - 1)))
+    kind = int(rng.integers(3))
+    if kind == 0:
+        return line[:at].rstrip(b" \n").rpartition(b" ")[0] + b"\n"
+    if kind == 1:
+        noise = bytes(_NOISE[int(i)] for i in rng.integers(0, len(_NOISE), int(rng.integers(1, 9))))
+        return line[:at] + noise + line[at:]
+    return line[:at]
+
+
+class ToyStream:
+    """The lines of a virtual toy without end: iterate over it."""
+
+    def __init__(self, spec: ToySpec, layout: Layout) -> None:
+        self.spec = spec
+        self.layout = layout
+        self._columns = channel_columns(layout)
+        person = draw_person(spec.person, spec.seed, spec.world)
+        self._session = Session(person, spec.seed, spec.session, spec.world, wait_s=_LIVE_WAIT_S)
+        self._rng = np.random.default_rng([spec.seed, spec.person, spec.session, 0x10])
+
+    def __iter__(self) -> Iterator[Line]:
+        for episode in self._session.play(self.spec.gestures):
+            yield from self._lines(episode)
+
+    def _lines(self, episode: Episode) -> Iterator[Line]:
+        world, n = self.spec.world, len(episode)
+        lost = world.lost if self.spec.lost is None else self.spec.lost
+        garbled = world.garbled if self.spec.garbled is None else self.spec.garbled
+        is_lost = self._rng.random(n) < lost
+        is_garbled = self._rng.random(n) < garbled
+        begins = {}
+        for mark in episode.marks:
+            start, stop = mark.start - episode.first, mark.stop - episode.first - 1
+            begins[start] = Performed(mark.label, int(episode.device_ms[start]), int(episode.device_ms[stop]))
+        order: Sequence[int] = [
+            -1 if name == DEVICE_MS else -2 if name == DELAY_MS else self._columns[self.layout.index(name)]
+            for name in self.layout.wire
+        ]
+        clocks = {-1: episode.device_ms, -2: episode.delay_ms}
+        rows = np.column_stack([clocks[at] if at < 0 else episode.values[:, at] for at in order]).tolist()
+        clock = episode.device_ms.tolist()
+        for i, row in enumerate(rows):
+            data = b"" if is_lost[i] else (" ".join(map(str, row)) + "\n").encode("ascii")
+            if data and is_garbled[i]:
+                data = _garble(data, self._rng)
+            yield Line(data, clock[i], begins.get(i))

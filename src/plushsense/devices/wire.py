@@ -1,0 +1,171 @@
+"""The line format: integers separated by spaces, one frame a line, as bytes both ways.
+
+Whatever comes in is survived: noise, half lines and lines without end are counted, and memory stays bounded.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from plushsense.core.signal import DELAY_MS, DEVICE_MS, Layout
+from plushsense.devices.base import Counters, LossMeter
+
+_INTEGER = re.compile(rb"[+-]?[0-9]{1,18}\Z")
+_DECIMAL = re.compile(rb"[+-]?(?:[0-9]{1,18}(?:\.[0-9]{0,18})?|\.[0-9]{1,18})(?:[eE][+-]?[0-9]{1,2})?\Z")
+_SEPARATORS = bytes.maketrans(b",;\t", b"   ")
+_LIMIT = 2**53
+
+
+@dataclass(frozen=True)
+class ParsedLine:
+    """One frame from the wire: ``device_ms``, and ``values`` (C,) in integer steps, in layout order.
+
+    ``garbage`` marks a value outside its channel's valid range: kept as it came.
+    """
+
+    device_ms: int
+    values: tuple[int, ...]
+    garbage: bool = False
+
+
+class LineParser:
+    """Bytes in any pieces to frames.
+
+    Fields are separated by any run of spaces, tabs, commas or semicolons, lines by ``\\n`` or ``\\r\\n``. Where a
+    layout's wire has no ``device_ms`` the delays are added up (a lost line then leaves no trace in the clock).
+    Channels with a step of 1 take integers only, others decimals too. Empty lines are nothing.
+
+    Args:
+        layout: whose wire order is read.
+        counters: to count in; a new one by default.
+        joining: the source is joined in the middle of its talk (a serial line): what comes before the first line end
+            is half a line and dropped; it is counted as malformed unless it happens to be a whole frame.
+    """
+
+    def __init__(self, layout: Layout, counters: Counters | None = None, *, joining: bool = False) -> None:
+        self.layout = layout
+        self.counters = counters if counters is not None else Counters()
+        self.max_line = max(256, 40 * len(layout.wire))
+        self._joining = joining
+        self._pending = bytearray()
+        self._skipping = False
+        self._clock_ms = 0
+        self._loss = LossMeter()
+        self._fields = len(layout.wire)
+        self._channels = [(layout.index(name), layout.wire.index(name)) for name in layout.names]
+        self._steps = [c.step for c in layout.channels]
+        low, high = layout.valid_min_int.tolist(), layout.valid_max_int.tolist()
+        self._valid = list(zip(low, high, strict=True))
+        self._clock_at = layout.wire.index(DEVICE_MS) if DEVICE_MS in layout.wire else -1
+        self._delay_at = layout.wire.index(DELAY_MS) if DELAY_MS in layout.wire else -1
+
+    def feed(self, data: bytes) -> list[ParsedLine]:
+        """The frames that end within these bytes; the rest of the last line is kept for the next call."""
+        parsed: list[ParsedLine] = []
+        start = 0
+        while True:
+            end = data.find(b"\n", start)
+            if end < 0:
+                self._keep(data[start:])
+                return parsed
+            self._keep(data[start:end])
+            start = end + 1
+            line = self._take()
+            if line is not None:
+                parsed.append(line)
+
+    def finish(self) -> None:
+        """The source has ended: half a line that is still waiting is counted as malformed."""
+        if self._pending.strip() and not self._skipping:
+            self.counters.malformed += 1
+        self._pending.clear()
+        self._skipping = False
+
+    def _keep(self, piece: bytes) -> None:
+        if self._skipping or not piece:
+            return
+        if len(self._pending) + len(piece) > self.max_line:
+            self.counters.malformed += 1
+            self._pending.clear()
+            self._skipping = True
+        else:
+            self._pending += piece
+
+    def _take(self) -> ParsedLine | None:
+        line = bytes(self._pending)
+        self._pending.clear()
+        joined, self._joining = self._joining, False
+        if self._skipping:
+            self._skipping = False
+            return None
+        fields = line.translate(_SEPARATORS).split()
+        if not fields:
+            return None
+        numbers = self._numbers(fields)
+        if numbers is None:
+            self.counters.malformed += 1
+            return None
+        if joined:
+            return None
+        if self._clock_at >= 0:
+            device_ms = numbers[self._clock_at]
+        else:
+            # The first delay refers to a frame nobody saw: the clock starts at 0.
+            self._clock_ms += numbers[self._delay_at] if self.counters.frames else 0
+            device_ms = self._clock_ms
+        values = tuple(numbers[at] for _, at in self._channels)
+        garbage = any(not low <= v <= high for v, (low, high) in zip(values, self._valid, strict=True))
+        self.counters.frames += 1
+        self.counters.garbage += garbage
+        self.counters.lost += self._loss.push(device_ms)
+        return ParsedLine(device_ms, values, garbage)
+
+    def _numbers(self, fields: list[bytes]) -> list[int] | None:
+        """All fields as integers (channels in steps, clocks in ms), or None for a line that is no frame."""
+        if len(fields) != self._fields:
+            return None
+        numbers = [0] * self._fields
+        for at in (self._clock_at, self._delay_at):
+            if at >= 0:
+                number = _integer(fields[at])
+                if number is None or number < 0:
+                    return None
+                numbers[at] = number
+        for index, at in self._channels:
+            step = self._steps[index]
+            number = _integer(fields[at]) if step == 1.0 else _steps(fields[at], step)
+            if number is None:
+                return None
+            numbers[at] = number
+        return numbers
+
+
+def _integer(field: bytes) -> int | None:
+    if _INTEGER.match(field) is None:
+        return None
+    number = int(field)
+    return number if -_LIMIT <= number <= _LIMIT else None
+
+
+def _steps(field: bytes, step: float) -> int | None:
+    if _DECIMAL.match(field) is None:
+        return None
+    number = float(field) / step
+    return round(number) if -_LIMIT <= number <= _LIMIT else None
+
+
+def format_line(layout: Layout, values: Sequence[int], device_ms: int, delay_ms: int) -> bytes:
+    """One frame as the toy sends it: ``values`` (C,) in integer steps, layout order; ended by ``\\n``."""
+    fields = []
+    for name in layout.wire:
+        if name == DEVICE_MS:
+            fields.append(str(device_ms))
+        elif name == DELAY_MS:
+            fields.append(str(delay_ms))
+        else:
+            at = layout.names.index(name)
+            step = layout.channels[at].step
+            fields.append(str(int(values[at])) if step == 1.0 else repr(round(values[at] * step, 9)))
+    return (" ".join(fields) + "\n").encode("ascii")

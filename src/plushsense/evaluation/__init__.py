@@ -1,0 +1,1 @@
+"""How well it reads whom: folds, scores, and every single prediction."""

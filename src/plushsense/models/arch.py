@@ -1,0 +1,309 @@
+"""The symbolic string of a network (``14d1_39d2_41d4``): parsed once, and all that can be counted from it.
+
+Layers are joined by ``_``; a number is the kernel length, ``d`` and a number the dilation (paper, 3.6.2).
+One block is Conv1d → ReLU → normalisation; after the blocks the mean over time, then one dense layer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, cast, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import ArchError, nearest
+from plushsense.models.symbol import MAX_LAYERS, MAX_NUMBER, fail, layer_start, parse_filters, parse_symbol
+
+Padding = Literal["stream", "causal", "mirror"]
+Norm = Literal["batch", "layer"]
+PADDINGS: tuple[str, ...] = get_args(Padding)
+NORMS: tuple[str, ...] = get_args(Norm)
+
+NORM_EPSILON = 1e-5
+DEFAULT_SYMBOL = "14d1_19d2_19d4"
+DEFAULT_FILTERS = (8, 12, 16)
+
+PAPER_FILTERS: tuple[tuple[int, ...], ...] = (
+    (4, 6, 8, 8),
+    (8, 12, 16, 16),
+    (16, 24, 32, 32),
+    (32, 48, 64, 64),
+)
+
+# Paper, Table 3, as printed; columns in the order of PAPER_FILTERS (the paper has them from large to small).
+TABLE3: dict[str, tuple[str, str, str, str]] = {
+    "250": ("11.2k", "22.4k", "44.8k", "90k"),
+    "126d2": ("5.7k", "11.4k", "22.9k", "46k"),
+    "100_151": ("8.2k", "23.6k", "76.3k", "169k"),
+    "83d1_84d2": ("5.8k", "15.7k", "47.6k", "160k"),
+    "1d1_126d2": ("3.2k", "12.5k", "49.3k", "195k"),
+    "70_90_91": ("9.8k", "32.6k", "117.5k", "444k"),
+    "14d1_39d2_41d4": ("3.7k", "13.2k", "49.7k", "192k"),
+    "28d1_32d2_41d4": ("4.1k", "13.8k", "49.5k", "186k"),
+    "20d2_16d4_20d8": ("2.4k", "7.5k", "25.8k", "95k"),
+    "19d1_24d3_19d9": ("2.5k", "8k", "27.9k", "103k"),
+    "1d1_84d3_1d1": ("2.3k", "8.7k", "34k", "134k"),
+    "1d1_27d3_20d9": ("1.8k", "6.9k", "26.7k", "105k"),
+    "19d1_19d2_19d4_17d8": ("3.4k", "11.8k", "43.4k", "165k"),
+}
+PAPER_ARCHITECTURES: tuple[str, ...] = tuple(TABLE3)
+# The cell that our count cannot meet: 268 258 parameters, printed as 169k.
+TABLE3_MISPRINT = ("100_151", (32, 48))
+
+
+@dataclass(frozen=True)
+class ConvLayer:
+    """One block: ``filters`` kernels of ``kernel`` taps, ``dilation`` samples apart."""
+
+    kernel: int
+    dilation: int
+    filters: int
+
+    @property
+    def reach(self) -> int:
+        """Samples before the current one that the layer sees: (kernel − 1) · dilation."""
+        return (self.kernel - 1) * self.dilation
+
+
+@dataclass(frozen=True)
+class Arch:
+    """A network, complete but for its weights.
+
+    ``window`` and ``step`` are in samples. ``pool`` exists under ``stream`` only: the positions that the mean
+    runs over. Left at None it becomes the largest multiple of ``step`` that keeps the span within the window;
+    where the receptive field leaves no room for that, the window rounded down to a multiple of ``step``.
+    """
+
+    layers: tuple[ConvLayer, ...]
+    channels: int = 11
+    classes: int = 18
+    padding: Padding = "stream"
+    norm: Norm = "batch"
+    window: int = 250
+    step: int = 5
+    pool: int | None = None
+
+    def __post_init__(self) -> None:
+        if not self.layers or len(self.layers) > MAX_LAYERS:
+            raise ArchError(f"A network has 1 to {MAX_LAYERS} layers, not {len(self.layers)}: change the architecture.")
+        for n, layer in enumerate(self.layers, 1):
+            _in_range(f"the kernel of layer {n}", layer.kernel, 1, MAX_NUMBER)
+            _in_range(f"the dilation of layer {n}", layer.dilation, 1, MAX_NUMBER)
+            _in_range(f"the filter count of layer {n}", layer.filters, 1, MAX_NUMBER)
+        _one_of("padding", self.padding, PADDINGS)
+        _one_of("norm", self.norm, NORMS)
+        _in_range("channels", self.channels, 1, MAX_NUMBER)
+        _in_range("classes", self.classes, 2, MAX_NUMBER)
+        _in_range("window", self.window, 2, 1_000_000)
+        _in_range("step", self.step, 1, self.window, " (the window)")
+        if self.padding != "stream":
+            if self.pool is not None:
+                raise ArchError(
+                    f"pool belongs to the padding 'stream'; under '{self.padding}' the mean runs over the "
+                    "whole window: leave pool out."
+                )
+        elif self.pool is None:
+            room = self.window - self.receptive_field + 1
+            object.__setattr__(self, "pool", (room if room >= self.step else self.window) // self.step * self.step)
+        else:
+            _in_range("pool", self.pool, self.step, 1_000_000)
+            if self.pool % self.step:
+                below = self.pool // self.step * self.step
+                raise ArchError(
+                    f"pool is {self.pool}, which the step of {self.step} samples does not divide: "
+                    f"give {below} or {below + self.step}."
+                )
+
+    @classmethod
+    def parse(
+        cls,
+        spec: str,
+        filters: str | Sequence[int],
+        *,
+        channels: int = 11,
+        classes: int = 18,
+        padding: str = "stream",
+        norm: str = "batch",
+        window: int = 250,
+        step: int = 5,
+        pool: int | None = None,
+    ) -> Arch:
+        """A network from its symbol and its filter counts (``(8, 12)`` or ``"8,12"``; extra are ignored).
+
+        Raises:
+            ArchError: with the symbol and a caret under the place, or saying which setting does not fit.
+        """
+        shape = parse_symbol(spec)
+        counts = (
+            parse_filters(filters)
+            if isinstance(filters, str)
+            else tuple(int(f) if isinstance(f, np.integer) else f for f in filters)
+        )
+        if len(counts) < len(shape):
+            given = ",".join(str(f) for f in counts) or "nothing"
+            example = ",".join(str(f) for f in PAPER_FILTERS[1][: len(shape)])
+            fail(
+                f"{len(shape)} layers but only {len(counts)} filter counts ({given}): "
+                f"give one count a layer, for example {example}",
+                spec,
+                layer_start(spec, len(counts)),
+            )
+        layers = tuple(ConvLayer(k, d, f) for (k, d), f in zip(shape, counts, strict=False))
+        return cls(layers, channels, classes, cast(Padding, padding), cast(Norm, norm), window, step, pool)
+
+    @property
+    def symbol(self) -> str:
+        """The symbol, spelt as the paper does: dilations are written when any of them is not 1."""
+        dilated = any(layer.dilation > 1 for layer in self.layers)
+        return "_".join(f"{layer.kernel}d{layer.dilation}" if dilated else f"{layer.kernel}" for layer in self.layers)
+
+    @property
+    def filters(self) -> tuple[int, ...]:
+        """Filter count of each layer."""
+        return tuple(layer.filters for layer in self.layers)
+
+    @property
+    def inputs(self) -> tuple[int, ...]:
+        """Channels that each layer reads."""
+        return (self.channels, *self.filters[:-1])
+
+    @property
+    def weight_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Every tensor of the network by name: what a weights dict holds, and nothing else."""
+        shapes: dict[str, tuple[int, ...]] = {}
+        for i, (layer, read) in enumerate(zip(self.layers, self.inputs, strict=True)):
+            shapes[f"conv{i}.weight"] = (layer.filters, read, layer.kernel)
+            shapes[f"conv{i}.bias"] = (layer.filters,)
+            for name in ("gain", "shift", "mean", "var") if self.norm == "batch" else ("gain", "shift"):
+                shapes[f"norm{i}.{name}"] = (layer.filters,)
+        shapes["dense.weight"] = (self.classes, self.filters[-1])
+        shapes["dense.bias"] = (self.classes,)
+        return shapes
+
+    @property
+    def parameters(self) -> int:
+        """Learnable numbers, as the paper's Table 3 counts them: without running means and variances."""
+        learnt = (s for name, s in self.weight_shapes.items() if not name.endswith((".mean", ".var")))
+        return sum(int(np.prod(shape)) for shape in learnt)
+
+    @property
+    def receptive_field(self) -> int:
+        """Samples that one position of the last layer sees."""
+        return 1 + sum(layer.reach for layer in self.layers)
+
+    @property
+    def pooled(self) -> int:
+        """Positions of the last layer that the mean runs over."""
+        return self.window if self.pool is None else self.pool
+
+    @property
+    def span(self) -> int:
+        """Samples that a decision sees: receptive field + pool − 1 under ``stream``, the window otherwise."""
+        return self.window if self.pool is None else self.receptive_field + self.pool - 1
+
+    @property
+    def positions(self) -> tuple[int, ...]:
+        """Positions that each layer computes when a decision is made from ``span`` samples at once."""
+        if self.padding != "stream":
+            return (self.window,) * len(self.layers)
+        after, left = [], self.span
+        for layer in self.layers:
+            left -= layer.reach
+            after.append(left)
+        return tuple(after)
+
+    @property
+    def macs_per_position(self) -> tuple[int, ...]:
+        """Multiply-accumulates of each layer at one position (convolutions only, as the paper counts)."""
+        return tuple(k.kernel * read * k.filters for k, read in zip(self.layers, self.inputs, strict=True))
+
+    @property
+    def macs_per_sample(self) -> int:
+        """Multiply-accumulates that one new sample costs when the network is fed sample by sample."""
+        return sum(self.macs_per_position)
+
+    @property
+    def macs_per_window(self) -> int:
+        """Multiply-accumulates of one decision from a whole window (``stream``: from ``span`` samples)."""
+        return sum(m * n for m, n in zip(self.macs_per_position, self.positions, strict=True))
+
+    @property
+    def macs_per_step(self) -> int:
+        """Multiply-accumulates between two decisions: ``stream`` reads new samples, the others all again."""
+        return self.step * self.macs_per_sample if self.padding == "stream" else self.macs_per_window
+
+    @property
+    def state_bytes_int8(self) -> int:
+        """Bytes kept between samples with 8-bit activations.
+
+        ``stream``: a ring of reach + 1 samples before each layer, and pool / step block sums of 16 bits for
+        each feature. Otherwise the ring of the window, without the activations that are recomputed from it.
+        """
+        if self.pool is None:
+            return self.window * self.channels
+        rings = sum((layer.reach + 1) * read for layer, read in zip(self.layers, self.inputs, strict=True))
+        return rings + 2 * self.filters[-1] * (self.pool // self.step)
+
+    @property
+    def table3(self) -> str | None:
+        """What the paper's Table 3 prints for this network ("13.2k"); None where it is not in the table."""
+        if (self.channels, self.classes) != (11, 18):
+            return None
+        for row, spec in enumerate(PAPER_FILTERS):
+            if self.symbol in TABLE3 and spec[: len(self.layers)] == self.filters:
+                return TABLE3[self.symbol][row]
+        return None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, ready for JSON; the layers as their symbol."""
+        return {
+            "symbol": self.symbol,
+            "filters": list(self.filters),
+            "channels": self.channels,
+            "classes": self.classes,
+            "padding": self.padding,
+            "norm": self.norm,
+            "window": self.window,
+            "step": self.step,
+            "pool": self.pool,
+        }
+
+    @classmethod
+    def from_dict(cls, table: Mapping[str, Any]) -> Arch:
+        """The network that ``to_dict`` described; ArchError for a missing, unknown or unfit key."""
+        known = ("symbol", "filters", "channels", "classes", "padding", "norm", "window", "step", "pool")
+        for key in table:
+            if key not in known:
+                accepted = ", ".join(known)
+                raise ArchError(
+                    f"Unknown key '{key}' in an architecture: accepted are {accepted}.{nearest(key, known)}"
+                )
+        missing = [key for key in known[:2] if key not in table]
+        if missing:
+            raise ArchError(f"An architecture lacks the key '{missing[0]}': add it.")
+        spec, filters = table["symbol"], table["filters"]
+        if not isinstance(spec, str) or not isinstance(filters, str | Sequence):
+            raise ArchError("An architecture needs its symbol as text and its filters as a list of whole numbers.")
+        return cls.parse(spec, filters, **{k: v for k, v in table.items() if k not in known[:2]})
+
+
+def reflected(length: int, left: int) -> NDArray[np.intp]:
+    """Indices that extend ``length`` samples by ``left`` mirrored ones, (left + length,).
+
+    The edge sample is not repeated; where the samples do not suffice they are reflected again, as
+    ``numpy.pad`` does with mode ``reflect``.
+    """
+    folded = np.abs(np.arange(-left, length)) % (2 * (length - 1))
+    return np.asarray(np.minimum(folded, 2 * (length - 1) - folded), dtype=np.intp)
+
+
+def _in_range(what: str, value: object, low: int, high: int, of_high: str = "") -> None:
+    if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
+        raise ArchError(f"{what} is {value!r}: accepted are whole numbers from {low} to {high}{of_high}.")
+
+
+def _one_of(what: str, value: str, known: tuple[str, ...]) -> None:
+    if value not in known:
+        raise ArchError(f"Unknown {what} '{value}': accepted are {', '.join(known)}.{nearest(str(value), known)}")

@@ -1,0 +1,257 @@
+"""A trained model in one file (``*.plush``): weights, and everything needed to feed it and to judge it.
+
+The file is safetensors; its one metadata entry ``plushsense`` holds JSON: format, version, the SHA-256 of
+content and tensors, and the content. Never pickle. The same bundle gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import math
+import os
+import uuid
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load as load_tensors
+from safetensors.numpy import save as save_tensors
+
+from plushsense.core.errors import BadInput, BundleError
+from plushsense.core.gestures import GestureSet
+from plushsense.core.signal import Layout
+from plushsense.models.arch import Arch
+from plushsense.models.reference import Network, check_weights
+from plushsense.windows.features import Scaler
+
+FORMAT = "plushsense-bundle"
+VERSION = 1
+_AGAIN = "copy it again from where it came, or train again"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Bundle:
+    """A network and its world. The order of ``gestures`` is the class index.
+
+    ``windowing``, ``decision`` and ``provenance`` are plain values for JSON: how the windows were cut, how
+    live decisions are smoothed, where the weights come from (data set hash, subjects, code version, split,
+    scores).
+
+    Raises:
+        BundleError: when the parts do not fit each other.
+    """
+
+    arch: Arch
+    weights: Mapping[str, NDArray[np.float32]]
+    layout: Layout
+    scaler: Scaler
+    gestures: GestureSet
+    windowing: dict[str, Any] = field(default_factory=dict)
+    decision: dict[str, Any] = field(default_factory=dict)
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check_weights(self.arch, self.weights)
+        for what, found, needed in (
+            ("inputs in the layout", self.layout.n_inputs, self.arch.channels),
+            ("offsets in the scaling", np.size(self.scaler.offset), self.arch.channels),
+            ("scales in the scaling", np.size(self.scaler.scale), self.arch.channels),
+            ("gestures in the set", len(self.gestures), self.arch.classes),
+        ):
+            if found != needed:
+                raise BundleError(f"The bundle does not fit together: {found} {what}, the network needs {needed}.")
+        if not (np.isfinite(self.scaler.offset).all() and np.isfinite(self.scaler.scale).all()):
+            raise BundleError("The bundle's scaling holds a value that is not finite: train again.")
+
+    def __repr__(self) -> str:
+        filters = "/".join(str(f) for f in self.arch.filters)
+        return (
+            f"Bundle({self.arch.symbol} {filters} {self.arch.padding}, {len(self.gestures)} gestures, "
+            f"layout {self.layout.name})"
+        )
+
+    def network(self) -> Network:
+        """The network in NumPy, ready to answer."""
+        return Network(self.arch, self.weights)
+
+    def save(self, path: str | Path) -> Path:
+        """Write the bundle; the file appears whole or not at all. Missing folders are made.
+
+        Raises:
+            BundleError: when the place cannot be written.
+        """
+        path = Path(path)
+        data = self._to_bytes()
+        part = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.part")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with part.open("wb") as out:
+                out.write(data)
+                out.flush()
+                os.fsync(out.fileno())
+            part.replace(path)
+        except OSError as cause:
+            raise BundleError(f"The bundle '{path}' cannot be written ({cause}): choose another place.") from None
+        finally:
+            with contextlib.suppress(OSError):
+                part.unlink(missing_ok=True)
+        return path
+
+    @classmethod
+    def load(cls, path: str | Path) -> Bundle:
+        """Read a bundle.
+
+        Raises:
+            BundleError: when the file is missing, cut, changed, of another version, or no bundle.
+        """
+        path = Path(path)
+        try:
+            data = path.read_bytes()
+        except FileNotFoundError:
+            raise BundleError(
+                f"There is no bundle '{path}': check the path, or make one with plushsense train."
+            ) from None
+        except OSError as cause:
+            raise BundleError(f"The bundle '{path}' cannot be read ({cause}).") from None
+        head = _header(data, path)
+        version = head.get("version")
+        if version != VERSION:
+            raise BundleError(
+                f"The bundle '{path}' has the version {version!r}; this PlushSense reads {VERSION}: "
+                "use the PlushSense that wrote it, or train again."
+            )
+        content = head.get("content")
+        try:
+            weights: dict[str, NDArray[Any]] = load_tensors(data)
+        except (SafetensorError, KeyError, ValueError, TypeError) as cause:
+            raise BundleError(f"{_damaged(path)} ({cause}).") from None
+        if not isinstance(content, dict) or head.get("sha256") != _digest(_canonical(content), weights):
+            raise BundleError(f"{_damaged(path)} (its checksum does not match).")
+        try:
+            bundle = cls(
+                Arch.from_dict(content["arch"]),
+                weights,
+                Layout.from_dict(content["layout"], "layout of the bundle"),
+                Scaler.from_dict(content["scaling"]),
+                GestureSet.from_dict(content["gestures"], "gesture set of the bundle"),
+                content["windowing"],
+                content["decision"],
+                content["provenance"],
+            )
+            implied = bundle._implied()
+            changed = [key for key in implied if content.get(key) != implied[key]]
+        except (BadInput, KeyError, TypeError, ValueError) as cause:
+            raise BundleError(f"The bundle '{path}' cannot be used: {cause}") from None
+        if changed:
+            was, now = content.get(changed[0]), implied[changed[0]]
+            raise BundleError(
+                f"The bundle '{path}' was written under other rules ({changed[0]} was {was}, is {now}): train again."
+            )
+        return bundle
+
+    def _implied(self) -> dict[str, Any]:
+        """What follows from the parts, written out for readers in other languages."""
+        return {
+            "features": list(self.layout.inputs),
+            "clock": {
+                "rate_hz": self.layout.rate_hz,
+                "period_us": self.layout.period_us,
+                "gap_ms": self.layout.gap_ms,
+            },
+            "pool": self.arch.pooled,
+            "step": self.arch.step,
+            "span": self.arch.span,
+        }
+
+    def _to_bytes(self) -> bytes:
+        content: dict[str, Any] = _plain(
+            {
+                "arch": self.arch.to_dict(),
+                "layout": self.layout.to_dict(),
+                "scaling": self.scaler.to_dict(),
+                "gestures": self.gestures.to_dict(),
+                "windowing": self.windowing,
+                "decision": self.decision,
+                "provenance": self.provenance,
+                **self._implied(),
+            }
+        )
+        weights = {n: np.ascontiguousarray(w, dtype=np.float32) for n, w in sorted(self.weights.items())}
+        head = {
+            "format": FORMAT,
+            "version": VERSION,
+            "sha256": _digest(_canonical(content), weights),
+            "content": content,
+        }
+        return bytes(save_tensors(weights, metadata={"plushsense": _canonical(head)}))
+
+
+def _header(data: bytes, path: Path) -> dict[str, Any]:
+    """The JSON of a bundle, once the length of the file is known to be right."""
+    stranger = f"'{path}' is not a PlushSense bundle: give a *.plush file made by plushsense train"
+    length = int.from_bytes(data[:8], "little")
+    if len(data) < 10 or data[8:9] != b"{":
+        raise BundleError(f"{stranger}." if data else f"'{path}' is empty: {_AGAIN}.")
+    if 8 + length > len(data):
+        # A file of another kind gives a length beyond any sense here.
+        raise BundleError(f"{_damaged(path)} (it ends within its header)." if length < 1 << 26 else f"{stranger}.")
+    try:
+        outer = json.loads(data[8 : 8 + length])
+        ends = [v["data_offsets"][1] for name, v in outer.items() if name != "__metadata__"]
+        inner = outer.get("__metadata__", {}).get("plushsense")
+        if inner is None:
+            raise BundleError(f"{stranger} (this is a safetensors file of something else, or a damaged bundle).")
+        head = json.loads(inner)
+        if head["format"] != FORMAT or "version" not in head:
+            raise BundleError(f"{stranger}.")
+        missing = 8 + length + max(ends, default=0) - len(data)
+    except (ValueError, TypeError, KeyError, AttributeError, IndexError, RecursionError):
+        raise BundleError(f"{_damaged(path)} (its header cannot be read).") from None
+    if missing > 0:
+        raise BundleError(f"{_damaged(path)} ({missing} bytes are missing at its end).")
+    return dict(head)
+
+
+def _damaged(path: Path) -> str:
+    return f"The bundle '{path}' is damaged: {_AGAIN}"
+
+
+def _canonical(content: Mapping[str, Any]) -> str:
+    return json.dumps(content, sort_keys=True, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
+
+
+def _digest(content: str, weights: Mapping[str, NDArray[Any]]) -> str:
+    """SHA-256 over the content and every tensor with its name, type and shape."""
+    total = hashlib.sha256(content.encode())
+    for name in sorted(weights):
+        values = np.ascontiguousarray(weights[name])
+        total.update(f"\n{name} {values.dtype.str} {values.shape}\n".encode())
+        total.update(values.tobytes())
+    return total.hexdigest()
+
+
+def _plain(value: Any) -> Any:
+    """A value for JSON: NumPy and paths made plain, keys text, numbers that are not finite null."""
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, set | frozenset):
+        return sorted(_plain(v) for v in value)
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if isinstance(value, Path):
+        return str(value)
+    raise BundleError(f"A bundle holds plain values only, not {value!r} of the type {type(value).__name__}.")

@@ -1,0 +1,162 @@
+"""Recording sessions of the virtual toy's people, left on disk exactly as the authors' recorder leaves them.
+
+One folder a person, with ``<label>_<epoch ms>_<rows>.csv`` a recording and ``fulldatastream.csv`` for all that the
+toy sent; nobody's recordings of the toy at rest are in the folder ``none``. A score on these says nothing about a
+real toy.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import ConfigError, DatasetError
+from plushsense.core.gestures import NOBODY
+from plushsense.core.recfile import STREAM_NAME, Frames, format_rows, recording_filename, write_recording
+from plushsense.core.signal import Layout, load_layout
+from plushsense.devices.virtual.motions import AT_REST
+from plushsense.devices.virtual.people import draw_person
+from plushsense.devices.virtual.session import GESTURES, Mark, Session
+from plushsense.devices.virtual.stream import channel_columns
+from plushsense.devices.virtual.world import WORLD, World
+
+START_MS = 1_760_000_000_000
+"""The first session, milliseconds since 1970: fixed, so that the same seed writes the same files."""
+
+Progress = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True)
+class SimulationSummary:
+    """What was written."""
+
+    folder: str
+    people: int
+    recordings: int
+    rows: int
+    stream_rows: int
+    lost: int
+    seed: int
+
+    def to_dict(self) -> dict[str, str | int]:
+        """Plain values, ready for JSON."""
+        return dataclasses.asdict(self)
+
+
+@dataclass(frozen=True)
+class _Take:
+    """One session: all frames that the recorder took in, and which rows became which recording."""
+
+    frames: Frames
+    cuts: list[tuple[str, int, int]]
+    lost: int
+
+
+def _session(
+    who: int | None, seed: int, gestures: Sequence[str], repetitions: int, layout: Layout, world: World
+) -> _Take:
+    """Play a session through, lose the lines that the air loses, and stamp the host's time on the rest."""
+    person = None if who is None else draw_person(who, seed, world)
+    session = Session(person, seed, 0, world)
+    episodes = [session.idle(2.0)]
+    episodes += [session.perform(label, repetitions) for label in gestures]
+    episodes.append(session.idle(2.0))
+    marks: list[Mark] = [m for e in episodes for m in e.marks]
+    values = np.concatenate([e.values for e in episodes])[:, channel_columns(layout)]
+    device_ms = np.concatenate([e.device_ms for e in episodes])
+    rng = np.random.default_rng([seed, 0 if who is None else who + 1, 0xF11E])
+    kept = rng.random(len(values)) >= world.lost + world.garbled
+    order = 40 if who is None else who
+    host_ms = START_MS + order * 86_400_000 + int(rng.integers(0, 20_000_000)) + _arrival(device_ms, rng)
+    row_of = np.concatenate(([0], np.cumsum(kept)))
+    frames = Frames(values[kept], device_ms[kept], host_ms[kept])
+    cuts = [(m.label, int(row_of[m.record_start]), int(row_of[m.record_stop])) for m in marks]
+    return _Take(frames, cuts, int(np.sum(~kept)))
+
+
+def _arrival(device_ms: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
+    """Host times of frames, from 0: the host's clock runs a little differently, and frames wait 0 to 6 ms."""
+    passed = (device_ms - device_ms[0]) * (1.0 + 4e-5 * rng.standard_normal())
+    return np.maximum.accumulate(np.rint(passed + 6.0 * rng.random(len(passed))).astype(np.int64))
+
+
+def _write(folder: Path, take: _Take, layout: Layout) -> int:
+    """Write the stream and the recordings of one session; returns the rows of the recordings."""
+    folder.mkdir(parents=True, exist_ok=True)
+    rows = 0
+    host = take.frames.host_ms
+    for label, start, stop in take.cuts:
+        part = take.frames.slice(start, stop)
+        saved_ms = (int(host[stop - 1]) if host is not None else 0) + 25
+        write_recording(folder / recording_filename(label, saved_ms, len(part)), part, layout)
+        rows += len(part)
+    target = folder / STREAM_NAME
+    part_file = target.with_name(STREAM_NAME + ".part")
+    with part_file.open("w", encoding="utf-8", newline="\n") as file:
+        for start in range(0, len(take.frames), 20_000):
+            file.write(format_rows(take.frames.slice(start, start + 20_000), layout))
+    os.replace(part_file, target)
+    return rows
+
+
+def simulate(
+    out: str | os.PathLike[str],
+    people: int = 25,
+    seed: int = 1,
+    repetitions: int = 3,
+    progress: Progress | None = None,
+    *,
+    at_rest: int | None = None,
+    gestures: Sequence[str] | None = None,
+    layout: Layout | str = "plush-15",
+    world: World = WORLD,
+) -> SimulationSummary:
+    """Write a data set shaped like the paper's: 25 people × 17 gestures × 3, and 51 at rest = 1326 recordings.
+
+    Args:
+        out: a new or empty folder; people become ``P01`` …, nobody ``none``.
+        people, repetitions: the size.
+        seed: the same seed writes the same files.
+        progress: called with sessions done, sessions in all, and the folder just written.
+        at_rest: recordings of nobody; by default gestures × repetitions, as in the paper.
+        gestures: a subset of the 17, in class order.
+        layout: whose columns are written: plush-15, plush-14 or accel-3.
+
+    Raises:
+        ConfigError: for a size or gesture that cannot be.
+        DatasetError: when the folder holds something already.
+    """
+    labels = tuple(gestures) if gestures is not None else GESTURES
+    unknown = [label for label in labels if label not in GESTURES]
+    if unknown:
+        raise ConfigError(f"The virtual people know no gesture '{unknown[0]}'; they know {', '.join(GESTURES)}.")
+    sizes = (("people", people, 1, 9999), ("repetitions", repetitions, 1, 1000), ("seed", seed, 0, 2**31))
+    for name, value, low, high in sizes:
+        if not low <= value <= high:
+            raise ConfigError(f"{name} is {value}; a whole number from {low} to {high} is accepted.")
+    resting = len(labels) * repetitions if at_rest is None else at_rest
+    folder = Path(out)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise DatasetError(f"'{folder}' holds something already: simulate into a new or empty folder.")
+    resolved = layout if isinstance(layout, Layout) else load_layout(layout)
+    width = max(2, len(str(people)))
+    sessions: list[tuple[str, int | None]] = [(f"P{who:0{width}d}", who) for who in range(1, people + 1)]
+    if resting > 0:
+        sessions.append((NOBODY, None))
+    recordings = rows = stream_rows = lost = 0
+    for done, (name, who) in enumerate(sessions, 1):
+        chosen, times = ((AT_REST,), resting) if who is None else (labels, repetitions)
+        take = _session(who, seed, chosen, times, resolved, world)
+        rows += _write(folder / name, take, resolved)
+        recordings += len(take.cuts)
+        stream_rows += len(take.frames)
+        lost += take.lost
+        if progress is not None:
+            progress(done, len(sessions), name)
+    return SimulationSummary(str(folder), people, recordings, rows, stream_rows, lost, seed)

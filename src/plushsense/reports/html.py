@@ -1,0 +1,138 @@
+"""The report: one HTML file that asks for nothing outside itself."""
+
+from __future__ import annotations
+
+import base64
+import uuid
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from plushsense.core.errors import ConfigError
+from plushsense.core.extras import need
+from plushsense.reports import figures, tables, words
+
+
+def write_report(
+    path: str | Path,
+    *,
+    title: str,
+    dataset: Mapping[str, Any],
+    evaluations: Sequence[Mapping[str, Any]],
+    models: Sequence[Mapping[str, Any]],
+    simulated: bool,
+) -> Path:
+    """Write one self-contained HTML report and return its path; an older file is replaced in one step.
+
+    Args:
+        path: the file to write; its folder is made.
+        title: shown on top.
+        dataset: name, subjects, recordings, gestures, streams, layout, licence, hash, warnings (numbers or
+            lists).
+        evaluations: ``Evaluation.to_dict()`` each; ``title`` and ``model`` may be added to name it.
+        models: one model card each (symbol, filters, …, provenance); ``title`` may be added.
+        simulated: True puts a banner on top and by every table of scores.
+
+    Every key may be missing: the report shows a dash. All texts are escaped.
+
+    Raises:
+        ConfigError: when the file cannot be written.
+        MissingExtraError: when jinja2 or matplotlib is not installed.
+    """
+    target = Path(path)
+    page = render(title=title, dataset=dataset, evaluations=evaluations, models=models, simulated=simulated)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        draft = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.part")
+        try:
+            draft.write_text(page, encoding="utf-8", newline="\n")
+            draft.replace(target)
+        finally:
+            draft.unlink(missing_ok=True)
+    except OSError as cause:
+        raise ConfigError(
+            f"The report '{target}' cannot be written ({cause.strerror}): name a file where you may write."
+        ) from cause
+    return target
+
+
+def render(
+    *,
+    title: str,
+    dataset: Mapping[str, Any],
+    evaluations: Sequence[Mapping[str, Any]],
+    models: Sequence[Mapping[str, Any]],
+    simulated: bool,
+) -> str:
+    """The report as one HTML text; arguments as in ``write_report``."""
+    jinja2 = need("jinja2", "train")
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    source = resources.files("plushsense.reports").joinpath("report.html.j2").read_text(encoding="utf-8")
+    named = [{**evaluation, "title": words.title_of(evaluation)} for evaluation in evaluations]
+    page: str = environment.from_string(source).render(
+        title=title,
+        made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+        simulated=simulated,
+        simulated_title=words.SIMULATED_TITLE,
+        simulated_words=words.SIMULATED_WORDS,
+        leaky_words=words.LEAKY_WORDS,
+        any_leaky=any(evaluation.get("leaky") for evaluation in named),
+        dataset=tables.dataset_rows(dataset),
+        comparison=tables.comparison_rows(named),
+        subjects=tables.subject_rows(named),
+        evaluations=[_evaluation(f"E{i}", evaluation) for i, evaluation in enumerate(named, start=1)],
+        models=[_model(model) for model in models],
+        contexts=words.CONTEXT_WORDS,
+    )
+    return page
+
+
+def _evaluation(key: str, evaluation: Mapping[str, Any]) -> dict[str, Any]:
+    """What the page shows of one evaluation, as finished text."""
+    nobody = evaluation.get("nobody")
+    return {
+        "key": key,
+        "title": evaluation["title"],
+        "leaky": bool(evaluation.get("leaky")),
+        "protocol": words.protocol(evaluation),
+        "spread": words.spread_words(evaluation),
+        "metrics": tables.metric_rows(evaluation),
+        "contexts": tables.context_rows(evaluation),
+        "nobody": None
+        if not nobody
+        else {name: words.count(nobody.get(name)) for name in ("recordings", "windows")}
+        | {"accuracy": words.number(nobody.get("accuracy"))},
+        "classes": tables.class_rows(evaluation),
+        "confusions": [
+            (name, table)
+            for name, table in (
+                ("by gesture", tables.confusion_rows(evaluation.get("confusion"))),
+                ("by affect", tables.confusion_rows(evaluation.get("confusion_affect"))),
+            )
+            if table and len(table["labels"]) > 1
+        ],
+        "curves": _curves(evaluation.get("histories")),
+        "predictions": evaluation.get("predictions"),
+    }
+
+
+def _curves(histories: Any) -> str | None:
+    """Training curves as a data URI; None when no fold kept its history."""
+    kept = [history for history in histories or () if history]
+    if not kept:
+        return None
+    return "data:image/svg+xml;base64," + base64.b64encode(figures.svg(figures.training_curves(kept))).decode("ascii")
+
+
+def _model(model: Mapping[str, Any]) -> dict[str, Any]:
+    symbol, filters = words.text(model.get("symbol")), words.text(model.get("filters"))
+    return {
+        "title": str(model.get("title") or f"{symbol}, filters {filters}"),
+        "rows": tables.model_rows(model),
+        "streams": model.get("padding") == "stream",
+        "padding": words.text(model.get("padding")),
+    }

@@ -1,0 +1,235 @@
+"""How recordings (or, leaky, windows) are divided into training, validation and test: functions on arrays.
+
+What is divided is called a unit: a recording in every split but the one over windows. A split by subject
+keeps whole people apart: those tested, those who validate (they decide when training stops), those trained
+on. Units of nobody (subject "none": the toy at rest) have no person to keep apart: the folds share them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import BadInput, ConfigError, nearest
+from plushsense.core.gestures import NOBODY
+
+Index = NDArray[np.int64]
+
+UNKNOWN = "unknown"
+VALIDATION_SHARE = 0.15
+# The paper trains on 70 %, validates on 15 % and tests on 15 % of the windows (section 3.6.1).
+HOLDOUT_SHARE = 0.15
+
+
+@dataclass(frozen=True)
+class Fold:
+    """One division of the units: three disjoint index arrays, each in ascending order.
+
+    ``subjects`` are the people tested (without nobody); where people are not kept apart they also train.
+    """
+
+    name: str
+    subjects: tuple[str, ...]
+    train: Index
+    validation: Index
+    test: Index
+
+
+@dataclass(frozen=True)
+class Split:
+    """A split as it is asked for: ``by-subject:5`` is kind "by-subject" with k = 5.
+
+    Without k, "windows" is the paper's one division (``windows:holdout``).
+    """
+
+    kind: str
+    k: int | None = None
+
+    @property
+    def text(self) -> str:
+        """The split as it is written on the command line."""
+        if self.kind == "windows" and self.k is None:
+            return "windows:holdout"
+        return self.kind if self.k is None else f"{self.kind}:{self.k}"
+
+    @property
+    def leaky(self) -> bool:
+        """Whether windows of one recording, which overlap, stand on both sides."""
+        return self.kind == "windows"
+
+    @property
+    def unit(self) -> str:
+        """What is divided: "recording" or "window"."""
+        return "window" if self.leaky else "recording"
+
+    @property
+    def apart(self) -> bool:
+        """Whether nobody who is tested was trained on."""
+        return self.kind in ("leave-one-subject-out", "by-subject")
+
+
+EXAMPLES = ("leave-one-subject-out", "by-subject:5", "by-recording:5", "windows:5", "windows:holdout")
+
+
+def parse_split(text: str) -> Split:
+    """The split that a string names.
+
+    Raises:
+        ConfigError: quoting the string, with the accepted forms and the nearest of them.
+    """
+    kind, colon, number = text.strip().partition(":")
+    if kind == "leave-one-subject-out" and not colon:
+        return Split(kind)
+    if kind == "windows" and number == "holdout":
+        return Split(kind)
+    if kind in ("by-subject", "by-recording", "windows"):
+        if number.isascii() and number.isdigit() and 2 <= int(number) <= 1000:
+            return Split(kind, int(number))
+        raise ConfigError(
+            f"Split '{text}' needs a number of folds from 2 to 1000 after the colon: for example {kind}:5"
+        )
+    raise ConfigError(f"Unknown split '{text}': accepted are {', '.join(EXAMPLES)}.{nearest(text, EXAMPLES)}")
+
+
+def make_folds(split: Split, subject: NDArray[np.str_], label: Index, seed: int = 0) -> list[Fold]:
+    """The folds of ``split`` over units with these people and classes, both (n,); the same for the same seed.
+
+    Raises:
+        BadInput: when there are too few people or units, or people whom nobody named, for the split.
+    """
+    if len(subject) != len(label):
+        raise BadInput(f"A split needs one class for each unit: got {len(subject)} people and {len(label)} classes.")
+    if split.kind == "leave-one-subject-out":
+        return leave_one_subject_out(subject, seed)
+    if split.kind == "by-subject":
+        return by_subject(subject, split.k or 5, seed)
+    if split.kind == "by-recording":
+        return by_recording(subject, label, split.k or 5, seed)
+    if split.k is None:
+        return holdout(subject, label, seed)
+    return windows(subject, label, split.k, seed)
+
+
+def leave_one_subject_out(subject: NDArray[np.str_], seed: int = 0) -> list[Fold]:
+    """Each person tested once, in the order of their codes; 15 % of the others, at least one, validate."""
+    people = _people(subject, "leave-one-subject-out", 3)
+    return _by_people(subject, [(person,) for person in people], people, seed)
+
+
+def by_subject(subject: NDArray[np.str_], k: int, seed: int = 0) -> list[Fold]:
+    """People dealt into ``k`` groups, each tested once; 15 % of the other people, at least one, validate."""
+    people = _people(subject, f"by-subject:{k}", max(k, 3))
+    dealt = np.random.default_rng([seed, 1]).permutation(people).tolist()
+    groups = [tuple(sorted(dealt[i::k])) for i in range(k)]
+    if min(len(people) - len(group) for group in groups) < 2:
+        raise BadInput(f"by-subject:{k} leaves one person to train and validate: use leave-one-subject-out.")
+    return _by_people(subject, groups, people, seed)
+
+
+def by_recording(subject: NDArray[np.str_], label: Index, k: int, seed: int = 0) -> list[Fold]:
+    """Recordings dealt into ``k`` groups, evenly over classes and people; 15 % of the others validate."""
+    _enough(len(label), max(k, 3), f"by-recording:{k}", "recordings")
+    return _stratified(subject, label, k, seed, strata=subject)
+
+
+def windows(subject: NDArray[np.str_], label: Index, k: int, seed: int = 0) -> list[Fold]:
+    """Windows dealt into ``k`` groups, evenly over classes; 15 % of the others validate. Leaky."""
+    _enough(len(label), max(k, 3), f"windows:{k}", "windows")
+    return _stratified(subject, label, k, seed, strata=np.full(len(label), ""))
+
+
+def holdout(subject: NDArray[np.str_], label: Index, seed: int = 0) -> list[Fold]:
+    """The paper's division, stratified by class: 70 % of the windows train, 15 % validate. Leaky."""
+    everything = np.arange(len(label), dtype=np.int64)
+    _enough(len(label), 3, "windows:holdout", "windows")
+    rng = np.random.default_rng([seed, 3])
+    test = _stratified_share(everything, label, HOLDOUT_SHARE, rng)
+    rest = np.setdiff1d(everything, test)
+    validation = _stratified_share(rest, label, VALIDATION_SHARE / (1.0 - HOLDOUT_SHARE), rng)
+    return [Fold("holdout", _named(subject[test]), np.setdiff1d(rest, validation), validation, test)]
+
+
+def purge(
+    stream: NDArray[np.str_], rows: Index, tested_stream: NDArray[np.str_], tested_rows: Index
+) -> NDArray[np.bool_]:
+    """Which windows may be trained on, (n,): those whose stream rows touch no tested recording.
+
+    Args:
+        stream, rows: stream id (n,) and rows (n, 2), the last exclusive, of each window; "" or −1: none.
+        tested_stream, tested_rows: the same of the recordings that are tested, (m,) and (m, 2).
+    """
+    keep = np.ones(len(stream), dtype=np.bool_)
+    for name in np.unique(tested_stream[tested_rows[:, 0] >= 0]):
+        mine = np.flatnonzero((stream == name) & (rows[:, 0] >= 0))
+        there = tested_rows[(tested_stream == name) & (tested_rows[:, 0] >= 0)]
+        if name == "" or not len(mine):
+            continue
+        first, last = rows[mine, 0, None], rows[mine, 1, None]
+        keep[mine] = ~((first < there[:, 1]) & (there[:, 0] < last)).any(axis=1)
+    return keep
+
+
+def _named(subject: NDArray[np.str_]) -> tuple[str, ...]:
+    return tuple(sorted({str(s) for s in subject} - {NOBODY}))
+
+
+def _people(subject: NDArray[np.str_], split: str, needed: int) -> list[str]:
+    people = list(_named(subject))
+    if UNKNOWN in people:
+        raise BadInput(
+            f"{split} needs to know who made each recording, but {int((subject == UNKNOWN).sum())} lack it: "
+            "import them again with a mapping file (--subjects map.csv), or use by-recording:5."
+        )
+    if len(people) < needed:
+        raise BadInput(f"{split} needs at least {needed} people (test, validation, training); there are {len(people)}.")
+    return people
+
+
+def _enough(n: int, needed: int, split: str, units: str) -> None:
+    if n < needed:
+        raise BadInput(f"{split} needs at least {needed} {units}; there are {n}.")
+
+
+def _by_people(subject: NDArray[np.str_], groups: list[tuple[str, ...]], people: list[str], seed: int) -> list[Fold]:
+    nobody = np.flatnonzero(subject == NOBODY)
+    dealt = np.random.default_rng([seed, 2]).permutation(nobody)
+    folds = []
+    for i, group in enumerate(groups):
+        rng = np.random.default_rng([seed, 4, i])
+        others = [person for person in people if person not in group]
+        watching = rng.permutation(others)[: max(1, round(VALIDATION_SHARE * len(others)))]
+        at_rest = dealt[i :: len(groups)]
+        rest = rng.permutation(np.setdiff1d(nobody, at_rest))
+        resting = rest[: round(VALIDATION_SHARE * len(rest)) or int(len(rest) > 1)]
+        test = np.union1d(np.flatnonzero(np.isin(subject, group)), at_rest)
+        validation = np.union1d(np.flatnonzero(np.isin(subject, watching)), resting)
+        name = group[0] if len(group) == 1 else f"fold {i + 1}"
+        train = np.setdiff1d(np.arange(len(subject)), np.union1d(test, validation))
+        folds.append(Fold(name, group, train, validation, test))
+    return folds
+
+
+def _stratified(subject: NDArray[np.str_], label: Index, k: int, seed: int, strata: NDArray[np.str_]) -> list[Fold]:
+    """Units dealt like cards, sorted by class, by ``strata``, then at random: each group has its share."""
+    rng = np.random.default_rng([seed, 5])
+    order = np.lexsort((rng.random(len(label)), strata, label))
+    group = np.empty(len(label), dtype=np.int64)
+    group[order] = np.arange(len(label)) % k
+    folds = []
+    for i in range(k):
+        test, rest = np.flatnonzero(group == i), np.flatnonzero(group != i)
+        validation = _stratified_share(rest, label, VALIDATION_SHARE, np.random.default_rng([seed, 6, i]))
+        train = np.setdiff1d(rest, validation)
+        folds.append(Fold(f"fold {i + 1}", _named(subject[test]), train, validation, test))
+    return folds
+
+
+def _stratified_share(units: Index, label: Index, share: float, rng: np.random.Generator) -> Index:
+    """About ``share`` of ``units``, at least one, evenly over classes, ascending."""
+    order = units[np.lexsort((rng.random(len(units)), label[units]))]
+    wanted = max(1, round(share * len(units)))
+    # Evenly spaced in class order, from a random place: each class gives its share to within one.
+    places = (np.arange(wanted) + rng.random()) * len(units) / wanted
+    return np.sort(order[places.astype(np.int64)])

@@ -1,0 +1,214 @@
+"""Train one network: windows in, weights, scaling and the history of every epoch out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import TrainingError
+from plushsense.models.arch import Arch
+from plushsense.models.net import Net
+from plushsense.training.augment import Turn
+from plushsense.training.spec import TrainSpec
+from plushsense.windows.cut import WindowSet
+from plushsense.windows.features import Scaler
+
+import torch  # isort: skip - after models.net, which says how to install it
+from torch import Tensor
+from torch.nn import functional as F
+
+# Called with (epoch, epochs at most, the epoch's row of the history).
+Progress = Callable[[int, int, dict[str, Any]], None]
+
+# Windows at a time where no gradient is kept.
+_READ = 512
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A trained network.
+
+    ``weights`` as ``models/reference`` takes them; ``history`` one row an epoch: epoch (from 1), train_loss,
+    train_accuracy (means over the epoch's batches, as they were trained on), validation_loss, validation_accuracy
+    (None without validation), learning_rate; ``best_epoch`` the one whose weights these are.
+    """
+
+    weights: dict[str, NDArray[np.float32]]
+    scaler: Scaler
+    history: list[dict[str, Any]]
+    best_epoch: int
+    seconds: float
+
+
+def fit(
+    train: WindowSet,
+    validation: WindowSet | None,
+    arch: Arch,
+    spec: TrainSpec | None = None,
+    progress: Progress | None = None,
+) -> Fitted:
+    """Train ``arch`` on ``train``; ``validation`` decides when to stop. The same seed gives the same weights.
+
+    Raises:
+        TrainingError: when the windows do not fit the network, or the loss is no longer a number.
+    """
+    began = time.perf_counter()
+    spec = spec or TrainSpec()
+    _check(train, arch, "train on")
+    if validation is not None and len(validation):
+        _check(validation, arch, "validate on")
+    device = _device(spec.device)
+    scaler = Scaler.fit(train.x)
+    x, y = _tensors(train, scaler, arch, device)
+    watched = None if validation is None or not len(validation) else _tensors(validation, scaler, arch, device)
+    with torch.random.fork_rng(devices=[]), _repeatable(device), _threads(spec.threads):
+        torch.manual_seed(spec.seed)
+        net = Net(arch).to(device)
+        order = torch.Generator().manual_seed(spec.seed)
+        turn = Turn(train.vectors, scaler, spec.turn_deg, device)
+        adam = torch.optim.Adam(net.parameters(), lr=spec.learning_rate, fused=True)
+        history: list[dict[str, Any]] = []
+        best_epoch, best_score, best = 0, float("-inf"), net.export_weights()
+        for epoch in range(1, spec.epochs + 1):
+            row: dict[str, Any] = {"epoch": epoch}
+            for group in adam.param_groups:
+                group["lr"] = spec.learning_rate_at(epoch)
+            row["train_loss"], row["train_accuracy"] = _train(net, adam, x, y, spec, order, turn)
+            row["validation_loss"], row["validation_accuracy"] = (
+                (None, None) if watched is None else _measure(net, *watched)
+            )
+            row["learning_rate"] = spec.learning_rate_at(epoch)
+            _still_numbers(row, spec)
+            history.append(row)
+            if progress is not None:
+                progress(epoch, spec.epochs, row)
+            if watched is not None and spec.patience is not None:
+                score = row["validation_accuracy"] if spec.stop_on == "accuracy" else -row["validation_loss"]
+                if score > best_score:
+                    best_epoch, best_score, best = epoch, score, net.export_weights()
+                elif epoch - best_epoch >= spec.patience:
+                    break
+        if best_epoch == 0:
+            best_epoch, best = len(history), net.export_weights()
+    return Fitted(best, scaler, history, best_epoch, time.perf_counter() - began)
+
+
+def predict(
+    arch: Arch, weights: dict[str, NDArray[np.float32]], scaler: Scaler, windows: WindowSet, device: str = "auto"
+) -> NDArray[np.float32]:
+    """Probabilities (N, K) of each class for each window."""
+    _check(windows, arch, "read", some=False)
+    place = _device(device)
+    net = Net(arch)
+    net.import_weights(weights)
+    net.to(place).eval()
+    x, _ = _tensors(windows, scaler, arch, place)
+    with torch.no_grad(), _threads(1):
+        parts = [F.softmax(net(x[at]), dim=1) for at in _slices(len(x), _READ)]
+    if not parts:
+        return np.zeros((0, arch.classes), dtype=np.float32)
+    found: NDArray[np.float32] = torch.cat(parts).cpu().numpy()
+    return found
+
+
+def _train(
+    net: Net, adam: torch.optim.Adam, x: Tensor, y: Tensor, spec: TrainSpec, order: torch.Generator, turn: Turn
+) -> tuple[float, float]:
+    """One epoch; the mean loss and accuracy of what was trained on."""
+    net.train()
+    # Summed where the data are: reading a number out of a GPU would wait for it in every batch.
+    sums, seen = torch.zeros(2, device=x.device), 0
+    shuffled = torch.randperm(len(x), generator=order).to(x.device)
+    for at in _slices(len(x), spec.batch):
+        batch = shuffled[at]
+        # A few left over would give noisy batch statistics; they come in another epoch.
+        if seen and len(batch) < min(8, spec.batch):
+            continue
+        truth = y[batch]
+        logits = net(turn(x[batch], order))
+        loss = F.cross_entropy(logits, truth)
+        adam.zero_grad(set_to_none=True)
+        torch.autograd.backward(loss)
+        adam.step()
+        sums[0] += loss.detach() * len(batch)
+        sums[1] += (logits.detach().argmax(dim=1) == truth).sum()
+        seen += len(batch)
+    return float(sums[0]) / seen, float(sums[1]) / seen
+
+
+def _measure(net: Net, x: Tensor, y: Tensor) -> tuple[float, float]:
+    """Mean loss and accuracy without training."""
+    net.eval()
+    loss, right = 0.0, 0
+    with torch.no_grad():
+        for at in _slices(len(x), _READ):
+            logits = net(x[at])
+            loss += float(F.cross_entropy(logits, y[at], reduction="sum"))
+            right += int((logits.argmax(dim=1) == y[at]).sum())
+    return loss / len(x), right / len(x)
+
+
+def _slices(n: int, size: int) -> Iterator[slice]:
+    return (slice(start, start + size) for start in range(0, n, size))
+
+
+def _tensors(windows: WindowSet, scaler: Scaler, arch: Arch, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Scaled windows (N, C, span or window) and classes (N,), whole and where they are needed."""
+    x = scaler.apply(windows.x[:, :, windows.x.shape[2] - arch.span :])
+    return torch.from_numpy(x).to(device), torch.from_numpy(windows.y.astype(np.int64)).to(device)
+
+
+def _check(windows: WindowSet, arch: Arch, what: str, some: bool = True) -> None:
+    if some and not len(windows):
+        raise TrainingError(f"There are no windows to {what}: check the data set, the gestures and the split.")
+    _, channels, samples = windows.x.shape
+    if channels != arch.channels or len(windows.labels) != arch.classes:
+        raise TrainingError(
+            f"The windows have {channels} channels and {len(windows.labels)} classes, but the network "
+            f"{arch.symbol} reads {arch.channels} and {arch.classes}: make the network for these windows."
+        )
+    if samples < arch.span:
+        raise TrainingError(
+            f"The windows hold {samples} samples, but the network {arch.symbol} needs {arch.span} for a decision: "
+            "cut windows with that span."
+        )
+
+
+def _still_numbers(row: dict[str, Any], spec: TrainSpec) -> None:
+    for name in ("train_loss", "validation_loss"):
+        if row[name] is not None and not np.isfinite(row[name]):
+            raise TrainingError(
+                f"The {name.replace('_', ' ')} is no longer a number in epoch {row['epoch']} at the learning rate "
+                f"{row['learning_rate']:g}: try a lower one, such as {spec.learning_rate / 10:g}."
+            )
+
+
+def _device(name: str) -> torch.device:
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise TrainingError("There is no CUDA device to train on: use the device 'auto' or 'cpu'.")
+    return torch.device(name)
+
+
+@contextmanager
+def _threads(wanted: int) -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(wanted)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _repeatable(device: torch.device) -> AbstractContextManager[Any]:
+    if device.type != "cuda":
+        return nullcontext()
+    flags: AbstractContextManager[Any] = torch.backends.cudnn.flags(enabled=True, deterministic=True)
+    return flags

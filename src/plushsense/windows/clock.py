@@ -1,0 +1,173 @@
+"""The clock rule: device frames become even samples, the same for a batch, a live stream and the chip.
+
+In integers throughout, so that every reader gets the same bits:
+
+1. A frame whose device clock runs backwards, or that comes more than ``layout.gap_ms`` after the one before, starts a
+   new segment: everything that remembers the past restarts.
+2. A value outside its channel's valid range is replaced by the channel's last valid value in the segment. Until every
+   channel has had one, frames of the segment are passed over.
+3. The first frame that is used sets the time of sample 0; sample k is due ``k * period_us`` later. Sample k is
+   computed when the first frame at or after its time arrives, by linear interpolation between the two frames around
+   it, rounded half up: ``x0 + floor((2 (x1 - x0) (t - t0) + (t1 - t0)) / (2 (t1 - t0)))``. Of several frames with
+   one time, the first closes the interval before it and the last opens the one after.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.recfile import Frames
+from plushsense.core.signal import Layout
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Even samples without a break.
+
+    ``data`` (n, C) int64; ``start_us`` is the device time of sample 0; ``first_row`` to ``last_row`` (exclusive) are
+    the rows of the source; ``row_of`` (n,) the source row whose arrival completed each sample; ``invalid`` counts
+    values that were replaced.
+    """
+
+    data: NDArray[np.int64]
+    start_us: int
+    period_us: int
+    first_row: int
+    last_row: int
+    row_of: NDArray[np.int64]
+    invalid: int
+
+    def __len__(self) -> int:
+        return len(self.data)
+
+
+class Clock:
+    """The clock rule for a live stream: frames in, even samples out."""
+
+    def __init__(self, layout: Layout) -> None:
+        self._low = [int(v) for v in layout.valid_min_int]
+        self._high = [int(v) for v in layout.valid_max_int]
+        self._period = layout.period_us
+        self._gap = layout.gap_ms * 1000
+        self.restarts = 0
+        self.invalid = 0
+        self.restarted = False
+        self._seen_us: int | None = None
+        self._forget()
+
+    def _forget(self) -> None:
+        self._held: list[int | None] = [None] * len(self._low)
+        self._last: tuple[int, list[int]] | None = None
+        self._start = 0
+        self._made = 0
+
+    @property
+    def now_us(self) -> int | None:
+        """Device time of the newest sample in microseconds; None before the first."""
+        return None if self._made == 0 else self._start + (self._made - 1) * self._period
+
+    def push(self, device_ms: int, values: Sequence[int]) -> list[NDArray[np.int64]]:
+        """The samples, each (C,) int64, that this frame completes.
+
+        ``restarted`` then says whether the frame began a new segment: what remembers the past must be reset before it
+        reads these samples.
+        """
+        time = int(device_ms) * 1000
+        seen, self._seen_us = self._seen_us, time
+        self.restarted = seen is not None and (time < seen or time - seen > self._gap)
+        if self.restarted:
+            self.restarts += 1
+            self._forget()
+        held = self._held
+        for i, value in enumerate(values):
+            if self._low[i] <= value <= self._high[i]:
+                held[i] = int(value)
+            else:
+                self.invalid += 1
+        now = [v for v in held if v is not None]
+        if len(now) < len(held):
+            return []
+        if self._last is None:
+            self._start, self._made, self._last = time, 1, (time, now)
+            return [np.array(now, dtype=np.int64)]
+        before, old = self._last
+        self._last = (time, now)
+        made = []
+        if time > before:
+            between = time - before
+            due = self._start + self._made * self._period
+            while due <= time:
+                into = 2 * (due - before)
+                made.append(
+                    np.array(
+                        [a + ((b - a) * into + between) // (2 * between) for a, b in zip(old, now, strict=True)],
+                        dtype=np.int64,
+                    )
+                )
+                due += self._period
+            self._made += len(made)
+        return made
+
+
+def resample(frames: Frames, layout: Layout) -> list[Segment]:
+    """The clock rule for a whole recording: the segments that a `Clock` would make of the same frames."""
+    time = frames.device_ms.astype(np.int64) * 1000
+    if len(time) == 0:
+        return []
+    step = np.diff(time)
+    breaks = np.flatnonzero((step < 0) | (step > layout.gap_ms * 1000)) + 1
+    edges = [0, *breaks.tolist(), len(time)]
+    found = []
+    for first, last in itertools.pairwise(edges):
+        segment = _segment(time[first:last], frames.values[first:last], layout, first)
+        if segment is not None:
+            found.append(segment)
+    return found
+
+
+def hold_valid(values: NDArray[np.int64], layout: Layout) -> tuple[NDArray[np.int64], int, int]:
+    """Rule 2 on the rows of one segment: (values, first usable row, how many values were invalid)."""
+    good = (values >= layout.valid_min_int) & (values <= layout.valid_max_int)
+    if good.all():
+        return values, 0, 0
+    rows = np.arange(len(values))[:, None]
+    source = np.maximum.accumulate(np.where(good, rows, -1), axis=0)
+    usable = np.flatnonzero((source >= 0).all(axis=1))
+    first = int(usable[0]) if len(usable) else len(values)
+    held = np.take_along_axis(values, np.maximum(source, 0), axis=0)
+    return held, first, int((~good).sum())
+
+
+def _segment(time: NDArray[np.int64], values: NDArray[np.int64], layout: Layout, offset: int) -> Segment | None:
+    held, first, invalid = hold_valid(values, layout)
+    if first >= len(time):
+        return None
+    time, held = time[first:], held[first:]
+    period = layout.period_us
+    # Equal stamps: the first row closes an interval, the last one opens the next.
+    opens = np.flatnonzero(np.append(np.diff(time) > 0, True))
+    closes = np.insert(opens[:-1] + 1, 0, 0)
+    moments = time[closes]
+    due = np.arange(time[0], time[-1] + 1, period, dtype=np.int64)
+    right = np.searchsorted(moments, due, side="left")
+    left = np.maximum(right - 1, 0)
+    a = held[opens[left]]
+    b = held[closes[right]]
+    between = np.maximum(moments[right] - moments[left], 1)[:, None]
+    into = (2 * (due - moments[left]))[:, None]
+    data = a + ((b - a) * into + between) // (2 * between)
+    data[0] = held[0]
+    return Segment(
+        data,
+        int(time[0]),
+        period,
+        offset + first,
+        offset + first + len(time),
+        offset + first + closes[right],
+        invalid,
+    )

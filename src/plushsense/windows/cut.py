@@ -1,0 +1,277 @@
+"""Windows: equal stretches of even samples that know their recording, their person and what their past is.
+
+A recording of at least one window gives full windows every ``step_s`` from its start. A shorter one gives one window,
+and where the rest of it comes from is the ``context``:
+
+- ``stream``: what the session's stream held before (the recording is located in it). Where there is no stream, or
+  too little of it, the recording is looped, and the window says so.
+- ``loop``: the recording repeated from its start, as the paper does (never zero-padded).
+
+A recording many times longer than its gesture usually is was not stopped in time: what its rows show is not known, so
+it is left out, and named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import ConfigError, DatasetError, nearest
+from plushsense.core.gestures import GestureSet
+from plushsense.dataset.store import RECORDINGS, Dataset, RecordingInfo
+from plushsense.windows.clock import Segment, resample
+from plushsense.windows.features import inputs
+
+CONTEXTS = ("stream", "loop")
+
+
+@dataclass(frozen=True)
+class WindowSpec:
+    """How windows are cut, in seconds.
+
+    ``span_s`` asks for more past than the window, for networks that need it. Recordings longer than
+    ``longest_factor`` times the median of their gesture are left out (0: none are).
+    """
+
+    window_s: float = 2.5
+    step_s: float = 0.5
+    context: str = "stream"
+    span_s: float = 0.0
+    longest_factor: float = 5.0
+
+    def __post_init__(self) -> None:
+        if self.context not in CONTEXTS:
+            raise ConfigError(
+                f"Unknown context '{self.context}': accepted are {', '.join(CONTEXTS)}."
+                f"{nearest(self.context, CONTEXTS)}"
+            )
+        if self.longest_factor != 0.0 and self.longest_factor < 1.0:
+            raise ConfigError(f"longest_factor is {self.longest_factor}: accepted are 0 (off) and 1 or more.")
+        if not (0.0 < self.window_s <= 60.0 and 0.0 < self.step_s <= 60.0):
+            raise ConfigError(
+                f"A window of {self.window_s} s every {self.step_s} s is out of range: above 0, at most 60 s."
+            )
+
+
+@dataclass(frozen=True)
+class WindowSet:
+    """N windows.
+
+    ``x`` (N, F, T) int32, even samples of the network's channels, not scaled; ``y`` (N,) class index; ``recording``
+    (N,) index into ``recording_ids``; ``subject`` (N,) the person's code, "none" for nobody; ``context`` (N,)
+    "stream" (real past), "inside" (wholly inside its recording) or "loop"; ``stream`` (N,) id, "" for none;
+    ``window_rows`` and ``recording_rows`` (N, 2) raw rows of the stream that the window and its recording cover.
+    ``vectors`` are triples of channels that are the axes of one vector; ``left_out`` names recordings that gave no
+    window, and why.
+    """
+
+    x: NDArray[np.int32]
+    y: NDArray[np.int64]
+    labels: tuple[str, ...]
+    affects: tuple[str, ...]
+    families: tuple[str, ...]
+    recording: NDArray[np.int64]
+    recording_ids: tuple[str, ...]
+    subject: NDArray[np.str_]
+    context: NDArray[np.str_]
+    stream: NDArray[np.str_]
+    window_rows: NDArray[np.int64]
+    recording_rows: NDArray[np.int64]
+    rate_hz: float
+    inputs: tuple[str, ...]
+    vectors: tuple[tuple[int, ...], ...] = ()
+    left_out: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.y)
+
+    def take(self, index: NDArray[np.int64]) -> WindowSet:
+        """The windows at ``index``; recordings keep their numbers."""
+        per_window = ("x", "y", "recording", "subject", "context", "stream", "window_rows", "recording_rows")
+        return replace(self, **{name: getattr(self, name)[index] for name in per_window})
+
+    def __repr__(self) -> str:
+        n, f, t = self.x.shape
+        kinds = ", ".join(f"{int((self.context == c).sum())} {c}" for c in np.unique(self.context))
+        return (
+            f"WindowSet({n} windows of {f} channels × {t} samples at {self.rate_hz:g} Hz, "
+            f"{len(np.unique(self.recording))} recordings, {len(self.labels)} classes; {kinds})"
+        )
+
+
+@dataclass
+class _Cut:
+    """One window on its way into the set."""
+
+    x: NDArray[np.int64]
+    context: str
+    window_rows: tuple[int, int]
+
+
+def _starts(samples: int, window: int, step: int) -> range:
+    return range(0, samples - window + 1, step)
+
+
+def _from_recording(segments: list[Segment], dataset: Dataset, window: int, step: int) -> list[_Cut]:
+    """Full windows of every stretch; if none is long enough, the longest stretch looped."""
+    cuts = []
+    for segment in segments:
+        if len(segment) >= window:
+            x = inputs(segment.data, dataset.layout)
+            cuts += [_Cut(x[s : s + window], "inside", (-1, -1)) for s in _starts(len(x), window, step)]
+    if not cuts and segments:
+        x = inputs(max(segments, key=len).data, dataset.layout)
+        repeated = np.tile(x, (-(-window // len(x)), 1))[:window]
+        cuts.append(_Cut(repeated, "loop", (-1, -1)))
+    return cuts
+
+
+def _from_stream(
+    segments: list[Segment], first: int, last: int, window: int, reach: int, step: int
+) -> Callable[[Dataset], list[_Cut]] | None:
+    """How to cut rows ``first`` to ``last`` of a stream with their real past; None where the past is too short."""
+    segment = next((s for s in segments if s.first_row <= last - 1 < s.last_row), None)
+    if segment is None:
+        return None
+    begin = int(np.searchsorted(segment.row_of, first, side="left"))
+    end = int(np.searchsorted(segment.row_of, last, side="left"))
+    if end <= begin:
+        return None
+    ends = [begin + s + window for s in _starts(end - begin, window, step)] or [end]
+    if ends[0] < reach:
+        return None
+
+    def cut(dataset: Dataset) -> list[_Cut]:
+        out = []
+        x = inputs(segment.data[ends[0] - reach : ends[-1]], dataset.layout)
+        for e in ends:
+            stop = e - (ends[0] - reach)
+            rows = (int(segment.row_of[e - reach]), int(segment.row_of[e - 1]) + 1)
+            out.append(_Cut(x[stop - reach : stop], "stream", rows))
+        return out
+
+    return cut
+
+
+def cut_windows(
+    dataset: Dataset,
+    spec: WindowSpec | None = None,
+    gestures: GestureSet | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> WindowSet:
+    """Cut the used recordings of ``dataset`` into windows.
+
+    Args:
+        gestures: the classes, in order; recordings of other gestures are left out. Default: all of the data set.
+        progress: called with (recordings done, recordings in all).
+
+    Raises:
+        DatasetError: when no window comes out.
+    """
+    spec = spec or WindowSpec()
+    gestures = gestures or dataset.gestures
+    layout = dataset.layout
+    window, step = layout.samples(spec.window_s), layout.samples(spec.step_s)
+    reach = max(window, layout.samples(spec.span_s) if spec.span_s else 0)
+    wanted, left_out = _not_too_long([r for r in dataset.used if r.gesture in gestures.labels], spec)
+    wanted.sort(key=lambda r: (r.stream, r.id))
+    cuts: list[tuple[RecordingInfo, _Cut]] = []
+    stream_id, segments = "", list[Segment]()
+    for done, recording in enumerate(wanted):
+        mine: list[_Cut] = []
+        if spec.context == "stream" and recording.stream_row >= 0:
+            if recording.stream != stream_id:
+                stream_id = recording.stream
+                segments = resample(dataset.read_stream(stream_id), layout)
+            first = recording.stream_row + recording.start
+            cut = _from_stream(segments, first, first + recording.stop - recording.start, window, reach, step)
+            if cut is not None:
+                mine = cut(dataset)
+        if not mine:
+            mine = _from_recording(resample(dataset.read(recording), layout), dataset, reach, step)
+        if not mine:
+            left_out.append(f"{recording.id}: no valid sample")
+        cuts += [(recording, c) for c in mine]
+        if progress is not None:
+            progress(done + 1, len(wanted))
+    if not cuts:
+        raise DatasetError(
+            f"Data set '{dataset.head.name}' gives no window: {len(wanted)} recordings of "
+            f"{len(gestures)} gestures ({', '.join(gestures.labels[:6])}…)."
+        )
+    return replace(_assemble(cuts, gestures, dataset), left_out=tuple(left_out))
+
+
+def _not_too_long(wanted: list[RecordingInfo], spec: WindowSpec) -> tuple[list[RecordingInfo], list[str]]:
+    """The recordings to cut, and those that nobody stopped. Runs of labels in a stream are as long as they are."""
+    durations: dict[str, list[int]] = {}
+    for r in wanted:
+        durations.setdefault(r.gesture, []).append(r.stop - r.start)
+    usual = {gesture: float(np.median(rows)) for gesture, rows in durations.items()}
+    kept, left_out = [], []
+    for r in wanted:
+        own_file = r.file.startswith(f"{RECORDINGS}/")
+        if spec.longest_factor and own_file and r.stop - r.start > spec.longest_factor * usual[r.gesture]:
+            left_out.append(f"{r.id}: {r.stop - r.start} rows where {r.gesture} usually has {usual[r.gesture]:.0f}")
+        else:
+            kept.append(r)
+    return kept, left_out
+
+
+def _assemble(cuts: list[tuple[RecordingInfo, _Cut]], gestures: GestureSet, dataset: Dataset) -> WindowSet:
+    ids = tuple(sorted({r.id for r, _ in cuts}))
+    number = {identity: i for i, identity in enumerate(ids)}
+    kind = np.iinfo(np.int32)
+    x = np.stack([np.clip(c.x, kind.min, kind.max).astype(np.int32).T for _, c in cuts])
+    order = np.array([number[r.id] for r, _ in cuts], dtype=np.int64)
+    by_recording = np.argsort(order, kind="stable")
+    rows = [(r.stream_row + r.start, r.stream_row + r.stop) if c.context == "stream" else (-1, -1) for r, c in cuts]
+
+    def text(values: Iterable[str]) -> NDArray[np.str_]:
+        return np.array(list(values), dtype=np.str_)
+
+    windows = WindowSet(
+        x=x,
+        y=np.array([gestures.index(r.gesture) for r, _ in cuts], dtype=np.int64),
+        labels=gestures.labels,
+        affects=gestures.affects,
+        families=gestures.families,
+        recording=order,
+        recording_ids=ids,
+        subject=text(r.subject for r, _ in cuts),
+        context=text(c.context for _, c in cuts),
+        stream=text(r.stream if c.context == "stream" else "" for r, c in cuts),
+        window_rows=np.array([c.window_rows for _, c in cuts], dtype=np.int64),
+        recording_rows=np.array(rows, dtype=np.int64),
+        rate_hz=dataset.layout.rate_hz,
+        inputs=dataset.layout.inputs,
+        vectors=tuple(
+            tuple(dataset.layout.inputs.index(axis) for axis in vector)
+            for vector in dataset.layout.vectors
+            if set(vector) <= set(dataset.layout.inputs)
+        ),
+    )
+    return windows.take(by_recording)
+
+
+def shared_gestures(dataset: Dataset, share: float = 0.9) -> tuple[GestureSet, dict[str, str]]:
+    """The gestures that at least ``share`` of the people made and that are not free choice, and why each other is not.
+
+    Gestures that are recorded without a person stay in.
+    """
+    people = dataset.subjects
+    kept, left_out = [], {}
+    for gesture in dataset.gestures.gestures:
+        made = {r.subject for r in dataset.used if r.gesture == gesture.label}
+        if gesture.free_choice:
+            left_out[gesture.label] = "free choice: everybody did something else"
+        elif not made:
+            left_out[gesture.label] = "no recording"
+        elif gesture.nobody or len(made & set(people)) >= share * len(people):
+            kept.append(gesture.label)
+        else:
+            left_out[gesture.label] = f"made by {len(made & set(people))} of {len(people)} people"
+    return dataset.gestures.subset(kept), left_out

@@ -1,0 +1,43 @@
+"""What tests share: the real recordings, and how a missing tool is treated."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+# Many small arrays: threads only get in each other's way when tests run in parallel.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+REPO = Path(__file__).resolve().parents[1]
+REQUIRED = {word.strip() for word in os.environ.get("PLUSHSENSE_REQUIRE", "").split(",") if word.strip()}
+
+
+def missing(what: str, reason: str) -> None:
+    """Skip for something this machine lacks, or fail where PLUSHSENSE_REQUIRE says that it must be here."""
+    if what in REQUIRED:
+        pytest.fail(f"{what} is required here (PLUSHSENSE_REQUIRE): {reason}")
+    pytest.skip(reason)
+
+
+@pytest.fixture(scope="session")
+def real_data() -> Path:
+    """The folder of real recordings beside the checkout; it is never committed."""
+    folder = Path(os.environ.get("PLUSHSENSE_DATA", REPO.parent / "shared" / "data"))
+    if not (folder / "makeability-gestures").is_dir():
+        missing("data", f"no real recordings at {folder}")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def pty_possible() -> None:
+    """Pseudo-terminals, which stand in for a serial port."""
+    try:
+        import pty
+
+        for end in pty.openpty():
+            os.close(end)
+    except (ImportError, OSError) as cause:
+        missing("pty", f"no pseudo-terminal here: {cause}")

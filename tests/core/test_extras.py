@@ -1,0 +1,15 @@
+import json
+
+import pytest
+
+from plushsense.core.errors import MissingExtraError
+from plushsense.core.extras import need
+
+
+def test_a_present_module_is_returned() -> None:
+    assert need("json", "train") is json
+
+
+def test_a_missing_package_names_the_install_command() -> None:
+    with pytest.raises(MissingExtraError, match=r"pip install 'plushsense\[cluster\]'"):
+        need("no_such_package_at_all", "cluster")

@@ -1,0 +1,81 @@
+from pathlib import Path
+
+import pytest
+
+from plushsense.core.errors import LayoutError
+from plushsense.core.signal import Layout, layout_names, load_layout
+
+OWN = """
+name = "pad"
+rate_hz = 50.0
+channels = [
+    { name = "a", unit = "count", kind = "capacitive" },
+    { name = "b", unit = "V", kind = "capacitive", step = 0.5 },
+]
+wire = ["a", "b", "device_ms"]
+"""
+
+
+def test_built_in_layouts_have_the_shapes_of_the_design() -> None:
+    shapes = {n: (load_layout(n).n_channels, load_layout(n).n_inputs, len(load_layout(n).wire)) for n in layout_names()}
+    assert shapes == {
+        "plush-15": (13, 11, 15),
+        "plush-14": (13, 11, 14),
+        "accel-3": (3, 3, 4),
+        "phone-6": (6, 6, 7),
+    }
+
+
+def test_plush_15_is_table_1_of_the_paper() -> None:
+    layout = load_layout("plush-15")
+    assert layout.wire[:2] == ("cap_all", "cap_extremities")
+    assert layout.wire[2:10] == ("ears", "head", "neck", "proximity", "nose", "tail", "back", "belly")
+    assert layout.wire[10:] == ("acc_x", "acc_y", "acc_z", "device_ms", "delay_ms")
+    assert layout.inputs == (*layout.names[:10], "acc_magnitude")
+    assert layout.valid_min_int[0] == -2000
+    assert load_layout("accel-3").valid_min_int[0] < -6992, "at rest an axis reads -6992"
+
+
+@pytest.mark.parametrize("name", layout_names())
+def test_a_layout_travels_as_plain_values(name: str) -> None:
+    layout = load_layout(name)
+    assert Layout.from_dict(layout.to_dict()) == layout
+
+
+def test_a_users_own_layout(tmp_path: Path) -> None:
+    path = tmp_path / "pad.toml"
+    path.write_text(OWN)
+    layout = load_layout(path)
+    assert layout.inputs == ("a", "b")
+    assert layout.period_us == 20_000
+    assert layout.csv.columns == ("host_ms", "device_ms", "a", "b")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("rate_hs = 1.0", r"Unknown key 'rate_hs' .* Did you mean 'rate_hz'\?"),
+        ('inputs = ["c"]', r"inputs names 'c'; known are a, b"),
+        ("rate_hz = 0.0", "not valid TOML"),
+        ('csv = { colums = ["a"] }', r"'colums'.*Did you mean 'columns'"),
+        ('derived = [{ name = "m", kind = "norm", of = ["a"] }]', "kind 'norm'"),
+    ],
+)
+def test_a_wrong_layout_is_refused_in_one_sentence(tmp_path: Path, change: str, said: str) -> None:
+    path = tmp_path / "pad.toml"
+    path.write_text(OWN + change + "\n")
+    with pytest.raises(LayoutError, match=said) as refusal:
+        load_layout(path)
+    assert "\n" not in str(refusal.value)
+
+
+def test_an_unknown_name_suggests_the_nearest() -> None:
+    with pytest.raises(LayoutError, match=r"Unknown layout 'plush15'.*Did you mean 'plush-15'\?"):
+        load_layout("plush15")
+
+
+def test_a_layout_without_a_clock_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "pad.toml"
+    path.write_text(OWN.replace(', "device_ms"]', "]"))
+    with pytest.raises(LayoutError, match="no clock"):
+        load_layout(path)

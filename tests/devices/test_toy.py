@@ -1,0 +1,200 @@
+"""The virtual toy as a byte stream for other programs: over TCP and on a pseudo terminal."""
+
+from __future__ import annotations
+
+import os
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+from plushsense.core.errors import ConfigError, DeviceError
+from plushsense.devices.opening import open_device
+from plushsense.devices.toy import ToyCounters, serve_pty, serve_tcp
+from plushsense.devices.virtual.stream import Performed, ToySpec
+
+needs_pty = pytest.mark.usefixtures("pty_possible")
+
+
+class Running:
+    """A toy in a thread."""
+
+    def __init__(self) -> None:
+        self.url = ""
+        self.performed: list[Performed] = []
+        self.counters: ToyCounters | None = None
+
+
+@contextmanager
+def toy(serve: Callable[..., ToyCounters], *args: Any, **options: Any) -> Iterator[Running]:
+    running, ready, stop = Running(), threading.Event(), threading.Event()
+
+    def on_ready(url: str) -> None:
+        running.url = url
+        ready.set()
+
+    def work() -> None:
+        running.counters = serve(*args, on_ready=on_ready, on_performed=running.performed.append, stop=stop, **options)
+
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    assert ready.wait(5)
+    try:
+        yield running
+    finally:
+        stop.set()
+        thread.join(5)
+        assert not thread.is_alive()
+
+
+def test_tcp_serves_every_line_and_the_truth() -> None:
+    spec = ToySpec(person=3, lost=0.0, garbled=0.0, gestures=("Tail hit 1", "Hold strong"))
+    with toy(serve_tcp, 0, spec, speed=0, seconds=60) as running:
+        with open_device(running.url) as device:
+            frames = list(device)
+        assert device.counters.to_dict() | {"garbage": 0} == {
+            "frames": len(frames), "lost": 0, "malformed": 0, "garbage": 0, "reconnects": 0,
+        }  # fmt: skip
+    assert len(frames) == pytest.approx(6000, rel=0.01)
+    assert [p.label for p in running.performed[:4]] == ["Tail hit 1", "Hold strong"] * 2
+    assert running.counters is not None
+    assert (running.counters.sent, running.counters.dropped) == (len(frames), 0)
+    # The truth fits the stream: in a hug the belly feels far more than before it.
+    hug = running.performed[1]
+    belly = {f.device_ms: f.values[9] for f in frames}
+    inside = [v for t, v in belly.items() if hug.start_ms + 600 < t < hug.end_ms - 600]
+    outside = [v for t, v in belly.items() if t < running.performed[0].start_ms - 1000]
+    assert min(inside) > 2 * max(outside)
+
+
+def test_tcp_counts_what_the_line_loses() -> None:
+    with (
+        toy(serve_tcp, 0, ToySpec(lost=0.02, garbled=0.02), speed=0, seconds=120) as running,
+        open_device(running.url) as device,
+    ):
+        for _ in device:
+            pass
+    counters = device.counters
+    assert counters.frames == pytest.approx(12_000 * 0.96, rel=0.02)
+    assert 150 < counters.malformed < 350
+    assert counters.frames + counters.lost == pytest.approx(12_000, abs=40)
+
+
+def test_one_reader_after_another() -> None:
+    with toy(serve_tcp, 0, speed=20) as running:
+        last = 0
+        for _ in range(3):
+            with open_device(running.url) as device:
+                iterator = iter(device)
+                now = [next(iterator).device_ms for _ in range(50)][-1]
+            assert now > last
+            last = now
+            time.sleep(0.05)
+    assert running.counters is not None and running.counters.connections == 3
+
+
+def test_pace_does_not_drift() -> None:
+    with (
+        toy(serve_tcp, 0, ToySpec(lost=0.0, garbled=0.0), speed=5) as running,
+        open_device(running.url) as device,
+    ):
+        iterator = iter(device)
+        for _ in range(20):
+            first = next(iterator)
+        start = time.monotonic()
+        frame = first
+        while time.monotonic() - start < 1.5:
+            frame = next(iterator)
+        passed = time.monotonic() - start
+    assert (frame.device_ms - first.device_ms) / 1000.0 == pytest.approx(5 * passed, rel=0.04)
+
+
+def test_a_taken_port_is_one_sentence() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(DeviceError, match=f"port {port}"):
+            serve_tcp(port)
+    with pytest.raises(ConfigError, match="65535"):
+        serve_tcp(70_000)
+    with pytest.raises(ConfigError, match="speed"):
+        serve_tcp(0, speed=-1)
+
+
+def test_a_broken_connection() -> None:
+    import struct
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        with open_device(f"tcp://127.0.0.1:{server.getsockname()[1]}") as device:
+            peer, _ = server.accept()
+            peer.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            peer.close()  # with no time to linger: a reset
+            with pytest.raises(DeviceError, match="went away"):
+                list(device)
+        with open_device(f"tcp://127.0.0.1:{server.getsockname()[1]}") as device:
+            peer, _ = server.accept()
+            peer.sendall(b"1 2 3 4 5 6 7 8 9 10 11 12 13 1000 10\n1 2 3")
+            peer.close()
+            assert len(list(device)) == 1
+            assert device.counters.malformed == 1
+
+
+@needs_pty
+def test_pty_with_two_readers_in_turn() -> None:
+    with toy(serve_pty, ToySpec(lost=0.0, garbled=0.0), speed=10) as running:
+        assert running.url.startswith("serial:///")
+        for _ in range(2):
+            with open_device(running.url + "?baud=115200") as device:
+                for count, _frame in enumerate(device, 1):
+                    if count >= 400:
+                        break
+            counters = device.counters
+            assert counters.frames == pytest.approx(400, abs=60)
+            # Half a line at the start is all that may go wrong.
+            assert counters.malformed <= 1
+            assert counters.lost <= 60
+            time.sleep(0.05)
+
+
+@needs_pty
+def test_a_second_reader_of_a_serial_port_is_refused() -> None:
+    with (
+        toy(serve_pty, speed=1) as running,
+        open_device(running.url),
+        pytest.raises(DeviceError, match="another program is using"),
+    ):
+        open_device(running.url)
+
+
+@needs_pty
+def test_an_unplugged_toy_is_one_sentence() -> None:
+    import pty
+    import tty
+
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    with open_device(f"serial://{os.ttyname(slave)}") as device:
+        os.write(master, b"half\n" + b"1 2 3 4 5 6 7 8 9 10 11 12 13 1000 10\n" * 3)
+        iterator = iter(device)
+        assert [next(iterator).device_ms for _ in range(3)] == [1000] * 3
+        os.close(slave)
+        os.close(master)
+        with pytest.raises(DeviceError, match="unplugged"):
+            for _ in iterator:
+                pass
+
+
+@needs_pty
+def test_pty_speed_must_be_above_zero() -> None:
+    with pytest.raises(ConfigError, match="above 0"):
+        serve_pty(speed=0)
+
+
+def test_windows_has_no_pty(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "platform", "win32")
+    with pytest.raises(DeviceError, match="toy --tcp"):
+        serve_pty()

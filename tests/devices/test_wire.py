@@ -1,0 +1,197 @@
+"""The wire parser survives everything and counts it; what it accepts it reads exactly."""
+
+from __future__ import annotations
+
+import tracemalloc
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from plushsense.core.signal import Channel, CsvFormat, Layout, load_layout
+from plushsense.devices.base import Counters, LossMeter
+from plushsense.devices.wire import LineParser, ParsedLine, format_line
+
+PLUSH = load_layout("plush-15")
+OLD = load_layout("plush-14")
+ACCEL = load_layout("accel-3")
+PHONE = load_layout("phone-6")
+GOOD = b"1 2 3 4 5 6 7 8 9 10 11 12 13 1000 10\n"
+
+
+def lines(layout: Layout, data: bytes, *, joining: bool = False) -> tuple[list[ParsedLine], Counters]:
+    parser = LineParser(layout, joining=joining)
+    parsed = parser.feed(data)
+    parser.finish()
+    return parsed, parser.counters
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"1 2 3 4 5 6 7 8 9 10 11 12 13 1000 10\n",
+        b"1 2 3 4 5 6 7 8 9 10 11 12 13 1000 10\r\n",
+        b"  1   2 3\t4 5 6 7 8   9 10 11 12 13 1000 10  \n",
+        b"1;2; 3;4;5;6;7;8;9;10;11;12;13;1000;10\n",
+        b"+1, 2,3,4,5,6,7,8,9,10,11,12,13,1000,10,\n",
+    ],
+)
+def test_any_spaces_and_line_ends(line: bytes) -> None:
+    parsed, counters = lines(PLUSH, line)
+    assert parsed == [ParsedLine(1000, tuple(range(1, 14)), False)]
+    assert counters.to_dict() == {"frames": 1, "lost": 0, "malformed": 0, "garbage": 0, "reconnects": 0}
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"1 2 3",
+        b"1 2 3 4 5 6 7 8 9 10 11 12 13 1000 10 5",
+        b"1 2 3 4 5 6 7 8 9 10 11 12 x 1000 10",
+        b"1 2 3 4 5 6 7 8 9 10 11 12 1_3 1000 10",
+        b"1 2 3 4 5 6 7 8 9 10 11 12 1.5 1000 10",
+        b"1 2 3 4 5 6 7 8 9 10 11 12 nan 1000 10",
+        b"1 2 3 4 5 6 7 8 9 10 11 12 inf 1000 10",
+        b"1 2 3 4 5 6 7 8 9 10 11 12 0x1F 1000 10",
+        b"1 2 3 4 5 6 7 8 9 10 11 12 13 -1000 10",
+        b"1 2 3 4 5 6 7 8 9 10 11 12 99999999999999999999999 1000 10",
+        b"1 2 3 4 5 6 7 8 9 10 11 12 \xd9\xa3 1000 10",
+        b"\x00\xff\xfe",
+        b"hello",
+    ],
+)
+def test_malformed_lines_are_counted_and_the_next_one_is_read(line: bytes) -> None:
+    parsed, counters = lines(PLUSH, line + b"\n" + GOOD)
+    assert [p.device_ms for p in parsed] == [1000]
+    assert counters.malformed == 1
+
+
+def test_a_half_line_at_the_end_is_counted() -> None:
+    parsed, counters = lines(PLUSH, GOOD + GOOD[:12])
+    assert len(parsed) == 1
+    assert counters.malformed == 1
+
+
+def test_joining_in_the_middle_never_yields_half_a_number() -> None:
+    cut_number = b"234 2 3 4 5 6 7 8 9 10 11 12 13 1000 10\n"  # was 1234: looks whole
+    parsed, counters = lines(PLUSH, cut_number + GOOD, joining=True)
+    assert [p.values[0] for p in parsed] == [1]
+    assert counters.malformed == 0
+    parsed, counters = lines(PLUSH, b"13 1000 10\n" + GOOD, joining=True)
+    assert len(parsed) == 1
+    assert counters.malformed == 1
+
+
+def test_values_out_of_range_are_kept_and_counted() -> None:
+    parsed, counters = lines(PLUSH, b"-2001 2 3 4 5 6 7 8 9 10 11 12 13 1000 10\n" + GOOD)
+    assert parsed[0].values[0] == -2001
+    assert [p.garbage for p in parsed] == [True, False]
+    assert (counters.frames, counters.garbage) == (2, 1)
+
+
+def test_old_firmware_adds_up_its_delays() -> None:
+    rows = b"".join(b"1 2 3 4 5 6 7 8 9 10 11 12 13 %d\n" % d for d in (7, 10, 11, 9))
+    parsed, _ = lines(OLD, rows)
+    assert [p.device_ms for p in parsed] == [0, 10, 21, 30]
+
+
+def test_other_layouts() -> None:
+    parsed, _ = lines(ACCEL, b"176637 -6992 -3328 -176\n")
+    assert parsed == [ParsedLine(176637, (-6992, -3328, -176), False)]
+    parsed, counters = lines(PHONE, b"0.1234 -9.81 .5 1e-2 0 -0.0004 1000\n")
+    assert parsed == [ParsedLine(1000, (123, -9810, 500, 10, 0, 0), False)]
+    assert counters.malformed == 0
+
+
+def test_wire_order_is_not_layout_order() -> None:
+    mixed = Layout(
+        name="mixed",
+        title="mixed",
+        rate_hz=100.0,
+        channels=(Channel("a", "", "x"), Channel("b", "", "x")),
+        wire=("b", "device_ms", "a"),
+        derived=(),
+        inputs=("a", "b"),
+        csv=CsvFormat(("host_ms", "device_ms", "a", "b"), ("h", "d", "a", "b"), ","),
+    )
+    assert lines(mixed, b"2 50 1\n")[0] == [ParsedLine(50, (1, 2), False)]
+    assert format_line(mixed, (1, 2), 50, 10) == b"2 50 1\n"
+
+
+@pytest.mark.parametrize("piece", [10_000_000, 65_536, 100])
+def test_a_line_without_end_is_counted_once_in_bounded_memory(piece: int) -> None:
+    parser = LineParser(PLUSH)
+    chunk = b"7" * piece
+    tracemalloc.start()
+    for _ in range(10_000_000 // piece):
+        assert parser.feed(chunk) == []
+    held = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    assert held < 100_000
+    assert len(parser.feed(b"\n" + GOOD)) == 1
+    assert (parser.counters.malformed, parser.counters.frames) == (1, 1)
+
+
+def test_lost_frames_come_from_the_device_clock() -> None:
+    clock, t = [], 1000
+    for i in range(300):
+        t += 10 + (i % 3 - 1)
+        if i not in (50, 51, 52, 200):
+            clock.append(t)
+    meter = LossMeter()
+    assert sum(meter.push(c) for c in clock) == 4
+
+
+def test_a_restarted_or_paused_clock_is_no_loss() -> None:
+    meter = LossMeter()
+    clock = [*range(0, 1000, 10), *range(5, 500, 10), *range(90_000, 91_000, 10)]
+    assert sum(meter.push(c) for c in clock) == 0
+
+
+def test_loss_follows_the_real_period() -> None:
+    meter = LossMeter()
+    assert sum(meter.push(c) for c in range(0, 3000, 31)) == 0
+
+
+@given(st.lists(st.binary(max_size=400), max_size=8))
+@settings(max_examples=200, deadline=None)
+def test_noise_never_breaks_the_next_frame(pieces: list[bytes]) -> None:
+    parser = LineParser(PLUSH)
+    for piece in pieces:
+        parser.feed(piece)
+    parsed = parser.feed(b"\n" + GOOD)
+    assert parsed[-1].values == tuple(range(1, 14))
+    assert parser.counters.malformed <= sum(p.count(b"\n") for p in pieces) + 1
+
+
+@given(st.binary(max_size=3000), st.lists(st.integers(1, 50), min_size=1, max_size=20))
+@settings(max_examples=150, deadline=None)
+def test_how_bytes_are_cut_into_pieces_does_not_matter(noise: bytes, cuts: list[int]) -> None:
+    data = GOOD + noise + b"\n" + GOOD
+    whole = LineParser(PLUSH)
+    expected = whole.feed(data)
+    parser = LineParser(PLUSH)
+    parsed, at, turn = [], 0, 0
+    while at < len(data):
+        size = cuts[turn % len(cuts)]
+        parsed += parser.feed(data[at : at + size])
+        at, turn = at + size, turn + 1
+    assert parsed == expected
+    assert parser.counters == whole.counters
+
+
+@given(
+    st.lists(st.integers(-(2**40), 2**40), min_size=13, max_size=13),
+    st.integers(0, 2**50),
+    st.integers(0, 1000),
+)
+def test_what_is_written_is_read_back(values: list[int], device_ms: int, delay_ms: int) -> None:
+    parsed, counters = lines(PLUSH, format_line(PLUSH, values, device_ms, delay_ms))
+    assert [(p.device_ms, p.values) for p in parsed] == [(device_ms, tuple(values))]
+    assert counters.malformed == 0
+
+
+@given(st.lists(st.integers(-200_000, 200_000), min_size=6, max_size=6), st.integers(0, 2**40))
+def test_decimal_layouts_round_trip(values: list[int], device_ms: int) -> None:
+    parsed, _ = lines(PHONE, format_line(PHONE, values, device_ms, 10))
+    assert [p.values for p in parsed] == [tuple(values)]

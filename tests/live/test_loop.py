@@ -1,0 +1,127 @@
+"""A device and a model together: what comes out, when it stops, what is counted."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+
+import pytest
+
+from plushsense.core.errors import ConfigError
+from plushsense.core.recfile import write_recording
+from plushsense.devices.base import Device, Frame
+from plushsense.devices.opening import open_device
+from plushsense.live.loop import run
+from plushsense.live.stream import StreamClassifier
+
+
+@pytest.fixture()
+def recording(tmp_path, frames):
+    """A recording of 400 rows with gaps, a clock reset and garbage, as a URL."""
+    from plushsense.core.signal import load_layout
+
+    path = tmp_path / "tap_1700000000000_400.csv"
+    write_recording(path, frames(), load_layout("accel-3"))
+    return f"replay://{path.as_posix()}?speed=0&layout=accel-3"
+
+
+def test_a_replay_gives_what_pushing_its_frames_gives(bundle, recording):
+    classifier = StreamClassifier(bundle())
+    with open_device(recording) as device:
+        wanted = [d for frame in device for d in classifier.push(frame)]
+    with open_device(recording) as device:
+        live = run(device, classifier)
+        assert list(live) == wanted
+        summary = live.summary()
+    assert summary.decisions == len(wanted) > 80
+    assert summary.warming == sum(d.state == "warming" for d in wanted)
+    assert summary.restarts == 2
+    assert summary.invalid == 14
+    assert summary.counters["frames"] == 400
+    assert summary.counters["garbage"] == 14
+    assert summary.seconds == pytest.approx(wanted[-1].t_s, abs=0.06)
+    assert summary.decisions_per_s == pytest.approx(len(wanted) / summary.seconds)
+    assert 0 < summary.latency_ms["p50"] <= summary.latency_ms["p95"]
+    assert summary.to_dict()["counters"] == summary.counters
+
+
+def test_it_stops_by_device_time_and_begins_anew(bundle, recording):
+    classifier = StreamClassifier(bundle())
+    for _ in range(2):
+        with open_device(recording) as device:
+            times = [d.t_s for d in run(device, classifier, seconds=1.5)]
+        assert 1.4 < times[-1] < 1.5
+
+
+@pytest.mark.parametrize("seconds", [0, -1, float("nan")])
+def test_a_duration_is_positive(bundle, recording, seconds):
+    with open_device(recording) as device, pytest.raises(ConfigError, match="seconds"):
+        run(device, StreamClassifier(bundle()), seconds=seconds)
+
+
+def test_another_layout_is_refused_before_anything_is_read(bundle, recording):
+    with open_device(recording) as device:
+        with pytest.raises(ConfigError, match=r"'accel-3'.*'plush-15'"):
+            run(device, StreamClassifier(bundle(layout="plush-15")))
+        assert device.counters.frames == 0
+
+
+def test_lost_and_garbled_lines_are_counted_and_survived(bundle):
+    lines = []
+    for i in range(300):
+        if i in (150, 151):
+            continue
+        lines.append(
+            b"hello toy\r\n" if i == 100 else b"%d %d %d %d\r\n" % (i * 10, i % 60, 40_000 if i == 200 else 5, -i)
+        )
+    lines.insert(60, b"12 1\n\xff\xfe\x00 7 7 7\n")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def serve():
+            peer, _ = server.accept()
+            with peer:
+                for line in lines:
+                    peer.sendall(line)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        classifier = StreamClassifier(bundle())
+        with open_device(f"tcp://127.0.0.1:{server.getsockname()[1]}?layout=accel-3") as device:
+            live = run(device, classifier)
+            found = list(live)
+        thread.join()
+    summary = live.summary()
+    assert len(found) == 300 // 5
+    assert summary.counters["malformed"] == 3
+    assert summary.counters["lost"] == 3
+    assert summary.counters["garbage"] == summary.invalid == 1
+    assert summary.restarts == 0
+    assert found[-1].state == "tracking"
+
+
+class Silent(Device):
+    """A toy that says one thing and then nothing."""
+
+    def read(self):
+        time.sleep(0.01)
+        first = not self.counters.frames
+        self.counters.frames = 1
+        return [Frame(0, 0, (0, 0, 0))] if first else []
+
+
+def test_a_silent_toy_ends_a_run_of_given_length(bundle):
+    model = bundle()
+    live = run(Silent("silent://", model.layout), StreamClassifier(model), seconds=0.1)
+    began = time.perf_counter()
+    assert not list(live)
+    assert time.perf_counter() - began < 2
+    assert live.summary().latency_ms == {"p50": None, "p95": None}
+    assert live.summary().decisions_per_s == 0
+
+
+def test_closing_the_device_ends_the_run(bundle):
+    model = bundle()
+    device = Silent("silent://", model.layout)
+    threading.Timer(0.05, device.close).start()
+    assert not list(run(device, StreamClassifier(model)))

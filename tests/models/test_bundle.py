@@ -1,0 +1,181 @@
+"""The model file: everything comes back, and no damaged file passes for a model."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from safetensors.numpy import save
+
+from plushsense.core.errors import BundleError
+from plushsense.core.gestures import load_gestures
+from plushsense.core.signal import load_layout
+from plushsense.models import bundle as room
+from plushsense.models.arch import Arch
+from plushsense.models.bundle import Bundle
+from plushsense.models.reference import random_weights
+from plushsense.windows.features import Scaler
+
+
+def make(**changes: Any) -> Bundle:
+    gestures = load_gestures("plush-18")
+    arch = Arch.parse("3d1_2d2", (3, 4), channels=3, classes=5, window=20)
+    parts: dict[str, Any] = {
+        "arch": arch,
+        "weights": random_weights(arch, 1),
+        "layout": load_layout("accel-3"),
+        "scaler": Scaler(np.array([1.0, 2.0, 3.0]), np.array([0.1, 1 / 3, 1e-7])),
+        "gestures": gestures.subset(gestures.labels[:5]),
+        "windowing": {"window_s": 2.5, "step_s": 0.5, "context": "stream"},
+        "decision": {"smoothing_s": 0.3},
+        "provenance": {"subjects": ("p1", "pä"), "scores": {"macro_f1": np.float64(0.5)}, "data": "ab12"},
+    }
+    return Bundle(**(parts | changes))
+
+
+def test_everything_comes_back(tmp_path: Path) -> None:
+    made = make()
+    path = made.save(tmp_path / "new folder" / "m.plush")
+    read = Bundle.load(path)
+    assert read.arch == made.arch
+    assert read.layout == made.layout
+    assert read.gestures == made.gestures
+    assert read.scaler.offset.tolist() == made.scaler.offset.tolist()
+    assert read.scaler.scale.tolist() == made.scaler.scale.tolist()
+    assert read.windowing == made.windowing and read.decision == made.decision
+    assert read.provenance == {"subjects": ["p1", "pä"], "scores": {"macro_f1": 0.5}, "data": "ab12"}
+    x = np.random.default_rng(0).normal(size=(2, 3, 40))
+    np.testing.assert_array_equal(read.network().forward(x), made.network().forward(x))
+    assert [p.name for p in path.parent.iterdir()] == ["m.plush"], "a temporary file stayed behind"
+    assert len(repr(read)) < 120
+
+
+def test_the_same_bundle_gives_the_same_bytes(tmp_path: Path) -> None:
+    one = make().save(tmp_path / "a.plush").read_bytes()
+    assert make().save(tmp_path / "b.plush").read_bytes() == one
+    assert Bundle.load(tmp_path / "a.plush").save(tmp_path / "c.plush").read_bytes() == one
+
+
+def test_every_flipped_byte_is_noticed(tmp_path: Path) -> None:
+    path = make().save(tmp_path / "m.plush")
+    good = path.read_bytes()
+    rng = np.random.default_rng(1)
+    header = 8 + int.from_bytes(good[:8], "little")
+    for at in [*range(0, header, 7), *rng.integers(header, len(good), 200)]:
+        bad = bytearray(good)
+        bad[at] ^= 1 << int(rng.integers(8))
+        path.write_bytes(bytes(bad))
+        with pytest.raises(BundleError) as caught:
+            Bundle.load(path)
+        assert str(path) in str(caught.value)
+    path.write_bytes(good)
+    Bundle.load(path)
+
+
+@pytest.mark.parametrize("part", [0.0, 0.0005, 0.02, 0.5, 0.99, 0.9999])
+def test_a_cut_file_is_noticed(tmp_path: Path, part: float) -> None:
+    path = make().save(tmp_path / "m.plush")
+    good = path.read_bytes()
+    path.write_bytes(good[: int(part * len(good))])
+    with pytest.raises(BundleError, match=r"damaged|is empty|not a PlushSense bundle"):
+        Bundle.load(path)
+    path.write_bytes(good[: len(good) // 2])
+    with pytest.raises(BundleError, match="damaged"):
+        Bundle.load(path)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"PK\x03\x04 a zip of some length that is not ours",
+        b"cap;1;2\n" * 50,
+        b"\x80\x04\x95pickle" * 9,
+        b"{}" * 30,
+    ],
+)
+def test_a_file_of_another_kind_is_not_a_bundle(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "x.plush"
+    path.write_bytes(content)
+    with pytest.raises(BundleError, match="is not a PlushSense bundle"):
+        Bundle.load(path)
+
+
+def test_safetensors_of_something_else_is_not_a_bundle(tmp_path: Path) -> None:
+    path = tmp_path / "x.plush"
+    path.write_bytes(save({"a": np.zeros(3)}))
+    with pytest.raises(BundleError, match="is not a PlushSense bundle"):
+        Bundle.load(path)
+
+
+def test_missing_and_unreadable_and_unwritable(tmp_path: Path) -> None:
+    with pytest.raises(BundleError, match="There is no bundle"):
+        Bundle.load(tmp_path / "none.plush")
+    with pytest.raises(BundleError, match="cannot be read"):
+        Bundle.load(tmp_path)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(BundleError, match="cannot be written"):
+        make().save(tmp_path / "file" / "m.plush")
+
+
+def test_another_version_says_which(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "m.plush"
+    with monkeypatch.context() as future:
+        future.setattr(room, "VERSION", 2)
+        make().save(path)
+    with pytest.raises(BundleError, match="version 2; this PlushSense reads 1"):
+        Bundle.load(path)
+
+
+def test_a_bundle_of_other_rules_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "m.plush"
+    with monkeypatch.context() as past:
+        past.setattr(Bundle, "_implied", lambda self: {"span": 7})
+        make().save(path)
+    with pytest.raises(BundleError, match="written under other rules"):
+        Bundle.load(path)
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = make().save(tmp_path / "m.plush")
+    before = path.read_bytes()
+
+    for failure, seen in ((OSError("no space left"), BundleError), (KeyboardInterrupt(), KeyboardInterrupt)):
+
+        def fails(*_: object, failure: BaseException = failure) -> None:
+            raise failure
+
+        monkeypatch.setattr(Path, "replace", fails)
+        with pytest.raises(seen):
+            make(provenance={"other": 1}).save(path)
+        assert path.read_bytes() == before
+        assert [p.name for p in tmp_path.iterdir()] == ["m.plush"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"layout": load_layout("plush-15")}, "11 inputs in the layout, the network needs 3"),
+        ({"scaler": Scaler(np.zeros(2), np.ones(3))}, "2 offsets"),
+        ({"scaler": Scaler(np.zeros(3), np.array([1.0, np.inf, 1.0]))}, "not finite"),
+        ({"gestures": load_gestures("plush-18")}, "18 gestures in the set, the network needs 5"),
+        ({"weights": {}}, "weights lack 'conv0.weight'"),
+    ],
+)
+def test_parts_that_do_not_fit_each_other(changes: dict[str, Any], why: str) -> None:
+    with pytest.raises(BundleError, match=why):
+        make(**changes)
+
+
+def test_provenance_is_plain_values(tmp_path: Path) -> None:
+    odd = {"f1": float("nan"), 3: np.int64(4), "where": Path("x"), "set": {"b", "a"}, "a": np.arange(2)}
+    read = Bundle.load(make(provenance=odd).save(tmp_path / "m.plush"))
+    assert read.provenance == {"f1": None, "3": 4, "where": "x", "set": ["a", "b"], "a": [0, 1]}
+    json.dumps(read.provenance)
+    with pytest.raises(BundleError, match="plain values only"):
+        make(provenance={"x": object()}).save(tmp_path / "n.plush")
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        make().arch = None  # type: ignore[misc, assignment]

@@ -1,0 +1,100 @@
+"""Simulated sessions: folders exactly as the authors' recorder leaves them."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from plushsense.core.errors import ConfigError, DatasetError
+from plushsense.core.recfile import parse_name, read_recording, read_stream
+from plushsense.core.signal import load_layout
+from plushsense.devices.virtual.session import GESTURES
+from plushsense.recording.simulate import simulate
+
+PLUSH = load_layout("plush-15")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("sim") / "people"
+    seen: list[tuple[int, int, str]] = []
+    summary = simulate(out, people=2, repetitions=1, at_rest=3, progress=lambda *a: seen.append(a))
+    assert seen == [(1, 3, "P01"), (2, 3, "P02"), (3, 3, "none")]
+    assert summary.recordings == 2 * 17 + 3
+    assert summary.to_dict()["people"] == 2
+    return out
+
+
+def test_one_folder_a_person(folder: Path) -> None:
+    assert sorted(p.name for p in folder.iterdir()) == ["P01", "P02", "none"]
+    for person in ("P01", "P02"):
+        names = [parse_name(p.name) for p in (folder / person).glob("*_*.csv")]
+        assert Counter(n.label for n in names if n) == Counter(GESTURES)
+    assert {parse_name(p.name).label for p in (folder / "none").glob("*_*.csv")} == {"At rest"}  # type: ignore[union-attr]
+
+
+def test_recordings_are_rows_of_the_stream(folder: Path) -> None:
+    for person in ("P01", "none"):
+        stream = read_stream(folder / person / "fulldatastream.csv", PLUSH)
+        assert stream.warnings == [] and stream.malformed == 0
+        host = stream.frames.host_ms
+        assert host is not None and np.all(np.diff(host) >= 0) and np.all(np.diff(stream.frames.device_ms) >= 9)
+        for path in (folder / person).glob("*_*.csv"):
+            read = read_recording(path, PLUSH)
+            name = parse_name(path.name)
+            assert name is not None and name.rows == len(read.frames) and read.had_header
+            assert read.frames.host_ms is not None
+            assert 0 <= name.epoch_ms - read.frames.host_ms[-1] < 1000
+            start = int(np.searchsorted(stream.frames.device_ms, read.frames.device_ms[0]))
+            part = stream.frames.slice(start, start + len(read.frames))
+            assert np.array_equal(part.values, read.frames.values)
+            assert part.host_ms is not None
+            assert np.array_equal(part.host_ms, read.frames.host_ms)
+
+
+def test_streams_hold_more_than_the_recordings(folder: Path) -> None:
+    stream = len(read_stream(folder / "P01" / "fulldatastream.csv", PLUSH).frames)
+    recorded = sum(n.rows for p in (folder / "P01").glob("*_*.csv") if (n := parse_name(p.name)))
+    assert stream > 1.5 * recorded
+
+
+def test_file_form(folder: Path) -> None:
+    first, second = next((folder / "P01").glob("Tail pull_*.csv")).read_text(encoding="utf-8").split("\n")[:2]
+    assert first.startswith("Cumulative capacitive; C1; ") and first.endswith("Arduino Timestamp (ms)")
+    assert len(second.split("; ")) == 15 and all(c.lstrip("-").isdigit() for c in second.split("; "))
+    assert not (folder / "P01" / "fulldatastream.csv").read_text(encoding="utf-8").startswith("Cum")
+
+
+def test_the_same_seed_writes_the_same_files(folder: Path, tmp_path: Path) -> None:
+    def digest(root: Path) -> dict[str, str]:
+        return {str(p.relative_to(root)): hashlib.sha256(p.read_bytes()).hexdigest() for p in root.rglob("*.csv")}
+
+    simulate(tmp_path / "again", people=2, repetitions=1, at_rest=3)
+    assert digest(tmp_path / "again") == digest(folder)
+    simulate(tmp_path / "other", people=1, repetitions=1, at_rest=0, gestures=["Tail pull"], seed=2)
+    assert sorted(p.name for p in (tmp_path / "other").iterdir()) == ["P01"]
+    assert digest(tmp_path / "other").items().isdisjoint(digest(folder).items())
+
+
+def test_other_layouts(tmp_path: Path) -> None:
+    for name in ("plush-14", "accel-3"):
+        layout = load_layout(name)
+        simulate(tmp_path / name, people=1, repetitions=1, at_rest=0, gestures=["Tail hit 1"], layout=name)
+        frames = read_stream(tmp_path / name / "P01" / "fulldatastream.csv", layout).frames
+        assert frames.values.shape[1] == layout.n_channels
+
+
+def test_refusals(tmp_path: Path) -> None:
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "x").write_text("x", encoding="utf-8")
+    with pytest.raises(DatasetError, match="empty folder"):
+        simulate(tmp_path / "full")
+    with pytest.raises(ConfigError, match="people"):
+        simulate(tmp_path / "none", people=0)
+    with pytest.raises(ConfigError, match="Tail kick"):
+        simulate(tmp_path / "none", gestures=["Tail kick"])
+    assert not (tmp_path / "none").exists()

@@ -1,0 +1,142 @@
+"""The report is one file, complete in itself, honest about leaks and simulations."""
+
+from __future__ import annotations
+
+import re
+from html.parser import HTMLParser
+
+import pytest
+
+from plushsense.core.errors import ConfigError
+from plushsense.reports.html import render, write_report
+
+VOID = {"meta", "img", "br"}
+
+
+class Reader(HTMLParser):
+    """Checks that tags close in order; collects the text and the addresses."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.addresses: list[str] = []
+        self.said: list[str] = []
+
+    def handle_starttag(self, tag, attrs):
+        if tag not in VOID:
+            self.open.append(tag)
+        self.addresses += [v or "" for k, v in attrs if k in ("src", "href", "data", "action")]
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] != "style":
+            self.said.append(data)
+
+    @property
+    def text(self) -> str:
+        return re.sub(r"\s+", " ", " ".join(self.said))
+
+
+def read(study, **changes) -> Reader:
+    reader = Reader()
+    reader.feed(render(**{**study, **changes}))
+    assert not reader.open
+    return reader
+
+
+def test_it_asks_for_nothing_outside_itself(tmp_path, study):
+    page = write_report(tmp_path / "deep" / "report.html", **study).read_text(encoding="utf-8")
+    reader = Reader()
+    reader.feed(page)
+    assert all(a.startswith(("#E", "data:image/svg+xml;base64,")) for a in reader.addresses)
+    assert "http" not in re.sub(r"http-equiv", "", page) and "<script" not in page and "@import" not in page
+    assert [p.name for p in (tmp_path / "deep").iterdir()] == ["report.html"]
+
+
+def test_it_says_what_a_researcher_looks_for(study):
+    text = read(study).text
+    for said in (
+        "E1",
+        "E3",
+        "P25",
+        "Tail scratch 2",
+        "never saw the person",
+        "Whole other people validate",
+        "trained on loops",
+        "Macro-F1, all classes (as the paper)",
+        "Confusion by gesture",
+        "Confusion by affect",
+        "95 % interval",
+        "Vote by recording",
+        "nobody",
+        "33 520",
+        "247 samples = 2.47 s",
+        "17",
+        "not a medical device",
+        "convention",
+    ):
+        assert said.replace(" ", "") in re.sub(r"\s", "", text), said
+
+
+def test_a_leak_is_marked_only_where_there_is_one(study):
+    leaky = read(study).text
+    assert leaky.count("This split leaks") == 1 and leaky.count("LEAKY") == 4
+    assert "LEAKY" not in read(study, evaluations=study["evaluations"][:2]).text
+
+
+def test_a_simulation_is_said_on_top_and_at_every_table_of_scores(study):
+    simulated, real = read(study).text, read(study, simulated=False).text
+    assert simulated.index("These scores are of a simulation") < simulated.index("side by side")
+    assert simulated.count("say nothing about a real toy") == 1 + 2 + 3 * 6
+    assert "imulation" not in real and "real toy" not in real
+
+
+def test_every_text_is_escaped(study):
+    evil = "<script>alert('x')</script>&\"$\\frac"
+    case = study["evaluations"][0]
+    case |= {"model": evil, "split": evil, "predictions": evil}
+    case["per_class"][0]["label"] = evil
+    case["confusion"]["labels"][0] = evil
+    case["subjects"][0]["subject"] = evil
+    changed = {
+        "title": evil,
+        "dataset": {"name": evil, evil: evil},
+        "evaluations": [case],
+        "models": [{"symbol": evil, "provenance": {evil: evil}}],
+    }
+    page = render(**{**study, **changed})
+    assert "<script" not in page and "&lt;script&gt;" in page
+    Reader().feed(page)
+
+
+def test_missing_keys_are_dashes(study):
+    reader = read(
+        study,
+        title="",
+        dataset={},
+        evaluations=[{}, {"folds": None, "accuracy": None, "by_context": {}}],
+        models=[{}],
+    )
+    assert "—" in reader.text and "None" not in reader.text and "nan" not in reader.text
+    assert read(study, evaluations=[], models=[]).text
+
+
+def test_one_affect_makes_no_matrix(study):
+    case = study["evaluations"][0]
+    case["confusion_affect"] = {"labels": ["none"], "counts": [[9]]}
+    assert "Confusion by affect" not in read(study, evaluations=[case]).text
+
+
+def test_a_place_that_cannot_be_written_is_one_sentence(tmp_path, study):
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(ConfigError, match=r"cannot be written"):
+        write_report(tmp_path / "file" / "report.html", **study)
+
+
+def test_an_older_report_is_replaced_whole(tmp_path, study):
+    target = tmp_path / "report.html"
+    target.write_text("old" * 1_000_000)
+    write_report(target, **{**study, "evaluations": []})
+    assert target.read_text(encoding="utf-8").rstrip().endswith("</html>")

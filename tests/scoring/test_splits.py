@@ -1,0 +1,170 @@
+"""Folds: who and what is kept apart, what leaks, and what is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from plushsense.core.errors import BadInput, ConfigError
+from plushsense.scoring.splits import Fold, make_folds, parse_split, purge
+
+CLASSES = 4
+
+
+def study(people: int, repetitions: int = 5, nobody: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Recordings of a study: each person makes each gesture some times; class 0 is nobody's."""
+    subject = [f"P{p:02d}" for p in range(people) for _ in range(CLASSES * repetitions)] + ["none"] * nobody
+    label = [k for _ in range(people) for k in range(CLASSES) for _ in range(repetitions)] + [0] * nobody
+    return np.array(subject), np.array(label, dtype=np.int64)
+
+
+def check_partition(folds: list[Fold], n: int, whole: bool = True) -> None:
+    for fold in folds:
+        parts = np.concatenate([fold.train, fold.validation, fold.test])
+        assert sorted(parts) == list(range(n))
+        assert min(len(fold.train), len(fold.validation), len(fold.test)) > 0
+    if whole:
+        tested = np.concatenate([fold.test for fold in folds])
+        assert sorted(tested) == list(range(n))
+
+
+@settings(max_examples=40, deadline=None)
+@given(people=st.integers(3, 12), nobody=st.integers(0, 20), k=st.integers(2, 12), seed=st.integers(0, 99))
+def test_subject_wise_folds_keep_whole_people_apart(people: int, nobody: int, k: int, seed: int) -> None:
+    subject, label = study(people, repetitions=1, nobody=nobody)
+    for text in ("leave-one-subject-out", f"by-subject:{k}"):
+        split = parse_split(text)
+        if (split.k or 2) > people or people - -(-people // (split.k or people)) < 2:
+            with pytest.raises(BadInput):
+                make_folds(split, subject, label, seed)
+            continue
+        folds = make_folds(split, subject, label, seed)
+        check_partition(folds, len(subject))
+        for fold in folds:
+            sides = [set(subject[part]) - {"none"} for part in (fold.train, fold.validation, fold.test)]
+            assert not (sides[0] & sides[1] or sides[0] & sides[2] or sides[1] & sides[2])
+            assert sides[2] == set(fold.subjects)
+            assert len(sides[1]) == max(1, round(0.15 * (people - len(fold.subjects))))
+
+
+def test_leave_one_subject_out_names_each_person_once() -> None:
+    subject, label = study(27)
+    folds = make_folds(parse_split("leave-one-subject-out"), subject, label)
+    assert [fold.name for fold in folds] == [f"P{p:02d}" for p in range(27)]
+    assert all(len(set(subject[fold.validation])) == 4 for fold in folds)
+    assert len({tuple(sorted(set(subject[fold.validation]))) for fold in folds}) > 20
+
+
+def test_nobody_is_spread_over_train_validation_and_test() -> None:
+    subject, label = study(25, nobody=51)
+    folds = make_folds(parse_split("leave-one-subject-out"), subject, label)
+    for fold in folds:
+        rest = [int((subject[part] == "none").sum()) for part in (fold.train, fold.validation, fold.test)]
+        assert rest[2] in (2, 3) and 6 <= rest[1] <= 9 and sum(rest) == 51
+        assert "none" not in fold.subjects
+
+
+def test_the_seed_decides_and_repeats() -> None:
+    subject, label = study(10)
+    for text in ("leave-one-subject-out", "by-subject:3", "by-recording:4", "windows:4", "windows:holdout"):
+        split = parse_split(text)
+        first, again, other = (make_folds(split, subject, label, seed) for seed in (1, 1, 2))
+        assert all(np.array_equal(a.validation, b.validation) for a, b in zip(first, again, strict=True))
+        assert not all(np.array_equal(a.validation, b.validation) for a, b in zip(first, other, strict=True))
+
+
+def test_recordings_are_dealt_evenly_over_people_and_gestures() -> None:
+    subject, label = study(6, repetitions=5)
+    folds = make_folds(parse_split("by-recording:5"), subject, label)
+    check_partition(folds, len(subject))
+    for fold in folds:
+        pairs = list(zip(subject[fold.test], label[fold.test], strict=True))
+        assert len(set(pairs)) == len(pairs) == 6 * CLASSES
+        assert set(label[fold.validation]) == set(range(CLASSES))
+
+
+def test_windows_are_stratified_over_classes() -> None:
+    rng = np.random.default_rng(0)
+    label = rng.choice(CLASSES, size=1000, p=[0.7, 0.15, 0.1, 0.05]).astype(np.int64)
+    subject = np.full(1000, "P01")
+    split = parse_split("windows:5")
+    assert split.leaky and not split.apart
+    folds = make_folds(split, subject, label)
+    check_partition(folds, 1000)
+    share = np.bincount(label) / 5
+    for fold in folds:
+        assert np.abs(np.bincount(label[fold.test], minlength=CLASSES) - share).max() <= 1
+        assert np.abs(np.bincount(label[fold.validation]) - 0.15 * 4 * share).max() <= 2
+
+
+def test_holdout_is_the_papers_70_15_15() -> None:
+    subject, label = study(10, repetitions=10)
+    folds = make_folds(parse_split("windows:holdout"), subject, label)
+    check_partition(folds, 400, whole=False)
+    assert [len(p) for p in (folds[0].train, folds[0].validation, folds[0].test)] == [280, 60, 60]
+    assert np.bincount(label[folds[0].test]).tolist() == [15] * CLASSES
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("by-subjekt:5", "Did you mean 'by-subject:5'"),
+        ("leave-one-out", "leave-one-subject-out"),
+        ("leave-one-subject-out:3", "leave-one-subject-out"),
+        ("by-subject", "by-subject:5"),
+        ("by-recording:1", "from 2"),
+        ("windows:x", "windows:5"),
+        ("windows:-2", "windows:5"),
+        ("windows:²", "windows:5"),
+        ("", "accepted are"),
+    ],
+)
+def test_bad_splits_say_what_is_accepted(text: str, says: str) -> None:
+    with pytest.raises(ConfigError, match="accepted|needs a number") as refusal:
+        parse_split(text)
+    assert says in str(refusal.value) and f"'{text}'" in str(refusal.value)
+
+
+@pytest.mark.parametrize("text", ["leave-one-subject-out", "by-subject:5", "by-recording:5", "windows:holdout"])
+def test_a_split_says_itself(text: str) -> None:
+    assert parse_split(text).text == text
+
+
+def test_too_few_people_and_unknown_people_are_refused() -> None:
+    subject, label = study(2)
+    with pytest.raises(BadInput, match="needs at least 3 people"):
+        make_folds(parse_split("leave-one-subject-out"), subject, label)
+    subject, label = study(4)
+    with pytest.raises(BadInput, match="needs at least 9 people"):
+        make_folds(parse_split("by-subject:9"), subject, label)
+    subject = subject.astype("U10")
+    subject[:7] = "unknown"
+    with pytest.raises(BadInput, match="7 lack it.*map.csv"):
+        make_folds(parse_split("by-subject:3"), subject, label)
+    assert make_folds(parse_split("by-recording:3"), subject, label)
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_purge_keeps_exactly_what_touches_no_tested_row(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    streams = np.array(["a", "b", ""])
+
+    def spans(n: int) -> tuple[np.ndarray, np.ndarray]:
+        first = rng.integers(0, 60, n)
+        rows = np.stack([first, first + rng.integers(1, 12, n)], axis=1)
+        name = streams[rng.integers(0, 3, n)]
+        rows[name == ""] = -1
+        return name, rows
+
+    stream, rows = spans(30)
+    tested, tested_rows = spans(5)
+    keep = purge(stream, rows, tested, tested_rows)
+    for i in range(30):
+        mine = set(range(*rows[i]))
+        touches = any(
+            stream[i] == tested[j] and mine & set(range(*tested_rows[j])) for j in range(5) if tested[j] != ""
+        )
+        assert keep[i] == (not touches)

@@ -1,0 +1,139 @@
+"""Training: it learns, repeats, stops where validation says, and refuses what cannot be trained."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from plushsense.core.errors import TrainingError
+from plushsense.models.arch import Arch
+from plushsense.models.reference import Network
+from plushsense.training.spec import TrainSpec
+from plushsense.windows.cut import WindowSet
+
+torch = pytest.importorskip("torch", reason="PyTorch is not installed (extra train)")
+from plushsense.training.fit import fit, predict  # noqa: E402
+
+Make = Callable[..., WindowSet]
+SPEC = TrainSpec(epochs=12, batch=16, device="cpu")
+
+
+def arch(**changes: object) -> Arch:
+    settings: dict[str, object] = {"channels": 2, "classes": 3, "window": 60, "step": 5} | changes
+    return Arch.parse("5_5d2", "6,8", **settings)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("padding", ["stream", "mirror"])
+@pytest.mark.parametrize("norm", ["batch", "layer"])
+def test_it_learns_and_the_reference_reads_the_same(made: Make, padding: str, norm: str) -> None:
+    net, test = arch(padding=padding, norm=norm), made(90, seed=2, person="P03")
+    out = fit(made(150), made(60, seed=1, person="P02"), net, replace(SPEC, epochs=25))
+    found = predict(net, out.weights, out.scaler, test, device="cpu")
+    assert found.dtype == np.float32 and found.sum(axis=1) == pytest.approx(np.ones(90), abs=1e-5)
+    assert (found.argmax(axis=1) == test.y).mean() > 0.9
+    network = Network(net, out.weights)
+    assert np.abs(found - network.probabilities(out.scaler.apply(test.x))).max() < 1e-5
+
+
+def test_the_same_seed_gives_the_same_weights_and_leaves_the_global_seed_alone(made: Make) -> None:
+    train, validation = made(60), made(30, seed=1)
+    torch.manual_seed(5)
+    first = fit(train, validation, arch(), SPEC)
+    after = torch.rand(1)
+    torch.manual_seed(5)
+    assert torch.equal(after, torch.rand(1))
+    again = fit(train, validation, arch(), SPEC)
+    other = fit(train, validation, arch(), replace(SPEC, seed=1))
+    assert all(np.array_equal(first.weights[name], again.weights[name]) for name in first.weights)
+    assert first.history == again.history
+    assert not np.array_equal(first.weights["dense.weight"], other.weights["dense.weight"])
+
+
+@pytest.mark.parametrize("stop_on", ["loss", "accuracy"])
+def test_it_stops_with_the_best_weights(made: Make, stop_on: str) -> None:
+    # Labels of the validation people mean nothing: it can only get worse.
+    validation = made(30, seed=1)
+    shuffled = replace(validation, y=np.random.default_rng(0).permutation(validation.y))
+    spec = replace(SPEC, epochs=150, patience=5, stop_on=stop_on)
+    out = fit(made(120), shuffled, arch(), spec)
+    watched = [row[f"validation_{stop_on}"] for row in out.history]
+    best = int(np.argmin(watched) if stop_on == "loss" else np.argmax(watched))
+    assert out.best_epoch == best + 1 == len(out.history) - 5 < 145
+    found = predict(arch(), out.weights, out.scaler, shuffled, device="cpu")
+    assert (found.argmax(axis=1) == shuffled.y).mean() == pytest.approx(out.history[best]["validation_accuracy"])
+    loss = -np.log(found[np.arange(30), shuffled.y]).mean()
+    assert loss == pytest.approx(out.history[best]["validation_loss"], rel=1e-4)
+
+
+def test_without_patience_or_validation_every_epoch_is_trained(made: Make) -> None:
+    rows: list[tuple[int, int, dict[str, object]]] = []
+    out = fit(made(50), None, arch(), SPEC, progress=lambda *said: rows.append(said))
+    assert [said[:2] for said in rows] == [(e, 12) for e in range(1, 13)]
+    assert [said[2] for said in rows] == out.history
+    assert out.best_epoch == 12 and out.history[0]["validation_loss"] is None
+    out = fit(made(50), made(9, seed=1), arch(), replace(SPEC, patience=None))
+    assert out.best_epoch == 12 and len(out.history) == 12
+    assert out.history[-1]["validation_accuracy"] is not None
+    assert set(out.history[0]) == {
+        "epoch", "train_loss", "train_accuracy", "validation_loss", "validation_accuracy", "learning_rate",
+    }  # fmt: skip
+
+
+def test_scaling_is_of_the_training_windows_and_survives_a_constant_channel(made: Make) -> None:
+    train, validation = made(40), made(20, seed=1)
+    train.x[:, 1] = 77
+    out = fit(train, replace(validation, x=validation.x * 3), arch(), replace(SPEC, epochs=2))
+    assert out.scaler.offset == pytest.approx(train.x.mean(axis=(0, 2)))
+    assert 1 / out.scaler.scale[0] == pytest.approx(train.x[:, 0].std())
+    assert np.isfinite(out.scaler.scale).all()
+    assert all(np.isfinite(w).all() for w in out.weights.values())
+
+
+@pytest.mark.parametrize("windows", [1, 2, 17, 33])
+def test_a_last_tiny_batch_does_no_harm(made: Make, windows: int) -> None:
+    out = fit(made(windows), None, arch(), replace(SPEC, epochs=2))
+    assert all(np.isfinite(w).all() for w in out.weights.values())
+
+
+def test_longer_windows_are_read_at_their_end(made: Make) -> None:
+    test = made(20)
+    longer = replace(test, x=np.concatenate([np.full((20, 2, 13), 9999, np.int32), test.x], axis=2))
+    out = fit(made(60), None, arch(), replace(SPEC, epochs=2))
+    one, other = (predict(arch(), out.weights, out.scaler, w, device="cpu") for w in (test, longer))
+    assert np.array_equal(one, other)
+
+
+def test_no_windows_give_no_predictions(made: Make) -> None:
+    out = fit(made(20), None, arch(), replace(SPEC, epochs=1))
+    assert predict(arch(), out.weights, out.scaler, made(0)).shape == (0, 3)
+
+
+def test_what_cannot_be_trained_is_said(made: Make) -> None:
+    with pytest.raises(TrainingError, match="no windows to train on"):
+        fit(made(0), None, arch(), SPEC)
+    with pytest.raises(TrainingError, match="2 channels and 3 classes.*5d1_5d2 reads 3 and 3"):
+        fit(made(20), None, arch(channels=3), SPEC)
+    with pytest.raises(TrainingError, match="hold 60 samples.*needs 72"):
+        fit(made(20), None, arch(window=60, pool=60), SPEC)
+    if not torch.cuda.is_available():
+        with pytest.raises(TrainingError, match="no CUDA device"):
+            fit(made(20), None, arch(), replace(SPEC, device="cuda"))
+
+
+def test_a_loss_that_is_no_number_ends_the_training(made: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("plushsense.training.fit._train", lambda *_: (float("nan"), 0.1))
+    with pytest.raises(TrainingError, match="train loss is no longer a number in epoch 1.*such as 0.0003"):
+        fit(made(20), None, arch(), SPEC)
+
+
+def test_the_number_of_threads_is_put_back(made: Make) -> None:
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        fit(made(20), None, arch(), replace(SPEC, epochs=1))
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)

@@ -1,0 +1,131 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from plushsense.core.errors import ConfigError, DatasetError
+from plushsense.core.gestures import GestureSet
+from plushsense.core.recfile import Frames, format_rows, recording_filename, write_recording
+from plushsense.core.signal import load_layout
+from plushsense.dataset.importers import import_recordings
+from plushsense.dataset.store import Dataset
+from plushsense.windows.cut import WindowSpec, cut_windows, shared_gestures
+
+ACCEL = load_layout("accel-3")
+
+
+def ramp(start: int, rows: int, epoch: int = 1_000_000) -> Frames:
+    """Frames at 100 Hz whose x is the row's number, so that a window says where it came from."""
+    row = np.arange(start, start + rows, dtype=np.int64)
+    return Frames(np.stack([row, row * 0 + 1, row * 0 - 1], axis=1), row * 10, epoch + row * 10)
+
+
+@pytest.fixture
+def dataset(tmp_path: Path) -> Dataset:
+    """Ana has a stream of 2000 rows; Ben has none. One clock gap in Ana's stream at row 1500."""
+    ana, ben = tmp_path / "src" / "ana", tmp_path / "src" / "ben"
+    ana.mkdir(parents=True)
+    ben.mkdir()
+    stream = ramp(0, 2000)
+    clock = stream.device_ms + np.where(np.arange(2000) >= 1500, 500, 0)
+    stream = Frames(stream.values, clock, stream.host_ms)
+    (ana / "fulldatastream.csv").write_text(format_rows(stream, ACCEL))
+    for label, first, rows in (
+        ("Wave", 400, 120),
+        ("Wave", 700, 410),
+        ("Shake", 100, 120),
+        ("Shake", 1550, 120),
+    ):
+        part = stream.slice(first, first + rows)
+        name = recording_filename(label, int(part.host_ms[-1]) if part.host_ms is not None else 0, rows)
+        write_recording(ana / name, part, ACCEL)
+    write_recording(ben / recording_filename("Wave", 5, 100), ramp(0, 100), ACCEL)
+    write_recording(ben / recording_filename("Custom", 6, 300), ramp(0, 300), ACCEL)
+    return import_recordings(tmp_path / "src", tmp_path / "DS", layout=ACCEL).dataset
+
+
+def test_loops_repeat_from_the_start_and_are_never_padded(dataset: Dataset) -> None:
+    w = cut_windows(dataset, WindowSpec(context="loop"), dataset.gestures.subset(["Wave"]))
+    short = w.x[(w.subject == "ben")][0, 0]
+    assert np.array_equal(short, np.tile(np.arange(100), 3)[:250])
+    assert w.context[w.subject == "ben"].tolist() == ["loop"]
+    long = w.x[np.array([i for i in range(len(w)) if w.context[i] == "inside"])]
+    assert long[:, 0, 0].tolist() == [700, 750, 800, 850], "full windows only, every 50 samples"
+    assert np.all(w.x[:, 1] == 1)
+    assert np.all(w.stream == "")
+
+
+def test_stream_context_is_what_came_before(dataset: Dataset) -> None:
+    w = cut_windows(dataset, WindowSpec(context="stream"), dataset.gestures.subset(["Wave", "Shake"]))
+    ana = w.take(np.flatnonzero(w.context == "stream"))
+    assert sorted(ana.x[:, 0, -1].tolist()) == [519, 949, 999, 1049, 1099]
+    assert np.all(np.diff(ana.x[:, 0], axis=1) == 1)
+    assert np.all(ana.window_rows[:, 1] - ana.window_rows[:, 0] == 250)
+    at = ana.window_rows[np.argmin(ana.x[:, 0, -1])]
+    assert at.tolist() == [270, 520], "the raw rows of the stream that the window touches"
+    assert ana.recording_rows[np.argmin(ana.x[:, 0, -1])].tolist() == [400, 520]
+
+
+def test_too_little_past_or_a_gap_falls_back_to_a_marked_loop(dataset: Dataset) -> None:
+    w = cut_windows(dataset, WindowSpec(context="stream"), dataset.gestures.subset(["Shake"]))
+    assert sorted(w.context.tolist()) == ["loop", "loop"], "row 100 has no past of 250; row 1550 has a gap in it"
+    assert sorted(w.x[:, 0, 0].tolist()) == [100, 1550]
+
+
+def test_a_longer_span_reaches_further_back(dataset: Dataset) -> None:
+    w = cut_windows(dataset, WindowSpec(context="stream", span_s=4.99), dataset.gestures.subset(["Wave"]))
+    real = w.take(np.flatnonzero(w.context == "stream"))
+    assert w.x.shape[2] == 499
+    assert real.x[:, 0, -1].tolist() == [519, 949, 999, 1049, 1099]
+    assert real.x[0, 0, 0] == 519 - 498
+
+
+def test_trimmed_and_excluded_recordings(dataset: Dataset) -> None:
+    from plushsense.dataset.index import open_dataset
+    from plushsense.dataset.marks import Mark, append_marks
+
+    wave = next(r for r in dataset.recordings if r.gesture == "Wave" and r.rows == 120)
+    long = next(r for r in dataset.recordings if r.rows == 410)
+    append_marks(
+        dataset.path,
+        [Mark(wave.id, "trim", "test", "late", 20, 100), Mark(long.id, "exclude", "test", "noise")],
+    )
+    w = cut_windows(open_dataset(dataset.path), WindowSpec(), dataset.gestures.subset(["Wave"]))
+    assert w.x[w.context == "stream", 0, -1].tolist() == [499]
+    assert open_dataset(dataset.path).hash != dataset.hash
+
+
+def test_shared_gestures_and_why_not_the_others(dataset: Dataset) -> None:
+    kept, left_out = shared_gestures(dataset)
+    assert kept.labels == ("Wave",)
+    assert left_out == {
+        "Custom": "free choice: everybody did something else",
+        "Shake": "made by 1 of 2 people",
+    }
+
+
+def test_bad_settings_are_refused(dataset: Dataset) -> None:
+    with pytest.raises(ConfigError, match=r"Unknown context 'streem'.*Did you mean 'stream'"):
+        WindowSpec(context="streem")
+    with pytest.raises(ConfigError, match="out of range"):
+        WindowSpec(window_s=0)
+    with pytest.raises(DatasetError, match="no window"):
+        cut_windows(dataset, WindowSpec(), GestureSet.infer(["Other"]))
+
+
+def test_a_recording_nobody_stopped_is_left_out_and_named(dataset: Dataset, tmp_path: Path) -> None:
+    for n in range(3):
+        write_recording(tmp_path / "src" / "ben" / f"Wave_9{n}_110.csv", ramp(10 * n, 110), ACCEL)
+    write_recording(tmp_path / "src" / "ben" / "Wave_99_3000.csv", ramp(5000, 3000), ACCEL)
+    longer = import_recordings(tmp_path / "src", tmp_path / "DS2", layout=ACCEL).dataset
+    waves = longer.gestures.subset(["Wave"])
+    w = cut_windows(longer, WindowSpec(context="loop"), waves)
+    assert w.left_out == ("ben/Wave_99_3000: 3000 rows where Wave usually has 110",)
+    assert w.x[:, 0].max() < 5000
+    everything = cut_windows(longer, WindowSpec(context="loop", longest_factor=0), waves)
+    assert everything.left_out == ()
+    assert len(everything) == len(w) + 56
+
+
+def test_vectors_are_found_among_the_inputs(dataset: Dataset) -> None:
+    assert cut_windows(dataset).vectors == ((0, 1, 2),)

@@ -1,0 +1,49 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from plushsense.core.errors import BadInput
+from plushsense.core.signal import load_layout
+from plushsense.windows.features import SampleInputs, Scaler, inputs, magnitude
+
+
+@given(st.lists(st.integers(-400_000_000, 400_000_000), min_size=3, max_size=3))
+def test_magnitude_is_the_exact_floor(parts: list[int]) -> None:
+    if sum(v * v for v in parts) << 8 >= 2**63:
+        return
+    assert int(magnitude(np.array([parts]))[0]) == math.isqrt(sum(v * v for v in parts) << 8)
+
+
+def test_magnitude_has_four_fraction_bits() -> None:
+    assert magnitude(np.array([[3, 4, 0], [1, 1, 0]])).tolist() == [80, 22]
+    with pytest.raises(BadInput, match="64 bits"):
+        magnitude(np.array([[500_000_000, 0, 0]]))
+
+
+def test_plush_inputs_replace_the_axes_by_their_magnitude() -> None:
+    layout = load_layout("plush-15")
+    rng = np.random.default_rng(0)
+    values = rng.integers(-32768, 32768, (50, 13))
+    batch = inputs(values, layout)
+    assert batch.shape == (50, 11)
+    assert np.array_equal(batch[:, :10], values[:, :10])
+    one = SampleInputs(layout)
+    assert [one(v) for v in values] == batch.tolist(), "sample by sample is the same"
+
+
+def test_scaler_is_the_z_score_and_survives_constant_channels() -> None:
+    rng = np.random.default_rng(0)
+    x = rng.integers(-100, 100, (40, 3, 25)).astype(np.int32)
+    x[:, 1] = 7
+    scaler = Scaler.fit(x)
+    out = scaler.apply(x)
+    assert out.dtype == np.float32
+    assert np.allclose(out[:, [0, 2]].mean(axis=(0, 2)), 0, atol=1e-5)
+    assert np.allclose(out[:, [0, 2]].std(axis=(0, 2)), 1, atol=1e-5)
+    assert np.all(out[:, 1] == 0)
+    assert np.array_equal(scaler.apply_sample(x[3, :, 4]), out[3, :, 4])
+    again = Scaler.from_dict(scaler.to_dict())
+    assert np.array_equal(again.apply(x), out)
