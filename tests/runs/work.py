@@ -15,8 +15,16 @@ def square(shared: Any, task: Any, report: Any) -> dict[str, Any]:
     return {"value": task * task + shared, "process": os.getpid(), "threads": os.environ.get("OPENBLAS_NUM_THREADS")}
 
 
+def wait_for(file: Path) -> None:
+    until = time.monotonic() + 30
+    while not file.exists() and time.monotonic() < until:
+        time.sleep(0.01)
+
+
 def refuse(shared: Any, task: Any, report: Any) -> dict[str, Any]:
+    """Fail at 2, but not before job 0 is kept in the folder ``shared``: which worker is faster is chance."""
     if task == 2:
+        wait_for(Path(shared, "job0.npz"))
         raise TrainingError("no more")
     return {"value": task}
 
@@ -27,8 +35,8 @@ def stumble(shared: Any, task: Any, report: Any) -> dict[str, Any]:
 
 def die(shared: Any, task: Any, report: Any) -> dict[str, Any]:
     if task == 2:
+        wait_for(Path(shared, "job0.npz"))
         os._exit(9)
-    time.sleep(0.2)
     return {"value": task}
 
 

@@ -52,7 +52,9 @@ def test_loops_repeat_from_the_start_and_are_never_padded(dataset: Dataset) -> N
     long = w.x[np.array([i for i in range(len(w)) if w.context[i] == "inside"])]
     assert long[:, 0, 0].tolist() == [700, 750, 800, 850], "full windows only, every 50 samples"
     assert np.all(w.x[:, 1] == 1)
-    assert np.all(w.stream == "")
+    assert set(w.stream[w.subject == "ana"]) == {"ana/fulldatastream"}, "where it lies is known all the same"
+    assert np.all(w.window_rows == -1)
+    assert set(w.stream[w.subject == "ben"]) == {""}
 
 
 def test_stream_context_is_what_came_before(dataset: Dataset) -> None:

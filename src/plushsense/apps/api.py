@@ -28,7 +28,7 @@ from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.runs.journal import Journal
 from plushsense.scoring.metrics import accuracy, confusion, macro_f1
-from plushsense.scoring.splits import by_recording, by_subject, holdout
+from plushsense.scoring.splits import by_recording, by_subject, holdout, parse_split
 from plushsense.training.spec import TrainSpec
 from plushsense.windows.cut import WindowSet, WindowSpec, cut_windows, shared_gestures
 
@@ -126,9 +126,9 @@ def train(
 ) -> Trained:
     """Train one network on a data set.
 
-    Whole people validate (15 % of them, chosen by the seed): they decide when to stop, and the scores are theirs, so
-    a little flattering; ask `evaluate` for a fair figure. The preset ``search`` splits windows as the paper does
-    (70/15/15), which is leaky, and says so.
+    Whole people validate (15 % of them, chosen by the seed), and the scores are theirs. Under presets with early
+    stopping they also decide when to stop, which flatters a little; ask `evaluate` for a figure over everybody.
+    The preset ``search`` splits windows as the paper does (70/15/15), which is leaky, and says so.
 
     Args:
         config: resolved settings; or give ``arch``, ``filters`` and settings such as ``preset="loso"``,
@@ -185,6 +185,7 @@ def train(
 def _divide(windows: WindowSet, config: RunConfig) -> tuple[dict[str, Any], Any, Any, Any]:
     """What the scores of a single training are taken on, and the windows to train on, to validate on, to score."""
     seed = config.evaluation.seed
+    stopped = "" if config.training.patience is None else " but decided when to stop"
     if config.preset == "search":
         fold = holdout(windows.subject, windows.y, seed)[0]
         said = "15 % of the windows, drawn at random: leaky, windows of one recording stand on both sides"
@@ -194,11 +195,11 @@ def _divide(windows: WindowSet, config: RunConfig) -> tuple[dict[str, Any], Any,
         groups = max(2, min(len(people), round(1 / 0.15)))
         fold = by_subject(windows.subject, groups, seed)[0]
         kind = "validation-subjects"
-        said = f"people who were not trained on but decided when to stop: {', '.join(fold.subjects)}"
+        said = f"people who were not trained on{stopped}: {', '.join(fold.subjects)}"
     else:
         fold = by_recording(windows.recording.astype(str), windows.y, 6, seed)[0]
         kind = "validation-recordings"
-        said = "recordings that were not trained on but decided when to stop; of the same people: flattering"
+        said = f"recordings that were not trained on{stopped}; of the same people: flattering"
     rest = np.sort(np.concatenate([fold.train, fold.validation]))
     return {"split": kind, "leaky": False, "said": said}, rest, fold.test, fold.test
 
@@ -228,6 +229,7 @@ def evaluate(
     config = config or _from_settings(arch, filters, settings)
     if split is not None:
         config = replace(config, evaluation=replace(config.evaluation, split=split))
+    parse_split(config.evaluation.split)
     gestures = choose_classes(dataset, config.evaluation.classes, warn)
     network = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
     score = windows_for(dataset, network, config.windows, gestures, warn)
@@ -258,6 +260,7 @@ def save_evaluation(result: Evaluation, dataset: Dataset, config: RunConfig, arc
     content = {
         **result.to_dict(),
         "predictions": "predictions.parquet",
+        "validation_decides": config.training.patience is not None,
         "title": evaluation_title(result, arch),
         "model": card(arch, dataset.layout.rate_hz),
         "dataset": dataset.summary(),

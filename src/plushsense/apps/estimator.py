@@ -141,7 +141,8 @@ class PlushClassifier:
 
     def predict(self, X: ArrayLike) -> NDArray[np.str_]:
         """The most probable label of each window, (N,)."""
-        found: NDArray[np.str_] = self.classes_[self.predict_proba(X).argmax(axis=1)]
+        best = self.predict_proba(X).argmax(axis=1)
+        found: NDArray[np.str_] = self.classes_[best]
         return found
 
     def score(self, X: ArrayLike, y: ArrayLike) -> float:

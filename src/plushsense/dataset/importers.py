@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.core.errors import DatasetError
-from plushsense.core.gestures import NOBODY, GestureSet, load_gestures
+from plushsense.core.gestures import GestureSet, load_gestures
 from plushsense.core.recfile import STREAM_NAME, parse_name
 from plushsense.core.signal import Layout, load_layout
 from plushsense.dataset.index import Progress, rebuild, sha256_of
@@ -252,7 +252,8 @@ def import_recordings(
         head = DatasetHead(
             name=name or source.resolve().name,
             layout=layout,
-            gestures=gestures or GestureSet("inferred", ()),
+            gestures=gestures
+            or GestureSet.infer(n.label for f in kept if (n := parse_name(f.source.name)) is not None),
             licence=licence,
             consent=consent,
             source=importer,
@@ -263,15 +264,15 @@ def import_recordings(
             rejected.append({"file": sources[file], "reason": reason})
             (work / file).unlink()
         if gestures is None:
-            head = DatasetHead(**{**head.__dict__, "gestures": GestureSet.infer(_labels(built.dataset))})
-            built = rebuild(work, head)
-        elif unknown := sorted(set(_labels(built.dataset)) - set(gestures.labels)):
+            made = GestureSet.infer(r.gesture for r in built.dataset.recordings)
+            head = DatasetHead(**{**head.__dict__, "gestures": made})
+        elif unknown := sorted({r.gesture for r in built.dataset.recordings} - set(gestures.labels)):
             extended = GestureSet(gestures.name, gestures.gestures + GestureSet.infer(unknown).gestures)
             head = DatasetHead(**{**head.__dict__, "gestures": extended})
         if not built.dataset.recordings:
             raise DatasetError(
                 f"'{source}' holds no recording that layout '{layout.name}' can read. "
-                f"The first: {rejected[0]['reason'] if rejected else 'none'}"
+                f"The first: {next(iter(built.unreadable.values()), 'none')}"
             )
         (work / HEAD).write_text(head.to_toml(), encoding="utf-8")
         dest.parent.mkdir(parents=True, exist_ok=True)
@@ -300,7 +301,3 @@ def import_recordings(
         time.perf_counter() - began,
         notes,
     )
-
-
-def _labels(dataset: Dataset) -> list[str]:
-    return [r.gesture for r in dataset.recordings if r.subject != NOBODY or r.gesture]

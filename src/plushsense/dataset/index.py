@@ -163,8 +163,9 @@ def _from_files(folder: Path, head: DatasetHead, recordings: list[_Read], stream
         frames = read.result.frames
         identity = read.path.relative_to(folder / RECORDINGS).with_suffix("").as_posix()
         flags = read.result.warnings + findings(Subject(frames, head.layout, name.rows, usual[label]))
-        if head.gestures.find(name.label) is None:
-            flags.append(f"its label '{name.label}' is not in the gesture set '{head.gestures.name}'")
+        known = head.gestures.find(name.label)
+        if known is None or (known.affect == "none" and not head.gestures.inferred):
+            flags.append(f"its label '{name.label}' is not in the gesture set '{head.gestures.name}': no affect")
         if read.sha256 in originals:
             flags.append(f"the same content as {originals[read.sha256]}")
         originals.setdefault(read.sha256, identity)

@@ -16,10 +16,7 @@ CONTEXT_WORDS = {
 CONTEXT_SHORT = {"stream": "real context", "loop": "loops", "inside": "windows inside the recording"}
 
 _NOT_LEAKY = "No training or validation window overlaps a recording that is scored."
-_PEOPLE_VALIDATE = (
-    "Whole other people validate (they decide when training stops); in that fold they are neither trained on "
-    "nor scored."
-)
+_PEOPLE_VALIDATE = "Whole other people validate{role}; in that fold they are neither trained on nor scored."
 _SPLITS = {
     "leave-one-subject-out": (
         "Leave one subject out: each person in turn is held out, and the network is trained anew on the "
@@ -35,17 +32,23 @@ _SPLITS = {
         "By recording, {k} folds: each recording stands whole on one side, but the people are known: other "
         "recordings of the same person are trained on. It answers how well the network reads people it was "
         "trained for.",
-        "Other recordings validate (they decide when training stops).",
+        "Other recordings validate{role}.",
     ),
     "windows": (
         "Random windows, {k} folds: windows are dealt at random, without regard to recording or person.",
-        "Other random windows validate (they decide when training stops).",
+        "Other random windows validate{role}.",
     ),
     "holdout": (
         "Hold-out, as in the paper: windows are dealt at random, even over the gestures: 70 % train, 15 % validate, "
         "15 % are scored, without regard to recording or person.",
-        "Other random windows validate (they decide when training stops).",
+        "Other random windows validate{role}.",
     ),
+}
+
+_ROLES = {
+    True: " (they decide when training stops)",
+    False: " (they are only watched: training runs its full length)",
+    None: "",
 }
 
 LEAKY_WORDS = (
@@ -100,14 +103,19 @@ def interval(metric: Any) -> str:
     return f"{number(ends[0])} to {number(ends[1])}"
 
 
-def split_words(split: str, folds: int | None = None) -> tuple[str, str]:
-    """How the data were divided, and who validates, as two sentences; an unknown split is quoted as it is."""
+def split_words(split: str, folds: int | None = None, decides: bool | None = None) -> tuple[str, str]:
+    """How the data were divided, and who validates, as two sentences; an unknown split is quoted as it is.
+
+    ``decides`` says whether validation ends the training or is only watched; None: not known.
+    """
     kind, _, wanted = split.partition(":")
+    if split == "windows:holdout":
+        kind = "holdout"
     if kind not in _SPLITS:
         return f"Split “{split}”.", "Who validates is not recorded."
     how, who = _SPLITS[kind]
     k = wanted or (str(folds) if folds else "several")
-    return how.format(k=k), who
+    return how.format(k=k), who.format(role=_ROLES[decides])
 
 
 def context_words(evaluation: Mapping[str, Any]) -> tuple[str, str]:
@@ -120,7 +128,7 @@ def context_words(evaluation: Mapping[str, Any]) -> tuple[str, str]:
 def protocol(evaluation: Mapping[str, Any]) -> list[tuple[str, str]]:
     """The protocol of an evaluation as (question, answer) pairs in plain words."""
     folds = evaluation.get("folds") or []
-    how, who = split_words(str(evaluation.get("split", DASH)), len(folds) or None)
+    how, who = split_words(str(evaluation.get("split", DASH)), len(folds) or None, evaluation.get("validation_decides"))
     trained, scored = context_words(evaluation)
     seeds = evaluation.get("seeds")
     sizes = [fold.get("test_windows") for fold in folds if isinstance(fold.get("test_windows"), int)]

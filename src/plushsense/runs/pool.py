@@ -11,6 +11,7 @@ import multiprocessing
 import os
 import pickle
 import signal
+import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -121,22 +122,15 @@ def _crew(workers: int, setup: bytes) -> Iterator[list[_Worker]]:
     """Started processes, ended again in any case."""
     spawn = multiprocessing.get_context("spawn")
     crew: list[_Worker] = []
-    before = {name: os.environ.get(name) for name in _THREADS}
     try:
-        os.environ.update(dict.fromkeys(_THREADS, "1"))
-        try:
-            for _ in range(workers):
-                here, there = spawn.Pipe()
-                process = spawn.Process(target=_serve, args=(there,), daemon=True)
+        for _ in range(workers):
+            here, there = spawn.Pipe()
+            process = spawn.Process(target=_serve, args=(there,), daemon=True)
+            with _inherited():
                 process.start()
-                # Only the worker may hold its end: then each side sees the other one go.
-                there.close()
-                crew.append(_Worker(process, here))
-        finally:
-            for name, value in before.items():
-                os.environ.pop(name, None)
-                if value is not None:
-                    os.environ[name] = value
+            # Only the worker may hold its end: then each side sees the other one go.
+            there.close()
+            crew.append(_Worker(process, here))
         for worker in crew:
             _send(worker, setup)
         yield crew
@@ -149,6 +143,25 @@ def _crew(workers: int, setup: bytes) -> Iterator[list[_Worker]]:
                 worker.process.kill()
             worker.process.join()
             worker.pipe.close()
+
+
+@contextmanager
+def _inherited() -> Iterator[None]:
+    """What a process that is started now takes over: one thread, and no ear for Ctrl-C while it loads."""
+    before = {name: os.environ.get(name) for name in _THREADS}
+    # Only the main thread may set a signal's handler.
+    ours = threading.current_thread() is threading.main_thread()
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN) if ours else None
+    os.environ.update(dict.fromkeys(_THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name, None)
+            if value is not None:
+                os.environ[name] = value
+        if ours:
+            signal.signal(signal.SIGINT, signal.SIG_DFL if handler is None else handler)
 
 
 def _conduct(crew: list[_Worker], jobs: Sequence[Job]) -> Iterator[tuple[Job, str, Any]]:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, DatasetError, nearest
 from plushsense.core.gestures import GestureSet
+from plushsense.dataset.quality import NEVER_STOPPED_FACTOR
 from plushsense.dataset.store import RECORDINGS, Dataset, RecordingInfo
 from plushsense.windows.clock import Segment, resample
 from plushsense.windows.features import inputs
@@ -40,7 +41,7 @@ class WindowSpec:
     step_s: float = 0.5
     context: str = "stream"
     span_s: float = 0.0
-    longest_factor: float = 5.0
+    longest_factor: float = NEVER_STOPPED_FACTOR
 
     def __post_init__(self) -> None:
         if self.context not in CONTEXTS:
@@ -62,9 +63,9 @@ class WindowSet:
 
     ``x`` (N, F, T) int32, even samples of the network's channels, not scaled; ``y`` (N,) class index; ``recording``
     (N,) index into ``recording_ids``; ``subject`` (N,) the person's code, "none" for nobody; ``context`` (N,)
-    "stream" (real past), "inside" (wholly inside its recording) or "loop"; ``stream`` (N,) id, "" for none;
-    ``window_rows`` and ``recording_rows`` (N, 2) raw rows of the stream that the window and its recording cover.
-    ``vectors`` are triples of channels that are the axes of one vector; ``left_out`` names recordings that gave no
+    "stream" (real past), "inside" (wholly inside its recording) or "loop"; ``stream`` (N,) id of the
+    stream in which the recording lies, "" for none; ``window_rows`` and ``recording_rows`` (N, 2) raw rows of that
+    stream that the window and its recording cover (−1: none; a looped window covers none). ``vectors`` are triples of channels that are the axes of one vector; ``left_out`` names recordings that gave no
     window, and why.
     """
 
@@ -228,7 +229,7 @@ def _assemble(cuts: list[tuple[RecordingInfo, _Cut]], gestures: GestureSet, data
     x = np.stack([np.clip(c.x, kind.min, kind.max).astype(np.int32).T for _, c in cuts])
     order = np.array([number[r.id] for r, _ in cuts], dtype=np.int64)
     by_recording = np.argsort(order, kind="stable")
-    rows = [(r.stream_row + r.start, r.stream_row + r.stop) if c.context == "stream" else (-1, -1) for r, c in cuts]
+    rows = [(r.stream_row + r.start, r.stream_row + r.stop) if r.stream_row >= 0 else (-1, -1) for r, _ in cuts]
 
     def text(values: Iterable[str]) -> NDArray[np.str_]:
         return np.array(list(values), dtype=np.str_)
@@ -243,7 +244,7 @@ def _assemble(cuts: list[tuple[RecordingInfo, _Cut]], gestures: GestureSet, data
         recording_ids=ids,
         subject=text(r.subject for r, _ in cuts),
         context=text(c.context for _, c in cuts),
-        stream=text(r.stream if c.context == "stream" else "" for r, c in cuts),
+        stream=text(r.stream if r.stream_row >= 0 else "" for r, _ in cuts),
         window_rows=np.array([c.window_rows for _, c in cuts], dtype=np.int64),
         recording_rows=np.array(rows, dtype=np.int64),
         rate_hz=dataset.layout.rate_hz,

@@ -40,7 +40,8 @@ def run(args: argparse.Namespace) -> int:
             "Live, a virtual person it never met; what it said as each gesture ended:",
             table(("at s", "performed", "said", "affect", "said"), rows),
             f"  affect right at the end of {right} of {len(heard)} gestures; "
-            f"{summary['decisions_per_s']:.1f} decisions a second, {summary['counters']['lost']} lines lost, {summary['counters']['malformed']} malformed",
+            f"{summary['decisions_per_s']:.1f} decisions a second, {summary['counters']['lost']} lines lost, "
+            f"{summary['counters']['malformed']} malformed",
             "",
             f"data set  {done['dataset']}",
             f"bundle    {done['bundle']}",

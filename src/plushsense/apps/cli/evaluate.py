@@ -86,7 +86,8 @@ def lines(e: dict[str, Any]) -> list[str]:
     out.append("")
     out.append(f"accuracy        {spread(e['accuracy'])}")
     out.append(f"macro-F1        {spread(e['macro_f1'])}")
-    out.append(f"by recording    {spread(e['by_recording']['accuracy'])}")
+    voted = e["by_recording"]
+    out.append(f"vote by recording, pooled: accuracy {voted['accuracy']:.3f}, macro-F1 {voted['macro_f1']:.3f}")
     for kind, part in e["by_context"].items():
         out.append(f"  on {kind} windows: accuracy {part['accuracy']:.3f} ({part['windows']} windows)")
     return out

@@ -23,7 +23,7 @@ class Parser(argparse.ArgumentParser):
             word = message.removeprefix("unrecognized arguments: ").split()[0].split("=")[0]
             known = [o for action in self._actions for o in action.option_strings]
             hint = nearest(word, known)
-        raise ConfigError(f"{self.prog}: {message}.{hint} See  {self.prog} --help")
+        raise ConfigError(f"{message[0].upper()}{message[1:]}.{hint} See  {self.prog} --help")
 
 
 def say(text: str) -> None:

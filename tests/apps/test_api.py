@@ -1,0 +1,86 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import plushsense as ps
+from plushsense.core.errors import ConfigError, DatasetError, TrainingError
+from plushsense.dataset.store import Dataset
+
+
+def test_the_face_is_about_a_dozen_names_and_all_of_them_load() -> None:
+    assert len(ps.__all__) < 20
+    for name in ps.__all__:
+        assert getattr(ps, name) is not None
+    with pytest.raises(AttributeError, match="it offers"):
+        _ = ps.trian
+
+
+def test_train_keeps_whole_people_apart_and_says_on_whom(dataset: Dataset) -> None:
+    trained = ps.train(dataset, epochs=2, filters=(4, 4, 4))
+    inside, watching = (set(trained.bundle.provenance[k]) for k in ("subjects", "validation_subjects"))
+    assert inside & watching == set()
+    assert inside | watching == set(dataset.subjects)
+    assert trained.scores["split"] == "validation-subjects"
+    assert next(iter(watching)) in trained.scores["said"]
+    assert trained.bundle.provenance["dataset_hash"] == dataset.hash
+    assert trained.figure().axes
+
+
+def test_the_search_preset_is_leaky_and_says_so(dataset: Dataset) -> None:
+    trained = ps.train(dataset, preset="search", epochs=1, filters=(4, 4, 4))
+    assert trained.scores["leaky"]
+    assert "leaky" in trained.scores["said"]
+
+
+def test_same_seed_same_weights(dataset: Dataset) -> None:
+    one, two, other = (ps.train(dataset, epochs=2, filters=(4, 4, 4), seed=s).bundle.weights for s in (3, 3, 4))
+    assert all(np.array_equal(one[k], two[k]) for k in one)
+    assert any(not np.array_equal(one[k], other[k]) for k in one)
+
+
+def test_the_papers_preset_is_mirrored_loops(dataset: Dataset) -> None:
+    bundle = ps.train(dataset, preset="paper", epochs=1, filters=(4, 4, 4)).bundle
+    assert bundle.arch.padding == "mirror"
+    assert bundle.windowing["context"] == "loop"
+
+
+def test_a_long_receptive_field_gets_the_past_it_needs(dataset: Dataset) -> None:
+    bundle = ps.train(dataset, arch="14d1_39d2_41d4", filters=(2, 2, 2), epochs=1).bundle
+    assert bundle.arch.span == 499
+
+
+def test_unknown_settings_and_too_few_classes_are_refused(dataset: Dataset) -> None:
+    with pytest.raises(ConfigError, match="Did you mean 'epochs'"):
+        ps.train(dataset, epoch=2)
+    with pytest.raises(DatasetError, match="Only 1 gesture"):
+        ps.train(dataset, classes="Slow")
+
+
+def test_notebook_faces(dataset: Dataset, bundle: Path) -> None:
+    assert "30 recordings, 5 people" in repr(dataset)
+    assert "<table>" in dataset._repr_html_()
+    assert "30 recordings" in repr(ps.cut_windows(dataset))
+    assert "14d1_19d2_19d4" in repr(ps.load(bundle))
+
+
+def test_the_estimator_learns_arrays() -> None:
+    rng = np.random.default_rng(0)
+    y = rng.integers(0, 2, 120)
+    t = np.arange(250) / 100
+    x = np.stack([np.sin(2 * np.pi * (1 + 3 * k) * t + rng.uniform(0, 6)) for k in y])[:, None, :]
+    x = np.concatenate([x, rng.normal(0, 0.1, x.shape)], axis=1)
+    people = np.arange(120) % 6
+    model = ps.PlushClassifier(filters=(4, 4, 4), epochs=12).fit(
+        x[:90], np.array(["slow", "fast"])[y[:90]], people[:90]
+    )
+    assert model.classes_.tolist() == ["fast", "slow"]
+    assert model.score(x[90:], np.array(["slow", "fast"])[y[90:]]) > 0.9
+    assert np.allclose(model.predict_proba(x[90:]).sum(axis=1), 1, atol=1e-5)
+    assert model.set_params(epochs=1).get_params()["epochs"] == 1
+    with pytest.raises(TrainingError, match=r"expected \(N, 2, T\)"):
+        model.predict(x[:, :1])
+    with pytest.raises(TrainingError, match="not trained"):
+        ps.PlushClassifier().predict(x)
