@@ -12,7 +12,7 @@ import plushsense as ps
 
 def main(out: Path, people: int = 6, epochs: int = 15, seconds: float = 20.0) -> None:
     ps.simulate(out / "recordings", people=people, repetitions=2)
-    ps.import_recordings(out / "recordings", out / "DS", layout="plush-15", simulated=True)
+    ps.import_recordings(out / "recordings", out / "DS", layout="plush-15")
     dataset = ps.open_dataset(out / "DS")
     print(dataset)
     print(ps.cut_windows(dataset))

@@ -16,8 +16,9 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from plushsense.apps.api import evaluate, load, simulate, train, write_report
+    from plushsense.apps.api import evaluate, load, simulate, train
     from plushsense.apps.estimator import PlushClassifier
+    from plushsense.apps.reporting import write_report
     from plushsense.core.gestures import GestureSet, load_gestures
     from plushsense.core.signal import Layout, load_layout
     from plushsense.dataset.importers import import_recordings
@@ -41,7 +42,7 @@ _WHERE = {
     "evaluate": "plushsense.apps.api",
     "load": "plushsense.apps.api",
     "simulate": "plushsense.apps.api",
-    "write_report": "plushsense.apps.api",
+    "write_report": "plushsense.apps.reporting",
     "PlushClassifier": "plushsense.apps.estimator",
     "open_device": "plushsense.devices.opening",
     "StreamClassifier": "plushsense.live.stream",

@@ -215,3 +215,15 @@ def test_har_phone_imports_whole(real_data: Path, tmp_path: Path) -> None:
     assert done.gestures == ["SEATED", "SITTING_DOWN", "STANDING_UP", "TURNING", "WALKING"]
     assert sorted(r["file"] for r in done.rejected) == ["executions_info.csv", "subjects_info.csv"]
     assert sum(r.rows for r in done.dataset.recordings) == sum(s.rows for s in done.dataset.streams)
+
+
+def test_a_simulation_stays_marked(tmp_path: Path) -> None:
+    from plushsense.recording.simulate import simulate
+
+    simulate(tmp_path / "virtual", people=1, repetitions=1, gestures=["Tail pull"])
+    whole = import_recordings(tmp_path / "virtual", tmp_path / "DS", layout="plush-15")
+    assert whole.dataset.head.simulated
+    assert whole.rejected == []
+    assert "virtual toy" in whole.to_dict()["warnings"][0]
+    assert import_recordings(tmp_path / "virtual" / "P01", tmp_path / "DS1", layout="plush-15").dataset.head.simulated
+    assert open_dataset(tmp_path / "DS").head.simulated

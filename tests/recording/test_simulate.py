@@ -30,7 +30,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_one_folder_a_person(folder: Path) -> None:
-    assert sorted(p.name for p in folder.iterdir()) == ["P01", "P02", "none"]
+    assert sorted(p.name for p in folder.iterdir()) == ["P01", "P02", "SIMULATION.txt", "none"]
     for person in ("P01", "P02"):
         names = [parse_name(p.name) for p in (folder / person).glob("*_*.csv")]
         assert Counter(n.label for n in names if n) == Counter(GESTURES)
@@ -76,7 +76,7 @@ def test_the_same_seed_writes_the_same_files(folder: Path, tmp_path: Path) -> No
     simulate(tmp_path / "again", people=2, repetitions=1, at_rest=3)
     assert digest(tmp_path / "again") == digest(folder)
     simulate(tmp_path / "other", people=1, repetitions=1, at_rest=0, gestures=["Tail pull"], seed=2)
-    assert sorted(p.name for p in (tmp_path / "other").iterdir()) == ["P01"]
+    assert sorted(p.name for p in (tmp_path / "other").iterdir()) == ["P01", "SIMULATION.txt"]
     assert digest(tmp_path / "other").items().isdisjoint(digest(folder).items())
 
 

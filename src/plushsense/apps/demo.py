@@ -10,9 +10,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from plushsense.apps.api import evaluate, simulated_dataset, train, write_report
+from plushsense.apps.api import evaluate, simulate, train
 from plushsense.apps.config import resolve
+from plushsense.apps.reporting import write_report
 from plushsense.core.errors import ConfigError
+from plushsense.core.signal import load_layout
+from plushsense.dataset.importers import import_recordings
+from plushsense.dataset.index import open_dataset
+from plushsense.dataset.store import Dataset
 from plushsense.devices.opening import open_device
 from plushsense.devices.virtual.device import VirtualDevice
 from plushsense.live.loop import run as run_loop
@@ -58,7 +63,7 @@ def run_demo(out: Path, *, quick: bool = False, stage: Stage, progress: Progress
     mark.write_text("Written by  plushsense demo . A simulation; this folder can be deleted.\n", encoding="utf-8")
     name = f"{size.people}x{size.repetitions}"
     stage(f"1/5  {size.people} virtual people record {size.repetitions} × 17 gestures, and the recordings are imported")
-    dataset = simulated_dataset(
+    dataset = _dataset(
         out / f"dataset-{name}",
         out / f"recordings-{name}",
         people=size.people,
@@ -92,6 +97,28 @@ def run_demo(out: Path, *, quick: bool = False, stage: Stage, progress: Progress
         "scores": {key: result[key] for key in ("split", "context", "leaky", "accuracy", "macro_f1", "by_recording")},
         "live": heard,
     }
+
+
+def _dataset(
+    dest: Path, raw: Path, *, people: int, repetitions: int, seed: int, progress: Callable[[str, int, int], None]
+) -> Dataset:
+    """A data set of virtual people, made as a real one would be: recorded, then imported. Kept when it is there."""
+    if (dest / "dataset.toml").is_file():
+        return open_dataset(dest)
+    if not raw.exists():
+        simulate(
+            raw, people=people, repetitions=repetitions, seed=seed, progress=lambda a, b: progress("recording", a, b)
+        )
+    return import_recordings(
+        raw,
+        dest,
+        layout=load_layout("plush-15"),
+        name="virtual toy",
+        licence="MIT",
+        consent="nobody: a simulation",
+        simulated=True,
+        progress=lambda a, b: progress("importing", a, b),
+    ).dataset
 
 
 def _live(bundle: Path, seconds: float) -> dict[str, Any]:

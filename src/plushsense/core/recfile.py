@@ -20,6 +20,8 @@ from plushsense.core.errors import FileFormatError
 from plushsense.core.signal import DELAY_MS, DEVICE_MS, HOST_MS, Layout, layout_names, load_layout
 
 STREAM_NAME = "fulldatastream.csv"
+# Lies in a folder of simulated recordings, so that no score on them can pass for a result.
+SIMULATION_MARK = "SIMULATION.txt"
 _NAME = re.compile(r"^(?P<label>.+)_(?P<epoch>\d{1,18})_(?P<rows>\d{1,12})\.csv$", re.IGNORECASE)
 _SPLIT = re.compile(rb"[;,\t]\s*|\s+")
 _LIMIT = 2.0**53

@@ -17,7 +17,7 @@ from typing import Any
 
 from plushsense.core.errors import DatasetError
 from plushsense.core.gestures import GestureSet, load_gestures
-from plushsense.core.recfile import STREAM_NAME, parse_name
+from plushsense.core.recfile import SIMULATION_MARK, STREAM_NAME, parse_name
 from plushsense.core.signal import Layout, load_layout
 from plushsense.dataset.index import Progress, rebuild, sha256_of
 from plushsense.dataset.store import HEAD, RECORDINGS, STREAMS, UNKNOWN_SUBJECT, Dataset, DatasetHead
@@ -207,6 +207,7 @@ def import_recordings(
         layout: the sensor layout, by name, path or as it is.
         gestures: the gesture set; by default ``plush-18`` for plush layouts, else inferred from the labels.
         subjects: "folder" (the folder is the person) or the path of a mapping file ``file,subject``.
+        simulated: these are recordings of the virtual toy; found out by itself where `plushsense simulate` wrote them.
         progress: called with (files done, files in all).
 
     Returns:
@@ -225,7 +226,8 @@ def import_recordings(
         raise DatasetError(f"'{dest}' already holds something: give a new or empty folder, nothing is overwritten.")
     mapping = None if str(subjects) == FOLDER else read_mapping(Path(subjects))
     importer = "labelled-rows" if "label" in layout.csv.columns else "gesture-recorder"
-    found = list(IMPORTERS[importer](source, mapping))
+    found = [f for f in IMPORTERS[importer](source, mapping) if f.source.name != SIMULATION_MARK]
+    simulated = simulated or any((place / SIMULATION_MARK).is_file() for place in (source, source.resolve().parent))
     rejected = [{"file": f.source.relative_to(source).as_posix(), "reason": f.reason} for f in found if not f.kind]
     kept = [f for f in found if f.kind]
     if not kept:
@@ -282,7 +284,9 @@ def import_recordings(
     finally:
         shutil.rmtree(work, ignore_errors=True)
     dataset = Dataset(dest, head, built.dataset.recordings, built.dataset.streams)
-    notes = []
+    notes = (
+        ["these recordings are of the virtual toy: scores on them say nothing about a real one"] if simulated else []
+    )
     if any(r.subject == UNKNOWN_SUBJECT for r in dataset.recordings):
         notes.append(
             "the folders are gestures, so the people are not known: splits by subject are not possible; "

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +19,14 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.gestures import NOBODY
-from plushsense.core.recfile import STREAM_NAME, Frames, format_rows, recording_filename, write_recording
+from plushsense.core.recfile import (
+    SIMULATION_MARK,
+    STREAM_NAME,
+    Frames,
+    format_rows,
+    recording_filename,
+    write_recording,
+)
 from plushsense.core.signal import Layout, load_layout
 from plushsense.devices.virtual.motions import AT_REST
 from plushsense.devices.virtual.people import draw_person
@@ -149,14 +157,24 @@ def simulate(
     sessions: list[tuple[str, int | None]] = [(f"P{who:0{width}d}", who) for who in range(1, people + 1)]
     if resting > 0:
         sessions.append((NOBODY, None))
+    # Whole or not at all: a folder half full would look like a small data set.
+    work = folder.with_name(folder.name + ".simulating")
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir(parents=True)
+    (work / SIMULATION_MARK).write_text(
+        f"Recordings of the virtual toy, seed {seed}. Nobody touched anything.\n", "utf-8"
+    )
     recordings = rows = stream_rows = lost = 0
     for done, (name, who) in enumerate(sessions, 1):
         chosen, times = ((AT_REST,), resting) if who is None else (labels, repetitions)
         take = _session(who, seed, chosen, times, resolved, world)
-        rows += _write(folder / name, take, resolved)
+        rows += _write(work / name, take, resolved)
         recordings += len(take.cuts)
         stream_rows += len(take.frames)
         lost += take.lost
         if progress is not None:
             progress(done, len(sessions), name)
+    if folder.exists():
+        folder.rmdir()
+    os.replace(work, folder)
     return SimulationSummary(str(folder), people, recordings, rows, stream_rows, lost, seed)

@@ -63,10 +63,10 @@ class WindowSet:
 
     ``x`` (N, F, T) int32, even samples of the network's channels, not scaled; ``y`` (N,) class index; ``recording``
     (N,) index into ``recording_ids``; ``subject`` (N,) the person's code, "none" for nobody; ``context`` (N,)
-    "stream" (real past), "inside" (wholly inside its recording) or "loop"; ``stream`` (N,) id of the
-    stream in which the recording lies, "" for none; ``window_rows`` and ``recording_rows`` (N, 2) raw rows of that
-    stream that the window and its recording cover (−1: none; a looped window covers none). ``vectors`` are triples of channels that are the axes of one vector; ``left_out`` names recordings that gave no
-    window, and why.
+    "stream" (real past), "inside" (wholly inside its recording) or "loop"; ``stream`` (N,) id of the stream in which
+    the recording lies, "" for none; ``window_rows`` and ``recording_rows`` (N, 2) raw rows of that stream that the
+    window and its recording cover (−1: none; a looped window covers none). ``vectors`` are triples of channels that
+    are the axes of one vector; ``left_out`` names recordings that gave no window, and why.
     """
 
     x: NDArray[np.int32]

@@ -25,7 +25,8 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from plushsense.apps.api import evaluate, write_report
+    from plushsense.apps.api import evaluate
+    from plushsense.apps.reporting import write_report
     from plushsense.dataset.index import open_dataset
 
     config = settings(args, split=args.split, train_context=args.train_context, workers=args.workers)

@@ -19,7 +19,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from plushsense.apps.api import write_report
+    from plushsense.apps.reporting import write_report
 
     folder = Path(args.dataset) / "evaluations"
     found = args.evaluation or [str(p.parent) for p in sorted(folder.glob("*/evaluation.json"))]

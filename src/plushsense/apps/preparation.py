@@ -1,0 +1,57 @@
+"""From a data set to what a network is trained on: which gestures, which windows."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from plushsense.apps.config import ALL, SHARED
+from plushsense.core.errors import DatasetError
+from plushsense.core.gestures import GestureSet
+from plushsense.dataset.index import open_dataset
+from plushsense.dataset.store import Dataset
+from plushsense.models.arch import Arch
+from plushsense.windows.cut import WindowSet, WindowSpec, cut_windows, shared_gestures
+
+Warn = Callable[[str], None]
+
+
+def silent(_: str) -> None:
+    """Where warnings go that nobody asked for."""
+
+
+def choose_classes(dataset: Dataset, wanted: str | Sequence[str], warn: Warn = silent) -> GestureSet:
+    """The classes to tell apart: "shared", "all", or labels (a list, or text with commas)."""
+    if wanted == SHARED:
+        gestures, left_out = shared_gestures(dataset)
+        if left_out:
+            reasons = "; ".join(f"{label} ({why})" for label, why in left_out.items())
+            warn(f"left out of the shared gestures: {reasons}")
+    elif wanted == ALL:
+        made = {r.gesture for r in dataset.used}
+        gestures = dataset.gestures.subset([g for g in dataset.gestures.labels if g in made])
+    else:
+        labels = wanted.split(",") if isinstance(wanted, str) else wanted
+        gestures = dataset.gestures.subset([label.strip() for label in labels])
+    if len(gestures) < 2:
+        raise DatasetError(
+            f"Only {len(gestures)} gesture is left to tell apart ({', '.join(gestures.labels) or 'none'}): "
+            "choose others with --classes all or --classes LABEL,LABEL."
+        )
+    return gestures
+
+
+def windows_for(dataset: Dataset, arch: Arch, spec: WindowSpec, gestures: GestureSet, warn: Warn = silent) -> WindowSet:
+    """Windows as ``arch`` needs them: with as much past as a decision sees."""
+    span_s = arch.span / dataset.layout.rate_hz
+    cut = cut_windows(dataset, replace(spec, span_s=span_s if span_s > spec.window_s else 0.0), gestures)
+    for line in cut.left_out:
+        warn(f"left out: {line}")
+    return cut
+
+
+def opened(dataset: Dataset | str | os.PathLike[str]) -> Dataset:
+    """The data set itself, or the one at a path."""
+    return dataset if isinstance(dataset, Dataset) else open_dataset(Path(dataset))
