@@ -139,7 +139,8 @@ def protocol(evaluation: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("Scored on", scored),
         (
             "Seeds",
-            text(seeds) + (f" ({len(seeds)} runs averaged)" if isinstance(seeds, list) and len(seeds) > 1 else ""),
+            text(seeds)
+            + (f" ({len(seeds)} runs averaged)" if isinstance(seeds, list) and len(seeds) > 1 else " (one run)"),
         ),
         ("Folds", count(folds) + (f", {count(sum(sizes))} windows scored" if sizes else "")),
     ]
