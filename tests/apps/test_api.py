@@ -84,3 +84,52 @@ def test_the_estimator_learns_arrays() -> None:
         model.predict(x[:, :1])
     with pytest.raises(TrainingError, match="not trained"):
         ps.PlushClassifier().predict(x)
+
+
+def long_recordings(folder: Path, people: int, recordings: int) -> Dataset:
+    """Recordings of several windows each, without a stream."""
+    from plushsense.core.recfile import Frames, write_recording
+    from plushsense.core.signal import load_layout
+    from plushsense.dataset.importers import import_recordings
+
+    layout, rng = load_layout("accel-3"), np.random.default_rng(0)
+    for person in range(people):
+        (folder / "src" / f"P{person}").mkdir(parents=True)
+        for number in range(recordings):
+            for label in ("Slow", "Fast"):
+                clock = np.arange(500, dtype=np.int64) * 10
+                name = f"{label}_{1000 * person + number}_500.csv"
+                frames = Frames(rng.integers(-900, 900, (500, 3)), clock, clock)
+                write_recording(folder / "src" / f"P{person}" / name, frames, layout)
+    return import_recordings(folder / "src", folder / "DS", layout="accel-3").dataset
+
+
+@pytest.mark.parametrize(
+    ("people", "kind"), [(1, "validation-recordings"), (2, "validation-recordings"), (3, "validation-subjects")]
+)
+def test_nothing_that_is_scored_was_trained_on(people: int, kind: str, tmp_path: Path) -> None:
+    from plushsense.apps.api import _divide
+    from plushsense.apps.config import resolve
+
+    dataset = long_recordings(tmp_path, people, 4)
+    windows = ps.cut_windows(dataset)
+    assert len(windows) == 6 * len(dataset.recordings), "several windows a recording"
+    division = _divide(windows, resolve(None))
+    trained, scored = (set(windows.recording[i].tolist()) for i in (division.train, division.fold.test))
+    assert trained
+    assert scored
+    assert not trained & scored
+    trained = ps.train(dataset, epochs=1, filters=(2, 2, 2))
+    assert trained.scores["split"] == kind
+    assert not trained.scores["leaky"]
+    if people < 3:
+        assert "flattering" in trained.scores["said"]
+
+
+def test_the_toy_at_rest_does_not_flatter_a_training(tmp_path: Path) -> None:
+    ps.simulate(tmp_path / "raw", people=3, repetitions=1)
+    dataset = ps.import_recordings(tmp_path / "raw", tmp_path / "DS", layout="plush-15").dataset
+    scores = ps.train(dataset, epochs=1, filters=(2, 2, 2)).scores
+    assert scores["simulated"]
+    assert scores["nobody"]["windows"] > 0
+    assert scores["accuracy"] < 0.6, "after one epoch only rest is known, and rest is nobody's"

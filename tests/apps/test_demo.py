@@ -31,7 +31,7 @@ def test_demo_twice(cli: Callable[..., Any], tmp_path: Path, monkeypatch: pytest
     again = cli("demo", "--quick", "--out", out)
     assert again.status == 0
     assert again.out.count("SIMULATION") >= 1
-    leftovers = [p.name for p in out.rglob("*") if p.name.endswith((".part", ".importing"))]
+    leftovers = [p.name for p in out.rglob("*") if p.name.endswith(".part") or "-unfinished-" in p.name]
     assert leftovers == []
 
 

@@ -39,3 +39,21 @@ def test_wrong_sets_are_refused() -> None:
         Gesture("x", affect="postive")
     with pytest.raises(GestureError, match="twice"):
         GestureSet("s", (Gesture("Tail tap"), Gesture("tail_tap")))
+
+
+def test_spellings_of_one_label_are_one_gesture() -> None:
+    found = GestureSet.infer(["tail_tap", "Tail Tap", "Shake", "tail tap"])
+    assert found.labels == ("Shake", "tail_tap")
+
+
+@pytest.mark.parametrize(
+    ("entry", "said"),
+    [
+        ({"label": 5}, "label is 5; it must be a text"),
+        ({"label": "a", "nobody": "no"}, "nobody is 'no'"),
+        ("a", "table"),
+    ],
+)
+def test_a_gesture_of_the_wrong_type_is_refused(entry: object, said: str) -> None:
+    with pytest.raises(GestureError, match=said):
+        GestureSet.from_dict({"name": "own", "gestures": [entry]})

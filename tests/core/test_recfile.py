@@ -136,3 +136,29 @@ def test_any_bytes_are_read_or_refused(tmp_path_factory: pytest.TempPathFactory,
         except FileFormatError:
             continue
         assert frames.values.shape == (len(frames), layout.n_channels)
+
+
+def test_a_clock_from_zero_with_paired_stamps_is_no_delay(tmp_path: Path) -> None:
+    phone = load_layout("phone-6")
+    clock = np.repeat(np.arange(50) * 20, 2).astype(np.int64)
+    for device_ms in (clock, np.tile(clock[:50], 2), clock[:4]):
+        path = tmp_path / f"x_1_{len(device_ms)}.csv"
+        path.unlink(missing_ok=True)
+        labels = np.array(["WALK"] * len(device_ms))
+        write_recording(path, Frames(np.zeros((len(device_ms), 6), np.int64), device_ms, None, labels), phone)
+        read = read_recording(path, phone)
+        assert np.array_equal(read.frames.device_ms, device_ms)
+        assert not read.integrated
+
+
+def test_delays_are_known_in_a_stream_that_was_appended_to(tmp_path: Path) -> None:
+    delays = np.tile([9, 11, 10, 10], 50).astype(np.int64)
+    host = np.cumsum(delays) + 10**12
+    host[100:] += 86_400_000
+    delays[150] = 400_000
+    host[150:] += 400_000
+    path = tmp_path / "fulldatastream.csv"
+    path.write_text(format_rows(Frames(np.ones((200, 13), np.int64), delays, host), PLUSH))
+    read = read_stream(path, load_layout("plush-14"))
+    assert read.integrated
+    assert np.array_equal(np.diff(read.frames.device_ms), delays[1:])

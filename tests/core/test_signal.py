@@ -59,6 +59,12 @@ def test_a_users_own_layout(tmp_path: Path) -> None:
         ("rate_hz = 0.0", "not valid TOML"),
         ('csv = { colums = ["a"] }', r"'colums'.*Did you mean 'columns'"),
         ('derived = [{ name = "m", kind = "norm", of = ["a"] }]', "kind 'norm'"),
+        ('derived = [{ name = "m", kind = "magnitude", of = ["a"] }]', "'a' feeds 'm'.*valid_min and valid_max"),
+        ('csv = { columns = ["a", "b", "device_ms"], header = ["A", "B"] }', "csv.header has 2 texts for 3 columns"),
+        ("inputs = [1]", "inputs is .1., not a list of texts"),
+        ('inputs = "ab"', "inputs is 'ab', not a list of texts"),
+        ("csv = { separator = 5 }", "separator is 5, not a text"),
+        ('derived = ["m"]', "derived is .*not a list of tables"),
     ],
 )
 def test_a_wrong_layout_is_refused_in_one_sentence(tmp_path: Path, change: str, said: str) -> None:
@@ -79,3 +85,44 @@ def test_a_layout_without_a_clock_is_refused(tmp_path: Path) -> None:
     path.write_text(OWN.replace(', "device_ms"]', "]"))
     with pytest.raises(LayoutError, match="no clock"):
         load_layout(path)
+
+
+@pytest.mark.parametrize(
+    ("entry", "said"),
+    [
+        ({"name": 5}, "name is 5"),
+        ({"valid_min": "low"}, "valid_min is 'low'"),
+        ({"step": 0.0}, "step is 0"),
+        ({"step": float("nan")}, "step is nan"),
+        ({"valid_min": 5.0, "valid_max": 1.0}, "must rise"),
+        ({"valid_min": -200.0, "valid_max": 200.0, "step": 1e-8}, "fit 32-bit"),
+    ],
+)
+def test_a_channel_that_cannot_be_is_refused(entry: dict[str, object], said: str) -> None:
+    table = load_layout("accel-3").to_dict()
+    table["channels"][0].update(entry)
+    with pytest.raises(LayoutError, match=said):
+        Layout.from_dict(table)
+
+
+def test_valid_ranges_fit_32_bits_and_so_does_the_magnitude() -> None:
+    for layout in map(load_layout, layout_names()):
+        assert (layout.valid_min_int >= -(2**31)).all() and (layout.valid_max_int < 2**31).all()
+    table = load_layout("plush-15").to_dict()
+    for entry in table["channels"]:
+        if entry["name"].startswith("acc"):
+            entry.update(valid_min=-7.7e7, valid_max=7.7e7)
+    layout = Layout.from_dict(table)
+    widest = int(layout.valid_max_int[-1])
+    assert 16 * widest * 3**0.5 < 2**31
+    table["channels"][-1]["valid_max"] = 7.8e7
+    with pytest.raises(LayoutError, match="'acc_z' feeds"):
+        Layout.from_dict(table)
+
+
+def test_a_range_that_nobody_gave_is_that_of_the_integers(tmp_path: Path) -> None:
+    path = tmp_path / "pad.toml"
+    path.write_text(OWN)
+    layout = load_layout(path)
+    assert (layout.valid_min_int == -(2**31)).all() and (layout.valid_max_int == 2**31 - 1).all()
+    assert Layout.from_dict(layout.to_dict()) == layout

@@ -17,16 +17,47 @@ def test_marks_are_appended_and_undone(tmp_path: Path) -> None:
     assert read_marks(tmp_path) == {"a": Standing()}
 
 
-def test_a_torn_last_line_is_passed_over_and_a_damaged_one_is_not(tmp_path: Path) -> None:
+def test_a_torn_line_swallows_nothing_and_locks_nothing(tmp_path: Path) -> None:
     append_marks(tmp_path, [Mark("a", "exclude", "x")])
     with (tmp_path / MARKS).open("a") as file:
         file.write('{"recording": "b", "act')
     assert set(read_marks(tmp_path)) == {"a"}
-    with (tmp_path / MARKS).open("a") as file:
-        file.write("\n")
     append_marks(tmp_path, [Mark("c", "exclude", "x")])
-    with pytest.raises(DatasetError, match="line 2 is damaged"):
+    assert set(read_marks(tmp_path)) == {"a", "c"}
+    with (tmp_path / MARKS).open("ab") as file:
+        file.write('{"recording": "ä'.encode()[:-1])
+    append_marks(tmp_path, [Mark("d", "exclude", "x")])
+    assert set(read_marks(tmp_path)) == {"a", "c", "d"}
+
+
+def test_only_a_newline_ends_a_mark(tmp_path: Path) -> None:
+    append_marks(tmp_path, [Mark("a", "exclude", "x", "noise\u2028and more\x85\x0b")])
+    assert read_marks(tmp_path) == {"a": Standing(True)}
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("[1]", "is no mark"),
+        ('{"recording": "a", "action": "trim"}', "lacks something.*who"),
+        ('{"recording": "a", "action": "trim", "who": "x", "start": -1}', "start is -1"),
+        ('{"recording": "a", "action": "trim", "who": "x", "start": "3"}', "start is '3'"),
+        ('{"recording": "a", "action": "trim", "who": "x", "stop": 2.5}', "stop is 2.5"),
+        ('{"recording": "a", "action": "trim", "who": "x", "start": 9, "stop": 4}', "keep nothing"),
+        ('{"recording": 7, "action": "exclude", "who": "x"}', "recording is 7"),
+        ('{"recording": "a", "acton": "exclude", "who": "x"}', "Did you mean 'action'"),
+    ],
+)
+def test_json_that_is_no_mark_is_refused_with_its_line(tmp_path: Path, line: str, said: str) -> None:
+    (tmp_path / MARKS).write_text("\n" + line + "\n")
+    with pytest.raises(DatasetError, match=f"line 2.*{said}"):
         read_marks(tmp_path)
+
+
+def test_a_mark_that_cannot_be_is_not_written(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="start is -5"):
+        append_marks(tmp_path, [Mark("a", "trim", "x", start=-5)])
+    assert not (tmp_path / MARKS).exists()
 
 
 def test_an_unknown_mark_is_refused(tmp_path: Path) -> None:

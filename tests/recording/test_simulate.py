@@ -13,6 +13,7 @@ from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.recfile import parse_name, read_recording, read_stream
 from plushsense.core.signal import load_layout
 from plushsense.devices.virtual.session import GESTURES
+from plushsense.devices.virtual.stream import ToySpec
 from plushsense.recording.simulate import simulate
 
 PLUSH = load_layout("plush-15")
@@ -98,3 +99,34 @@ def test_refusals(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="Tail kick"):
         simulate(tmp_path / "none", gestures=["Tail kick"])
     assert not (tmp_path / "none").exists()
+
+
+def test_older_firmware_leaves_delays_in_the_clock_column(tmp_path: Path) -> None:
+    layout = load_layout("plush-14")
+    simulate(tmp_path / "old", people=1, repetitions=1, at_rest=0, gestures=["Tail hit 1"], layout=layout)
+    path = tmp_path / "old" / "P01" / "fulldatastream.csv"
+    last = [int(line.split("; ")[-1]) for line in path.read_text(encoding="utf-8").splitlines()]
+    assert max(last) < 1000
+    read = read_stream(path, layout)
+    assert read.integrated
+    assert read.frames.host_ms is not None
+    passed = int(read.frames.host_ms[-1] - read.frames.host_ms[0])
+    assert abs(int(read.frames.device_ms[-1]) - passed) < 0.05 * passed
+
+
+def test_a_users_folder_beside_is_left_alone(tmp_path: Path) -> None:
+    mine = tmp_path / "out.simulating"
+    mine.mkdir()
+    (mine / "thesis.txt").write_text("x", encoding="utf-8")
+    simulate(tmp_path / "out", people=1, repetitions=1, at_rest=0, gestures=["Tail hit 1"])
+    assert (mine / "thesis.txt").is_file()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "out.simulating"]
+    (tmp_path / "afile").write_text("x", encoding="utf-8")
+    with pytest.raises(DatasetError, match="cannot be made"):
+        simulate(tmp_path / "afile" / "x", people=1, repetitions=1, at_rest=0, gestures=["Tail hit 1"])
+
+
+def test_a_virtual_toy_of_a_negative_person_is_refused() -> None:
+    for given in ({"person": -1}, {"seed": -1}, {"session": -1}):
+        with pytest.raises(ConfigError, match=r"is -1; a whole number from 0"):
+            ToySpec(**given)

@@ -137,6 +137,75 @@ def test_a_place_that_cannot_be_written_is_one_sentence(tmp_path, study):
 
 def test_an_older_report_is_replaced_whole(tmp_path, study):
     target = tmp_path / "report.html"
-    target.write_text("old" * 1_000_000)
+    write_report(target, **study)
+    target.write_text(target.read_text(encoding="utf-8") + "old" * 1_000_000, encoding="utf-8")
     write_report(target, **{**study, "evaluations": []})
     assert target.read_text(encoding="utf-8").rstrip().endswith("</html>")
+
+
+@pytest.mark.parametrize("name", ["thesis.html", "thesis.docx", "folder.html", "noending"])
+def test_nothing_else_is_ever_replaced(name, tmp_path, study):
+    target = tmp_path / name
+    if name == "folder.html":
+        target.mkdir()
+    else:
+        target.write_text("<!DOCTYPE html><title>my thesis</title>")
+    with pytest.raises(ConfigError, match="name"):
+        write_report(target, **study)
+    assert target.is_dir() or "my thesis" in target.read_text()
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def section(page: str, key: str) -> str:
+    """The part of a page about one evaluation."""
+    return page.split(f'<h2 id="{key}">')[1].split('<h2 id="')[0]
+
+
+def row(page: str, key: str) -> str:
+    """The row of the comparison for one evaluation."""
+    return page.split(f'<tr><td><a href="#{key}">')[1].split("</tr>")[0]
+
+
+def test_a_simulated_evaluation_of_a_real_data_set_is_marked_and_only_it(study):
+    cases = study["evaluations"]
+    cases[1]["simulated"] = True
+    page = render(**{**study, "simulated": False})
+    assert "A part of this page is of a simulation" in page
+    assert "These scores are of a simulation" not in page
+    assert ["SIMULATION" in row(page, key) for key in ("E1", "E2", "E3")] == [False, True, False]
+    assert ["nothing about a real toy" in section(page, key) for key in ("E1", "E2")] == [False, True]
+    cases[1] |= {"simulated": None, "dataset": {"simulated": True}}
+    assert "SIMULATION" in row(render(**{**study, "simulated": False}), "E2"), "its data set says it"
+    cases[1]["dataset"]["simulated"] = False
+    mixed = render(**study)
+    assert ["SIMULATION" in row(mixed, key) for key in ("E1", "E2")] == [True, False], "a real one among virtual ones"
+
+
+def test_a_model_of_a_simulation_is_marked(study):
+    study["models"][0]["provenance"]["simulated"] = True
+    page = render(**{**study, "simulated": False})
+    assert "A part of this page" in page and "trained on a virtual toy" in page
+    assert "SIMULATION" not in row(page, "E1")
+
+
+def test_an_evaluation_of_other_data_says_so(study):
+    same, other = study["evaluations"][:2]
+    same["dataset"] = {"name": "virtual-plush", "hash": study["dataset"]["hash"]}
+    other["dataset"] = {"name": "an older one", "hash": "0" * 64}
+    page = render(**study)
+    assert ["OTHER DATA" in row(page, key) for key in ("E1", "E2", "E3")] == [False, True, False]
+    assert "an older one" in section(page, "E2") and "are not of the data" in section(page, "E2")
+    assert "Other data" not in section(page, "E1") + section(page, "E3")
+
+
+def test_a_spread_is_said_to_be_over_what_it_is(study):
+    people, _, folds = study["evaluations"]
+    people["over"], folds["over"] = "subjects", "folds"
+    folds["folds"] = folds["folds"][:5]
+    page = render(**study)
+    assert ">25 people<" in row(page, "E1") and ">5 folds<" in row(page, "E3")
+    first, last = section(page, "E1"), section(page, "E3")
+    assert "deviation over 25 people" in first and "too narrow" not in first
+    assert "deviation over 5 folds" in last and "too narrow" in last and "over 25 people" not in last
+    assert "all classes (as the paper), over 25 folds" in first
+    assert "all classes (as the paper), over 5 folds" in last

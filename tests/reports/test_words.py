@@ -43,6 +43,22 @@ def test_every_split_is_told_in_words(split, said):
     assert said in words.split_words(split)[0]
 
 
+@pytest.mark.parametrize(
+    ("evaluation", "said"),
+    [
+        ({"over": "subjects", "subjects": [{}] * 7, "folds": [{}] * 3}, "over 7 people;"),
+        ({"over": "folds", "subjects": [{}] * 7, "folds": [{}] * 3}, "over 3 folds;"),
+        ({"split": "by-subject:3", "subjects": [{}] * 7, "folds": [{}] * 3}, "over 7 people;"),
+        ({"split": "by-recording:3", "subjects": [{}] * 7, "folds": [{}] * 3}, "over 3 folds;"),
+        ({"over": "folds", "subjects": [{}] * 7, "folds": [{}]}, "Of 1 fold: there is no spread"),
+        ({"over": "subjects", "subjects": []}, "over the people;"),
+    ],
+)
+def test_over_what_a_mean_is_taken(evaluation, said):
+    assert said in words.spread_words(evaluation)
+    assert ("too narrow" in words.spread_words(evaluation)) == ("3 folds;" in said)
+
+
 def test_the_two_contexts_are_told_apart():
     told = dict(words.protocol({"split": "by-subject:5", "context": "stream", "train_context": "loop", "folds": []}))
     assert told["Trained on"].startswith("looped") and told["Scored on"].startswith("real context")

@@ -59,7 +59,8 @@ def test_loops_repeat_from_the_start_and_are_never_padded(dataset: Dataset) -> N
 
 def test_stream_context_is_what_came_before(dataset: Dataset) -> None:
     w = cut_windows(dataset, WindowSpec(context="stream"), dataset.gestures.subset(["Wave", "Shake"]))
-    ana = w.take(np.flatnonzero(w.context == "stream"))
+    assert sorted(w.x[w.context == "stream", 0, -1].tolist()) == [519], "the one with a past of its own"
+    ana = w.take(np.flatnonzero(np.isin(w.context, ["stream", "inside"]) & (w.window_rows[:, 0] >= 0)))
     assert sorted(ana.x[:, 0, -1].tolist()) == [519, 949, 999, 1049, 1099]
     assert np.all(np.diff(ana.x[:, 0], axis=1) == 1)
     assert np.all(ana.window_rows[:, 1] - ana.window_rows[:, 0] == 250)
@@ -78,6 +79,7 @@ def test_a_longer_span_reaches_further_back(dataset: Dataset) -> None:
     w = cut_windows(dataset, WindowSpec(context="stream", span_s=4.99), dataset.gestures.subset(["Wave"]))
     real = w.take(np.flatnonzero(w.context == "stream"))
     assert w.x.shape[2] == 499
+    assert "inside" not in w.context, "410 rows do not fill 499"
     assert real.x[:, 0, -1].tolist() == [519, 949, 999, 1049, 1099]
     assert real.x[0, 0, 0] == 519 - 498
 
@@ -131,3 +133,16 @@ def test_a_recording_nobody_stopped_is_left_out_and_named(dataset: Dataset, tmp_
 
 def test_vectors_are_found_among_the_inputs(dataset: Dataset) -> None:
     assert cut_windows(dataset).vectors == ((0, 1, 2),)
+
+
+def test_a_recording_with_a_gap_keeps_the_full_windows_before_it(dataset: Dataset, tmp_path: Path) -> None:
+    from plushsense.core.recfile import read_stream
+
+    stream = read_stream(dataset.path / dataset.streams[0].file, ACCEL).frames
+    part = stream.slice(1150, 1800)
+    write_recording(tmp_path / "src" / "ana" / "Shake_77_650.csv", part, ACCEL)
+    again = import_recordings(tmp_path / "src", tmp_path / "DS2", layout=ACCEL).dataset
+    w = cut_windows(again, WindowSpec(longest_factor=0), again.gestures.subset(["Shake"]))
+    mine = w.take(np.flatnonzero(w.recording == w.recording_ids.index("ana/Shake_77_650")))
+    assert mine.x[:, 0, 0].tolist() == [1150, 1200, 1250, 1500, 1550]
+    assert set(mine.context) == {"inside"}

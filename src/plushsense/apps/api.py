@@ -12,20 +12,25 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from plushsense import __version__
 from plushsense.apps.config import RunConfig, resolve
 from plushsense.apps.preparation import Warn, choose_classes, opened, silent, windows_for
 from plushsense.apps.reporting import save_evaluation
 from plushsense.core.errors import ConfigError
-from plushsense.dataset.store import Dataset
+from plushsense.core.gestures import NOBODY
+from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
 from plushsense.evaluation.crossval import Evaluation, FoldOutput, FoldProgress
 from plushsense.evaluation.crossval import evaluate as crossvalidate
+from plushsense.evaluation.folds import WindowFold, fold_windows
+from plushsense.evaluation.predictions import gather
+from plushsense.evaluation.scores import FoldRecord
+from plushsense.evaluation.scores import scores as score_predictions
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.runs.journal import Journal
-from plushsense.scoring.metrics import accuracy, confusion, macro_f1
-from plushsense.scoring.splits import by_recording, by_subject, holdout, parse_split
+from plushsense.scoring.splits import VALIDATION_SHARE, Split, parse_split
 from plushsense.training.spec import TrainSpec
 from plushsense.windows.cut import WindowSet
 
@@ -101,18 +106,24 @@ def train(
     gestures = choose_classes(dataset, config.evaluation.classes, warn)
     network = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
     windows = windows_for(dataset, network, config.windows, gestures, warn)
-    split, train_at, validation_at, test_at = _divide(windows, config)
+    division = _divide(windows, config)
+    train_at, test_at = division.train, division.fold.test
     from plushsense.training.fit import fit, predict
 
-    fitted = fit(windows.take(train_at), windows.take(validation_at), network, config.training, progress)
-    held = windows.take(test_at)
-    probabilities = predict(network, fitted.weights, fitted.scaler, held, config.training.device)
-    counts = confusion(held.y, probabilities.argmax(axis=1), len(gestures))
+    fitted = fit(windows.take(train_at), windows.take(division.watch), network, config.training, progress)
+    probabilities = predict(network, fitted.weights, fitted.scaler, windows.take(test_at), config.training.device)
+    predictions = gather(windows, [(division.fold.name, test_at)], [probabilities])
+    sizes = (len(train_at), len(division.watch), len(test_at))
+    record = FoldRecord(division.fold.name, division.fold.subjects, sizes, len(fitted.history), fitted.seconds)
+    figures = score_predictions(predictions, [record], windows.affects, division.split.apart)
     scores = {
-        **split,
-        "windows": len(held),
-        "accuracy": accuracy(counts),
-        "macro_f1": macro_f1(counts),
+        "split": division.kind,
+        "leaky": division.split.leaky,
+        "said": division.said,
+        "windows": len(test_at),
+        "accuracy": figures["accuracy"]["mean"],
+        "macro_f1": figures["macro_f1"]["mean"],
+        "nobody": figures["nobody"],
         "best_epoch": fitted.best_epoch,
         "simulated": dataset.head.simulated,
     }
@@ -128,9 +139,9 @@ def train(
             "dataset": dataset.head.name,
             "dataset_hash": dataset.hash,
             "simulated": dataset.head.simulated,
-            "subjects": sorted({str(s) for s in windows.take(train_at).subject}),
-            "validation_subjects": sorted({str(s) for s in windows.take(validation_at).subject}),
-            "split": split["split"],
+            "subjects": sorted({str(s) for s in windows.subject[train_at]}),
+            "validation_subjects": sorted({str(s) for s in windows.subject[division.watch]}),
+            "split": division.kind,
             "context": _context_said(windows),
             "preset": config.preset,
             "training": config.training.to_dict(),
@@ -142,26 +153,41 @@ def train(
     return Trained(bundle, fitted.history, scores)
 
 
-def _divide(windows: WindowSet, config: RunConfig) -> tuple[dict[str, Any], Any, Any, Any]:
-    """What the scores of a single training are taken on, and the windows to train on, to validate on, to score."""
+@dataclass(frozen=True)
+class _Division:
+    """What a single training is trained on and scored on; ``said`` in words."""
+
+    split: Split
+    kind: str
+    said: str
+    fold: WindowFold
+    train: NDArray[np.int64]
+    watch: NDArray[np.int64]
+
+
+def _divide(windows: WindowSet, config: RunConfig) -> _Division:
+    """Hold some people back; of fewer than three, some recordings. Nothing that is scored is trained on."""
     seed = config.evaluation.seed
     stopped = "" if config.training.patience is None else " but decided when to stop"
     if config.preset == "search":
-        fold = holdout(windows.subject, windows.y, seed)[0]
+        split = parse_split("windows:holdout")
+        fold = fold_windows(windows, windows, split, seed)[0]
         said = "15 % of the windows, drawn at random: leaky, windows of one recording stand on both sides"
-        return {"split": "windows:holdout", "leaky": True, "said": said}, fold.train, fold.validation, fold.test
-    people = sorted(set(windows.subject.tolist()) - {"none", "unknown"})
-    if len(people) >= 2:
-        groups = max(2, min(len(people), round(1 / 0.15)))
-        fold = by_subject(windows.subject, groups, seed)[0]
-        kind = "validation-subjects"
-        said = f"people who were not trained on{stopped}: {', '.join(fold.subjects)}"
+        return _Division(split, split.text, said, fold, fold.train, fold.validation)
+    people = set(windows.subject.tolist()) - {NOBODY, UNKNOWN_SUBJECT}
+    if len(people) >= 3:
+        split = parse_split(f"by-subject:{min(len(people), round(1 / VALIDATION_SHARE))}")
+        kind, said = "validation-subjects", f"people who were not trained on{stopped}: "
     else:
-        fold = by_recording(windows.recording.astype(str), windows.y, 6, seed)[0]
+        recordings = len(np.unique(windows.recording))
+        split = parse_split(f"by-recording:{max(2, min(recordings // 2, round(1 / VALIDATION_SHARE)))}")
         kind = "validation-recordings"
-        said = f"recordings that were not trained on{stopped}; of the same people: flattering"
+        said = f"recordings that were not trained on{stopped}; of the people who were, so flattering"
+    fold = fold_windows(windows, windows, split, seed)[0]
+    if split.apart:
+        said += ", ".join(fold.subjects)
     rest = np.sort(np.concatenate([fold.train, fold.validation]))
-    return {"split": kind, "leaky": False, "said": said}, rest, fold.test, fold.test
+    return _Division(split, kind, said, fold, rest, fold.test)
 
 
 def evaluate(
@@ -203,7 +229,7 @@ def evaluate(
         config.evaluation.split,
         TrainAndPredict(network, config.training),
         journal=Journal(dataset.path / "cache" / "folds"),
-        key={"arch": network.to_dict(), "training": config.training.to_dict()},
+        key={"arch": network.to_dict(), "training": config.training.key(), "vectors": fit_on.vectors},
         workers=config.evaluation.processes,
         seed=config.evaluation.seed,
         progress=progress,

@@ -11,20 +11,24 @@ Flags of the command line go over the file; an unknown key is refused with the n
 
 from __future__ import annotations
 
+import math
+import numbers
 import os
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+import types
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Union, get_args, get_origin, get_type_hints
 
-from plushsense.core.errors import ConfigError
+from plushsense.core.errors import ConfigError, nearest
 from plushsense.core.signal import Layout
 from plushsense.core.tomlfile import read_toml, refuse_unknown
 from plushsense.live.decide import DecideSpec
 from plushsense.models.arch import DEFAULT_FILTERS, DEFAULT_SYMBOL, Arch
 from plushsense.models.symbol import parse_filters
+from plushsense.scoring.splits import parse_split
 from plushsense.training.spec import CONTEXT, PADDING, PRESETS, TrainSpec, preset
-from plushsense.windows.cut import WindowSpec
+from plushsense.windows.cut import CONTEXTS, WindowSpec
 
 SHARED, ALL = "shared", "all"
 
@@ -39,6 +43,11 @@ class ModelSpec:
     norm: str = "batch"
     step_s: float = 0.05
     pool_s: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, seconds in (("step_s", self.step_s), ("pool_s", self.pool_s)):
+            if seconds is not None and not 0.0 < seconds <= 60.0:
+                raise ConfigError(f"{name} is {seconds}: accepted is above 0, at most 60 seconds.")
 
     def build(self, layout: Layout, classes: int, window_s: float, padding: str) -> Arch:
         """The network for a toy's layout and a number of classes."""
@@ -69,6 +78,17 @@ class EvaluationSpec:
     workers: int = 0
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        parse_split(self.split)
+        for name, value in (("workers", self.workers), ("seed", self.seed)):
+            if value < 0:
+                raise ConfigError(f"{name} is {value}: accepted are whole numbers from 0 up.")
+        context = self.train_context
+        if context is not None and context not in CONTEXTS:
+            raise ConfigError(
+                f"Unknown train_context '{context}': accepted are {', '.join(CONTEXTS)}.{nearest(context, CONTEXTS)}"
+            )
+
     @property
     def processes(self) -> int:
         """Worker processes."""
@@ -95,6 +115,19 @@ class RunConfig:
         """Plain values, ready for JSON: what a bundle carries."""
         return asdict(self)
 
+    def outcome(self) -> dict[str, Any]:
+        """What an evaluation's figures depend on: not how it is computed, shown or named. Ready for JSON."""
+        evaluation = asdict(self.evaluation) | {
+            "train_context": self.evaluation.train_context or self.windows.context,
+        }
+        del evaluation["workers"]
+        return {
+            "windows": asdict(self.windows),
+            "model": asdict(self.model) | {"padding": self.padding},
+            "training": self.training.key(),
+            "evaluation": evaluation,
+        }
+
 
 _TABLES: dict[str, type[Any]] = {
     "windows": WindowSpec,
@@ -103,6 +136,73 @@ _TABLES: dict[str, type[Any]] = {
     "evaluation": EvaluationSpec,
     "live": DecideSpec,
 }
+
+# Keys of a table that are no fields, and fields that are no keys: the network says how much past it needs.
+_MORE: dict[str, dict[str, Any]] = {"training": {"preset": str}}
+_DERIVED = {("windows", "span_s"): "it follows from the network; set arch, window_s or pool_s"}
+
+
+def _kinds(table: str) -> dict[str, Any]:
+    """The keys of a table and the types that they accept."""
+    kinds = {**get_type_hints(_TABLES[table]), **_MORE.get(table, {})}
+    return {key: kind for key, kind in kinds.items() if (table, key) not in _DERIVED}
+
+
+def _fitted(value: Any, kind: Any) -> Any:
+    """A value as ``kind`` has it (a whole number is a float too, a list a tuple); TypeError when it does not fit."""
+    if get_origin(kind) in (Union, types.UnionType):
+        for one in get_args(kind):
+            try:
+                return _fitted(value, one)
+            except TypeError:
+                continue
+    elif get_origin(kind) is tuple:
+        if isinstance(value, Iterable) and not isinstance(value, str | bytes | Mapping):
+            return tuple(_fitted(item, get_args(kind)[0]) for item in value)
+    elif kind is int:
+        if isinstance(value, numbers.Integral) and not isinstance(value, bool):
+            return int(value)
+    elif kind is float:
+        if isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value):
+            return float(value)
+    elif isinstance(value, kind):
+        return value
+    raise TypeError(kind)
+
+
+_SAID = {int: "a whole number", float: "a number", str: "text", bool: "true or false"}
+_SAID_MANY = {int: "whole numbers", float: "numbers", str: "texts"}
+
+
+def _said(kind: Any) -> str:
+    """A type in words."""
+    if get_origin(kind) in (Union, types.UnionType):
+        return " or ".join(_said(one) for one in get_args(kind) if one is not type(None))
+    if get_origin(kind) is tuple:
+        return f"a list of {_SAID_MANY[get_args(kind)[0]]}"
+    return _SAID[kind]
+
+
+def _checked(table: str, given: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """The values of a table, each of a type that its key accepts.
+
+    Raises:
+        ConfigError: for an unknown key, or a value of another type.
+    """
+    kinds = _kinds(table)
+    out: dict[str, Any] = {}
+    for key, value in given.items():
+        if (table, key) in _DERIVED:
+            raise ConfigError(f"[{table}] {key}{where} cannot be set: {_DERIVED[table, key]}.")
+        refuse_unknown({key: value}, kinds, f"[{table}]{where}", ConfigError)
+        kind = kinds[key]
+        if (table, key) == ("model", "filters") and isinstance(value, str):
+            value = parse_filters(value)
+        try:
+            out[key] = _fitted(value, kind)
+        except TypeError:
+            raise ConfigError(f"[{table}] {key}{where} is {value!r}: accepted is {_said(kind)}.") from None
+    return out
 
 
 def resolve(path: str | Path | None = None, **flags: Mapping[str, Any]) -> RunConfig:
@@ -120,30 +220,21 @@ def resolve(path: str | Path | None = None, **flags: Mapping[str, Any]) -> RunCo
         for name, table in content.items():
             if not isinstance(table, dict):
                 raise ConfigError(f"'{name}' in '{path}' is a single value; it is a table: write  [{name}]")
-            known = [f.name for f in fields(_TABLES[name])] + (["preset"] if name == "training" else [])
-            refuse_unknown(table, known, f"[{name}] of '{path}'", ConfigError)
-            tables[name].update(table)
+            tables[name].update(_checked(name, table, f" of '{path}'"))
+    refuse_unknown(flags, _TABLES, "the settings", ConfigError)
     for name, given in flags.items():
-        tables[name].update({key: value for key, value in given.items() if value is not None})
-    chosen = str(tables["training"].pop("preset", "people"))
+        tables[name].update(_checked(name, {key: value for key, value in given.items() if value is not None}, ""))
+    chosen = tables["training"].pop("preset", "people")
     training = preset(chosen)
     tables["windows"].setdefault("context", CONTEXT[chosen])
-    if "filters" in tables["model"]:
-        wanted = tables["model"]["filters"]
-        tables["model"]["filters"] = parse_filters(wanted) if isinstance(wanted, str) else tuple(wanted)
-    if isinstance(classes := tables["evaluation"].get("classes"), list):
-        tables["evaluation"]["classes"] = tuple(classes)
-    try:
-        return RunConfig(
-            chosen,
-            WindowSpec(**tables["windows"]),
-            ModelSpec(**tables["model"]),
-            replace(training, **tables["training"]),
-            EvaluationSpec(**tables["evaluation"]),
-            DecideSpec(**tables["live"]),
-        )
-    except TypeError as cause:
-        raise ConfigError(f"A setting has a value of the wrong kind: {cause}.") from None
+    return RunConfig(
+        chosen,
+        WindowSpec(**tables["windows"]),
+        ModelSpec(**tables["model"]),
+        replace(training, **tables["training"]),
+        EvaluationSpec(**tables["evaluation"]),
+        DecideSpec(**tables["live"]),
+    )
 
 
 PRESET_NAMES = tuple(PRESETS)

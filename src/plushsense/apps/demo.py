@@ -38,8 +38,8 @@ class DemoSize:
     live_s: float
 
 
-FULL = DemoSize(people=12, repetitions=3, epochs=40, folds=4, live_s=120.0)
-QUICK = DemoSize(people=8, repetitions=2, epochs=30, folds=2, live_s=60.0)
+FULL = DemoSize(people=12, repetitions=3, epochs=60, folds=4, live_s=120.0)
+QUICK = DemoSize(people=10, repetitions=2, epochs=45, folds=2, live_s=60.0)
 
 # Data sets hold people 1 to 25: this one was never met.
 STRANGER = 101

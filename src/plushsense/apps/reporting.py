@@ -11,28 +11,67 @@ from typing import Any
 from plushsense import __version__
 from plushsense.apps.config import RunConfig
 from plushsense.apps.preparation import opened
-from plushsense.core.errors import BadInput
+from plushsense.core.errors import BadInput, ConfigError
 from plushsense.dataset.store import Dataset, write_atomically
 from plushsense.evaluation.crossval import Evaluation
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
+from plushsense.runs.journal import job_id
+
+SCORES, PREDICTIONS, PAGE = "evaluation.json", "predictions.parquet", "report.html"
+
+
+def evaluation_id(config: RunConfig, dataset: Dataset) -> str:
+    """The same for the same settings and data: 20 hexadecimal digits."""
+    return job_id({"settings": config.outcome(), "data": dataset.hash})
+
+
+def check_place(out: Path, config: RunConfig, dataset: Dataset, *, replace: bool = False) -> None:
+    """Whether an evaluation may be written to a folder: better asked before hours of training than after.
+
+    Raises:
+        ConfigError: where ``out`` is no folder and cannot be one, holds a ``report.html`` of something else, or (not
+            with ``replace``) an evaluation of other settings or other data.
+    """
+    from plushsense.reports.html import check_place as check_page
+
+    there = next(p for p in (out.absolute(), *out.absolute().parents) if p.exists())
+    if not there.is_dir():
+        raise ConfigError(f"An evaluation cannot be written to '{out}': '{there}' is a file; give a folder.")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise ConfigError(f"An evaluation cannot be written to '{out}': you may not write in '{there}'.")
+    check_page(out / PAGE)
+    path = out / SCORES
+    if replace or not path.exists():
+        return
+    held = _evaluation_table(path)
+    if held.get("id") == evaluation_id(config, dataset):
+        return
+    kept = held.get("dataset")
+    other = isinstance(kept, Mapping) and kept.get("hash") != dataset.hash
+    raise ConfigError(
+        f"'{out}' holds an evaluation of {'other data' if other else 'other settings'} "
+        f"({held.get('split')}, {held.get('title')}): choose another --out, or --force to replace it."
+    )
 
 
 def save_evaluation(result: Evaluation, dataset: Dataset, config: RunConfig, arch: Arch, out: Path) -> Path:
     """Write ``predictions.parquet`` and ``evaluation.json`` (scores, data set, network, settings) to a folder."""
     out.mkdir(parents=True, exist_ok=True)
-    result.write_predictions(out / "predictions.parquet")
+    result.write_predictions(out / PREDICTIONS)
     content = {
         **result.to_dict(),
-        "predictions": "predictions.parquet",
+        "predictions": PREDICTIONS,
+        "id": evaluation_id(config, dataset),
+        "simulated": dataset.head.simulated,
         "validation_decides": config.training.patience is not None,
         "title": evaluation_title(result, arch),
-        "model": card(arch, dataset.layout.rate_hz),
+        "model": card(arch, rate_hz=dataset.layout.rate_hz),
         "dataset": dataset.summary(),
         "config": config.to_dict(),
         "code_version": __version__,
     }
-    path = out / "evaluation.json"
+    path = out / SCORES
     write_atomically(path, json.dumps(content, ensure_ascii=False, indent=1))
     return path
 
@@ -46,8 +85,8 @@ def evaluation_title(result: Evaluation, arch: Arch) -> str:
     return f"{arch.symbol} {filters} {arch.padding}, {context}"
 
 
-def card(arch: Arch, rate_hz: float, **more: Any) -> dict[str, Any]:
-    """The counts of a network, as a model card shows them."""
+def card(arch: Arch, **more: Any) -> dict[str, Any]:
+    """The counts of a network, as a model card and the command line show them."""
     return {
         **arch.to_dict(),
         "parameters": arch.parameters,
@@ -56,7 +95,7 @@ def card(arch: Arch, rate_hz: float, **more: Any) -> dict[str, Any]:
         "macs_per_window": arch.macs_per_window,
         "macs_per_step": arch.macs_per_step,
         "state_bytes_int8": arch.state_bytes_int8,
-        "rate_hz": rate_hz,
+        "table3": arch.table3,
         **more,
     }
 
@@ -82,7 +121,7 @@ def write_report(
     cards = [
         card(
             b.arch,
-            b.layout.rate_hz,
+            rate_hz=b.layout.rate_hz,
             name=str(b.provenance.get("name", f"{b.arch.symbol} trained on {b.provenance.get('dataset', '?')}")),
             provenance=dict(b.provenance),
         )
@@ -107,7 +146,7 @@ def write_report(
         dataset=shown,
         evaluations=[_evaluation_table(e) for e in evaluations],
         models=cards,
-        simulated=bool(summary["simulated"]) or any(b.provenance.get("simulated") for b in bundles),
+        simulated=bool(summary["simulated"]),
     )
 
 
@@ -118,7 +157,7 @@ def _evaluation_table(given: Evaluation | Mapping[str, Any] | str | os.PathLike[
         table = dict(given)
     else:
         path = Path(given)
-        path = path / "evaluation.json" if path.is_dir() else path
+        path = path / SCORES if path.is_dir() else path
         try:
             table = json.loads(path.read_text(encoding="utf-8"))
         except FileNotFoundError:
@@ -129,6 +168,8 @@ def _evaluation_table(given: Evaluation | Mapping[str, Any] | str | os.PathLike[
             raise BadInput(
                 f"'{path}' is not an evaluation ({cause}): give a folder that evaluate --out wrote."
             ) from None
+        if not isinstance(table, dict):
+            raise BadInput(f"'{path}' is not an evaluation: give a folder that evaluate --out wrote.")
     # The page has its own words for the network; the counts stand on the model card.
     table.pop("model", None)
     return table

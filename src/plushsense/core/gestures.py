@@ -14,6 +14,10 @@ AFFECTS = ("positive", "neutral", "negative", "none")
 NOBODY = "none"
 
 
+def _plain(label: str) -> str:
+    return " ".join(label.replace("_", " ").split()).casefold()
+
+
 @dataclass(frozen=True)
 class Gesture:
     """One gesture: its label, the affect it carries ("none" where nobody said), and its family of look-alikes.
@@ -30,6 +34,16 @@ class Gesture:
     description: str = ""
 
     def __post_init__(self) -> None:
+        for key in ("label", "affect", "family", "description"):
+            if not isinstance(getattr(self, key), str):
+                raise GestureError(f"Gesture {self.label!r}: {key} is {getattr(self, key)!r}; it must be a text.")
+        for key in ("free_choice", "nobody"):
+            if not isinstance(getattr(self, key), bool):
+                raise GestureError(
+                    f"Gesture '{self.label}': {key} is {getattr(self, key)!r}; it must be true or false."
+                )
+        if not _plain(self.label):
+            raise GestureError("A gesture has an empty label: give it a word.")
         if self.affect not in AFFECTS:
             raise GestureError(
                 f"Gesture '{self.label}' has the affect '{self.affect}'; accepted are {', '.join(AFFECTS)}."
@@ -37,10 +51,6 @@ class Gesture:
             )
         if not self.family:
             object.__setattr__(self, "family", self.label)
-
-
-def _plain(label: str) -> str:
-    return " ".join(label.replace("_", " ").split()).casefold()
 
 
 @dataclass(frozen=True)
@@ -110,6 +120,8 @@ class GestureSet:
         gestures = []
         try:
             for entry in table["gestures"]:
+                if not isinstance(entry, dict):
+                    raise TypeError(f"{entry!r} is not a table")
                 refuse_unknown(entry, Gesture.__dataclass_fields__, f"{where}, gestures", GestureError)
                 gestures.append(Gesture(**entry))
             return cls(str(table["name"]), tuple(gestures), bool(table.get("inferred", False)))
@@ -122,13 +134,14 @@ class GestureSet:
     def infer(cls, labels: Iterable[str], name: str = "inferred") -> GestureSet:
         """The set that a folder of recordings implies: its labels in alphabetical order, affect unknown.
 
+        Labels that differ only in case, or ``_`` against space, are one gesture; the first spelling wins.
         ``Custom`` is the GestureRecorder's own word for a gesture of the recorder's choice: free choice.
         """
-        return cls(
-            name,
-            tuple(Gesture(label, free_choice=_plain(label) == "custom") for label in sorted(set(labels))),
-            inferred=True,
-        )
+        spellings: dict[str, str] = {}
+        for label in labels:
+            spellings.setdefault(_plain(label), label)
+        gestures = tuple(Gesture(s, free_choice=_plain(s) == "custom") for s in sorted(spellings.values()))
+        return cls(name, gestures, inferred=True)
 
 
 def gesture_set_names() -> tuple[str, ...]:

@@ -25,6 +25,9 @@ SIMULATION_MARK = "SIMULATION.txt"
 _NAME = re.compile(r"^(?P<label>.+)_(?P<epoch>\d{1,18})_(?P<rows>\d{1,12})\.csv$", re.IGNORECASE)
 _SPLIT = re.compile(rb"[;,\t]\s*|\s+")
 _LIMIT = 2.0**53
+# Layouts begin at 1 frame a second: delays over twice that are none.
+_SLOWEST_MS = 2000
+_PAUSE_MS = 60_000
 
 
 @dataclass(frozen=True)
@@ -65,12 +68,16 @@ class RecordingName:
 
 @dataclass(frozen=True)
 class ReadResult:
-    """Frames read, with what was odd about the file; ``malformed`` lines were left out."""
+    """Frames read, with what was odd about the file; ``malformed`` lines were left out.
+
+    ``integrated``: the file held delays, so ``device_ms`` is their sum and begins at 0 in every file.
+    """
 
     frames: Frames
     warnings: list[str] = field(default_factory=list)
     malformed: int = 0
     had_header: bool = False
+    integrated: bool = False
 
 
 def parse_name(filename: str) -> RecordingName | None:
@@ -186,17 +193,21 @@ def _table(
 def _looks_like_delay(column: NDArray[np.int64], host_ms: NDArray[np.int64] | None) -> bool:
     """Whether the clock column really holds delays, as recordings of the 14-integer firmware do.
 
-    Delays are small, do not grow, and add up to the time that passed on the host.
+    Delays are small, fall as often as they rise (a clock falls only where it was reset, even one that starts at 0 and
+    stamps its rows in pairs), and add up to the time that passed on the host; pauses apart, since a stream that was
+    appended to on another day has one.
     """
-    if len(column) < 3 or column.max() > 60_000 or column.min() < 0:
+    if len(column) < 3 or column.min() < 0 or np.median(column) > _SLOWEST_MS:
         return False
-    falls = np.mean(np.diff(column) <= 0)
-    if falls < 0.3:
+    steps = np.diff(column)
+    if np.mean(steps <= 0) < 0.3 or np.sum(steps < 0) < 0.3 * np.sum(steps > 0):
         return False
     if host_ms is None:
         return True
-    passed = float(host_ms[-1] - host_ms[0])
-    return abs(float(column[1:].sum()) - passed) <= max(200.0, 0.5 * passed)
+    passed = np.diff(host_ms)
+    together = (passed <= _PAUSE_MS) & (column[1:] <= _PAUSE_MS)
+    on_host = float(passed[together].sum())
+    return abs(float(column[1:][together].sum()) - on_host) <= max(200.0, 0.5 * on_host)
 
 
 def _read(path: Path, layout: Layout, *, whole_lines: bool = False) -> ReadResult:
@@ -241,6 +252,7 @@ def _read(path: Path, layout: Layout, *, whole_lines: bool = False) -> ReadResul
     if clock is not None and (delay is None) and _looks_like_delay(clock, host):
         delay, clock = clock, None
         warnings.append("the clock column holds delays (14-integer firmware): integrated")
+    integrated = clock is None and delay is not None
     if clock is None:
         if delay is not None:
             clock = np.cumsum(delay) - delay[0]
@@ -250,7 +262,7 @@ def _read(path: Path, layout: Layout, *, whole_lines: bool = False) -> ReadResul
         else:
             raise FileFormatError(f"'{path.name}' has no clock column: {DEVICE_MS}, {DELAY_MS} or {HOST_MS}.")
     frames = Frames(np.round(values / steps).astype(np.int64), clock, host, labels)
-    return ReadResult(frames, warnings, malformed + cut, header)
+    return ReadResult(frames, warnings, malformed + cut, header, integrated)
 
 
 def read_recording(path: str | os.PathLike[str], layout: Layout) -> ReadResult:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,12 @@ DEVICE_MS = "device_ms"
 DELAY_MS = "delay_ms"
 HOST_MS = "host_ms"
 MAGNITUDE_FRACTION_BITS = 4
+_INT32 = (-2147483648.0, 2147483647.0)
+
+
+def magnitude_limit(n: int) -> int:
+    """The largest component of n whose magnitude, with its fraction bits, is sure to fit 32 bits: 2²⁷ / √n."""
+    return math.isqrt(2 ** (62 - 2 * MAGNITUDE_FRACTION_BITS) // n)
 
 
 @dataclass(frozen=True)
@@ -31,9 +38,31 @@ class Channel:
     kind: str
     offset: float = 0.0
     scale: float = 1.0
-    valid_min: float = -2147483648.0
-    valid_max: float = 2147483647.0
+    valid_min: float = _INT32[0]
+    valid_max: float = _INT32[1]
     step: float = 1.0
+
+    def __post_init__(self) -> None:
+        for key in ("name", "unit", "kind"):
+            if not isinstance(getattr(self, key), str):
+                raise LayoutError(f"Channel {self.name!r}: {key} is {getattr(self, key)!r}; it must be a text.")
+        for key in ("offset", "scale", "valid_min", "valid_max", "step"):
+            value = getattr(self, key)
+            if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+                raise LayoutError(f"Channel '{self.name}': {key} is {value!r}; it must be a number.")
+        if self.step <= 0:
+            raise LayoutError(f"Channel '{self.name}': step is {self.step}; it must be above 0.")
+        # A range that nobody gave is whatever the integers hold.
+        if self.valid_min == _INT32[0]:
+            object.__setattr__(self, "valid_min", _INT32[0] * self.step)
+        if self.valid_max == _INT32[1]:
+            object.__setattr__(self, "valid_max", _INT32[1] * self.step)
+        low, high = self.valid_min / self.step, self.valid_max / self.step
+        if not _INT32[0] - 0.5 <= low <= high <= _INT32[1] + 0.5:
+            raise LayoutError(
+                f"Channel '{self.name}': valid_min {self.valid_min:g} to valid_max {self.valid_max:g} in steps of "
+                f"{self.step:g} must rise and fit 32-bit integers: narrow the range or take a larger step."
+            )
 
 
 @dataclass(frozen=True)
@@ -77,6 +106,11 @@ class Layout:
         names = [c.name for c in self.channels] + [d.name for d in self.derived]
         if len(set(names)) != len(names):
             raise LayoutError(f"Layout '{self.name}' names a channel twice: {', '.join(names)}.")
+        if len(self.csv.header) != len(self.csv.columns):
+            raise LayoutError(
+                f"Layout '{self.name}': csv.header has {len(self.csv.header)} texts for {len(self.csv.columns)} "
+                "columns: give one for each."
+            )
         for where, used, extra in (
             ("wire", self.wire, (DEVICE_MS, DELAY_MS)),
             ("inputs", self.inputs, tuple(d.name for d in self.derived)),
@@ -104,8 +138,19 @@ class Layout:
                     f"Layout '{self.name}': derived channel '{derived.name}' is of kind '{derived.kind}'; "
                     "accepted is magnitude."
                 )
+            if not derived.of:
+                raise LayoutError(
+                    f"Layout '{self.name}': derived channel '{derived.name}' is of no channel: fill in of."
+                )
+            limit = magnitude_limit(len(derived.of))
             for name in derived.of:
-                self.index(name)
+                at = self.index(name)
+                if max(-self.valid_min_int[at], self.valid_max_int[at]) > limit:
+                    raise LayoutError(
+                        f"Layout '{self.name}': channel '{name}' feeds '{derived.name}' but is valid from "
+                        f"{self.valid_min_int[at]} to {self.valid_max_int[at]} steps: give it valid_min and valid_max "
+                        f"within ±{limit} steps, so that the magnitude fits 32 bits."
+                    )
         for vector in self.vectors:
             if len(vector) != 3:
                 raise LayoutError(f"Layout '{self.name}': a vector has three axes, not {len(vector)}.")
@@ -135,12 +180,12 @@ class Layout:
     @property
     def valid_min_int(self) -> NDArray[np.int64]:
         """Smallest valid integer of each channel, (C,)."""
-        return np.array([np.ceil(c.valid_min / c.step) for c in self.channels], dtype=np.int64)
+        return np.array([max(_INT32[0], np.ceil(c.valid_min / c.step)) for c in self.channels], dtype=np.int64)
 
     @property
     def valid_max_int(self) -> NDArray[np.int64]:
         """Largest valid integer of each channel, (C,)."""
-        return np.array([np.floor(c.valid_max / c.step) for c in self.channels], dtype=np.int64)
+        return np.array([min(_INT32[1], np.floor(c.valid_max / c.step)) for c in self.channels], dtype=np.int64)
 
     def index(self, name: str) -> int:
         """Position of a channel; LayoutError with the nearest known name when there is none."""
@@ -169,37 +214,54 @@ class Layout:
         refuse_unknown(table, cls.__dataclass_fields__, where, LayoutError)
         try:
             channels = []
-            for entry in table["channels"]:
+            for entry in _list(table, "channels"):
                 refuse_unknown(entry, Channel.__dataclass_fields__, f"{where}, channels", LayoutError)
                 channels.append(Channel(**entry))
             derived = []
-            for entry in table.get("derived", ()):
+            for entry in _list(table, "derived"):
                 refuse_unknown(entry, Derived.__dataclass_fields__, f"{where}, derived", LayoutError)
-                derived.append(Derived(entry["name"], entry["kind"], tuple(entry["of"])))
+                derived.append(Derived(_text(entry, "name"), _text(entry, "kind"), _texts(entry, "of")))
             names = tuple(c.name for c in channels)
             csv = dict(table.get("csv", {}))
             refuse_unknown(csv, CsvFormat.__dataclass_fields__, f"{where}, csv", LayoutError)
-            columns = tuple(csv.get("columns", (HOST_MS, DEVICE_MS, *names)))
+            columns = _texts(csv, "columns", (HOST_MS, DEVICE_MS, *names))
             return cls(
-                name=str(table["name"]),
-                title=str(table.get("title", table["name"])),
+                name=_text(table, "name"),
+                title=_text(table, "title", _text(table, "name")),
                 rate_hz=float(table["rate_hz"]),
                 channels=tuple(channels),
-                wire=tuple(table["wire"]),
+                wire=_texts(table, "wire"),
                 derived=tuple(derived),
-                inputs=tuple(table.get("inputs", names)),
-                csv=CsvFormat(
-                    columns,
-                    tuple(csv.get("header", columns)),
-                    str(csv.get("separator", ", ")),
-                ),
+                inputs=_texts(table, "inputs", names),
+                csv=CsvFormat(columns, _texts(csv, "header", columns), _text(csv, "separator", ", ")),
                 gap_ms=int(table.get("gap_ms", 100)),
-                vectors=tuple(tuple(v) for v in table.get("vectors", ())),
+                vectors=tuple(_texts({"vectors": v}, "vectors") for v in table.get("vectors", ())),
             )
         except KeyError as missing:
             raise LayoutError(f"The {where} lacks the key {missing}: add it.") from None
         except (TypeError, ValueError) as cause:
             raise LayoutError(f"The {where} holds a value that does not fit: {cause}.") from None
+
+
+def _text(table: dict[str, Any], key: str, default: str | None = None) -> str:
+    value = table[key] if default is None else table.get(key, default)
+    if not isinstance(value, str):
+        raise TypeError(f"{key} is {value!r}, not a text")
+    return value
+
+
+def _texts(table: dict[str, Any], key: str, default: tuple[str, ...] | None = None) -> tuple[str, ...]:
+    value = table[key] if default is None else table.get(key, default)
+    if not isinstance(value, list | tuple) or not all(isinstance(v, str) for v in value):
+        raise TypeError(f"{key} is {value!r}, not a list of texts")
+    return tuple(value)
+
+
+def _list(table: dict[str, Any], key: str) -> list[dict[str, Any]]:
+    value = table[key] if key == "channels" else table.get(key, ())
+    if not isinstance(value, list | tuple) or not all(isinstance(v, dict) for v in value):
+        raise TypeError(f"{key} is {value!r}, not a list of tables")
+    return list(value)
 
 
 def layout_names() -> tuple[str, ...]:

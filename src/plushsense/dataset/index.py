@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import itertools
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from plushsense.core.errors import DatasetError, FileFormatError
+from plushsense.core.gestures import NOBODY, Gesture
 from plushsense.core.recfile import Frames, ReadResult, parse_name, read_recording, read_stream
-from plushsense.dataset.marks import MARKS, Standing, read_marks
-from plushsense.dataset.quality import Subject, findings, measured_rate_hz
+from plushsense.dataset.freshness import RECORDINGS_INDEX, STREAMS_INDEX, is_fresh, raw_files, taken, write_stamp
+from plushsense.dataset.marks import Standing, read_marks
+from plushsense.dataset.quality import Examined, findings, measured_rate_hz
 from plushsense.dataset.store import (
     RECORDINGS,
     STREAMS,
@@ -25,8 +29,6 @@ from plushsense.dataset.store import (
     write_index,
 )
 
-RECORDINGS_INDEX = "recordings.csv"
-STREAMS_INDEX = "streams.csv"
 Progress = Callable[[int, int], None]
 
 
@@ -52,27 +54,64 @@ def sha256_of(path: Path) -> str:
 
 
 def open_dataset(path: str | Path) -> Dataset:
-    """Open a data set folder; the index is rebuilt when it is missing or older than the marks.
+    """Open a data set folder; the index is made anew when the raw files, the marks or the head changed since.
+
+    On a disk that cannot be written the index is made in memory each time it is out of date.
 
     Raises:
-        DatasetError: when the folder is missing, empty, or not a data set.
+        DatasetError: when the folder is missing, empty, or not a data set, or a raw file cannot be read any more.
     """
     folder = Path(path)
     head = DatasetHead.read(folder)
-    index, streams = folder / RECORDINGS_INDEX, folder / STREAMS_INDEX
-    marks = folder / MARKS
-    stale = not index.is_file() or not streams.is_file()
-    if not stale and marks.is_file() and marks.stat().st_mtime_ns > index.stat().st_mtime_ns:
-        stale = True
-    if stale:
-        return rebuild(folder, head).dataset
-    return Dataset(folder, head, read_index(index, RecordingInfo), read_index(streams, StreamInfo))
+    try:
+        if is_fresh(folder):
+            return Dataset(
+                folder,
+                head,
+                read_index(folder / RECORDINGS_INDEX, RecordingInfo),
+                read_index(folder / STREAMS_INDEX, StreamInfo),
+            )
+        stamp = taken(folder)
+        built = build(folder, head)
+    except OSError as cause:
+        raise DatasetError(f"'{folder}' cannot be read: {cause.strerror or cause} ({cause.filename}).") from None
+    if built.unreadable:
+        file, reason = next(iter(built.unreadable.items()))
+        raise DatasetError(
+            f"'{folder / file}' can no longer be read"
+            f"{f', nor can {len(built.unreadable) - 1} other files' if len(built.unreadable) > 1 else ''}: "
+            f"bring it back, or take it out of the data set. {reason}"
+        )
+    # A read-only disk: the index is only there to be fast.
+    with contextlib.suppress(OSError):
+        write(built.dataset, stamp)
+    return built.dataset
 
 
 def rebuild(folder: Path, head: DatasetHead | None = None, progress: Progress | None = None) -> Rebuilt:
-    """Read every raw file, locate the recordings in their streams, apply the marks, and replace the index."""
-    head = head or DatasetHead.read(folder)
-    files = [(kind, p) for kind in (STREAMS, RECORDINGS) for p in sorted((folder / kind).rglob("*.csv"))]
+    """Make the index anew; while a raw file cannot be read, the index on disk is left as it is."""
+    stamp = taken(folder)
+    built = build(folder, head or DatasetHead.read(folder), progress)
+    if not built.unreadable:
+        write(built.dataset, stamp)
+    return built
+
+
+def write(dataset: Dataset, stamp: dict[str, Any] | None = None) -> None:
+    """Replace the index files by what ``dataset`` holds; ``stamp`` is what was `taken` before the raw files were read.
+
+    Raises:
+        OSError: when the disk refuses.
+    """
+    stamp = stamp or taken(dataset.path)
+    write_index(dataset.path / STREAMS_INDEX, dataset.streams, StreamInfo)
+    write_index(dataset.path / RECORDINGS_INDEX, dataset.recordings, RecordingInfo)
+    write_stamp(dataset.path, stamp)
+
+
+def build(folder: Path, head: DatasetHead, progress: Progress | None = None) -> Rebuilt:
+    """Read every raw file, locate the recordings in their streams and apply the marks; nothing is written."""
+    files = raw_files(folder)
     unreadable: dict[str, str] = {}
     streams: list[_Read] = []
     recordings: list[_Read] = []
@@ -90,10 +129,12 @@ def rebuild(folder: Path, head: DatasetHead | None = None, progress: Progress | 
     infos = [*_from_files(folder, head, recordings, streams), *_from_labels(folder, head, streams)]
     infos = _with_marks(infos, read_marks(folder))
     infos.sort(key=lambda r: r.id)
-    stream_infos = [_stream_info(folder, head, s) for s in streams]
-    write_index(folder / STREAMS_INDEX, stream_infos, StreamInfo)
-    write_index(folder / RECORDINGS_INDEX, infos, RecordingInfo)
-    return Rebuilt(Dataset(folder, head, infos, stream_infos), unreadable)
+    return Rebuilt(Dataset(folder, head, infos, [_stream_info(folder, head, s) for s in streams]), unreadable)
+
+
+def _subject(folder_name: str, gesture: Gesture | None) -> str:
+    """Whose a recording is: its folder's person, but nobody's where the gesture is made by nobody."""
+    return NOBODY if gesture is not None and gesture.nobody else folder_name
 
 
 def _stream_id(folder: Path, read: _Read) -> str:
@@ -104,7 +145,7 @@ def _stream_info(folder: Path, head: DatasetHead, read: _Read) -> StreamInfo:
     frames = read.result.frames
     steps = np.diff(frames.device_ms)
     broken = (steps < 0) | (steps > head.layout.gap_ms)
-    said = findings(Subject(frames, head.layout, None, None))
+    said = findings(Examined(frames, head.layout, None, None))
     return StreamInfo(
         id=_stream_id(folder, read),
         subject=read.subject,
@@ -118,14 +159,24 @@ def _stream_info(folder: Path, head: DatasetHead, read: _Read) -> StreamInfo:
     )
 
 
-def _locate(frames: Frames, stream: Frames, at: dict[int, list[int]]) -> tuple[int, int]:
+def _locate(recording: ReadResult, stream: ReadResult, at: dict[int, list[int]]) -> tuple[int, int]:
     """Row of the stream at which a recording begins, and how many of its rows follow there; (−1, 0) when absent."""
-    stamps = frames.device_ms if frames.host_ms is None or stream.host_ms is None else frames.host_ms
+    frames, whole = recording.frames, stream.frames
+    # Delays that were added up begin at 0 in every file: only their differences can be compared.
+    relative = recording.integrated or stream.integrated
+    rows: Iterable[int]
+    if frames.host_ms is not None and whole.host_ms is not None:
+        rows = at.get(int(frames.host_ms[0]), ())
+    elif whole.host_ms is None and not relative:
+        rows = at.get(int(frames.device_ms[0]), ())
+    else:
+        rows = np.flatnonzero((whole.values == frames.values[0]).all(axis=1)).tolist()
     best = (-1, 0)
-    for row in at.get(int(stamps[0]), ()):
-        n = min(len(frames), len(stream) - row)
-        same = (frames.device_ms[:n] == stream.device_ms[row : row + n]) & (
-            frames.values[:n] == stream.values[row : row + n]
+    for row in rows:
+        n = min(len(frames), len(whole) - row)
+        shift = int(whole.device_ms[row] - frames.device_ms[0]) if relative else 0
+        same = (frames.device_ms[:n] + shift == whole.device_ms[row : row + n]) & (
+            frames.values[:n] == whole.values[row : row + n]
         ).all(axis=1)
         # Rows that the host stamped alike may be missing from one of the two files: the start decides.
         agreeing = int(np.argmin(same)) if not same.all() else n
@@ -162,7 +213,7 @@ def _from_files(folder: Path, head: DatasetHead, recordings: list[_Read], stream
     for read, name, label in named:
         frames = read.result.frames
         identity = read.path.relative_to(folder / RECORDINGS).with_suffix("").as_posix()
-        flags = read.result.warnings + findings(Subject(frames, head.layout, name.rows, usual[label]))
+        flags = read.result.warnings + findings(Examined(frames, head.layout, name.rows, usual[label]))
         known = head.gestures.find(name.label)
         if known is None or (known.affect == "none" and not head.gestures.inferred):
             flags.append(f"its label '{name.label}' is not in the gesture set '{head.gestures.name}': no affect")
@@ -172,7 +223,7 @@ def _from_files(folder: Path, head: DatasetHead, recordings: list[_Read], stream
         stream_id, stream_row = "", -1
         candidates = by_subject.get(read.subject, [])
         for stream in candidates:
-            row, rows = _locate(frames, stream.result.frames, lookups[id(stream)])
+            row, rows = _locate(read.result, stream.result, lookups[id(stream)])
             if row >= 0:
                 stream_id, stream_row = _stream_id(folder, stream), row
                 if rows < len(frames):
@@ -183,7 +234,7 @@ def _from_files(folder: Path, head: DatasetHead, recordings: list[_Read], stream
         infos.append(
             RecordingInfo(
                 id=identity,
-                subject=read.subject,
+                subject=_subject(read.subject, known),
                 session="1",
                 gesture=label,
                 file=read.path.relative_to(folder).as_posix(),
@@ -226,11 +277,11 @@ def _from_labels(folder: Path, head: DatasetHead, streams: list[_Read]) -> list[
             found = head.gestures.find(said)
             label = found.label if found else said
             part = frames.slice(first, last)
-            flags = findings(Subject(part, head.layout, None, None))
+            flags = findings(Examined(part, head.layout, None, None))
             infos.append(
                 RecordingInfo(
                     id=f"{_stream_id(folder, read)}#{number:03d} {label}",
-                    subject=read.subject,
+                    subject=_subject(read.subject, found),
                     session=_stream_id(folder, read).rsplit("/", 1)[-1],
                     gesture=label,
                     file=read.path.relative_to(folder).as_posix(),

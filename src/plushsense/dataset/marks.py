@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from datetime import datetime, timezone
@@ -40,37 +41,78 @@ class Standing:
     stop: int = -1
 
 
+def _checked(mark: Mark, where: str) -> Mark:
+    """The mark, when its values are of the right type and range."""
+    for key in ("recording", "action", "who", "why", "when"):
+        if not isinstance(getattr(mark, key), str):
+            raise DatasetError(f"{where}: {key} is {getattr(mark, key)!r}; it must be a text.")
+    if mark.action not in ACTIONS:
+        raise DatasetError(
+            f"{where}: unknown mark '{mark.action}': accepted are {', '.join(ACTIONS)}.{nearest(mark.action, ACTIONS)}"
+        )
+    for key, low in (("start", 0), ("stop", -1)):
+        value = getattr(mark, key)
+        if isinstance(value, bool) or not isinstance(value, int) or value < low:
+            raise DatasetError(f"{where}: {key} is {value!r}; it must be a whole number from {low} on.")
+    if 0 <= mark.stop <= mark.start:
+        raise DatasetError(f"{where}: rows {mark.start} to {mark.stop} keep nothing; stop must be above start, or -1.")
+    return mark
+
+
 def append_marks(folder: Path, marks: Iterable[Mark]) -> None:
-    """Add marks at the end, under a file lock, so that two programs can mark at once."""
+    """Add marks at the end, under a file lock, so that two programs can mark at once.
+
+    Raises:
+        DatasetError: for a mark that cannot be, or a folder that cannot be written.
+    """
     lines = []
     for mark in marks:
-        if mark.action not in ACTIONS:
-            raise DatasetError(
-                f"Unknown mark '{mark.action}': accepted are {', '.join(ACTIONS)}.{nearest(mark.action, ACTIONS)}"
-            )
-        table = asdict(mark)
+        table = asdict(_checked(mark, f"The mark of '{mark.recording}'"))
         table["when"] = mark.when or datetime.now(timezone.utc).isoformat(timespec="seconds")
         lines.append(json.dumps(table, ensure_ascii=False) + "\n")
-    with FileLock(folder / (MARKS + ".lock")), (folder / MARKS).open("a", encoding="utf-8") as file:
-        file.write("".join(lines))
+    path = folder / MARKS
+    try:
+        with FileLock(folder / (MARKS + ".lock")), path.open("a+b") as file:
+            # What a crash left without an end must not swallow the next mark.
+            if file.seek(0, os.SEEK_END) > 0:
+                file.seek(-1, os.SEEK_END)
+                if file.read(1) != b"\n":
+                    lines.insert(0, "\n")
+            file.write("".join(lines).encode("utf-8"))
+    except OSError as cause:
+        raise DatasetError(f"'{path}' cannot be written: {cause.strerror or cause}.") from None
 
 
 def read_marks(folder: Path) -> dict[str, Standing]:
-    """Where the marks leave each marked recording; a torn last line (a crash while writing) is passed over."""
+    """Where the marks leave each marked recording.
+
+    A line that is no JSON was torn by a crash while writing and is passed over; one that is JSON but no mark is an
+    error.
+
+    Raises:
+        DatasetError: naming the line.
+    """
     path = folder / MARKS
     standing: dict[str, Standing] = {}
-    if not path.is_file():
+    try:
+        lines = path.read_bytes().split(b"\n")
+    except FileNotFoundError:
         return standing
-    lines = path.read_text(encoding="utf-8").splitlines()
+    except OSError as cause:
+        raise DatasetError(f"'{path}' cannot be read: {cause.strerror or cause}.") from None
     for number, line in enumerate(lines, 1):
+        where = f"'{path}' line {number}"
         try:
-            table: dict[str, Any] = json.loads(line)
-            refuse_unknown(table, Mark.__dataclass_fields__, f"'{path}' line {number}", DatasetError)
-            mark = Mark(**table)
-        except (json.JSONDecodeError, TypeError):
-            if number == len(lines):
-                continue
-            raise DatasetError(f"'{path}' line {number} is damaged: each line is one mark in JSON.") from None
+            table: Any = json.loads(line.decode("utf-8"))
+        except ValueError:
+            continue
+        if not isinstance(table, dict):
+            raise DatasetError(f"{where} is no mark: each line is one JSON object.")
+        refuse_unknown(table, Mark.__dataclass_fields__, where, DatasetError)
+        try:
+            mark = _checked(Mark(**table), where)
+        except TypeError as cause:
+            raise DatasetError(f"{where} lacks something: {cause}.") from None
         now = standing.get(mark.recording, Standing())
         match mark.action:
             case "trim":
@@ -81,7 +123,5 @@ def read_marks(folder: Path) -> dict[str, Standing]:
                 now = Standing(True, now.start, now.stop)
             case "include":
                 now = Standing(False, now.start, now.stop)
-            case other:
-                raise DatasetError(f"'{path}' line {number}: unknown mark '{other}'.{nearest(other, ACTIONS)}")
         standing[mark.recording] = now
     return standing

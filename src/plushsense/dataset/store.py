@@ -5,6 +5,7 @@ recordings/<subject>/*.csv   raw recordings, never rewritten
 streams/<subject>/*.csv      raw session streams; a file with a label on every row is a stream too
 marks.jsonl                  trim, exclude: who and why, append-only
 recordings.csv, streams.csv  the index: rebuilt from the above, replaced atomically
+index.json                   what the index was made from: when that changed, it is made anew
 cache/                       can be deleted
 """
 
@@ -125,9 +126,12 @@ class StreamInfo(_Row):
 
 def write_atomically(path: Path, text: str) -> None:
     """Replace a text file in one step: readers see the old one or the new one."""
-    part = path.with_name(path.name + ".part")
-    part.write_text(text, encoding="utf-8", newline="\n")
-    os.replace(part, path)
+    part = path.with_name(f"{path.name}.{os.getpid()}.part")
+    try:
+        part.write_text(text, encoding="utf-8", newline="\n")
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def write_index(path: Path, rows: Iterable[_Row], kind: type[_Row]) -> None:

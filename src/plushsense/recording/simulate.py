@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, DatasetError
+from plushsense.core.folders import whole_folder
 from plushsense.core.gestures import NOBODY
 from plushsense.core.recfile import (
     SIMULATION_MARK,
@@ -27,7 +27,7 @@ from plushsense.core.recfile import (
     recording_filename,
     write_recording,
 )
-from plushsense.core.signal import Layout, load_layout
+from plushsense.core.signal import DEVICE_MS, Layout, load_layout
 from plushsense.devices.virtual.motions import AT_REST
 from plushsense.devices.virtual.people import draw_person
 from plushsense.devices.virtual.session import GESTURES, Mark, Session
@@ -78,12 +78,14 @@ def _session(
     marks: list[Mark] = [m for e in episodes for m in e.marks]
     values = np.concatenate([e.values for e in episodes])[:, channel_columns(layout)]
     device_ms = np.concatenate([e.device_ms for e in episodes])
+    # The recorder writes the last integer of a line as it came: of firmware without a clock, the delay.
+    written = device_ms if DEVICE_MS in layout.wire else np.concatenate([e.delay_ms for e in episodes])
     rng = np.random.default_rng([seed, 0 if who is None else who + 1, 0xF11E])
     kept = rng.random(len(values)) >= world.lost + world.garbled
     order = 40 if who is None else who
     host_ms = START_MS + order * 86_400_000 + int(rng.integers(0, 20_000_000)) + _arrival(device_ms, rng)
     row_of = np.concatenate(([0], np.cumsum(kept)))
-    frames = Frames(values[kept], device_ms[kept], host_ms[kept])
+    frames = Frames(values[kept], written[kept], host_ms[kept])
     cuts = [(m.label, int(row_of[m.record_start]), int(row_of[m.record_stop])) for m in marks]
     return _Take(frames, cuts, int(np.sum(~kept)))
 
@@ -150,31 +152,24 @@ def simulate(
             raise ConfigError(f"{name} is {value}; a whole number from {low} to {high} is accepted.")
     resting = len(labels) * repetitions if at_rest is None else at_rest
     folder = Path(out)
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise DatasetError(f"'{folder}' holds something already: simulate into a new or empty folder.")
     resolved = layout if isinstance(layout, Layout) else load_layout(layout)
     width = max(2, len(str(people)))
     sessions: list[tuple[str, int | None]] = [(f"P{who:0{width}d}", who) for who in range(1, people + 1)]
     if resting > 0:
         sessions.append((NOBODY, None))
-    # Whole or not at all: a folder half full would look like a small data set.
-    work = folder.with_name(folder.name + ".simulating")
-    shutil.rmtree(work, ignore_errors=True)
-    work.mkdir(parents=True)
-    (work / SIMULATION_MARK).write_text(
-        f"Recordings of the virtual toy, seed {seed}. Nobody touched anything.\n", "utf-8"
-    )
     recordings = rows = stream_rows = lost = 0
-    for done, (name, who) in enumerate(sessions, 1):
-        chosen, times = ((AT_REST,), resting) if who is None else (labels, repetitions)
-        take = _session(who, seed, chosen, times, resolved, world)
-        rows += _write(work / name, take, resolved)
-        recordings += len(take.cuts)
-        stream_rows += len(take.frames)
-        lost += take.lost
-        if progress is not None:
-            progress(done, len(sessions), name)
-    if folder.exists():
-        folder.rmdir()
-    os.replace(work, folder)
+    # Whole or not at all: a folder half full would look like a small data set.
+    with whole_folder(folder, DatasetError) as work:
+        (work / SIMULATION_MARK).write_text(
+            f"Recordings of the virtual toy, seed {seed}. Nobody touched anything.\n", "utf-8"
+        )
+        for done, (name, who) in enumerate(sessions, 1):
+            chosen, times = ((AT_REST,), resting) if who is None else (labels, repetitions)
+            take = _session(who, seed, chosen, times, resolved, world)
+            rows += _write(work / name, take, resolved)
+            recordings += len(take.cuts)
+            stream_rows += len(take.frames)
+            lost += take.lost
+            if progress is not None:
+                progress(done, len(sessions), name)
     return SimulationSummary(str(folder), people, recordings, rows, stream_rows, lost, seed)

@@ -14,6 +14,35 @@ from plushsense.core.errors import ConfigError
 from plushsense.core.extras import need
 from plushsense.reports import figures, tables, words
 
+ENDINGS = (".html", ".htm")
+# What the template writes; a file that has it is a report, and may be replaced by one.
+GENERATOR = '<meta name="generator" content="PlushSense">'
+_HEAD = 4096
+
+
+def check_place(path: str | Path) -> Path:
+    """The path, when a report may be written there: a new .html file, or the place of an older report.
+
+    Raises:
+        ConfigError: for another ending, a folder, or a file that is not a report of PlushSense.
+    """
+    target = Path(path)
+    if target.suffix.lower() not in ENDINGS:
+        raise ConfigError(f"A report is an HTML page, and '{target}' does not end in .html or .htm: name it so.")
+    if target.is_dir():
+        raise ConfigError(f"'{target}' is a folder: name a file in it for the report.")
+    if target.exists():
+        try:
+            with target.open("rb") as file:
+                ours = GENERATOR.encode() in file.read(_HEAD)
+        except OSError as cause:
+            raise ConfigError(
+                f"'{target}' is there and cannot be read ({cause.strerror}): name another file."
+            ) from cause
+        if not ours:
+            raise ConfigError(f"'{target}' is there and is not a report of PlushSense: name another file.")
+    return target
+
 
 def write_report(
     path: str | Path,
@@ -24,24 +53,26 @@ def write_report(
     models: Sequence[Mapping[str, Any]],
     simulated: bool,
 ) -> Path:
-    """Write one self-contained HTML report and return its path; an older file is replaced in one step.
+    """Write one self-contained HTML report and return its path; an older report is replaced in one step.
 
     Args:
-        path: the file to write; its folder is made.
+        path: the .html file to write; its folder is made.
         title: shown on top.
         dataset: name, subjects, recordings, gestures, streams, layout, licence, hash, warnings (numbers or
             lists).
-        evaluations: ``Evaluation.to_dict()`` each; ``title`` and ``model`` may be added to name it.
+        evaluations: ``Evaluation.to_dict()`` each; ``title`` and ``model`` may be added to name it, ``simulated``
+            and ``dataset`` (name, hash) to say what it was made on.
         models: one model card each (symbol, filters, …, provenance); ``title`` may be added.
-        simulated: True puts a banner on top and by every table of scores.
+        simulated: whether the data set is a simulation. It, or any evaluation or model that says so, puts a
+            banner on top; every table of simulated scores is marked.
 
     Every key may be missing: the report shows a dash. All texts are escaped.
 
     Raises:
-        ConfigError: when the file cannot be written.
+        ConfigError: when the file cannot be written, or is there and is no report.
         MissingExtraError: when jinja2 or matplotlib is not installed.
     """
-    target = Path(path)
+    target = check_place(path)
     page = render(title=title, dataset=dataset, evaluations=evaluations, models=models, simulated=simulated)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -72,20 +103,33 @@ def render(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     source = resources.files("plushsense.reports").joinpath("report.html.j2").read_text(encoding="utf-8")
-    named = [{**evaluation, "title": words.title_of(evaluation)} for evaluation in evaluations]
+    named = [
+        {
+            **evaluation,
+            "title": words.title_of(evaluation),
+            "simulated": words.simulated(evaluation, simulated),
+            "foreign": words.foreign_words(evaluation, dataset),
+        }
+        for evaluation in evaluations
+    ]
+    cards = [_model(model) for model in models]
+    # Wholly: tables say it once, on top. Partly: every simulated row bears a mark.
+    wholly = simulated and all(evaluation["simulated"] for evaluation in named)
+    any_simulated = simulated or any(part["simulated"] for part in (*named, *cards))
     page: str = environment.from_string(source).render(
         title=title,
         made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
-        simulated=simulated,
-        simulated_title=words.SIMULATED_TITLE,
-        simulated_words=words.SIMULATED_WORDS,
+        simulated=any_simulated,
+        wholly_simulated=wholly,
+        simulated_title=words.SIMULATED_TITLE if wholly else words.PARTLY_SIMULATED_TITLE,
+        simulated_words=words.SIMULATED_WORDS if wholly else words.PARTLY_SIMULATED_WORDS,
         leaky_words=words.LEAKY_WORDS,
         any_leaky=any(evaluation.get("leaky") for evaluation in named),
         dataset=tables.dataset_rows(dataset),
         comparison=tables.comparison_rows(named),
         subjects=tables.subject_rows(named),
         evaluations=[_evaluation(f"E{i}", evaluation) for i, evaluation in enumerate(named, start=1)],
-        models=[_model(model) for model in models],
+        models=cards,
         contexts=words.CONTEXT_WORDS,
     )
     return page
@@ -98,6 +142,8 @@ def _evaluation(key: str, evaluation: Mapping[str, Any]) -> dict[str, Any]:
         "key": key,
         "title": evaluation["title"],
         "leaky": bool(evaluation.get("leaky")),
+        "simulated": bool(evaluation["simulated"]),
+        "foreign": evaluation["foreign"],
         "protocol": words.protocol(evaluation),
         "spread": words.spread_words(evaluation),
         "metrics": tables.metric_rows(evaluation),
@@ -133,6 +179,7 @@ def _model(model: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "title": str(model.get("title") or f"{symbol}, filters {filters}"),
         "rows": tables.model_rows(model),
+        "simulated": (model.get("provenance") or {}).get("simulated") is True,
         "streams": model.get("padding") == "stream",
         "padding": words.text(model.get("padding")),
     }

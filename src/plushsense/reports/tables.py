@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.reports.words import DASH, count, interval, mean_sd, number, text
+from plushsense.reports.words import DASH, count, interval, mean_sd, number, number_of, over, text
 
 METRICS = (
     ("accuracy", "Accuracy"),
@@ -99,17 +99,21 @@ def comparison_rows(evaluations: Sequence[Mapping[str, Any]]) -> list[dict[str, 
                 "f1_interval": interval(evaluation.get("macro_f1")),
                 "recording": number(recordings.get("accuracy")),
                 "pooled": number(pooled.get("accuracy")),
+                "over": number_of(evaluation, over(evaluation)),
+                "simulated": bool(evaluation.get("simulated")),
+                "foreign": bool(evaluation.get("foreign")),
             }
         )
     return rows
 
 
 def metric_rows(evaluation: Mapping[str, Any]) -> list[dict[str, str]]:
-    """One row a metric: mean ± sd, interval, pooled, by recording."""
+    """One row a metric: mean ± sd, interval, pooled, by recording; the paper's average is always over folds."""
+    folds = f", over {number_of(evaluation, 'folds')}"
     pooled, recordings = evaluation.get("pooled") or {}, evaluation.get("by_recording") or {}
     return [
         {
-            "name": name,
+            "name": name + folds * (key == "macro_f1_all_classes"),
             "mean_sd": mean_sd(evaluation.get(key)),
             "interval": interval(evaluation.get(key)),
             "pooled": number(pooled.get(key)),

@@ -58,6 +58,12 @@ LEAKY_WORDS = (
 )
 SIMULATED_TITLE = "These scores are of a simulation."
 SIMULATED_WORDS = "They were made on a virtual toy with virtual people and say nothing about a real toy."
+PARTLY_SIMULATED_TITLE = "A part of this page is of a simulation."
+PARTLY_SIMULATED_WORDS = (
+    "What bears the mark SIMULATION was made on a virtual toy with virtual people and says nothing about a real toy."
+)
+# The splits that keep people apart, for evaluations that do not say over what their mean is.
+_OVER_PEOPLE = ("leave-one-subject-out", "by-subject")
 
 
 def number(value: Any, digits: int = 3) -> str:
@@ -152,13 +158,58 @@ def protocol(evaluation: Mapping[str, Any]) -> list[tuple[str, str]]:
     return answers
 
 
+def over(evaluation: Mapping[str, Any]) -> str:
+    """Of what a mean has one value each: "subjects" or "folds"."""
+    kept = evaluation.get("over")
+    if kept in ("subjects", "folds"):
+        return str(kept)
+    return "subjects" if str(evaluation.get("split")).partition(":")[0] in _OVER_PEOPLE else "folds"
+
+
+def number_of(evaluation: Mapping[str, Any], units: str) -> str:
+    """How many ``units`` ("subjects" or "folds") an evaluation has, in words: "25 people", "1 fold"."""
+    n = len(evaluation.get(units) or [])
+    one, many = ("person", "people") if units == "subjects" else ("fold", "folds")
+    return f"{n or 'the'} {one if n == 1 else many}"
+
+
 def spread_words(evaluation: Mapping[str, Any]) -> str:
-    """Over what the mean, the deviation and the interval are taken."""
-    people = len(evaluation.get("subjects") or [])
-    over = f"{people} people" if people else "the people"
+    """Over what the mean, the deviation and the interval are taken, and what that interval is worth."""
+    units = over(evaluation)
+    taken = number_of(evaluation, units)
+    pooled = "Pooled: over all windows at once."
+    if len(evaluation.get(units) or []) == 1:
+        return f"Of {taken}: there is no spread and no interval. {pooled}"
+    words = (
+        f"Mean ± standard deviation over {taken}; the 95 % interval is of the mean (percentile bootstrap over "
+        f"{'people' if units == 'subjects' else 'folds'}). {pooled}"
+    )
+    if units == "folds":
+        words += (
+            f" These are folds, not people: an interval over so few ({taken}), which share most of what they were "
+            "trained on, is too narrow, and says nothing about another person."
+        )
+    return words
+
+
+def simulated(evaluation: Mapping[str, Any], page: bool) -> bool:
+    """Whether an evaluation's scores are of a simulation; one that does not say is as its ``page``'s data set."""
+    for table in (evaluation, evaluation.get("dataset")):
+        if isinstance(table, Mapping) and isinstance(table.get("simulated"), bool):
+            return bool(table["simulated"])
+    return page
+
+
+def foreign_words(evaluation: Mapping[str, Any], dataset: Mapping[str, Any]) -> str | None:
+    """A sentence for an evaluation of other data than the page's data set; None for one of the same data."""
+    made = evaluation.get("dataset")
+    theirs, ours = (table.get("hash") if isinstance(table, Mapping) else None for table in (made, dataset))
+    if not theirs or not ours or theirs == ours:
+        return None
     return (
-        f"Mean ± standard deviation over {over}; the 95 % interval is of the mean (percentile bootstrap over "
-        "people). Pooled: over all windows at once."
+        f"This evaluation was made on “{text(made.get('name') if isinstance(made, Mapping) else None)}” with the hash "
+        f"{str(theirs)[:12]}…; the data set of this page has the hash {str(ours)[:12]}…. Its scores are not of the "
+        "data described here."
     )
 
 

@@ -10,6 +10,9 @@ from plushsense.core.errors import ConfigError, nearest
 DEVICES = ("auto", "cpu", "cuda")
 STOP_ON = ("loss", "accuracy")
 
+# Part of every journalled training: raise it when the same settings would train differently.
+TRAINING_VERSION = 1
+
 
 def _one_of(what: str, value: str, known: tuple[str, ...]) -> None:
     if value not in known:
@@ -67,6 +70,11 @@ class TrainSpec:
     def to_dict(self) -> dict[str, Any]:
         """Plain values, ready for JSON."""
         return asdict(self)
+
+    def key(self) -> dict[str, Any]:
+        """What the outcome depends on: the settings without where they are computed, and the code's version."""
+        elsewhere = ("device", "threads")
+        return {"version": TRAINING_VERSION} | {k: v for k, v in asdict(self).items() if k not in elsewhere}
 
 
 # "search": paper, section 3.6.1; "loso": paper, section 4.4; "paper" is the same schedule, for the paper's own form

@@ -1,7 +1,7 @@
 """Windows: equal stretches of even samples that know their recording, their person and what their past is.
 
-A recording of at least one window gives full windows every ``step_s`` from its start. A shorter one gives one window,
-and where the rest of it comes from is the ``context``:
+A recording of at least one window gives full windows every ``step_s`` from its start ("inside"). A shorter one gives
+one window, and where the rest of it comes from is the ``context``:
 
 - ``stream``: what the session's stream held before (the recording is located in it). Where there is no stream, or
   too little of it, the recording is looped, and the window says so.
@@ -131,30 +131,27 @@ def _from_recording(segments: list[Segment], dataset: Dataset, window: int, step
 
 
 def _from_stream(
-    segments: list[Segment], first: int, last: int, window: int, reach: int, step: int
-) -> Callable[[Dataset], list[_Cut]] | None:
-    """How to cut rows ``first`` to ``last`` of a stream with their real past; None where the past is too short."""
-    segment = next((s for s in segments if s.first_row <= last - 1 < s.last_row), None)
-    if segment is None:
-        return None
-    begin = int(np.searchsorted(segment.row_of, first, side="left"))
-    end = int(np.searchsorted(segment.row_of, last, side="left"))
-    if end <= begin:
-        return None
-    ends = [begin + s + window for s in _starts(end - begin, window, step)] or [end]
-    if ends[0] < reach:
-        return None
+    segments: list[Segment], first: int, last: int, window: int, reach: int, step: int, dataset: Dataset
+) -> list[_Cut]:
+    """Rows ``first`` to ``last`` of a stream with their real past; nothing where the past is too short.
 
-    def cut(dataset: Dataset) -> list[_Cut]:
-        out = []
+    Where a gap or a clock reset divides the recording, its end is cut as usual, and full windows of the parts before.
+    """
+    cuts: list[_Cut] = []
+    for segment in (s for s in segments if s.first_row < last and first < s.last_row):
+        begin = int(np.searchsorted(segment.row_of, first, side="left"))
+        end = int(np.searchsorted(segment.row_of, last, side="left"))
+        ends = [begin + s + window for s in _starts(end - begin, window, step)]
+        if not ends and segment.last_row >= last and end > begin:
+            ends = [end]
+        if not ends or ends[0] < reach:
+            continue
         x = inputs(segment.data[ends[0] - reach : ends[-1]], dataset.layout)
         for e in ends:
             stop = e - (ends[0] - reach)
             rows = (int(segment.row_of[e - reach]), int(segment.row_of[e - 1]) + 1)
-            out.append(_Cut(x[stop - reach : stop], "stream", rows))
-        return out
-
-    return cut
+            cuts.append(_Cut(x[stop - reach : stop], "inside" if e - reach >= begin else "stream", rows))
+    return cuts
 
 
 def cut_windows(
@@ -188,9 +185,8 @@ def cut_windows(
                 stream_id = recording.stream
                 segments = resample(dataset.read_stream(stream_id), layout)
             first = recording.stream_row + recording.start
-            cut = _from_stream(segments, first, first + recording.stop - recording.start, window, reach, step)
-            if cut is not None:
-                mine = cut(dataset)
+            last = first + recording.stop - recording.start
+            mine = _from_stream(segments, first, last, window, reach, step, dataset)
         if not mine:
             mine = _from_recording(resample(dataset.read(recording), layout), dataset, reach, step)
         if not mine:
@@ -225,8 +221,8 @@ def _not_too_long(wanted: list[RecordingInfo], spec: WindowSpec) -> tuple[list[R
 def _assemble(cuts: list[tuple[RecordingInfo, _Cut]], gestures: GestureSet, dataset: Dataset) -> WindowSet:
     ids = tuple(sorted({r.id for r, _ in cuts}))
     number = {identity: i for i, identity in enumerate(ids)}
-    kind = np.iinfo(np.int32)
-    x = np.stack([np.clip(c.x, kind.min, kind.max).astype(np.int32).T for _, c in cuts])
+    # Layouts see to it that every input fits 32 bits.
+    x = np.stack([c.x.astype(np.int32).T for _, c in cuts])
     order = np.array([number[r.id] for r, _ in cuts], dtype=np.int64)
     by_recording = np.argsort(order, kind="stable")
     rows = [(r.stream_row + r.start, r.stream_row + r.stop) if r.stream_row >= 0 else (-1, -1) for r, _ in cuts]

@@ -14,20 +14,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import BadInput
-from plushsense.core.signal import MAGNITUDE_FRACTION_BITS, Layout
+from plushsense.core.signal import MAGNITUDE_FRACTION_BITS, Layout, magnitude_limit
 
 
 def magnitude(parts: NDArray[np.int64]) -> NDArray[np.int64]:
     """Floor of 16 · √(Σ v²), the magnitude with 4 fraction bits, exact in integers.
 
     Args:
-        parts: (..., n) integers of at most 32 bits; the sum is held in 64.
+        parts: (..., n) integers; the sum of squares is held in 64 bits, the result in 32.
 
     Raises:
-        BadInput: when the sum would leave 64 bits (beyond about ±4·10⁸ a component).
+        BadInput: for a component beyond `magnitude_limit`.
     """
-    if len(parts) and int(np.abs(parts).max()) > 400_000_000:
-        raise BadInput("A magnitude of values beyond ±4·10⁸ does not fit 64 bits: check the channel's valid range.")
+    limit = magnitude_limit(parts.shape[-1])
+    if parts.size and int(np.abs(parts).max()) > limit:
+        raise BadInput(f"A magnitude of values beyond ±{limit} does not fit 32 bits: narrow the channels' valid range.")
     total = (parts * parts).sum(axis=-1) << (2 * MAGNITUDE_FRACTION_BITS)
     root = np.floor(np.sqrt(total.astype(np.float64))).astype(np.int64)
     # The float root of a 64-bit number may be off by one either way.

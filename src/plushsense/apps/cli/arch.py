@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
 
 from plushsense.apps.cli.output import emit
 from plushsense.models.arch import Arch
@@ -11,38 +10,23 @@ from plushsense.models.arch import Arch
 
 def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "spec", help="architecture symbol: kernel lengths joined by _, dilation after d (14d1_39d2_41d4)"
+        "spec",
+        metavar="SPEC",
+        help="architecture symbol: kernel lengths in samples, joined by _, dilations after d (14d1_39d2_41d4)",
     )
-    parser.add_argument("--filters", required=True, help="filters by layer, for example 8,12,16")
-    parser.add_argument("--padding", default="stream", help="mirror, causal or stream (default)")
+    parser.add_argument("--filters", required=True, metavar="N,N,...", help="filters by layer, for example 8,12,16")
+    parser.add_argument("--padding", default="stream", help="stream (default), causal or mirror")
     parser.add_argument("--norm", default="batch", help="batch (default) or layer")
-    parser.add_argument("--channels", type=int, default=11, help="channels read (11)")
-    parser.add_argument("--classes", type=int, default=18, help="classes told apart (18)")
-    parser.add_argument("--window", type=int, default=250, help="window in samples (250)")
-    parser.add_argument("--step", type=int, default=5, help="samples between two live decisions (5)")
-    parser.add_argument("--pool", type=int, help="positions averaged, stream padding only (default: fills the window)")
-
-
-def describe(arch: Arch) -> dict[str, Any]:
-    """The counts that a model card shows."""
-    return {
-        "symbol": arch.symbol,
-        "filters": list(arch.filters),
-        "padding": arch.padding,
-        "norm": arch.norm,
-        "channels": arch.channels,
-        "classes": arch.classes,
-        "window": arch.window,
-        "step": arch.step,
-        "pool": arch.pool,
-        "parameters": arch.parameters,
-        "receptive_field": arch.receptive_field,
-        "span": arch.span,
-        "macs_per_window": arch.macs_per_window,
-        "macs_per_step": arch.macs_per_step,
-        "state_bytes_int8": arch.state_bytes_int8,
-        "table3": arch.table3,
-    }
+    parser.add_argument("--channels", type=int, default=11, metavar="N", help="channels read (11)")
+    parser.add_argument("--classes", type=int, default=18, metavar="N", help="classes told apart (18)")
+    parser.add_argument("--window", type=int, default=250, metavar="N", help="window in samples (250: 2.5 s at 100 Hz)")
+    parser.add_argument("--step", type=int, default=5, metavar="N", help="samples between two live decisions (5)")
+    parser.add_argument(
+        "--pool",
+        type=int,
+        metavar="N",
+        help="positions averaged, in samples, stream padding only (default: fills the window)",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -57,12 +41,13 @@ def run(args: argparse.Namespace) -> int:
         step=args.step,
         pool=args.pool,
     )
-    counts = describe(arch)
+    from plushsense.apps.reporting import card
+
     printed = f" (the paper's Table 3 prints {arch.table3})" if arch.table3 else ""
     again = "" if arch.padding == "stream" else "; this padding recomputes the window at every step"
     emit(
         args,
-        counts,
+        card(arch),
         [
             f"{arch.symbol}  filters {','.join(map(str, arch.filters))}  padding {arch.padding}  norm {arch.norm}",
             f"  parameters        {arch.parameters:,}{printed}",

@@ -4,53 +4,74 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from plushsense.apps.cli.output import emit, say, table
 from plushsense.apps.cli.settings import add_settings, folds_shown, settings, warn
+
+if TYPE_CHECKING:
+    from plushsense.apps.config import RunConfig
+    from plushsense.dataset.store import Dataset
 
 
 def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("dataset", metavar="DATASET", help="data set folder")
     parser.add_argument(
         "--split",
-        help="leave-one-subject-out (default), by-subject:5, by-recording:5; leaky: windows:5, windows:holdout",
+        metavar="SPLIT",
+        help="leave-one-subject-out (default), by-subject:K or by-recording:K for K folds; leaky, as in the paper: "
+        "windows:K, windows:holdout",
     )
     parser.add_argument(
-        "--train-context", help="train on windows of another context than the scored ones: stream or loop"
+        "--train-context",
+        metavar="CONTEXT",
+        help="context of the windows to train on: stream or loop (default: as those to score)",
     )
-    parser.add_argument("--workers", type=int, help="folds at a time (one a processor)")
-    parser.add_argument("--out", metavar="DIR", help="folder for evaluation.json, predictions.parquet and report.html")
+    parser.add_argument("--workers", type=int, metavar="N", help="folds at a time (default 0: one a processor)")
+    parser.add_argument(
+        "--out",
+        metavar="DIR",
+        help="folder for evaluation.json, predictions.parquet and report.html "
+        "(default: DATASET/evaluations/, a folder for each settings and data)",
+    )
+    parser.add_argument("--force", action="store_true", help="replace an evaluation of other settings or data in --out")
     add_settings(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     from plushsense.apps.api import evaluate
-    from plushsense.apps.reporting import write_report
+    from plushsense.apps.reporting import PAGE, check_place, write_report
     from plushsense.dataset.index import open_dataset
 
     config = settings(args, split=args.split, train_context=args.train_context, workers=args.workers)
     dataset = open_dataset(args.dataset)
-    out = Path(args.out) if args.out else dataset.path / "evaluations" / name_of(config)
+    out = Path(args.out) if args.out else dataset.path / "evaluations" / name_of(config, dataset)
+    check_place(out, config, dataset, replace=args.force)
     result = evaluate(dataset, config, out=out, progress=folds_shown("evaluating"), warn=warn)
-    report = write_report(out / "report.html", dataset, [out])
+    report = write_report(out / PAGE, dataset, [out])
     shown = {**result.to_dict(), "out": str(out), "report": str(report), "simulated": dataset.head.simulated}
     say(f"written: {out}")
     emit(args, shown, lines(shown))
     return 0
 
 
-def name_of(config: Any) -> str:
-    """A folder name that tells evaluations apart."""
+def name_of(config: RunConfig, dataset: Dataset) -> str:
+    """A folder name for an evaluation: a person tells them apart by the words, the hash by everything else."""
+    from plushsense.apps.reporting import evaluation_id
+
     evaluation, model = config.evaluation, config.model
     context = config.windows.context
     if evaluation.train_context not in (None, context):
         context = f"{evaluation.train_context}-to-{context}"
     filters = "-".join(map(str, model.filters))
-    classes = evaluation.classes if isinstance(evaluation.classes, str) else "some"
     parts = (evaluation.split.replace(":", "-"), model.arch, filters, config.padding, model.norm, context)
-    tail = "" if classes == "shared" else "_" + "".join(c if c.isalnum() else "-" for c in classes)[:40]
-    return "_".join(parts) + f"_{config.preset}_e{config.training.epochs}_seed{config.training.seed}{tail}"
+    words = "_".join(parts) + f"_{config.preset}_e{config.training.epochs}_seed{config.training.seed}"
+    return f"{words[:180]}_{evaluation_id(config, dataset)[:8]}"
+
+
+def figure(value: float | None) -> str:
+    """Three digits; a dash for what could not be computed."""
+    return "-" if value is None else f"{value:.3f}"
 
 
 def spread(score: dict[str, Any]) -> str:
@@ -78,17 +99,21 @@ def lines(e: dict[str, Any]) -> list[str]:
             s["subject"],
             s["windows"],
             s["recordings"],
-            *(f"{s[k]:.3f}" for k in ("accuracy", "macro_f1")),
-            f"{s['by_recording_accuracy']:.3f}",
+            *(figure(s[k]) for k in ("accuracy", "macro_f1", "by_recording_accuracy")),
         )
         for s in e["subjects"]
     ]
     out.append(table(("subject", "windows", "recordings", "accuracy", "macro-F1", "by recording"), rows))
+    units = e["over"]
+    n = len(e[units])
     out.append("")
+    out.append(f"mean ± standard deviation over {n} {'people' if units == 'subjects' else 'folds'}")
+    if units == "folds" and n > 1:
+        out.append("an interval over so few folds is too narrow, and it is not one over people")
     out.append(f"accuracy        {spread(e['accuracy'])}")
     out.append(f"macro-F1        {spread(e['macro_f1'])}")
     voted = e["by_recording"]
-    out.append(f"vote by recording, pooled: accuracy {voted['accuracy']:.3f}, macro-F1 {voted['macro_f1']:.3f}")
+    out.append(f"vote by recording, pooled: accuracy {figure(voted['accuracy'])}, macro-F1 {figure(voted['macro_f1'])}")
     for kind, part in e["by_context"].items():
-        out.append(f"  on {kind} windows: accuracy {part['accuracy']:.3f} ({part['windows']} windows)")
+        out.append(f"  on {kind} windows: accuracy {figure(part['accuracy'])} ({part['windows']} windows)")
     return out

@@ -13,20 +13,25 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("source", metavar="SRC", help="folder as the recorder left it: a folder a person, or a label")
     parser.add_argument("dest", metavar="DEST", help="the new data set folder")
     parser.add_argument(
-        "--layout", required=True, help="sensor layout: plush-15, plush-14, accel-3, phone-6, or a TOML file"
+        "--layout",
+        required=True,
+        metavar="NAME",
+        help="sensor layout: plush-15, plush-14, accel-3, phone-6, or a TOML file",
     )
     parser.add_argument(
         "--gestures",
-        help="gesture set: plush-18 or a TOML file (default: plush-18 for plush layouts, else inferred)",
+        metavar="NAME",
+        help="gesture set: plush-18 or a TOML file (default: plush-18 for plush layouts, else from the file names)",
     )
     parser.add_argument(
         "--subjects",
         default="folder",
-        help="'folder' (default) or a mapping file with the columns file,subject",
+        metavar="FILE",
+        help="who is recorded: folder (default: the folder's name), or a CSV file with the columns file,subject",
     )
     parser.add_argument("--name", help="name of the data set (default: the source folder's)")
-    parser.add_argument("--licence", default="", help="licence, as an SPDX name")
-    parser.add_argument("--consent", default="", help="consent statement")
+    parser.add_argument("--licence", default="", help="licence, as an SPDX name (default: not said)")
+    parser.add_argument("--consent", default="", metavar="TEXT", help="consent statement (default: not said)")
 
 
 def run(args: argparse.Namespace) -> int:

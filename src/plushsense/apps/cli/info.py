@@ -9,7 +9,7 @@ from plushsense.apps.cli.output import emit, table
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("path", help="a data set folder or a .plush bundle")
+    parser.add_argument("path", metavar="PATH", help="a data set folder or a .plush bundle")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -31,11 +31,16 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _bundle(args: argparse.Namespace) -> int:
-    from plushsense.apps.cli.arch import describe
+    from plushsense.apps.reporting import card
     from plushsense.models.bundle import Bundle
 
     bundle = Bundle.load(args.path)
-    result = {**describe(bundle.arch), "gestures": list(bundle.gestures.labels), "layout": bundle.layout.name}
-    result["provenance"] = bundle.provenance
+    result = card(
+        bundle.arch,
+        rate_hz=bundle.layout.rate_hz,
+        layout=bundle.layout.name,
+        gestures=list(bundle.gestures.labels),
+        provenance=bundle.provenance,
+    )
     emit(args, result, [f"{key:<20}{value}" for key, value in result.items()])
     return 0

@@ -15,12 +15,24 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--device",
         required=True,
         metavar="URL",
-        help="serial:///dev/ttyUSB0, tcp://host:port, replay:///path/stream.csv?speed=0, virtual://?person=7",
+        help="the toy: serial:///dev/ttyUSB0, tcp://host:port, replay:///path/stream.csv?speed=0, virtual://?person=7",
     )
     parser.add_argument("--model", required=True, metavar="BUNDLE", help="a .plush bundle")
-    parser.add_argument("--engine", default="float", choices=("float", "int8"), help="float (int8 is not built yet)")
-    parser.add_argument("--seconds", type=float, help="stop after so much time on the device's clock")
-    parser.add_argument("--smoothing", type=float, metavar="S", help="time constant of the smoothing (the bundle's)")
+    parser.add_argument(
+        "--engine", default="float", choices=("float", "int8"), help="float (default; int8 is not built yet)"
+    )
+    parser.add_argument(
+        "--seconds",
+        type=float,
+        metavar="S",
+        help="stop after so many seconds of the toy's clock (default: when it ends)",
+    )
+    parser.add_argument(
+        "--smoothing",
+        type=float,
+        metavar="S",
+        help="time constant of the smoothing, seconds; 0: off (default: the bundle's)",
+    )
 
 
 def run(args: argparse.Namespace) -> int:

@@ -6,13 +6,15 @@ A verb is a module with ``add(parser)`` and ``run(args) -> int``; only the one t
 from __future__ import annotations
 
 import argparse
+import contextlib
+import errno
 import importlib
 import os
 import sys
 from collections.abc import Sequence
 
 from plushsense import __version__
-from plushsense.apps.cli.output import Parser, say
+from plushsense.apps.cli.output import Parser, say, utf8
 from plushsense.core.errors import PlushSenseError, nearest
 
 VERBS: dict[str, tuple[str, str]] = {
@@ -26,6 +28,16 @@ VERBS: dict[str, tuple[str, str]] = {
     "report": ("report", "one HTML page from evaluations and bundles"),
     "live": ("live", "read a toy and say what it feels, 20 times a second"),
     "toy": ("toy", "a virtual toy that speaks the wire format over a pty or TCP"),
+}
+
+# What a stopped verb has left; the others leave nothing that would need a word.
+STOPPED = {
+    "demo": "what was finished is kept, and the same command goes on from there",
+    "evaluate": "finished folds are kept, and the same command goes on from there",
+    "simulate": "nothing was written",
+    "import": "nothing was written",
+    "train": "no bundle was written",
+    "report": "no page was written",
 }
 
 
@@ -43,6 +55,7 @@ def _overview() -> str:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
+    utf8()
     words = list(sys.argv[1:] if argv is None else argv)
     if not words or words[0] in ("-h", "--help", "help"):
         sys.stdout.write(_overview())
@@ -58,19 +71,43 @@ def main(argv: Sequence[str] | None = None) -> int:
         command = importlib.import_module(f"plushsense.apps.cli.{module}")
         parser = Parser(prog=f"plushsense {verb}", description=what[0].upper() + what[1:] + ".")
         command.add(parser)
-        parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
+        if verb == "live":
+            said = "changes nothing: decisions are JSON always, one object a line"
+        else:
+            said = "one JSON object on standard output, and nothing else there (default: text)"
+        parser.add_argument("--json", action="store_true", help=said)
         args: argparse.Namespace = parser.parse_args(rest)
         return int(command.run(args))
     except PlushSenseError as refusal:
         say(f"plushsense: {refusal}")
         return 2
     except KeyboardInterrupt:
-        say("plushsense: stopped; what was finished is kept.")
+        say(f"plushsense: stopped; {STOPPED[verb]}." if verb in STOPPED else "plushsense: stopped.")
         return 130
-    except BrokenPipeError:
-        # The reader of our output went away (`| head`): not our failure.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+    except OSError as cause:
+        if _reader_gone(cause):
+            # The reader of our output went away (`| head`): not our failure.
+            with contextlib.suppress(OSError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 0
+        say(f"plushsense: {_in_words(cause)}")
+        return 2
+
+
+def _reader_gone(cause: OSError) -> bool:
+    """Whether this is standard output without a reader, which Windows calls an invalid argument."""
+    if isinstance(cause, BrokenPipeError):
+        return True
+    return sys.platform == "win32" and cause.errno == errno.EINVAL and cause.filename is None
+
+
+def _in_words(cause: OSError) -> str:
+    """A refusal of the operating system as a sentence with the path."""
+    paths = " and ".join(f"'{os.fsdecode(p)}'" for p in (cause.filename, cause.filename2) if isinstance(p, str | bytes))
+    why = cause.strerror or str(cause) or type(cause).__name__
+    if not paths:
+        return f"The system refused: {why}."
+    return f"{paths} cannot be used: {why[0].lower()}{why[1:]}; check the path and whether you may write there."
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import sys
 import time
@@ -17,13 +18,30 @@ Progress = Callable[[int, int], None]
 class Parser(argparse.ArgumentParser):
     """An argument parser whose refusals are PlushSense's: one sentence, the nearest known option, status 2."""
 
+    words: Sequence[str] = ()
+
+    def parse_args(self, args: Sequence[str], namespace: Any = None) -> argparse.Namespace:  # type: ignore[override]
+        """As argparse does, remembering what was typed: a slip in an option's name is looked for there."""
+        self.words = args
+        parsed: argparse.Namespace = super().parse_args(args, namespace)
+        return parsed
+
     def error(self, message: str) -> NoReturn:
-        hint = ""
-        if message.startswith("unrecognized arguments: "):
-            word = message.removeprefix("unrecognized arguments: ").split()[0].split("=")[0]
-            known = [o for action in self._actions for o in action.option_strings]
-            hint = nearest(word, known)
+        # An option misspelt is also one that is missing, which argparse notices first.
+        known = [o for action in self._actions for o in action.option_strings]
+        typed = [word.partition("=")[0] for word in self.words if word.startswith("--") and word != "--"]
+        unknown = [word for word in typed if not any(option.startswith(word) for option in known)]
+        hint = nearest(unknown[0], known) if unknown else ""
+        if hint and "unrecognized" not in message:
+            message = f"unknown option {unknown[0]}; {message}"
         raise ConfigError(f"{message[0].upper()}{message[1:]}.{hint} See  {self.prog} --help")
+
+
+def utf8() -> None:
+    """What is printed is UTF-8, whatever the console's code page: names and labels are anybody's."""
+    for stream, errors in ((sys.stdout, "strict"), (sys.stderr, "backslashreplace")):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(encoding="utf-8", errors=errors)
 
 
 def say(text: str) -> None:

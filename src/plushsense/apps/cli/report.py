@@ -9,13 +9,22 @@ from plushsense.apps.cli.output import emit
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("out", metavar="OUT.html", help="the page to write")
-    parser.add_argument("--dataset", required=True, help="data set folder")
+    parser.add_argument("out", metavar="OUT.html", help="the page to write: a new file, or a report to replace")
+    parser.add_argument("--dataset", required=True, metavar="DATASET", help="data set folder")
     parser.add_argument(
-        "--evaluation", action="append", metavar="DIR", help="what evaluate wrote (default: all of DATASET/evaluations)"
+        "--evaluation",
+        action="append",
+        metavar="DIR",
+        help="a folder that evaluate wrote; may be given again (default: all of DATASET/evaluations)",
     )
-    parser.add_argument("--model", action="append", metavar="FILE", default=[], help="a bundle, for its model card")
-    parser.add_argument("--title", help="heading of the page")
+    parser.add_argument(
+        "--model",
+        action="append",
+        metavar="FILE",
+        default=[],
+        help="a bundle, for its model card; may be given again (default: none)",
+    )
+    parser.add_argument("--title", metavar="TEXT", help="heading of the page (default: the data set's name)")
 
 
 def run(args: argparse.Namespace) -> int:

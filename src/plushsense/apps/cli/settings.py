@@ -15,18 +15,41 @@ if TYPE_CHECKING:
 
 def add_settings(parser: argparse.ArgumentParser) -> None:
     """Network, training and windows. Nothing given: the preset's, or the configuration file's."""
-    parser.add_argument("--arch", help="architecture symbol (14d1_19d2_19d4)")
-    parser.add_argument("--filters", help="filters by layer (8,12,16)")
-    parser.add_argument("--padding", help="stream (default), causal or mirror (the preset paper's)")
+    parser.add_argument(
+        "--arch",
+        metavar="SPEC",
+        help="architecture symbol: kernel lengths in samples, dilations after d (14d1_19d2_19d4)",
+    )
+    parser.add_argument("--filters", metavar="N,N,...", help="filters by layer (8,12,16)")
+    parser.add_argument(
+        "--padding", help="stream, causal or mirror (default: the preset's; paper mirror, others stream)"
+    )
     parser.add_argument("--norm", help="batch (default) or layer")
-    parser.add_argument("--preset", help="people (default), loso, paper or search")
-    parser.add_argument("--context", help="what a short gesture's window holds before it: stream (default) or loop")
-    parser.add_argument("--classes", help="shared (default), all, or labels joined by commas")
-    parser.add_argument("--epochs", type=int, help="epochs at most")
-    parser.add_argument("--batch", type=int, help="windows a batch")
-    parser.add_argument("--seed", type=int, help="seed of the split and of the training (0)")
-    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), help="where to train (auto)")
-    parser.add_argument("--config", help="TOML file with the tables windows, model, training, evaluation, live")
+    parser.add_argument(
+        "--preset",
+        help="training schedule: people (default, 60 epochs), loso or paper (at most 150, stops early), search (250)",
+    )
+    parser.add_argument(
+        "--context",
+        help="what a short gesture's window holds before it: stream, the real past, or loop, the gesture over and "
+        "over (default: the preset's; people and loso stream, paper and search loop)",
+    )
+    parser.add_argument(
+        "--classes",
+        metavar="LABELS",
+        help="shared (default: made by 90 %% of the people, no free choice), all, or labels joined by commas",
+    )
+    parser.add_argument("--epochs", type=int, metavar="N", help="epochs at most (default: the preset's)")
+    parser.add_argument("--batch", type=int, metavar="N", help="windows a batch (64)")
+    parser.add_argument("--seed", type=int, metavar="N", help="seed of the split and of the training (0)")
+    parser.add_argument(
+        "--device", choices=("auto", "cpu", "cuda"), help="where to train (default auto: cuda where it is available)"
+    )
+    parser.add_argument(
+        "--config",
+        metavar="FILE",
+        help="TOML file with the tables windows, model, training, evaluation, live; options go over it (default: none)",
+    )
 
 
 def settings(args: argparse.Namespace, **evaluation: Any) -> RunConfig:

@@ -14,15 +14,35 @@ def add(parser: argparse.ArgumentParser) -> None:
     where = parser.add_mutually_exclusive_group(required=True)
     where.add_argument("--serial-pty", action="store_true", help="a pseudo terminal that looks like a serial port")
     where.add_argument("--tcp", type=int, metavar="PORT", help="a port of 127.0.0.1; 0 takes a free one")
-    parser.add_argument("--person", type=int, default=101, help="which virtual person plays (101: in no data set)")
-    parser.add_argument("--seed", type=int, default=1, help="same seed, same bytes (1)")
-    parser.add_argument("--speed", type=float, default=1.0, help="1: real time")
-    parser.add_argument("--layout", default="plush-15", help="firmware: plush-15 (default) or plush-14")
-    parser.add_argument("--gestures", help="labels joined by commas, over and over (default: all, at random)")
-    parser.add_argument("--lost", type=float, help="share of lines that are lost, 0 to 0.9")
-    parser.add_argument("--garbled", type=float, help="share of lines that are garbled, 0 to 0.9")
-    parser.add_argument("--seconds", type=float, default=0.0, help="stop after so much of the toy's time (0: never)")
-    parser.add_argument("--truth", metavar="FILE", help="append what is performed, as JSON lines")
+    parser.add_argument(
+        "--person", type=int, default=101, metavar="N", help="which virtual person plays (101: in no data set)"
+    )
+    parser.add_argument("--seed", type=int, default=1, metavar="N", help="same seed, same bytes (1)")
+    parser.add_argument("--speed", type=float, default=1.0, metavar="X", help="times real time (1)")
+    parser.add_argument("--layout", default="plush-15", metavar="NAME", help="firmware: plush-15 (default) or plush-14")
+    parser.add_argument(
+        "--gestures", metavar="LABELS", help="labels joined by commas, over and over (default: all, at random)"
+    )
+    parser.add_argument(
+        "--lost",
+        type=float,
+        metavar="P",
+        help="share of lines that are lost, 0 to 0.9 (0.0005)",
+    )
+    parser.add_argument(
+        "--garbled",
+        type=float,
+        metavar="P",
+        help="share of lines that are garbled, 0 to 0.9 (0.0003)",
+    )
+    parser.add_argument(
+        "--seconds",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="stop after so many seconds of the toy's time (0: never)",
+    )
+    parser.add_argument("--truth", metavar="FILE", help="append what is performed, as JSON lines (default: nowhere)")
 
 
 def run(args: argparse.Namespace) -> int:

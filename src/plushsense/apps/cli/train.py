@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from plushsense.apps.cli.evaluate import figure
 from plushsense.apps.cli.output import emit
 from plushsense.apps.cli.settings import add_settings, epochs_shown, settings, warn
 from plushsense.core.errors import ConfigError
@@ -12,7 +13,7 @@ from plushsense.core.errors import ConfigError
 
 def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("dataset", metavar="DATASET", help="data set folder")
-    parser.add_argument("--out", metavar="FILE", default="model.plush", help="the bundle (model.plush)")
+    parser.add_argument("--out", metavar="FILE", default="model.plush", help="the bundle to write (model.plush)")
     parser.add_argument("--force", action="store_true", help="replace a bundle that is already there")
     add_settings(parser)
 
@@ -32,8 +33,8 @@ def run(args: argparse.Namespace) -> int:
         [
             f"{bundle}: {done.bundle.arch.symbol}, {done.bundle.arch.parameters:,} parameters, "
             f"epoch {scores['best_epoch']} of {len(done.history)} kept{mark}",
-            f"accuracy {scores['accuracy']:.3f}, macro-F1 {scores['macro_f1']:.3f} on {scores['windows']} windows of "
-            f"{scores['said']}.",
+            f"accuracy {figure(scores['accuracy'])}, macro-F1 {figure(scores['macro_f1'])} on {scores['windows']} "
+            f"windows of {scores['said']}.",
         ],
     )
     return 0

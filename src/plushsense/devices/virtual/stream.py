@@ -61,6 +61,9 @@ class ToySpec:
     world: World = WORLD
 
     def __post_init__(self) -> None:
+        for name, number in (("person", self.person), ("seed", self.seed), ("session", self.session)):
+            if number < 0:
+                raise ConfigError(f"The virtual toy's {name} is {number}; a whole number from 0 on is accepted.")
         for name, value in (("lost", self.lost), ("garbled", self.garbled)):
             if value is not None and not 0.0 <= value <= 0.9:
                 raise ConfigError(f"The virtual toy's {name} is {value}; a share from 0 to 0.9 is accepted.")

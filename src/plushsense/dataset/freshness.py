@@ -1,0 +1,62 @@
+"""Whether the index still says what the raw files and the marks say: by names, sizes and times, not by reading all."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+from plushsense.dataset.marks import MARKS
+from plushsense.dataset.store import HEAD, RECORDINGS, STREAMS, write_atomically
+
+RECORDINGS_INDEX = "recordings.csv"
+STREAMS_INDEX = "streams.csv"
+STAMP = "index.json"
+STAMP_VERSION = 1
+
+
+def raw_files(folder: Path) -> list[tuple[str, Path]]:
+    """Every raw file of a data set with its kind, streams or recordings; the suffix in any case."""
+    files = []
+    for kind in (STREAMS, RECORDINGS):
+        found = [
+            Path(place) / name
+            for place, _, names in os.walk(folder / kind)
+            for name in names
+            if name.lower().endswith(".csv")
+        ]
+        files += [(kind, path) for path in sorted(found)]
+    return files
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
+
+
+def taken(folder: Path) -> dict[str, Any]:
+    """What an index is made from: the raw files (name, size, time in ns), the marks and the head (hashes)."""
+    files = []
+    for _, path in raw_files(folder):
+        now = path.stat()
+        files.append([path.relative_to(folder).as_posix(), now.st_size, now.st_mtime_ns])
+    return {"format": STAMP_VERSION, "files": files, "marks": _sha256(folder / MARKS), "head": _sha256(folder / HEAD)}
+
+
+def _index(folder: Path) -> dict[str, str]:
+    return {name: _sha256(folder / name) for name in (RECORDINGS_INDEX, STREAMS_INDEX)}
+
+
+def write_stamp(folder: Path, stamp: dict[str, Any]) -> None:
+    """Say what the index in ``folder`` was made from; called after the index files were written."""
+    write_atomically(folder / STAMP, json.dumps(stamp | {"index": _index(folder)}) + "\n")
+
+
+def is_fresh(folder: Path) -> bool:
+    """Whether the index in ``folder`` is whole and made from what is there now."""
+    try:
+        said = json.loads((folder / STAMP).read_text(encoding="utf-8"))
+    except (FileNotFoundError, ValueError):
+        return False
+    return bool(said == taken(folder) | {"index": _index(folder)})
