@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from plushsense import __version__
 from plushsense.apps.config import RunConfig, resolve
 from plushsense.apps.preparation import Warn, choose_classes, opened, silent, windows_for
-from plushsense.apps.reporting import save_evaluation
+from plushsense.apps.reporting import check_place, save_evaluation
 from plushsense.core.errors import ConfigError
 from plushsense.core.gestures import NOBODY
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
@@ -198,6 +198,7 @@ def evaluate(
     arch: str | None = None,
     filters: Sequence[int] | str | None = None,
     out: str | os.PathLike[str] | None = None,
+    overwrite: bool = False,
     progress: Callable[[FoldProgress], None] | None = None,
     warn: Warn = silent,
     **settings: Any,
@@ -209,13 +210,16 @@ def evaluate(
     Args:
         config, arch, filters, settings, warn: as for `train`, and ``train_context``, ``workers``.
         split: "leave-one-subject-out" (default), "by-subject:5", "by-recording:5", "windows:5" (leaky).
-        out: a folder for ``evaluation.json`` and ``predictions.parquet``.
+        out: a folder for ``evaluation.json`` and ``predictions.parquet``; one that holds an evaluation of other
+            settings or data is refused unless ``overwrite``.
     """
     dataset = opened(dataset)
     config = config or _from_settings(arch, filters, settings)
     if split is not None:
         config = replace(config, evaluation=replace(config.evaluation, split=split))
     parse_split(config.evaluation.split)
+    if out is not None:
+        check_place(Path(out), config, dataset, replace=overwrite)
     gestures = choose_classes(dataset, config.evaluation.classes, warn)
     network = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
     score = windows_for(dataset, network, config.windows, gestures, warn)

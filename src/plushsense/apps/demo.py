@@ -82,6 +82,7 @@ def run_demo(out: Path, *, quick: bool = False, stage: Stage, progress: Progress
         config,
         split=f"by-subject:{size.folds}",
         out=evaluation,
+        overwrite=True,
         progress=lambda at: progress("folds", at.done, at.folds),
     ).to_dict()
     stage(f"4/5  live: {size.live_s:.0f} s of a virtual person it never met")

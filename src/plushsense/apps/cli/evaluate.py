@@ -40,14 +40,13 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from plushsense.apps.api import evaluate
-    from plushsense.apps.reporting import PAGE, check_place, write_report
+    from plushsense.apps.reporting import PAGE, write_report
     from plushsense.dataset.index import open_dataset
 
     config = settings(args, split=args.split, train_context=args.train_context, workers=args.workers)
     dataset = open_dataset(args.dataset)
     out = Path(args.out) if args.out else dataset.path / "evaluations" / name_of(config, dataset)
-    check_place(out, config, dataset, replace=args.force)
-    result = evaluate(dataset, config, out=out, progress=folds_shown("evaluating"), warn=warn)
+    result = evaluate(dataset, config, out=out, overwrite=args.force, progress=folds_shown("evaluating"), warn=warn)
     report = write_report(out / PAGE, dataset, [out])
     shown = {**result.to_dict(), "out": str(out), "report": str(report), "simulated": dataset.head.simulated}
     say(f"written: {out}")
