@@ -65,7 +65,7 @@ def save_evaluation(result: Evaluation, dataset: Dataset, config: RunConfig, arc
         "id": evaluation_id(config, dataset),
         "simulated": dataset.head.simulated,
         "validation_decides": config.training.patience is not None,
-        "title": evaluation_title(result, arch),
+        "title": evaluation_title(result, arch, config),
         "model": card(arch, rate_hz=dataset.layout.rate_hz),
         "dataset": dataset.summary(),
         "config": config.to_dict(),
@@ -76,13 +76,14 @@ def save_evaluation(result: Evaluation, dataset: Dataset, config: RunConfig, arc
     return path
 
 
-def evaluation_title(result: Evaluation, arch: Arch) -> str:
+def evaluation_title(result: Evaluation, arch: Arch, config: RunConfig) -> str:
     """A line that tells one evaluation from another."""
     filters = "/".join(map(str, arch.filters))
     context = f"{result.context} context"
     if result.train_context != result.context:
         context += f", trained on {result.train_context}"
-    return f"{arch.symbol} {filters} {arch.padding}, {context}"
+    training = f"{config.preset} training, seed {config.training.seed}"
+    return f"{arch.symbol} {filters} {arch.padding}, {result.split.text}, {context}, {training}"
 
 
 def card(arch: Arch, **more: Any) -> dict[str, Any]:
