@@ -431,3 +431,10 @@ def test_output_is_utf8_whatever_the_console(cli: Cli, recordings: Path, tmp_pat
     done = subprocess.run(words, capture_output=True, check=False, env={**os.environ, "PYTHONIOENCODING": "cp1252"})
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout.decode("utf-8"))["name"] == "Plüsch"
+
+
+def test_the_example_configuration_resolves() -> None:
+    from plushsense.apps.config import resolve
+
+    config = resolve(Path(__file__).resolve().parents[2] / "examples" / "har-phone.toml")
+    assert (config.windows.window_s, config.model.filters, config.training.epochs) == (0.5, (16, 24, 32), 20)
