@@ -50,6 +50,9 @@ def test_a_new_a_changed_and_a_removed_raw_file_are_noticed(folder: Path) -> Non
     path.write_text(path.read_text() + "1, 2, 3, 4, 5\n")
     assert next(r for r in open_dataset(folder).recordings if r.gesture == "Wave").rows == 61
     path.unlink()
+    with pytest.raises(DatasetError, match=r"lacks 1 raw file that it had \('recordings/ana/Wave_3_60.csv'\)"):
+        open_dataset(folder)
+    (folder / "index.json").unlink()
     assert len(open_dataset(folder).recordings) == 2
 
 

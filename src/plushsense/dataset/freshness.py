@@ -60,3 +60,12 @@ def is_fresh(folder: Path) -> bool:
     except (FileNotFoundError, ValueError):
         return False
     return bool(said == taken(folder) | {"index": _index(folder)})
+
+
+def missing_files(folder: Path) -> list[str]:
+    """Raw files that the last index was made from and that are not there now; none where there is no stamp."""
+    try:
+        listed = json.loads((folder / STAMP).read_text(encoding="utf-8"))["files"]
+        return [str(entry[0]) for entry in listed if not (folder / str(entry[0])).is_file()]
+    except (FileNotFoundError, ValueError, KeyError, TypeError, IndexError):
+        return []

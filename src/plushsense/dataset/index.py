@@ -15,7 +15,16 @@ import numpy as np
 from plushsense.core.errors import DatasetError, FileFormatError
 from plushsense.core.gestures import NOBODY, Gesture
 from plushsense.core.recfile import Frames, ReadResult, parse_name, read_recording, read_stream
-from plushsense.dataset.freshness import RECORDINGS_INDEX, STREAMS_INDEX, is_fresh, raw_files, taken, write_stamp
+from plushsense.dataset.freshness import (
+    RECORDINGS_INDEX,
+    STAMP,
+    STREAMS_INDEX,
+    is_fresh,
+    missing_files,
+    raw_files,
+    taken,
+    write_stamp,
+)
 from plushsense.dataset.marks import Standing, read_marks
 from plushsense.dataset.quality import Examined, findings, measured_rate_hz
 from plushsense.dataset.store import (
@@ -59,7 +68,8 @@ def open_dataset(path: str | Path) -> Dataset:
     On a disk that cannot be written the index is made in memory each time it is out of date.
 
     Raises:
-        DatasetError: when the folder is missing, empty, or not a data set, or a raw file cannot be read any more.
+        DatasetError: when the folder is missing, empty, or not a data set, or a raw file is gone or cannot be read
+            any more.
     """
     folder = Path(path)
     head = DatasetHead.read(folder)
@@ -70,6 +80,11 @@ def open_dataset(path: str | Path) -> Dataset:
                 head,
                 read_index(folder / RECORDINGS_INDEX, RecordingInfo),
                 read_index(folder / STREAMS_INDEX, StreamInfo),
+            )
+        if missing := missing_files(folder):
+            raise DatasetError(
+                f"'{folder}' lacks {len(missing)} raw file{'s' if len(missing) > 1 else ''} that it had "
+                f"('{missing[0]}'): bring them back, or delete {STAMP} there to go on without them."
             )
         stamp = taken(folder)
         built = build(folder, head)

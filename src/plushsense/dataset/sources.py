@@ -127,6 +127,11 @@ def _refuse_unclear_people(source: Path, found: Iterable[Found], *, nested: bool
             )
 
 
+def _mapped(path: Path, source: Path, subjects: dict[str, str]) -> str | None:
+    """The person that a mapping names for a file, by its path below ``source`` or by its name alone."""
+    return subjects.get(path.relative_to(source).as_posix(), subjects.get(path.name))
+
+
 def find_gesture_recorder(
     source: Path, files: list[Path], subjects: dict[str, str] | None, gestures: GestureSet | None
 ) -> Iterator[Found]:
@@ -143,7 +148,7 @@ def find_gesture_recorder(
             yield refused
             continue
         if subjects is not None:
-            subject = subjects.get(path.relative_to(source).as_posix(), subjects.get(path.name))
+            subject = _mapped(path, source, subjects)
         elif path.parent in nobodys:
             subject = NOBODY
         elif by_label:
@@ -174,7 +179,7 @@ def find_labelled_rows(
             yield refused
             continue
         if subjects is not None:
-            subject = subjects.get(path.relative_to(source).as_posix(), subjects.get(path.name))
+            subject = _mapped(path, source, subjects)
         else:
             subject = path.parent.resolve().name if one_person or path.parent != source else None
         if path.suffix.lower() != ".csv":
