@@ -438,3 +438,14 @@ def test_the_example_configuration_resolves() -> None:
 
     config = resolve(Path(__file__).resolve().parents[2] / "examples" / "har-phone.toml")
     assert (config.windows.window_s, config.model.filters, config.training.epochs) == (0.5, (16, 24, 32), 20)
+
+
+def test_simulate_makes_a_data_set_in_one_command(cli: Cli, tmp_path: Path) -> None:
+    words = ("simulate", tmp_path / "R", "--people", "1", "--repetitions", "1", "--dataset", tmp_path / "DS")
+    found = cli(*words, "--json").json
+    assert found["recordings"] == 34
+    info = cli("info", found["dataset"], "--json").json
+    assert (info["recordings"], info["subjects"], info["simulated"]) == (34, 1, True)
+    refused = cli(*words)
+    assert refused.status == 2
+    assert "already holds something" in refused.err

@@ -20,6 +20,7 @@ from plushsense.apps.preparation import Warn, choose_classes, opened, silent, wi
 from plushsense.apps.reporting import check_place, save_evaluation
 from plushsense.core.errors import ConfigError
 from plushsense.core.gestures import NOBODY
+from plushsense.dataset.importers import import_recordings
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
 from plushsense.evaluation.crossval import Evaluation, FoldOutput, FoldProgress
 from plushsense.evaluation.crossval import evaluate as crossvalidate
@@ -254,13 +255,46 @@ def simulate(
     people: int = 25,
     repetitions: int = 3,
     seed: int = 1,
-    progress: Callable[[int, int], None] | None = None,
+    dataset: str | os.PathLike[str] | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
 ) -> dict[str, Any]:
-    """Recordings of virtual people, as the authors' recorder would leave them; the paper's shape by default."""
+    """Recordings of virtual people, as the authors' recorder would leave them; the paper's shape by default.
+
+    Args:
+        out: a new or empty folder.
+        dataset: also import them as a data set there.
+        progress: called with ("recording" or "importing", done, in all).
+    """
     from plushsense.recording.simulate import simulate as run
 
-    told = (lambda done, total, _: progress(done, total)) if progress is not None else None
-    return dict(run(Path(out), people=people, repetitions=repetitions, seed=seed, progress=told).to_dict())
+    tell = progress or (lambda *_: None)
+    done = run(
+        Path(out),
+        people=people,
+        repetitions=repetitions,
+        seed=seed,
+        progress=lambda at, total, _: tell("recording", at, total),
+    )
+    summary: dict[str, Any] = dict(done.to_dict())
+    if dataset is not None:
+        import_simulation(out, dataset, tell)
+        summary["dataset"] = str(dataset)
+    return summary
+
+
+def import_simulation(
+    source: str | os.PathLike[str], dest: str | os.PathLike[str], progress: Callable[[str, int, int], None]
+) -> Dataset:
+    """Import what `simulate` wrote, as a data set that says what it is."""
+    return import_recordings(
+        Path(source),
+        Path(dest),
+        layout="plush-15",
+        name="virtual toy",
+        licence="MIT",
+        consent="nobody: a simulation",
+        progress=lambda at, total: progress("importing", at, total),
+    ).dataset
 
 
 def _context_said(windows: WindowSet) -> dict[str, int]:

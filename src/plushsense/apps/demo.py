@@ -10,12 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from plushsense.apps.api import evaluate, simulate, train
+from plushsense.apps.api import evaluate, import_simulation, simulate, train
 from plushsense.apps.config import resolve
 from plushsense.apps.reporting import write_report
 from plushsense.core.errors import ConfigError
-from plushsense.core.signal import load_layout
-from plushsense.dataset.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.store import Dataset
 from plushsense.devices.opening import open_device
@@ -107,19 +105,8 @@ def _dataset(
     if (dest / "dataset.toml").is_file():
         return open_dataset(dest)
     if not raw.exists():
-        simulate(
-            raw, people=people, repetitions=repetitions, seed=seed, progress=lambda a, b: progress("recording", a, b)
-        )
-    return import_recordings(
-        raw,
-        dest,
-        layout=load_layout("plush-15"),
-        name="virtual toy",
-        licence="MIT",
-        consent="nobody: a simulation",
-        simulated=True,
-        progress=lambda a, b: progress("importing", a, b),
-    ).dataset
+        simulate(raw, people=people, repetitions=repetitions, seed=seed, progress=progress)
+    return import_simulation(raw, dest, progress)
 
 
 def _live(bundle: Path, seconds: float) -> dict[str, Any]:

@@ -16,18 +16,25 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--repetitions", type=int, default=3, metavar="N", help="recordings of each gesture by each person (3)"
     )
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="same seed, same recordings (1)")
+    parser.add_argument("--dataset", metavar="DIR", help="also import them as a data set in this new folder")
 
 
 def run(args: argparse.Namespace) -> int:
     from plushsense.apps.api import simulate
 
+    bars = {"recording": bar("people"), "importing": bar("importing")}
     summary = simulate(
-        args.out, people=args.people, repetitions=args.repetitions, seed=args.seed, progress=bar("people")
+        args.out,
+        people=args.people,
+        repetitions=args.repetitions,
+        seed=args.seed,
+        dataset=args.dataset,
+        progress=lambda what, done, total: bars[what](done, total),
     )
     emit(
         args,
         summary,
-        f"{args.out}: {summary['recordings']} recordings of {summary['people']} virtual people. "
-        f"A simulation: scores on it say nothing about a real toy.",
+        f"{args.dataset or args.out}: {summary['recordings']} recordings of {args.people} virtual people. "
+        "A simulation: scores on it say nothing about a real toy.",
     )
     return 0
