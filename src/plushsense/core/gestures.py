@@ -14,7 +14,8 @@ AFFECTS = ("positive", "neutral", "negative", "none")
 NOBODY = "none"
 
 
-def _plain(label: str) -> str:
+def plain_label(label: str) -> str:
+    """A label as it is compared: without case, and with ``_`` and runs of space as one space."""
     return " ".join(label.replace("_", " ").split()).casefold()
 
 
@@ -42,7 +43,7 @@ class Gesture:
                 raise GestureError(
                     f"Gesture '{self.label}': {key} is {getattr(self, key)!r}; it must be true or false."
                 )
-        if not _plain(self.label):
+        if not plain_label(self.label):
             raise GestureError("A gesture has an empty label: give it a word.")
         if self.affect not in AFFECTS:
             raise GestureError(
@@ -62,8 +63,8 @@ class GestureSet:
     inferred: bool = False
 
     def __post_init__(self) -> None:
-        plain = [_plain(g.label) for g in self.gestures]
-        doubled = sorted({g.label for g in self.gestures if plain.count(_plain(g.label)) > 1})
+        plain = [plain_label(g.label) for g in self.gestures]
+        doubled = sorted({g.label for g in self.gestures if plain.count(plain_label(g.label)) > 1})
         if doubled:
             raise GestureError(f"Gesture set '{self.name}' holds '{doubled[0]}' twice: labels must differ.")
 
@@ -87,8 +88,8 @@ class GestureSet:
 
     def find(self, label: str) -> Gesture | None:
         """The gesture of a label, ignoring case and ``_`` against space; None when it is not in the set."""
-        wanted = _plain(label)
-        return next((g for g in self.gestures if _plain(g.label) == wanted), None)
+        wanted = plain_label(label)
+        return next((g for g in self.gestures if plain_label(g.label) == wanted), None)
 
     def get(self, label: str) -> Gesture:
         """The gesture of a label; GestureError with the nearest one when it is not in the set."""
@@ -139,8 +140,8 @@ class GestureSet:
         """
         spellings: dict[str, str] = {}
         for label in labels:
-            spellings.setdefault(_plain(label), label)
-        gestures = tuple(Gesture(s, free_choice=_plain(s) == "custom") for s in sorted(spellings.values()))
+            spellings.setdefault(plain_label(label), label)
+        gestures = tuple(Gesture(s, free_choice=plain_label(s) == "custom") for s in sorted(spellings.values()))
         return cls(name, gestures, inferred=True)
 
 

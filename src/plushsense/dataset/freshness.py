@@ -31,7 +31,8 @@ def raw_files(folder: Path) -> list[tuple[str, Path]]:
     return files
 
 
-def _sha256(path: Path) -> str:
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file, in hexadecimal; "" where there is none."""
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
 
 
@@ -41,11 +42,16 @@ def taken(folder: Path) -> dict[str, Any]:
     for _, path in raw_files(folder):
         now = path.stat()
         files.append([path.relative_to(folder).as_posix(), now.st_size, now.st_mtime_ns])
-    return {"format": STAMP_VERSION, "files": files, "marks": _sha256(folder / MARKS), "head": _sha256(folder / HEAD)}
+    return {
+        "format": STAMP_VERSION,
+        "files": files,
+        "marks": sha256_of(folder / MARKS),
+        "head": sha256_of(folder / HEAD),
+    }
 
 
 def _index(folder: Path) -> dict[str, str]:
-    return {name: _sha256(folder / name) for name in (RECORDINGS_INDEX, STREAMS_INDEX)}
+    return {name: sha256_of(folder / name) for name in (RECORDINGS_INDEX, STREAMS_INDEX)}
 
 
 def write_stamp(folder: Path, stamp: dict[str, Any]) -> None:

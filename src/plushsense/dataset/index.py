@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import itertools
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -22,6 +21,7 @@ from plushsense.dataset.freshness import (
     is_fresh,
     missing_files,
     raw_files,
+    sha256_of,
     taken,
     write_stamp,
 )
@@ -55,11 +55,6 @@ class Rebuilt:
 
     dataset: Dataset
     unreadable: dict[str, str] = field(default_factory=dict)
-
-
-def sha256_of(path: Path) -> str:
-    """SHA-256 of a file, in hexadecimal."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def open_dataset(path: str | Path) -> Dataset:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from plushsense.core.errors import BadInput, DatasetError
-from plushsense.core.gestures import NOBODY, GestureSet
+from plushsense.core.gestures import NOBODY, GestureSet, plain_label
 from plushsense.core.recfile import SIMULATION_MARK, STREAM_NAME, parse_name
 from plushsense.core.tomlfile import read_toml
 from plushsense.dataset.store import HEAD, RECORDINGS, STREAMS, UNKNOWN_SUBJECT
@@ -80,15 +80,11 @@ def _not_a_file(path: Path) -> Found | None:
     return None if path.is_file() else Found(path, "", reason="not a regular file")
 
 
-def _plain(label: str) -> str:
-    return " ".join(label.replace("_", " ").split()).casefold()
-
-
 def _is_by_label(source: Path, files: Iterable[Path]) -> bool:
     """Whether the folders are gestures, not people: every recording's label is its folder's name."""
     named = [(path, name) for path in files if (name := parse_name(path.name)) is not None]
     inside = [(path, name) for path, name in named if path.parent != source] or named
-    return bool(inside) and all(_plain(n.label) == _plain(p.parent.resolve().name) for p, n in inside)
+    return bool(inside) and all(plain_label(n.label) == plain_label(p.parent.resolve().name) for p, n in inside)
 
 
 def _nobodys_folders(files: Iterable[Path], gestures: GestureSet | None) -> set[Path]:
@@ -143,10 +139,6 @@ def find_gesture_recorder(
     by_label = subjects is None and _is_by_label(source, files)
     nobodys = _nobodys_folders(files, gestures)
     for path in files:
-        refused = _not_a_file(path)
-        if refused is not None:
-            yield refused
-            continue
         if subjects is not None:
             subject = _mapped(path, source, subjects)
         elif path.parent in nobodys:
@@ -174,10 +166,6 @@ def find_labelled_rows(
     """CSVs with a label on every row: each file is a stream, and its runs of equal labels are the recordings."""
     one_person = all(path.parent == source for path in files)
     for path in files:
-        refused = _not_a_file(path)
-        if refused is not None:
-            yield refused
-            continue
         if subjects is not None:
             subject = _mapped(path, source, subjects)
         else:
@@ -209,7 +197,9 @@ def find(
     Raises:
         DatasetError: when the folders leave open who the person is.
     """
-    found = list(FINDERS[shape](source, files, subjects, gestures))
+    refused = [f for path in files if (f := _not_a_file(path)) is not None]
+    odd = {f.source for f in refused}
+    found = refused + list(FINDERS[shape](source, [p for p in files if p not in odd], subjects, gestures))
     if subjects is None:
         _refuse_unclear_people(source, found, nested=shape == "gesture-recorder")
     return found
