@@ -64,3 +64,15 @@ def test_an_unknown_mark_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"'exclud'.*Did you mean 'exclude'"):
         append_marks(tmp_path, [Mark("a", "exclud", "x")])
     assert not (tmp_path / MARKS).exists()
+
+
+def test_a_finding_is_accepted_and_taken_back(tmp_path: Path) -> None:
+    append_marks(
+        tmp_path, [Mark("a", "accept", "x", "a bumpy bus", check="gaps"), Mark("a", "accept", "x", check="rate")]
+    )
+    assert read_marks(tmp_path)["a"].accepted == {"gaps", "rate"}
+    append_marks(tmp_path, [Mark("a", "trim", "x", start=3), Mark("a", "unaccept", "y", check="gaps")])
+    assert read_marks(tmp_path)["a"] == Standing(False, 3, -1, frozenset({"rate"}))
+    for wrong in (Mark("a", "accept", "x"), Mark("a", "trim", "x", check="gaps")):
+        with pytest.raises(DatasetError, match="name a check"):
+            append_marks(tmp_path, [wrong])

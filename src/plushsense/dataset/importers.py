@@ -14,7 +14,7 @@ from plushsense.core.folders import whole_folder
 from plushsense.core.gestures import GestureSet, load_gestures
 from plushsense.core.recfile import SIMULATION_MARK, parse_name
 from plushsense.core.signal import Layout, load_layout
-from plushsense.dataset.index import Progress, build, write
+from plushsense.dataset.index import AGAIN, Progress, build, write
 from plushsense.dataset.sources import Found, find, is_simulation, read_mapping, source_files
 from plushsense.dataset.store import HEAD, UNKNOWN_SUBJECT, Dataset, DatasetHead
 
@@ -73,7 +73,7 @@ def _copy(found: Found, work: Path, taken: dict[str, bytes]) -> tuple[Path | Non
         if taken[key] == content:
             return None, "the same file was already imported"
         again += 1
-        target = folder / f"again-{again}" / found.source.name
+        target = folder / f"{AGAIN}{again}" / found.source.name
     taken[key] = content
     target.parent.mkdir(parents=True, exist_ok=True)
     target.write_bytes(raw)

@@ -142,6 +142,15 @@ def build(folder: Path, head: DatasetHead, progress: Progress | None = None) -> 
     return Rebuilt(Dataset(folder, head, infos, [_stream_info(folder, head, s) for s in streams]), unreadable)
 
 
+AGAIN = "again-"
+
+
+def _session(relative: Path) -> str:
+    """The session of a raw file by its path below ``recordings/`` or ``streams/``: the folder in the person's, or 1."""
+    inner = relative.parts[1:-1]
+    return inner[0] if inner and not inner[0].startswith(AGAIN) else "1"
+
+
 def _subject(folder_name: str, gesture: Gesture | None) -> str:
     """Whose a recording is: its folder's person, but nobody's where the gesture is made by nobody."""
     return NOBODY if gesture is not None and gesture.nobody else folder_name
@@ -159,7 +168,7 @@ def _stream_info(folder: Path, head: DatasetHead, read: _Read) -> StreamInfo:
     return StreamInfo(
         id=_stream_id(folder, read),
         subject=read.subject,
-        session="1",
+        session=_session(read.path.relative_to(folder / STREAMS)),
         file=read.path.relative_to(folder).as_posix(),
         rows=len(frames),
         seconds=float(steps[~broken].sum()) / 1000.0,
@@ -245,7 +254,7 @@ def _from_files(folder: Path, head: DatasetHead, recordings: list[_Read], stream
             RecordingInfo(
                 id=identity,
                 subject=_subject(read.subject, known),
-                session="1",
+                session=_session(read.path.relative_to(folder / RECORDINGS)),
                 gesture=label,
                 file=read.path.relative_to(folder).as_posix(),
                 first_row=0,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -16,12 +16,16 @@ from plushsense.core.errors import DatasetError, nearest
 from plushsense.core.tomlfile import refuse_unknown
 
 MARKS = "marks.jsonl"
-ACTIONS = ("trim", "untrim", "exclude", "include")
+ACTIONS = ("trim", "untrim", "exclude", "include", "accept", "unaccept")
 
 
 @dataclass(frozen=True)
 class Mark:
-    """One decision: ``trim`` keeps rows ``start`` to ``stop``; ``untrim`` and ``include`` undo."""
+    """One decision: ``trim`` keeps rows ``start`` to ``stop``; ``untrim``, ``include`` and ``unaccept`` undo.
+
+    ``accept`` says that what the check ``check`` found is known and no fault. ``recording`` is the id of a recording or
+    a stream, or "" for the data set as a whole.
+    """
 
     recording: str
     action: str
@@ -30,20 +34,22 @@ class Mark:
     start: int = 0
     stop: int = -1
     when: str = ""
+    check: str = ""
 
 
 @dataclass(frozen=True)
 class Standing:
-    """Where the marks leave one recording."""
+    """Where the marks leave one recording; ``accepted`` are the checks whose findings somebody accepted."""
 
     excluded: bool = False
     start: int = 0
     stop: int = -1
+    accepted: frozenset[str] = frozenset()
 
 
 def _checked(mark: Mark, where: str) -> Mark:
     """The mark, when its values are of the right type and range."""
-    for key in ("recording", "action", "who", "why", "when"):
+    for key in ("recording", "action", "who", "why", "when", "check"):
         if not isinstance(getattr(mark, key), str):
             raise DatasetError(f"{where}: {key} is {getattr(mark, key)!r}; it must be a text.")
     if mark.action not in ACTIONS:
@@ -54,6 +60,10 @@ def _checked(mark: Mark, where: str) -> Mark:
         value = getattr(mark, key)
         if isinstance(value, bool) or not isinstance(value, int) or value < low:
             raise DatasetError(f"{where}: {key} is {value!r}; it must be a whole number from {low} on.")
+    if bool(mark.check) != (mark.action in ("accept", "unaccept")):
+        raise DatasetError(
+            f"{where}: a mark '{mark.action}' with check '{mark.check}'; accept and unaccept name a check."
+        )
     if 0 <= mark.stop <= mark.start:
         raise DatasetError(f"{where}: rows {mark.start} to {mark.stop} keep nothing; stop must be above start, or -1.")
     return mark
@@ -116,12 +126,16 @@ def read_marks(folder: Path) -> dict[str, Standing]:
         now = standing.get(mark.recording, Standing())
         match mark.action:
             case "trim":
-                now = Standing(now.excluded, mark.start, mark.stop)
+                now = replace(now, start=mark.start, stop=mark.stop)
             case "untrim":
-                now = Standing(now.excluded)
+                now = replace(now, start=0, stop=-1)
             case "exclude":
-                now = Standing(True, now.start, now.stop)
+                now = replace(now, excluded=True)
             case "include":
-                now = Standing(False, now.start, now.stop)
+                now = replace(now, excluded=False)
+            case "accept":
+                now = replace(now, accepted=now.accepted | {mark.check})
+            case "unaccept":
+                now = replace(now, accepted=now.accepted - {mark.check})
         standing[mark.recording] = now
     return standing

@@ -6,6 +6,7 @@ streams/<subject>/*.csv      raw session streams; a file with a label on every r
 marks.jsonl                  trim, exclude: who and why, append-only
 recordings.csv, streams.csv  the index: rebuilt from the above, replaced atomically
 index.json                   what the index was made from: when that changed, it is made anew
+subjects.csv                 the people by code: age group, gender, consent reference (`dataset.people`)
 cache/                       can be deleted
 """
 
