@@ -44,6 +44,7 @@ class TcpDevice(Device):
         except OSError as cause:
             if self.closed:
                 return None
+            self._parser.finish()
             raise DeviceError(f"'{self.url}' went away: {cause.strerror or cause}.") from None
         if not data:
             self._parser.finish()
