@@ -333,3 +333,23 @@ def test_without_bleak(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setitem(sys.modules, "bleak", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'plushsense\[ble\]'"):
         open_device(f"ble://{ADDRESS}")
+
+
+def test_toys_are_listed_by_service_or_by_name() -> None:
+    from plushsense.devices.listing import list_devices
+
+    Air.devices = [
+        ("11:22:33:44:55:66", "Lamp", []),
+        (ADDRESS, None, [UART_SERVICE.upper()]),
+        ("C0:FF:EE:00:00:02", "MyTeddy", []),
+    ]
+    listing = list_devices(0.1, FAKE)
+    toys = {d.url: d for d in listing.devices if d.kind == "ble"}
+    assert set(toys) == {f"ble://{ADDRESS}", "ble://C0:FF:EE:00:00:02"}
+    assert toys[f"ble://{ADDRESS}"].description == "-60 dBm, Nordic UART service"
+    assert toys["ble://C0:FF:EE:00:00:02"].name == "MyTeddy"
+    assert "Bluetooth: 1 more device advertises, by name and service no toy; ble://ADDRESS opens any." in listing.notes
+    Air.fault = FileNotFoundError(2, "No such file or directory")
+    listing = list_devices(0.1, FAKE)
+    assert [d for d in listing.devices if d.kind == "ble"] == []
+    assert sum("Bluetooth cannot be used here" in note for note in listing.notes) == 1
