@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import threading
+import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -18,6 +19,8 @@ from plushsense.devices.virtual.stream import Performed, ToySpec
 STREAM_TYPE = "Touch"
 _DRIFT = 200e-6
 _FAR_S = 10.0
+_LINGER_S = 0.25
+"""A reader gets nothing more of a stream that is gone, not even what has arrived: it is given time to take it."""
 
 
 class LslOutlet:
@@ -89,6 +92,8 @@ class LslOutlet:
 
     def close(self) -> None:
         """Withdraw the stream. Closing twice is harmless."""
+        if self._outlet is not None and self._outlet.have_consumers():
+            time.sleep(_LINGER_S)
         self._outlet = None
 
     def __enter__(self) -> LslOutlet:
