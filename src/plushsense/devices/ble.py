@@ -68,11 +68,25 @@ class Seen:
     services: tuple[str, ...]
 
 
+_started = threading.Lock()
+_loops: list[asyncio.AbstractEventLoop] = []
+
+
+def bluetooth_loop() -> asyncio.AbstractEventLoop:
+    """The event loop of all Bluetooth, one for the program: bleak keeps its connection to the system in it."""
+    with _started:
+        if not _loops:
+            loop = asyncio.new_event_loop()
+            threading.Thread(target=loop.run_forever, name="plushsense-ble", daemon=True).start()
+            _loops.append(loop)
+        return _loops[0]
+
+
 class BleDevice(Device):
     """Frames from the notifications of a Bluetooth toy. One that disconnects raises DeviceError.
 
-    bleak lives in an event loop of its own, in a thread of its own; `read` takes what that has put aside. Notifications
-    cut the lines anywhere; the first line is joined in its middle, as on a serial port.
+    bleak lives in an event loop in a thread of its own (`bluetooth_loop`); `read` takes what that has put aside.
+    Notifications cut the lines anywhere; the first line is joined in its middle, as on a serial port.
     """
 
     def __init__(self, url: str, layout: Layout, target: BleTarget, backends: Backends | None = None) -> None:
@@ -82,11 +96,10 @@ class BleDevice(Device):
         self._backends = backends or Backends()
         self._parser = LineParser(layout, self.counters, joining=True)
         self._heard: queue.SimpleQueue[tuple[int, bytes] | None] = queue.SimpleQueue()
-        self._loop: asyncio.AbstractEventLoop | None = None
         self._over: asyncio.Event | None = None
+        self._loop = bluetooth_loop()
         opened: Future[None] = Future()
-        self._thread = threading.Thread(target=self._work, args=(opened,), name="plushsense-ble", daemon=True)
-        self._thread.start()
+        self._talk = asyncio.run_coroutine_threadsafe(self._work(opened), self._loop)
         try:
             opened.result()
         except BaseException:
@@ -116,47 +129,45 @@ class BleDevice(Device):
         return None
 
     def _shut(self) -> None:
-        loop, over = self._loop, self._over
-        if loop is not None and over is not None:
-            with contextlib.suppress(RuntimeError):  # the loop has ended by itself
-                loop.call_soon_threadsafe(over.set)
+        self._loop.call_soon_threadsafe(self._end)
         self._heard.put(None)
-        if threading.current_thread() is not self._thread:
-            self._thread.join(5.0)
+        with contextlib.suppress(TimeoutError):
+            self._talk.result(5.0)
 
-    def _work(self, opened: Future[None]) -> None:
-        try:
-            asyncio.run(self._talk(opened))
-        except Exception as cause:  # noqa: BLE001 (backends raise what their system raises)
-            if not opened.done():
-                refusal = cause if isinstance(cause, DeviceError) else DeviceError(f"'{self.url}': {in_words(cause)}.")
-                opened.set_exception(refusal)
-        finally:
-            if not opened.done():
-                opened.set_exception(DeviceError(f"'{self.url}' broke off while it was being connected; try again."))
-            self._heard.put(None)
+    def _end(self) -> None:
+        if self._over is not None:
+            self._over.set()
 
-    async def _talk(self, opened: Future[None]) -> None:
+    async def _work(self, opened: Future[None]) -> None:
         """Find, connect, listen; until the toy has gone or `close` was called."""
         self._over = over = asyncio.Event()
-        self._loop = loop = asyncio.get_running_loop()
         if self.closed:
-            return
-        steps = asyncio.ensure_future(self._listen(loop, over, opened))
+            over.set()
+        steps = asyncio.ensure_future(self._listen(over, opened))
         stop = asyncio.ensure_future(over.wait())
-        # Closing also ends a search or a connection that is still under way.
-        await asyncio.wait((steps, stop), return_when=asyncio.FIRST_COMPLETED)
-        if not steps.done() and not opened.done():
-            steps.cancel()
-        stop.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await steps
+        try:
+            # Closing also ends a search or a connection that is still under way.
+            await asyncio.wait((steps, stop), return_when=asyncio.FIRST_COMPLETED)
+            if not steps.done() and not opened.done():
+                steps.cancel()
+            stop.cancel()
+            await asyncio.wait((steps,))
+            cause = None if steps.cancelled() else steps.exception()
+            if not opened.done():
+                broken = cause
+                if not isinstance(cause, Exception):
+                    broken = DeviceError(f"'{self.url}' broke off while it was being connected; try again.")
+                elif not isinstance(cause, DeviceError):
+                    broken = DeviceError(f"'{self.url}': {in_words(cause)}.")
+                opened.set_exception(broken)
+        finally:
+            self._heard.put(None)
 
-    async def _listen(self, loop: asyncio.AbstractEventLoop, over: asyncio.Event, opened: Future[None]) -> None:
+    async def _listen(self, over: asyncio.Event, opened: Future[None]) -> None:
         device = await self._find()
         chosen = {} if self._backends.client is None else {"backend": self._backends.client}
         client = self._bleak.BleakClient(
-            device, lambda _: loop.call_soon_threadsafe(over.set), timeout=_CONNECT_S, **chosen
+            device, lambda _: self._loop.call_soon_threadsafe(over.set), timeout=_CONNECT_S, **chosen
         )
         try:
             await asyncio.wait_for(client.connect(), _CONNECT_S)
@@ -242,7 +253,7 @@ def scan(seconds: float, backends: Backends | None = None) -> list[Seen]:
             await asyncio.sleep(seconds)
 
     try:
-        asyncio.run(look())
+        asyncio.run_coroutine_threadsafe(look(), bluetooth_loop()).result()
     except Exception as cause:  # noqa: BLE001 (backends raise what their system raises)
         words = in_words(cause)
         raise DeviceError(f"{words[0].upper()}{words[1:]}.") from None

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Literal
 
-from plushsense.core.errors import DeviceError, PlushSenseError
+from plushsense.core.errors import DeviceError
 from plushsense.core.signal import Layout
 from plushsense.devices.base import Counters, Device, Frame, now_ms
 
@@ -81,7 +81,7 @@ class ReconnectingDevice(Device):
         self._lock = threading.Lock()
         self._awake = threading.Event()
         self._waiting_since = 0.0
-        self._found: Device | PlushSenseError | None = None
+        self._found: Device | Exception | None = None
         self.inner: Device | None = open_inner()
         self._count()
 
@@ -122,7 +122,6 @@ class ReconnectingDevice(Device):
             setattr(self.counters, name, getattr(self._before, name) + getattr(inner.counters, name))
 
     def _lost(self, inner: Device, reason: str) -> list[Frame]:
-        inner.close()
         self._count()
         self._before = Counters(**self.counters.to_dict())
         # Gone again before a frame came: it is still the same gap, and the next try is not made at once.
@@ -135,25 +134,26 @@ class ReconnectingDevice(Device):
         with self._lock:
             self.inner = None
             self.state = "waiting"
-        # Opening may take seconds (a scan, a silent host): not in the thread that reads.
+        # Closing and opening may take seconds (a scan, a silent host): not in the thread that reads.
         self._awake.clear()
-        threading.Thread(target=self._seek, args=(again,), name="plushsense-reconnect", daemon=True).start()
+        threading.Thread(target=self._seek, args=(inner, again), name="plushsense-reconnect", daemon=True).start()
         return []
 
-    def _seek(self, pause: bool) -> None:
+    def _seek(self, gone: Device, pause: bool) -> None:
         """Try until the toy is there, the device is closed or an error comes that trying again will not mend."""
+        gone.close()
         while not self.closed:
             if pause:
                 self._awake.wait(RETRY_S)
                 pause = False
                 continue
-            found: Device | PlushSenseError
+            found: Device | Exception
             try:
                 found = self._open_inner()
             except DeviceError:
                 pause = True
                 continue
-            except PlushSenseError as cause:
+            except Exception as cause:  # noqa: BLE001 (raised where it is read, not lost in this thread)
                 found = cause
             with self._lock:
                 if not self.closed:
@@ -181,7 +181,7 @@ class ReconnectingDevice(Device):
                 self.inner = found
                 self.state = "connected"
                 self.counters.reconnects += 1
-        if isinstance(found, PlushSenseError):
+        if isinstance(found, Exception):
             self.close()
             raise found
         return []
