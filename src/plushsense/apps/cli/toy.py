@@ -87,5 +87,8 @@ def run(args: argparse.Namespace) -> int:
     finally:
         if truth is not None:
             truth.close()
-    say(f"sent {counters.sent} lines, {counters.dropped} found no reader")
+    if args.lsl is not None:
+        say(f"published {counters.sent} frames")  # who took them, LSL does not say
+    else:
+        say(f"sent {counters.sent} lines, {counters.dropped} found no reader")
     return 0
