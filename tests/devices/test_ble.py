@@ -263,10 +263,12 @@ def test_a_toy_that_disconnects_gives_what_it_said_and_then_an_error() -> None:
 
 def test_closing_from_another_thread_ends_the_frames() -> None:
     device = opened()
-    threading.Timer(0.1, device.close).start()
+    closing = threading.Timer(0.1, device.close)
+    closing.start()
     begun = time.monotonic()
     assert list(device) == []
     assert time.monotonic() - begun < 3
+    closing.join(5)
 
 
 def test_it_comes_back() -> None:
