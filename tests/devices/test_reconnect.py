@@ -43,7 +43,7 @@ def collect(device: Device, until: Callable[[list[Frame]], bool], patience_s: fl
         assert time.monotonic() < end, "it took too long"
         begun = time.monotonic()
         got = device.read()
-        assert time.monotonic() - begun < 0.6  # about 0.1 s, on a busy machine
+        assert time.monotonic() - begun < 2.0  # about 0.1 s, on a busy machine
         assert got is not None
         frames += got
     return frames
@@ -104,7 +104,7 @@ def test_a_serial_toy_is_unplugged_and_comes_back_on_another_port(tmp_path: Path
         assert "unplugged" in gap.reason
         begun = time.monotonic()
         assert device.read() == []
-        assert time.monotonic() - begun < 0.5
+        assert time.monotonic() - begun < 2.0
         assert device.counters.malformed == 2  # half a line at either end
         second = Pty(link)
         try:
@@ -149,14 +149,15 @@ def test_a_connection_that_only_opens_and_breaks_is_one_gap_and_no_storm() -> No
             server.accept()[0].close()
             begun, accepted = time.monotonic(), 0
             server.settimeout(0.01)
-            while time.monotonic() - begun < 1.3:
+            while accepted < 3:
+                assert time.monotonic() - begun < 20
                 device.read()
                 try:
                     server.accept()[0].close()
                     accepted += 1
                 except TimeoutError:
                     continue
-            assert 1 <= accepted <= 4
+            assert time.monotonic() - begun > 0.9  # the first try at once, then one every 0.5 s
             assert len(device.gaps) == 1 and device.gaps[0].host_ms_end is None
 
 
