@@ -47,11 +47,15 @@ class Trim:
         return "suggested" if self.suggestion.onset_visible else "none"
 
     def rows(self, offset: bool = False, above: float = 0.0) -> tuple[int, int]:
-        """The rows that accepting would keep: every visible edge whose confidence is at least ``above`` is moved."""
+        """The rows that accepting would keep, all of them where the start is not visible or less sure than ``above``.
+
+        With ``offset`` the end goes too, where it is visible and as sure.
+        """
         s = self.suggestion
-        start = s.start if s.onset_visible and s.onset_confidence >= above else 0
+        if not s.onset_visible or s.onset_confidence < above:
+            return 0, self.recording.rows
         ends = offset and s.offset_visible and s.offset_confidence >= above
-        return start, s.stop if ends else self.recording.rows
+        return s.start, s.stop if ends else self.recording.rows
 
     def shown(self, offset: bool = False) -> tuple[int, int]:
         """The rows that a mark keeps, or else those suggested."""
@@ -83,7 +87,7 @@ class Trim:
 
 @dataclass(frozen=True)
 class Accepted:
-    """What accepting did: ids marked, already so, without a visible edge (or below the confidence), kept by hand."""
+    """What accepting did: ids marked, already so, without a visible onset (or below the confidence), kept by hand."""
 
     marked: tuple[str, ...] = ()
     already: tuple[str, ...] = ()
@@ -161,7 +165,7 @@ def choose(dataset: Dataset, pattern: str) -> list[RecordingInfo]:
 def accept(
     dataset: Dataset, chosen: Iterable[Trim], who: str, why: str = "", *, above: float = 0.0, offset: bool = False
 ) -> Accepted:
-    """Mark what is suggested, each visible edge whose confidence is at least ``above``; ``offset`` trims the end too.
+    """Mark `Trim.rows` of what is suggested: starts of at least the confidence ``above``, with ``offset`` ends too.
 
     A mark set by hand stays, and a mark that is there already is not made again. The data set that was opened does not
     change: open it anew.

@@ -25,7 +25,7 @@ def trim_page(dataset: Dataset, trims: Sequence[Trim], offset: bool = True) -> F
     """One page of recordings: every channel over the device clock, a dotted line where an edge is suggested, a solid
     one where a mark stands; what a mark cuts off is shaded.
 
-    Channels of one kind share a scale: each is drawn off its median, in shares of the kind's largest swing.
+    Channels of one kind share a lane and a scale: each is drawn off its median, in shares of the kind's largest swing.
 
     Args:
         trims: at most `PER_PAGE` of `plushsense.dataset.trim.trims`.
@@ -36,17 +36,22 @@ def trim_page(dataset: Dataset, trims: Sequence[Trim], offset: bool = True) -> F
         figsize=(5.2 * _COLUMNS, 2.5 * rows + 0.6), layout="constrained"
     )
     grid = figure.subplots(rows, _COLUMNS, squeeze=False)
+    channels = dataset.layout.channels
+    kinds = list(dict.fromkeys(c.kind for c in channels))
+    colours = need("matplotlib", "reports").colormaps["tab10" if len(channels) <= 10 else "tab20"]
     for axes, trim in zip(grid.flat, trims, strict=False):
         info, s = trim.recording, trim.suggestion
         frames = dataset.read(replace(info, start=0, stop=info.rows))
         values = frames.values.astype(np.float64)
         values -= np.median(values, axis=0)
         at = trim.seconds[: len(frames)]
-        for kind in dict.fromkeys(c.kind for c in dataset.layout.channels):
-            mine = [i for i, c in enumerate(dataset.layout.channels) if c.kind == kind]
+        for lane, kind in enumerate(kinds):
+            mine = [i for i, c in enumerate(channels) if c.kind == kind]
             swing = max(1.0, float(np.abs(values[:, mine]).max()))
             for i in mine:
-                axes.plot(at, values[:, i] / swing, linewidth=0.8, label=dataset.layout.names[i])
+                axes.plot(
+                    at, values[:, i] / swing - 2.1 * lane, linewidth=0.8, color=colours(i), label=channels[i].name
+                )
         edges = [(s.start, s.onset_visible), (s.stop, s.offset_visible and offset)]
         for edge in (row for row, visible in edges if visible):
             axes.axvline(trim.seconds[edge], color=_SUGGESTION, linestyle=":", linewidth=1.6)
@@ -59,14 +64,13 @@ def trim_page(dataset: Dataset, trims: Sequence[Trim], offset: bool = True) -> F
         said = f"{trim.state}, confidence {s.onset_confidence:.2f}" + (f"; {s.why}" if s.why else "")
         axes.set_title(f"{info.id}\n{said}", fontsize=7.5, parse_math=False)
         axes.set_xlim(0.0, float(trim.seconds[-1]))
-        axes.set_ylim(-1.08, 1.08)
+        axes.set_ylim(-1.08 - 2.1 * (len(kinds) - 1), 1.08)
+        axes.set_yticks([-2.1 * lane for lane in range(len(kinds))], kinds, rotation=90, va="center")
         axes.tick_params(labelsize=7)
     for axes in grid.flat[len(trims) :]:
         axes.set_axis_off()
     for axes in grid[-1, : len(trims) - (rows - 1) * _COLUMNS]:
         axes.set_xlabel("Seconds since the first row", fontsize=8)
-    for axes in grid[:, 0]:
-        axes.set_ylabel("Off the median,\nshare of the largest", fontsize=8)
     handles, labels = grid[0, 0].get_legend_handles_labels()
     line = need("matplotlib.lines", "reports").Line2D
     handles += [line([], [], color=_SUGGESTION, linestyle=":"), line([], [], color=_MARK)]
