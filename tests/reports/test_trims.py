@@ -10,7 +10,7 @@ from plushsense.reports.trims import PER_PAGE, save_trims, trim_page
 
 
 def _dataset(folder: Path) -> Dataset:
-    simulate(folder / "raw", people=1, repetitions=2, at_rest=0, gestures=("Back stroke 1", "Tail hit 1"))
+    simulate(folder / "raw", people=1, repetitions=2, at_rest=0, gestures=("Head stroke 1", "Hold strong"))
     return import_recordings(folder / "raw", folder / "DS", layout="plush-15").dataset
 
 

@@ -50,11 +50,14 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from plushsense.core.errors import ConfigError
+    from plushsense.core.extras import need
     from plushsense.dataset import trim
     from plushsense.dataset.index import open_dataset
 
     if args.accept_above is not None and not 0.0 <= args.accept_above <= 1.0:
         raise ConfigError(f"--accept-above is {args.accept_above:g}: a confidence from 0 to 1 is accepted.")
+    if args.plot:
+        need("matplotlib", "reports")
     times = [(identity, *_seconds(text)) for identity, text in args.set]
     dataset = open_dataset(args.dataset)
     shown = trim.choose(dataset, args.only)
