@@ -22,6 +22,8 @@ VERBS: dict[str, tuple[str, str]] = {
     "simulate": ("simulate", "recordings of virtual people, as the authors' recorder would leave them"),
     "import": ("importing", "make a data set from recordings"),
     "info": ("info", "what a data set or a model bundle holds"),
+    "trim": ("trim", "where each gesture begins: suggested, then accepted, adjusted or undone"),
+    "stats": ("stats", "how long gestures last, before and after trimming"),
     "arch": ("arch", "count a network: parameters, receptive field, multiply-accumulates, state"),
     "train": ("train", "train one network and save it as a bundle"),
     "evaluate": ("evaluate", "how good it is, on people it never met"),
