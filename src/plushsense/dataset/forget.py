@@ -1,4 +1,4 @@
-"""Taking a person out of a data set, for good: raw files, session files, marks, the people's table, caches, evaluations.
+"""Taking a person out of a data set, for good: raw and session files, marks, the people's table, caches, evaluations.
 
 Here append-only is broken on purpose. What is about to go is written down first (``forgetting.json``), so that a run
 that was stopped can be finished by the same call; at the end only a line in ``forgotten.jsonl`` stays, which says when
@@ -7,6 +7,7 @@ and how many files, not who: codes are so few that even a hash of one would tell
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -20,11 +21,12 @@ from filelock import FileLock
 
 from plushsense.core.errors import DatasetError, nearest
 from plushsense.core.gestures import NOBODY
-from plushsense.dataset.contents import CACHE, EVALUATIONS, INDEX, contents, folders_of_people
+from plushsense.dataset.contents import CACHE, EVALUATIONS, INDEX, contents, folders_of_people, same_code
+from plushsense.dataset.freshness import missing_files
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import MARKS
-from plushsense.dataset.people import PEOPLE, read_people, write_people
-from plushsense.dataset.store import HEAD, UNKNOWN_SUBJECT, DatasetHead, write_atomically
+from plushsense.dataset.people import read_people, write_people
+from plushsense.dataset.store import UNKNOWN_SUBJECT, DatasetHead, write_atomically
 from plushsense.dataset.wording import Names
 
 FORGOTTEN = "forgotten.jsonl"
@@ -88,6 +90,8 @@ def leaving(dataset: str | Path, subject: str) -> Leaving:
     """
     folder = Path(dataset)
     DatasetHead.read(folder)
+    if not subject.strip():
+        raise DatasetError("No person was named: give the code of one, as  plushsense info  shows it.")
     people = folders_of_people(folder)
     table = read_people(folder)
     if subject in (NOBODY, UNKNOWN_SUBJECT):
@@ -104,10 +108,16 @@ def leaving(dataset: str | Path, subject: str) -> Leaving:
             f"Another person is being taken out of '{folder}' and that was stopped: finish it first, with  "
             f"plushsense forget {folder} {begun['subject']} --yes"
         )
-    if not mine and not marks and subject not in table and begun is None:
+    if not mine and not marks and not _row_of(subject, table) and begun is None:
         known = sorted({*people, *table} - {NOBODY, UNKNOWN_SUBJECT})
         raise DatasetError(
             f"'{folder}' knows no person '{subject}': it knows {', '.join(known) or 'nobody'}.{nearest(subject, known)}"
+        )
+    lost = [f for f in missing_files(folder) if PurePosixPath(f).parts[1] != subject]
+    if begun is None and lost:
+        raise DatasetError(
+            f"'{folder}' lacks {len(lost)} raw file{'s' if len(lost) > 1 else ''} of other people ('{lost[0]}'): bring "
+            "them back first, or nobody would notice any more."
         )
     caches = (CACHE,) if (folder / CACHE).exists() else ()
     gone = {*mine}
@@ -126,7 +136,7 @@ def leaving(dataset: str | Path, subject: str) -> Leaving:
         tuple(mine),
         max(raw, int(begun["files"]) if begun else 0),
         marks,
-        subject in table,
+        bool(_row_of(subject, table)),
         caches,
         evaluations,
         tuple(m for m in mentions if m not in (UNDER_WAY, FORGOTTEN)),
@@ -165,17 +175,24 @@ def forget(dataset: str | Path, subject: str) -> Leaving:
             _remove_empty(folder, plan.files)
             _rewrite_marks(folder, subject)
             people = read_people(folder)
-            if people.pop(subject, None) is not None:
+            if people.pop(_row_of(subject, people), None) is not None:
                 write_people(folder, people.values())
             _bury(folder, intent)
     except OSError as cause:
         raise DatasetError(
-            f"'{cause.filename or folder}' cannot be removed ({cause.strerror or cause}): close what uses it, then give "
-            "the same command again; it finishes what was begun."
+            f"'{cause.filename or folder}' cannot be removed ({cause.strerror or cause}): close what uses it, then "
+            "give the same command again; it finishes what was begun."
         ) from None
-    if any((folder / place).is_dir() and folders_of_people(folder) for place in ("recordings", "streams")):
+    # The person is gone whatever else is wrong with the data set: who opens it next is told.
+    with contextlib.suppress(DatasetError):
         open_dataset(folder)
     return plan
+
+
+def _row_of(subject: str, table: Iterable[str]) -> str:
+    """The code under which the people's table has a person; "" where it has not."""
+    codes = list(table)
+    return subject if subject in codes else same_code(subject, codes)
 
 
 def _mark_lines(folder: Path) -> list[bytes]:
