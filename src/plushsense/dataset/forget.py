@@ -108,7 +108,9 @@ def leaving(dataset: str | Path, subject: str) -> Leaving:
             f"Another person is being taken out of '{folder}' and that was stopped: finish it first, with  "
             f"plushsense forget {folder} {begun['subject']} --yes"
         )
-    if not mine and not marks and not _row_of(subject, table) and begun is None:
+    # A torn line proves nobody, nor does another spelling: what goes for good is named exactly.
+    marked = any(_is_about(line, subject) and _whole(line) for line in _mark_lines(folder))
+    if not mine and not marked and subject not in table and begun is None:
         known = sorted({*people, *table} - {NOBODY, UNKNOWN_SUBJECT})
         raise DatasetError(
             f"'{folder}' knows no person '{subject}': it knows {', '.join(known) or 'nobody'}.{nearest(subject, known)}"
@@ -207,9 +209,18 @@ def _is_about(line: bytes, subject: str) -> bool:
     try:
         table = json.loads(line.decode("utf-8"))
     except ValueError:
-        return bool(Names({subject: ""}).found(line.decode("utf-8", "replace"))) or subject.encode() in line
+        text = line.decode("utf-8", "replace")
+        return f'"{subject}/' in text or bool(Names({subject: ""}).found(text))
     identity = table.get("recording") if isinstance(table, dict) else None
     return isinstance(identity, str) and (identity == subject or identity.startswith(f"{subject}/"))
+
+
+def _whole(line: bytes) -> bool:
+    try:
+        json.loads(line.decode("utf-8"))
+    except ValueError:
+        return False
+    return True
 
 
 def _rewrite_marks(folder: Path, subject: str) -> None:

@@ -31,9 +31,10 @@ def searchable(word: str) -> bool:
 
 def _pattern(word: str) -> str:
     pieces = _PIECES.findall(unicodedata.normalize("NFC", word))
-    # Of a single letter only "S_1" is another spelling: "it's 1 o'clock" is not S1.
-    between = "[_-]?" if any(len(p) == 1 and p.isalpha() for p in pieces) else r"[\s_.'-]*"
-    return between.join(map(re.escape, pieces))
+    if any(len(p) == 1 and p.isalpha() for p in pieces):
+        # A letter alone is easily part of something else: "it's 1 o'clock" is not S1.
+        return "(?<!['’])" + r"[\s_-]?".join(map(re.escape, pieces))
+    return r"[\s_.'-]*".join(map(re.escape, pieces))
 
 
 class Names:
