@@ -60,6 +60,8 @@ def folder(recordings: Path, tmp_path: Path) -> Path:
         + json.dumps(
             {"what": "note", "at_ms": WHEN + 1, "text": "ana_maria cried on 2025-10-09; p02 helped", "who": "jdoe"}
         )
+        + "\n"
+        + json.dumps({"what": "mended", "at_ms": WHEN, "how": "torn last line cut off", "text": str(WHEN)[:9]})
         + '\n{"what": "note", "te'
     )
     sidecar = place / (Path(mine[0].file).stem + ".json")
@@ -76,6 +78,7 @@ def folder(recordings: Path, tmp_path: Path) -> Path:
             Mark("", "accept", "JDoe", "as jdoe said", check="rate", when="2025-10-11T10:15:00+00:00"),
         ],
     )
+    (ds.path / "streams" / "P02" / "origin.json").write_text('{"file": "my daughter.xdf"}')
     (ds.path / "photo of Ana.txt").write_text("x")
     (ds.path / "cache").mkdir()
     (ds.path / "cache" / "a.npz").write_text("Ana Maria")
@@ -158,6 +161,7 @@ def test_no_name_code_address_or_date_is_left(folder: Path, tmp_path: Path) -> N
             assert not re.search(r"(?<!\d)17[56]\d{10}(?!\d)", text), path
     assert not (out / "cache").exists()
     assert not list(out.rglob("photo*"))
+    assert not list(out.rglob("origin.json"))
     said = "\n".join(f["message"] for f in done.findings)
     assert "photo of Ana.txt" in said
     assert "torn" in said
@@ -183,11 +187,12 @@ def test_session_files_people_and_marks_go_along(folder: Path, tmp_path: Path) -
     assert head.protocol["say"] == f"{code}, press now"
     assert head.layout == json.loads(json.dumps(PLUSH.to_dict()))
     assert re.fullmatch(r"2\d{7}-\d{6}", head.session)
-    take, note = read_events(place)
+    take, note, mended = read_events(place)
     assert (place / take.more["file"]).is_file()
     assert (place / Path(take.more["file"]).with_suffix(".json")).is_file()
+    assert mended.more == {"how": "torn last line cut off"}
     assert note.more["who"] == "person-1"
-    assert note.more["text"].startswith(f"{code} cried on 21")
+    assert note.more["text"].startswith(f"{code} cried on 2")
     assert key["P02"][0] in note.more["text"]
     sidecar = json.loads((place / Path(take.more["file"]).with_suffix(".json")).read_text())
     assert sidecar == {

@@ -111,12 +111,8 @@ def _suggest_layout(columns: int, layout: Layout) -> str:
     return f" Layouts with {columns} columns: {', '.join(fitting)}." if fitting else ""
 
 
-def column_keys(first: bytes, layout: Layout, path: Path) -> tuple[list[str], bool]:
-    """Column keys in file order, and whether ``first``, the file's first line, is a header.
-
-    Raises:
-        FileFormatError: when the columns are not those of the layout; ``path`` is named in it.
-    """
+def _column_keys(first: bytes, layout: Layout, path: Path) -> tuple[list[str], bool]:
+    """Column keys in file order, and whether the first line is a header."""
     separator = _separator(first)
     cells = [c.strip() for c in (first.split(separator.encode()) if separator else first.split())]
     while cells and not cells[-1]:
@@ -233,7 +229,7 @@ def _read(path: Path, layout: Layout, *, whole_lines: bool = False) -> ReadResul
         raise FileFormatError(f"'{path.name}' is empty: a recording has one row a sample.")
     end = data.find(b"\n")
     first = data if end < 0 else data[:end]
-    keys, header = column_keys(first, layout, path)
+    keys, header = _column_keys(first, layout, path)
     if header and (end < 0 or not data[end:].strip()):
         raise FileFormatError(f"'{path.name}' holds a header and no row.")
     table, labels, malformed = _table(data, keys, 1 if header else 0, path)

@@ -21,12 +21,13 @@ from filelock import FileLock
 
 from plushsense.core.errors import DatasetError, nearest
 from plushsense.core.gestures import NOBODY
+from plushsense.core.tomlfile import read_toml
 from plushsense.dataset.contents import CACHE, EVALUATIONS, INDEX, contents, folders_of_people, same_code
 from plushsense.dataset.freshness import missing_files
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import MARKS
 from plushsense.dataset.people import read_people, write_people
-from plushsense.dataset.store import UNKNOWN_SUBJECT, DatasetHead, write_atomically
+from plushsense.dataset.store import HEAD, UNKNOWN_SUBJECT, DatasetHead, write_atomically
 from plushsense.dataset.wording import Names
 
 FORGOTTEN = "forgotten.jsonl"
@@ -47,7 +48,8 @@ class Leaving:
     """What belongs to a person in a data set, by paths in its folder.
 
     ``files`` theirs alone; ``marks`` the lines about them; ``listed`` whether the people's table names them;
-    ``caches`` and ``evaluations`` were made with them; ``mentions`` stay, and name them in their text.
+    ``caches`` and ``evaluations`` were made with them; ``mentions`` stay, and name them in their text; ``published``
+    is the DOI under which the data set says that it can be had.
     """
 
     subject: str
@@ -58,6 +60,7 @@ class Leaving:
     caches: tuple[str, ...]
     evaluations: tuple[str, ...]
     mentions: tuple[str, ...]
+    published: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, ready for JSON."""
@@ -142,6 +145,7 @@ def leaving(dataset: str | Path, subject: str) -> Leaving:
         caches,
         evaluations,
         tuple(m for m in mentions if m not in (UNDER_WAY, FORGOTTEN)),
+        _published(folder),
     )
 
 
@@ -189,6 +193,11 @@ def forget(dataset: str | Path, subject: str) -> Leaving:
     with contextlib.suppress(DatasetError):
         open_dataset(folder)
     return plan
+
+
+def _published(folder: Path) -> str:
+    about = read_toml(folder / HEAD, "data set", DatasetError).get("about")
+    return str(about.get("doi", "")) if isinstance(about, dict) else ""
 
 
 def _row_of(subject: str, table: Iterable[str]) -> str:

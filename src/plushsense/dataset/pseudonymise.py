@@ -27,6 +27,7 @@ from plushsense.dataset.keyfile import KEPT, Pseudonym, extended, read_key, writ
 from plushsense.dataset.marks import MARKS
 from plushsense.dataset.people import PEOPLE, read_people, write_people
 from plushsense.dataset.rewording import (
+    ORIGIN,
     Findings,
     Rewording,
     logins_in,
@@ -230,7 +231,9 @@ class _Work:
         left: list[str] = []
         for content in self.files:
             path = self.folder / content.path
-            if content.kind == "words" and content.person:
+            if content.path.name == ORIGIN:
+                self.found.add("", f"'{ORIGIN}' of a converted file was left out: it names the file that it came from")
+            elif content.kind == "words" and content.person:
                 new = self._place(content)
                 text = reworded_json(path, new.as_posix(), self._words(content.person))
                 if text is not None:

@@ -23,6 +23,9 @@ from plushsense.dataset.timeshift import FIRST_MS, shifted_number, shifted_text
 from plushsense.dataset.wording import Names, without_addresses
 
 ON_FILE = "on file"
+ORIGIN = "origin.json"
+"""What the importer writes of a file that it converted: the name that somebody gave it, and its hash."""
+_MENDED = "mended"
 LOGINS = frozenset({"who", "by", "user", "author", "leader", "operator", "recorded_by"})
 _SUBJECT, _CONSENT = "subject", "consent"
 _PLACES = frozenset({"device", "port", "address", "url", "mac", "hostname", "computer", "serial_number"})
@@ -82,7 +85,10 @@ class Rewording:
     def value(self, value: Any, key: str = "", where: tuple[str, int] = ("", 0)) -> Any:
         """A value of JSON or TOML, with everything in it."""
         if isinstance(value, dict):
-            return {self.text(str(k)): self.value(v, str(k), where) for k, v in value.items()}
+            # What was cut off a torn line can be a piece of a date.
+            torn = value.get("what") == _MENDED
+            kept = {k: v for k, v in value.items() if not (torn and k == "text")}
+            return {self.text(str(k)): self.value(v, str(k), where) for k, v in kept.items()}
         if isinstance(value, list):
             return [self.value(v, key, where) for v in value]
         if isinstance(value, str):
@@ -205,12 +211,14 @@ def reworded_head(folder: Path, words: Rewording) -> str:
     """``dataset.toml`` under pseudonyms; layout and gesture set stay as they are."""
     table = read_toml(folder / HEAD, "data set", DatasetError)
     kept = ("layout", "gesture_set", "format")
-    out = {
-        key: value
-        if key in kept
-        else words.text(value, (HEAD, 0))
-        if isinstance(value, str)
-        else words.value(value, where=(HEAD, 0))
-        for key, value in table.items()
-    }
+    out = {key: value if key in kept else _texts(value, words) for key, value in table.items()}
     return tomli_w.dumps(out)
+
+
+def _texts(value: Any, words: Rewording) -> Any:
+    """A value of the head: who made a data set is meant to be named, so only people's codes and dates change."""
+    if isinstance(value, dict):
+        return {key: _texts(v, words) for key, v in value.items()}
+    if isinstance(value, list):
+        return [_texts(v, words) for v in value]
+    return words.text(value, (HEAD, 0)) if isinstance(value, str) else value

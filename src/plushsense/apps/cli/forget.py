@@ -60,6 +60,8 @@ def _lines(found: Forgotten) -> list[str]:
         out.append(f"  … and {len(plan.files) - SHOWN} more files")
     out += [f"still names them, look at it: {path}" for path in plan.mentions]
     out += [f"bundle: {b.bundle}: {b.message}" for b in found.bundles]
+    if plan.published:
+        out.append(f"published as https://doi.org/{plan.published}: make a new version without them")
     out.append(
         "Out of reach: backups, published copies, copies under pseudonyms and their key, evaluations and models kept "
         "elsewhere. What to do about them is in docs/privacy.md."
