@@ -79,7 +79,12 @@ def test_a_bundle_of_another_data_set_is_only_a_question(dataset: Dataset, bundl
     (dataset.path / "index.json").unlink()
     found = ps.forget(dataset.path, "P1", bundles=[bundle])
     assert [b.certain for b in found.bundles] == [False]
+    assert "look whether" in found.bundles[0].message
     assert not found.done
+    head.write_text(text)
+    again = ps.forget(dataset.path, "P1", bundles=[bundle]).bundles
+    assert not again[0].certain, "another content"
+    assert "earlier state" in again[0].message or ps.load(bundle).provenance["dataset"] != dataset.head.name
 
 
 def test_forget_takes_the_evaluations_that_hold_the_person(cli: Cli, dataset: Dataset) -> None:

@@ -3,6 +3,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from plushsense.core.recfile import read_recording, read_stream
 from plushsense.core.signal import DEVICE_MS, HOST_MS, load_layout
@@ -109,3 +111,32 @@ def test_nothing_to_move_leaves_the_bytes_alone(tmp_path: Path) -> None:
     data = b"1, 2, 3, 4, 5\n"
     assert shifted_rows(data, ACCEL, (), SHIFT, tmp_path / "x.csv") is data
     assert shifted_rows(b"", ACCEL, (HOST_MS,), SHIFT, tmp_path / "x.csv") == b""
+
+
+_CELLS = [str(NOW), str(NOW + 10), f"{NOW}.25", "1.76e+12", "nan", "-", "", "0", "5000", "1e999999999", "x"]
+_PIECES = st.one_of(st.sampled_from(_CELLS), st.text("0123456789eE.-+", max_size=20))
+
+
+@st.composite
+def malformed(draw: st.DrawFn) -> str:
+    """A line of the wrong number of cells: in one of the right number, other columns hold values, which stay."""
+    line = draw(st.sampled_from([", ", ",", ";", "\t"])).join(draw(st.lists(_PIECES, max_size=8)))
+    return line if len(re.findall(r"[^;,\s]+", line)) != 5 else line + ",1"
+
+
+@settings(max_examples=200, deadline=None)
+@given(lines=st.lists(malformed(), max_size=6), end=st.sampled_from(["\n", "\r\n"]))
+def test_whatever_a_line_holds_no_date_is_left_and_no_line_lost(lines: list[str], end: str) -> None:
+    first = f"{NOW}, 5000, 1, 2, 3"
+    data = end.join([first, *lines, ""]).encode()
+    out = shifted_rows(data, ACCEL, (HOST_MS,), SHIFT, Path("x_1_1.csv"))
+    assert str(NOW).encode() not in out
+    assert str(NOW + 10).encode() not in out
+    assert out.count(b"\n") == data.count(b"\n")
+    kept = [line for line in lines if not re.search(r"\d{5}|[eE]", line)]
+    assert set(kept) <= set(out.decode().split(end)), "a line without a date or a piece of one is left alone"
+
+
+def test_a_line_without_end_takes_no_time() -> None:
+    for line in (b"9" * 10**6, b"1," * 10**6, b"1;" * 10**6 + b"x"):
+        assert shifted_rows(f"{NOW}, 5000, 1, 2, 3\n".encode() + line, ACCEL, (HOST_MS,), SHIFT, Path("x_1_1.csv"))

@@ -20,7 +20,7 @@ SUFFIX = ".plush"
 
 @dataclass(frozen=True)
 class TrainedOn:
-    """A bundle and the person: ``certain`` when its data set is this one by name or content, else only the code is."""
+    """A bundle that names the person's code; ``certain`` where its data set had the content that this one has."""
 
     bundle: str
     certain: bool
@@ -92,10 +92,13 @@ def trained_on(folder: Path, subject: str, places: Iterable[Path]) -> list[Train
         if subject not in people:
             continue
         theirs = provenance.get("dataset_hash"), provenance.get("dataset")
-        certain = theirs[0] == content or theirs[1] == name
-        said = "trained on this person: train it again without them, and remove it"
-        other = f"trained on somebody with this code, of the data set '{theirs[1]}': look whether it is the same person"
-        out.append(TrainedOn(str(path), certain, said if certain else other))
+        if certain := theirs[0] == content:
+            said = "trained on this person: train it again without them, and remove it"
+        elif theirs[1] == name:
+            said = "trained on this code in an earlier state of this data set: train it again, and remove it"
+        else:
+            said = f"trained on this code in the data set '{theirs[1]}': look whether it is the same person"
+        out.append(TrainedOn(str(path), certain, said))
     return out
 
 

@@ -25,6 +25,7 @@ LAST_MS = 4_102_444_800_000
 _BEYOND_MS = 10**14
 # Of a number in a time column that is no date, so many digits can be a piece of one.
 _PIECE = 5
+_LONGEST = 40
 
 _WORD_BEFORE, _WORD_AFTER = r"(?<![^\W_])", r"(?![^\W_])"
 _DIGITS = re.compile(rf"{_WORD_BEFORE}\d{{12,19}}{_WORD_AFTER}")
@@ -121,7 +122,7 @@ _BETWEEN = rb"[;,\t ]+"
 def _cell(token: bytes, shift_ms: int) -> bytes:
     """A cell of a dated column: moved, or made zeros where it is a piece of a date."""
     try:
-        value = Decimal(token.decode("ascii"))
+        value = Decimal(token.decode("ascii") if len(token) <= _LONGEST else "NaN")
         if FIRST_MS <= value < _BEYOND_MS:
             return format(value + shift_ms, "f").encode()
     except (InvalidOperation, UnicodeDecodeError):
