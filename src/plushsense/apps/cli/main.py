@@ -21,6 +21,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "demo": ("demo", "the whole path on a virtual toy, in a few minutes"),
     "simulate": ("simulate", "recordings of virtual people, as the authors' recorder would leave them"),
     "import": ("importing", "make a data set from recordings"),
+    "check": ("check", "what may be wrong in a data set, what to do about it, and decisions as marks"),
     "info": ("info", "what a data set or a model bundle holds"),
     "arch": ("arch", "count a network: parameters, receptive field, multiply-accumulates, state"),
     "train": ("train", "train one network and save it as a bundle"),

@@ -215,7 +215,7 @@ def _finding(said: Said, name: str, info: RecordingInfo | StreamInfo | None) -> 
         check=name,
         severity=said.severity or check.severity,
         message=said.message,
-        action=check.action,
+        action=(isinstance(info, StreamInfo) and check.stream_action) or check.action,
         rows=said.rows,
         channels=said.channels,
     )

@@ -66,7 +66,7 @@ def _people(w: Whole) -> dict[str, Counter[str]]:
     return counts
 
 
-def missing_repetitions(w: Whole) -> Iterator[Said]:
+def missing(w: Whole) -> Iterator[Said]:
     """Fewer recordings of a gesture than the others made, where most made the same number."""
     people = _people(w)
     cells = Counter(n for counts in people.values() for n in counts.values())
