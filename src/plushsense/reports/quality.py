@@ -224,7 +224,7 @@ class _Places:
         if not len(frames):
             return
         title = f"{f.about}: {f.message}"
-        title = title if len(title) <= 125 else title[:122] + " …"
+        title = title if len(title) <= 205 else title[:202] + " …"
         first = self._recordings[f.recording].start if f.recording else 0
         if f.check == "drift":
             info = next(s for s in self._dataset.streams if s.id == f.stream)

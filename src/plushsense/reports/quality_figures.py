@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -77,7 +78,7 @@ def overlay(gesture: str, lines: Sequence[Line], mean_s: float, tolerance: float
         top.plot(one.seconds, one.size, style, color=COLOURS[i % len(COLOURS)], linewidth=1.4, label=one.name)
     heights = [s for one in lines for s in (np.percentile(one.size, 99.5),) if one.size.size]
     top.set_ylim(0, 1.25 * float(np.percentile(heights, 98)) if heights else 1.0)
-    top.set_ylabel("deviation from its median\n(1 = usual for a touch)", fontsize=9)
+    top.set_ylabel("deviation from its median\n(1 = usual)", fontsize=9)
     top.set_title(f"{gesture}: {len(lines)} recordings", fontsize=10, parse_math=False)
     if named:
         shown = top.legend(fontsize=7.5, frameon=True, framealpha=0.85, loc="upper right")
@@ -90,7 +91,14 @@ def overlay(gesture: str, lines: Sequence[Line], mean_s: float, tolerance: float
     strip.plot(rest, (np.arange(len(rest)) * 0.618) % 1.0, "o", color=GREY, markersize=2.6, alpha=0.7)
     for i, one in enumerate(named):
         at = min(one.lasts, end)
-        strip.plot(at, 0.5, ">" if one.lasts > end else "D", color=COLOURS[i % len(COLOURS)], markersize=5, zorder=3)
+        strip.plot(
+            at,
+            0.2 + 0.6 * ((i * 0.618) % 1.0),
+            ">" if one.lasts > end else "D",
+            color=COLOURS[i % len(COLOURS)],
+            markersize=5,
+            zorder=3,
+        )
     strip.set_yticks([])
     strip.set_ylim(-0.15, 1.15)
     strip.set_xlim(0, end * 1.01)
@@ -118,7 +126,7 @@ def signals(
     title: str = "",
 ) -> Figure:
     """The channels of a recording by row, with places marked; only ``channels`` where they are named."""
-    figure = _figure(7.4, 2.1)
+    figure = _figure(7.4, 2.2)
     axes = figure.add_subplot()
     shown = list(channels) or list(range(layout.n_channels))
     kinds = {layout.channels[c].unit for c in shown} | {layout.channels[c].kind for c in shown}
@@ -149,7 +157,7 @@ def signals(
 
 def clock(frames: Frames, rows: Sequence[tuple[int, int]] = (), *, first_row: int = 0, title: str = "") -> Figure:
     """The time from each row to the next by the device clock, with places marked."""
-    figure = _figure(7.4, 2.1)
+    figure = _figure(7.4, 2.2)
     axes = figure.add_subplot()
     steps = np.diff(frames.device_ms)
     # The far ones must not be thinned away.
@@ -159,13 +167,17 @@ def clock(frames: Frames, rows: Sequence[tuple[int, int]] = (), *, first_row: in
     _mark(axes, rows)
     if len(steps) and (steps.max() > 2000 or steps.min() < -2000):
         axes.set_yscale("symlog", linthresh=100)
+        far_power = int(np.log10(np.abs(steps).max()))
+        powers = range(2, far_power + 1, 1 + far_power // 5)
+        axes.set_yticks([-(10.0**p) for p in powers if steps.min() < -100] + [0.0] + [10.0**p for p in powers])
+        axes.minorticks_off()
     axes.set_ylabel("ms since row before", fontsize=8)
     return _finished(figure, axes, title)
 
 
 def baselines(lows: NDArray[np.float64], layout: Layout, channels: Sequence[int], *, title: str = "") -> Figure:
     """The low level of channels over a session, one value for every 10 s."""
-    figure = _figure(7.4, 2.1)
+    figure = _figure(7.4, 2.2)
     axes = figure.add_subplot()
     minutes = np.arange(len(lows)) / 6
     for i, c in enumerate(channels[: len(COLOURS)]):
@@ -189,7 +201,7 @@ def _finished(figure: Figure, axes: Any, title: str) -> Figure:
     axes.spines[["top", "right"]].set_visible(False)
     axes.margins(x=0.01)
     if title:
-        axes.set_title(title, fontsize=8.5, parse_math=False)
+        axes.set_title(textwrap.fill(title, 105), fontsize=8, loc="left", parse_math=False)
     return figure
 
 

@@ -16,12 +16,16 @@ _ENOUGH = 4
 _FLAT_ROWS = 20
 _QUIET = 0.15
 _BURST = 0.4
+_AS_MUCH = 0.2
 _SEVERAL_USUAL = 0.2
 _SESSION_S = 60.0
 _PLAIN = 0.25
+_GENTLE = 0.5
 _TOLD_S = 0.3
-_RAIL = 0.95
+_RAIL = 0.99
 _OFF_RAIL = 3.0
+_ALIKE = 3
+_OFTEN = 0.04
 
 
 def usual_seconds(group: list[Outline]) -> float:
@@ -142,22 +146,26 @@ def saturated(w: Whole) -> Iterator[Said]:
     if not w.recordings:
         return
     names = w.dataset.layout.names
-    limit = np.maximum(w.limits.saturated_s * 1000, 4 * w.usual_top_ms)
     usual = np.median([o.spread for o in w.recordings], axis=0)
-    # The sensor's end is the same in all recordings; at another height a flat top must be plainer.
-    rail = np.max([np.abs(o.top) for o in w.recordings], axis=0)
+    # The sensor's end is where several recordings stop alike; at any other height a flat top must be plainer.
+    tops = np.abs([o.top for o in w.recordings])
+    rail = tops.max(axis=0)
+    shared = (tops >= _RAIL * rail).sum(axis=0) >= _ALIKE
+    most = np.maximum(w.limits.saturated_s * 1000, 4 * w.usual_top_ms)
     for o in w.recordings:
+        at_rail = shared & (np.abs(o.top) >= _RAIL * rail)
         held = o.top_runs * o.period_ms
-        held = np.where(np.abs(o.top) >= _RAIL * rail, held, held / _OFF_RAIL)
+        long = np.where(at_rail, held >= most / 2, held >= _OFF_RAIL * most) & (o.top_runs >= 3)
+        often = at_rail & (o.top_rows >= 10) & (o.top_rows >= _OFTEN * o.rows)
         moving = (o.spread > 0.5 * usual) & (o.spread > 0) & (o.runs < o.rows)
-        found = np.flatnonzero((held > limit) & (o.top_runs >= 5) & moving)
+        found = np.flatnonzero((long | often) & moving)
         if not len(found):
             continue
         c = int(found[np.argmax(held[found])])
         first = int(o.top_at[c]) + o.first_row
         yield Said(
-            f"{_channels(names, found)} {'stays' if len(found) == 1 else 'stay'} at the highest or lowest value for "
-            f"up to {o.top_runs[c] * o.period_ms:.0f} ms (at {o.top[c]:g}, from row {first + 1})",
+            f"{_channels(names, found)} {'stays' if len(found) == 1 else 'stay'} at the highest or lowest value, "
+            f"{names[c]} for {held[c]:.0f} ms at {o.top[c]:g} (from row {first + 1}), {o.top_rows[c]} rows in all",
             ((first, first + int(o.top_runs[c])),),
             tuple(found.tolist()),
             o.info.id,
@@ -230,13 +238,21 @@ def no_onset(w: Whole) -> Iterator[Said]:
 
 
 def bursts(activity: np.ndarray, quiet_blocks: int) -> list[tuple[int, int]]:
-    """Stretches of blocks in which something happens, parted by stillness of at least ``quiet_blocks``."""
+    """Stretches of blocks in which something happens, parted by stillness of at least ``quiet_blocks``.
+
+    What is much less than the largest of them is no gesture: the toy is put down, a key is pressed.
+    """
     top = float(np.percentile(activity, 95)) if len(activity) else 0.0
     on = np.flatnonzero(activity > _QUIET * top)
     if top <= 0 or not len(on):
         return []
     parts = np.split(on, np.flatnonzero(np.diff(on) > quiet_blocks) + 1)
-    return [(int(p[0]), int(p[-1]) + 1) for p in parts if activity[p].max() > _BURST * top]
+    most = max(float(activity[p].sum()) for p in parts)
+    return [
+        (int(p[0]), int(p[-1]) + 1)
+        for p in parts
+        if activity[p].max() > _BURST * top and float(activity[p].sum()) > _AS_MUCH * most
+    ]
 
 
 def several_gestures(w: Whole) -> Iterator[Said]:

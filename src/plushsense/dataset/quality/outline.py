@@ -29,7 +29,7 @@ class Outline:
     ``activity`` (B, C) float32: how much each channel does in each 0.1 s, its range over 0.2 s; for channels of
     `LEVEL_KINDS` at least its height over the recording's low. ``hop`` rows a block. ``runs`` (C,) the longest stretch
     of one value in rows, from ``run_at``; ``top_runs`` the same at the highest or lowest
-    value, which is ``top``. ``spread`` (C,) from
+    value, which is ``top`` and is reached in ``top_rows``. ``spread`` (C,) from
     the 2nd to the 98th percentile; ``low`` the 10th. ``lows`` (K, C): the 10th percentile of every 10 s of a stream.
     """
 
@@ -44,6 +44,7 @@ class Outline:
     top_runs: NDArray[np.int64]
     top_at: NDArray[np.int64]
     top: NDArray[np.int64]
+    top_rows: NDArray[np.int64]
     spread: NDArray[np.float64]
     low: NDArray[np.float64]
     content: bytes
@@ -99,6 +100,7 @@ def outline(info: RecordingInfo | StreamInfo, frames: Frames, layout: Layout) ->
     # Where nothing touches, a level rests at its lowest: that is no stop.
     held_low[level] = 0
     top_at = np.where(held_low > held_top, low_at, top_at)
+    top = values[top_at, np.arange(c)]
     low, q2, q98 = (
         np.percentile(values, (10, 2, 98), axis=0) if not stream else np.percentile(values[::10], (10, 2, 98), axis=0)
     )
@@ -118,7 +120,8 @@ def outline(info: RecordingInfo | StreamInfo, frames: Frames, layout: Layout) ->
         at - 1,
         np.maximum(held_top, held_low),
         top_at,
-        values[top_at, np.arange(c)],
+        top,
+        (values == top).sum(axis=0),
         q98 - q2,
         low,
         b"" if stream else _content(frames),
