@@ -39,7 +39,7 @@ _ODD = ("never-stopped", "duration", "no-onset", "several-gestures", "stuck", "f
 _CLOCK = ("clock-reset", "gaps", "lost-frames", "jitter", "resumed", "rate")
 _SIGNAL = (
     *("never-stopped", "duration", "no-onset", "several-gestures", "overlap", "clock-reset", "gaps"),
-    *("garbage", "blank-rows", "flat", "stuck", "saturated"),
+    *("garbage", "blank-rows", "spikes", "flat", "stuck", "saturated"),
 )
 _SEVERITY = {"error": "to decide", "warning": "to look at", "info": "good to know"}
 

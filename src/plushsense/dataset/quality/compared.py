@@ -16,6 +16,7 @@ _ENOUGH = 4
 _FLAT_ROWS = 20
 _QUIET = 0.15
 _BURST = 0.4
+_SOMETHING = 0.05
 _AS_MUCH = 0.2
 _SEVERAL_USUAL = 0.2
 _SESSION_S = 60.0
@@ -244,7 +245,7 @@ def bursts(activity: np.ndarray, quiet_blocks: int) -> list[tuple[int, int]]:
     """
     top = float(np.percentile(activity, 95)) if len(activity) else 0.0
     on = np.flatnonzero(activity > _QUIET * top)
-    if top <= 0 or not len(on):
+    if top < _SOMETHING or not len(on):
         return []
     parts = np.split(on, np.flatnonzero(np.diff(on) > quiet_blocks) + 1)
     most = max(float(activity[p].sum()) for p in parts)

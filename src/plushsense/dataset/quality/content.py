@@ -12,6 +12,8 @@ from plushsense.dataset.quality.finding import Limits, Said, Severity
 
 _SHOWN = 50
 _FEW = 0.01
+_TELLING_ROWS = 20
+_OF_SPREAD = 0.02
 
 
 def _weight(share: float, limits: Limits) -> Severity | None:
@@ -58,6 +60,29 @@ def blank_rows(s: Examined) -> Iterator[Said]:
             f"(first row {s.row(int(np.argmax(rows)))})",
             tuple((int(r) + s.first_row, int(r) + s.first_row + 1) for r in np.flatnonzero(rows)[:_SHOWN]),
             severity=_weight(float(rows.mean()), s.limits),
+        )
+
+
+def spikes(s: Examined) -> Iterator[Said]:
+    """Single rows in which a channel jumps far away and back: a reading that failed, not a touch."""
+    values = s.frames.values
+    if len(values) < _TELLING_ROWS:
+        return
+    steps = np.diff(values, axis=0)
+    there, back = steps[:-1], steps[1:]
+    size = np.where(np.sign(there) == -np.sign(back), np.minimum(np.abs(there), np.abs(back)), 0)
+    usual = np.percentile(np.abs(steps), 95, axis=0)
+    usual = np.maximum(usual, _OF_SPREAD * np.subtract(*np.percentile(values, (98, 2), axis=0)))
+    far = (size > s.limits.spike * np.maximum(usual, 1)) & (size > 3 * np.abs(values[2:] - values[:-2]))
+    # What is outside the valid range has a check of its own.
+    far &= (values[1:-1] >= s.layout.valid_min_int) & (values[1:-1] <= s.layout.valid_max_int)
+    rows = np.flatnonzero(far.any(axis=1)) + 1
+    if len(rows):
+        yield Said(
+            f"{len(rows)} row{'s' if len(rows) > 1 else ''} in which a value jumps far away and back "
+            f"(first row {s.row(rows[0])}): a reading that failed?",
+            tuple((int(r) + s.first_row, int(r) + s.first_row + 1) for r in rows[:_SHOWN]),
+            severity=_weight(len(rows) / len(values), s.limits),
         )
 
 

@@ -56,8 +56,8 @@ class Examined:
 
     @cached_property
     def spread_ms(self) -> tuple[float, float]:
-        """The 5th and 95th percentile of the time between frames, gaps and resets apart."""
-        even = self.steps[(self.steps >= 0) & (self.steps <= self.gap_ms)]
+        """The 5th and 95th percentile of the time between frames; lost frames, gaps and resets apart."""
+        even = self.steps[(self.steps >= 0) & (self.steps < 1.75 * self.period_ms)]
         low, high = np.percentile(even, (5, 95)) if len(even) else (0.0, 0.0)
         return float(low), float(high)
 

@@ -33,6 +33,8 @@ class Limits:
     """Share of frames that the device clock misses."""
     garbage: float = 0.2
     """Share of rows with an invalid value that asks for a decision."""
+    spike: float = 6.0
+    """A jump of one row away and back, as a multiple of the channel's 95 % step in the recording."""
     stuck_s: float = 0.5
     """A channel that holds one value; at least 10 times what is usual for the channel."""
     saturated_s: float = 0.1

@@ -20,6 +20,7 @@ LEVEL_KINDS = ("capacitive", "proximity")
 """Kinds of channel with a baseline: their level says that something touches. Others turn with the toy."""
 _HOP_S = 0.1
 _CHUNK_S = 10.0
+_NOISE = 2.0
 
 
 @dataclass(frozen=True)
@@ -156,18 +157,24 @@ class Whole:
         return found
 
     @cached_property
+    def noise(self) -> NDArray[np.float64]:
+        """What each channel does when nothing happens, (C,): the quiet moments of the quietest recordings."""
+        quiet = [np.percentile(o.activity, 10, axis=0) for o in self.recordings if len(o.activity)]
+        floor: NDArray[np.float64] = np.percentile(quiet or np.zeros((1, self.dataset.layout.n_channels)), 5, axis=0)
+        return floor
+
+    @cached_property
     def scale(self) -> NDArray[np.float64]:
         """What each channel does when something happens to it, (C,): so channels of all kinds can be compared."""
-        peaks = np.array([np.percentile(o.activity, 95, axis=0) for o in self.recordings if len(o.activity)])
-        if not len(peaks):
-            return np.ones(self.dataset.layout.n_channels)
-        high: NDArray[np.float64] = np.percentile(peaks, 90, axis=0)
-        high[high <= 0] = 1.0
-        return high
+        peaks = [np.percentile(o.activity, 95, axis=0) for o in self.recordings if len(o.activity)]
+        table = np.asarray(peaks or np.zeros((1, self.dataset.layout.n_channels)), dtype=np.float64)
+        high: NDArray[np.float64] = np.percentile(table, 90, axis=0)
+        return np.maximum(high - _NOISE * self.noise, np.maximum(self.noise, 1.0))
 
     def activity(self, o: Outline) -> NDArray[np.float64]:
-        """How much happens in each block of a recording over all channels, (B,)."""
-        total: NDArray[np.float64] = np.sqrt(np.square(o.activity / self.scale).sum(axis=1))
+        """How much happens in each block of a recording over all channels, beyond their noise, (B,)."""
+        beyond = np.maximum(o.activity - _NOISE * self.noise, 0.0) / self.scale
+        total: NDArray[np.float64] = np.sqrt(np.square(beyond).sum(axis=1))
         return total
 
     @cached_property

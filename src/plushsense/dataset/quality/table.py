@@ -60,6 +60,7 @@ CHECKS: dict[str, Check] = {
     "rows": Check((_R,), "warning", "compare with the original file, or accept", content.rows_against_name, door=True),
     "garbage": Check((_R, _S), "warning", _SENSOR, content.garbage, door=True),
     "blank-rows": Check((_R, _S), "warning", _SENSOR, content.blank_rows),
+    "spikes": Check((_R,), "warning", _SENSOR, content.spikes),
     "flat": Check((_R, _S, _D), "error", "check the sensor's cable; exclude what it spoiled", whole=compared.flat),
     "stuck": Check((_R, _S), "warning", _SENSOR, whole=compared.stuck),
     "saturated": Check((_R,), "warning", "widen the sensor's range, or accept strong touch", whole=compared.saturated),
