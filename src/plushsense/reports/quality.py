@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -82,10 +82,10 @@ def gesture_figure(result: Checked, gesture: str, scale: NDArray[np.float64] | N
 class _Pictures:
     """Pictures as data URIs until they weigh too much; ``left_out`` counts the rest."""
 
-    limit: int = PICTURE_BYTES
+    limit: int
     weight: int = 0
     left_out: int = 0
-    made: int = field(default=0)
+    made: int = 0
 
     def add(self, figure: Figure) -> str | None:
         data = figures.png(figure)
@@ -111,7 +111,7 @@ def write_report(path: Path, result: Checked, progress: Progress | None = None) 
 def render(result: Checked, progress: Progress | None = None) -> str:
     """The page as one HTML text; every file is read again only where it is drawn."""
     dataset = result.dataset
-    pictures = _Pictures()
+    pictures = _Pictures(PICTURE_BYTES)
     gestures = [g.label for g in dataset.gestures.gestures if any(r.gesture == g.label for r in dataset.used)]
     by_check = {name: result.of(name) for name in CHECKS}
     by_check = {name: found for name, found in by_check.items() if found}
@@ -190,14 +190,14 @@ def _section(name: str, found: list[Finding], places: _Places, pictures: _Pictur
 
 
 def _spread(found: list[Finding]) -> Iterator[Finding]:
-    """The findings in turn over the people, the most urgent first: the plots then show all kinds."""
+    """The findings in turn over the people, so that the plots show all kinds; most urgent first, then recordings."""
     turns: dict[tuple[int, str], int] = {}
     order = []
     for i, f in enumerate(found):
         severity = SEVERITIES.index(f.severity)
         turn = turns[severity, f.subject] = turns.get((severity, f.subject), -1) + 1
-        order.append((severity, turn, i, f))
-    yield from (entry[3] for entry in sorted(order, key=lambda entry: entry[:3]))
+        order.append((severity, not f.recording, turn, i, f))
+    yield from (entry[4] for entry in sorted(order, key=lambda entry: entry[:4]))
 
 
 class _Places:

@@ -222,9 +222,16 @@ def no_onset(w: Whole) -> Iterator[Said]:
         peaks = np.array([np.percentile(w.activity(o), 95) for o in group])
         usual = float(np.median(peaks))
         # A gesture that many make without moving has no onset to miss.
-        if np.percentile(peaks, 20) < _PLAIN * usual:
+        if usual < 2 * _SOMETHING or np.percentile(peaks, 20) < _PLAIN * usual:
             continue
+        own: dict[str, list[float]] = {}
         for o, peak in zip(group, peaks, strict=True):
+            own.setdefault(o.info.subject, []).append(float(peak))
+        for o, peak in zip(group, peaks, strict=True):
+            # Somebody who always does it gently has a way, not a fault; at rest, nobody is that strong.
+            mine = own[o.info.subject]
+            if len(mine) >= 3 and peak > max(0.5 * float(np.median(mine)), _GENTLE * w.limits.onset * usual):
+                continue
             if (
                 peak < w.limits.onset * usual
                 and not _is_cut_by_the_file(o, w)

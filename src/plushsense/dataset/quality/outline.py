@@ -21,6 +21,8 @@ LEVEL_KINDS = ("capacitive", "proximity")
 _HOP_S = 0.1
 _CHUNK_S = 10.0
 _NOISE = 2.0
+# A channel that never does more than this many times its noise says little.
+_MOVED = 10.0
 
 
 @dataclass(frozen=True)
@@ -169,7 +171,7 @@ class Whole:
         peaks = [np.percentile(o.activity, 95, axis=0) for o in self.recordings if len(o.activity)]
         table = np.asarray(peaks or np.zeros((1, self.dataset.layout.n_channels)), dtype=np.float64)
         high: NDArray[np.float64] = np.percentile(table, 90, axis=0)
-        return np.maximum(high - _NOISE * self.noise, np.maximum(self.noise, 1.0))
+        return np.maximum(high - _NOISE * self.noise, np.maximum(_MOVED * self.noise, 1.0))
 
     def activity(self, o: Outline) -> NDArray[np.float64]:
         """How much happens in each block of a recording over all channels, beyond their noise, (B,)."""
