@@ -24,7 +24,6 @@ _PLAIN = 0.25
 _GENTLE = 0.5
 _TOLD_S = 0.3
 _RAIL = 0.99
-_OFF_RAIL = 3.0
 _ALIKE = 3
 _OFTEN = 0.04
 
@@ -156,7 +155,7 @@ def saturated(w: Whole) -> Iterator[Said]:
     for o in w.recordings:
         at_rail = shared & (np.abs(o.top) >= _RAIL * rail)
         held = o.top_runs * o.period_ms
-        long = np.where(at_rail, held >= most / 2, held >= _OFF_RAIL * most) & (o.top_runs >= 3)
+        long = np.where(at_rail, held >= most / 2, held >= most) & (o.top_runs >= 3)
         often = at_rail & (o.top_rows >= 10) & (o.top_rows >= _OFTEN * o.rows)
         moving = (o.spread > 0.5 * usual) & (o.spread > 0) & (o.runs < o.rows)
         found = np.flatnonzero((long | often) & moving)

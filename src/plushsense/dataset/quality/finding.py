@@ -39,7 +39,7 @@ class Limits:
     """A channel that holds one value; at least 10 times what is usual for the channel."""
     saturated_s: float = 0.1
     """A channel that stays at its highest or lowest value; at least 4 times what is usual for the channel. Half of it
-    where several recordings end at that value, thrice where none does."""
+    where several recordings end at that value."""
     drift: float = 0.5
     """Change of a capacitive channel's baseline within a session, as a share of its signal when touched."""
     onset: float = 0.1
