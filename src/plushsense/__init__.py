@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from plushsense.apps.api import evaluate, load, simulate, train
+    from plushsense.apps.checking import check_dataset
     from plushsense.apps.estimator import PlushClassifier
     from plushsense.apps.reporting import write_report
     from plushsense.core.gestures import GestureSet, load_gestures
@@ -43,6 +44,7 @@ _WHERE = {
     "load": "plushsense.apps.api",
     "simulate": "plushsense.apps.api",
     "write_report": "plushsense.apps.reporting",
+    "check_dataset": "plushsense.apps.checking",
     "PlushClassifier": "plushsense.apps.estimator",
     "open_device": "plushsense.devices.opening",
     "StreamClassifier": "plushsense.live.stream",
@@ -60,6 +62,7 @@ __all__ = [
     "PlushClassifier",
     "StreamClassifier",
     "WindowSpec",
+    "check_dataset",
     "cut_windows",
     "evaluate",
     "import_recordings",

@@ -172,15 +172,15 @@ def test_the_page_replaces_its_own_kind_only(cli: Cli, folder: Path, tmp_path: P
 
 
 def test_from_python(folder: Path) -> None:
-    from plushsense.apps.checking import check_dataset, decide
+    from plushsense.apps.checking import decide
 
-    result = check_dataset(folder)
+    result = ps.check_dataset(folder)
     assert "CheckResult" in repr(result)
     assert "2 errors" in repr(result)
     assert "clock-reset" in result._repr_html_()
     figure = result.figure("slow")
     assert len(figure.axes) == 2
     with pytest.raises(ConfigError, match="no limit 'durations'"):
-        check_dataset(ps.open_dataset(folder), limits={"durations": 1})
+        ps.check_dataset(ps.open_dataset(folder), limits={"durations": 1})
     after, marked = decide(folder, exclude=["P2/Slow_*"], why="fell", who="Kim")
     assert (marked, after.excluded, after.ok) == (2, 2, True)

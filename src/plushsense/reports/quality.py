@@ -123,13 +123,13 @@ def render(result: Checked, progress: Progress | None = None) -> str:
         if progress is not None:
             progress(done, total)
 
-    places = _Places(dataset)
+    scale = scale_of(dataset)
+    places = _Places(dataset, scale)
     # Findings first: where pictures must be left out, the places of faults matter more.
     sections = []
     for name, found in by_check.items():
         sections.append(_section(name, found, places, pictures))
         step()
-    scale = scale_of(dataset)
     overlays = []
     for gesture in gestures:
         overlays.append({"label": gesture, "picture": pictures.add(gesture_figure(result, gesture, scale))})
@@ -203,8 +203,9 @@ def _spread(found: list[Finding]) -> Iterator[Finding]:
 class _Places:
     """Where findings are, drawn; the last file read is kept."""
 
-    def __init__(self, dataset: Dataset) -> None:
+    def __init__(self, dataset: Dataset, scale: NDArray[np.float64]) -> None:
         self._dataset = dataset
+        self._scale = scale
         self._recordings: Mapping[str, RecordingInfo] = {r.id: r for r in dataset.recordings}
         self._last: tuple[str, Frames] | None = None
 
@@ -237,7 +238,9 @@ class _Places:
             title = ""
         if f.check in _SIGNAL and (f.recording or f.check not in _CLOCK):
             marked = () if f.check in ("never-stopped", "flat") else f.rows
-            yield figures.signals(frames, self._layout, marked, f.channels, first_row=first, title=title)
+            yield figures.signals(
+                frames, self._layout, marked, f.channels, first_row=first, title=title, scale=self._scale
+            )
 
     def _frames(self, f: Finding) -> Frames:
         if self._last is None or self._last[0] != f.about:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from plushsense.core.extras import need
 from plushsense.core.recfile import Frames
 from plushsense.core.signal import Layout
+from plushsense.dataset.quality.outline import LEVEL_KINDS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -41,14 +42,21 @@ def _figure(width: float, height: float) -> Figure:
     return made
 
 
-def deviation(frames: Frames, layout: Layout, scale: NDArray[np.float64]) -> NDArray[np.float64]:
-    """How far each row is from the recording's median, (T,): root of the summed squares over the channels.
+def away(frames: Frames, layout: Layout, scale: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How far each channel is from its rest in the recording, (T, C), in units of ``scale``.
 
-    Each channel is divided by ``scale``, what it does when something happens; garbage is drawn to the valid range.
+    Rest is the low of channels that have a baseline, and the median of others; garbage is drawn to the valid range.
     """
     values = np.clip(frames.values, layout.valid_min_int, layout.valid_max_int)
-    away = (values - np.median(values, axis=0)) / scale
-    size: NDArray[np.float64] = np.sqrt(np.square(away).sum(axis=1))
+    level = np.array([c.kind in LEVEL_KINDS for c in layout.channels])
+    low, middle = np.percentile(values, (10, 50), axis=0)
+    found: NDArray[np.float64] = (values - np.where(level, low, middle)) / scale
+    return found
+
+
+def deviation(frames: Frames, layout: Layout, scale: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How far all channels together are from their rest, (T,): root of the summed squares."""
+    size: NDArray[np.float64] = np.sqrt(np.square(away(frames, layout, scale)).sum(axis=1))
     return size
 
 
@@ -78,7 +86,7 @@ def overlay(gesture: str, lines: Sequence[Line], mean_s: float, tolerance: float
         top.plot(one.seconds, one.size, style, color=COLOURS[i % len(COLOURS)], linewidth=1.4, label=one.name)
     heights = [s for one in lines for s in (np.percentile(one.size, 99.5),) if one.size.size]
     top.set_ylim(0, 1.25 * float(np.percentile(heights, 98)) if heights else 1.0)
-    top.set_ylabel("deviation from its median\n(1 = usual)", fontsize=9)
+    top.set_ylabel("deviation from rest\n(1 = usual)", fontsize=9)
     top.set_title(f"{gesture}: {len(lines)} recordings", fontsize=10, parse_math=False)
     if named:
         shown = top.legend(fontsize=7.5, frameon=True, framealpha=0.85, loc="upper right")
@@ -124,20 +132,22 @@ def signals(
     *,
     first_row: int = 0,
     title: str = "",
+    scale: NDArray[np.float64] | None = None,
 ) -> Figure:
-    """The channels of a recording by row, with places marked; only ``channels`` where they are named."""
+    """The channels of a recording by row, with places marked; only ``channels`` where they are named.
+
+    Channels of several kinds are drawn from their rest, each divided by its ``scale``.
+    """
     figure = _figure(7.4, 2.2)
     axes = figure.add_subplot()
     shown = list(channels) or list(range(layout.n_channels))
     kinds = {layout.channels[c].unit for c in shown} | {layout.channels[c].kind for c in shown}
     at = _thinned(len(frames))
-    values = np.clip(frames.values, layout.valid_min_int, layout.valid_max_int)
-    mixed = len(kinds) > 2
+    mixed = scale is not None and len(kinds) > 2
+    values: NDArray[Any] = np.clip(frames.values, layout.valid_min_int, layout.valid_max_int)
+    values = away(frames, layout, scale) if mixed and scale is not None else values * [c.step for c in layout.channels]
     for i, c in enumerate(shown[:_CHANNELS]):
-        y = values[:, c] * layout.channels[c].step
-        if mixed:
-            low, high = np.percentile(y, (1, 99))
-            y = (y - low) / ((high - low) or 1.0)
+        y = values[:, c]
         style = ("-", "--", ":")[i // len(COLOURS)]
         axes.plot(
             at + first_row + 1,
@@ -148,7 +158,7 @@ def signals(
             label=layout.names[c],
         )
     _mark(axes, rows)
-    axes.set_ylabel("share of its range" if mixed else layout.channels[shown[0]].unit, fontsize=8)
+    axes.set_ylabel("from rest (1 = usual)" if mixed else layout.channels[shown[0]].unit, fontsize=8)
     axes.legend(
         fontsize=6.5, ncols=1 if len(shown) < 7 else 2, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5)
     )
