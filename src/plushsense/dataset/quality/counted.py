@@ -124,12 +124,13 @@ def subject_balance(w: Whole) -> Iterator[Said]:
 
 
 def not_in_stream(w: Whole) -> Iterator[Said]:
-    streamed = {s.info.subject for s in w.streams}
+    streamed = {(s.info.subject, s.info.session) for s in w.streams}
     for o in w.recordings:
         if not isinstance(o.info, RecordingInfo):
             continue
+        # Nobody's recordings lie in the folder of the person whose session they belong to.
         folder = o.info.id.split("/", 1)[0]
-        if o.info.stream_row < 0 and folder in streamed:
+        if o.info.stream_row < 0 and (folder, o.info.session) in streamed:
             yield Said("not found in the session's stream", about=o.info.id)
         for flag in o.info.flags:
             if flag.startswith("only its first"):
