@@ -41,6 +41,7 @@ _SIGNAL = (
     *("never-stopped", "duration", "no-onset", "several-gestures", "overlap", "clock-reset", "gaps"),
     *("garbage", "blank-rows", "spikes", "flat", "stuck", "saturated"),
 )
+_DRAWN_ROWS = 3
 _SEVERITY = {"error": "to decide", "warning": "to look at", "info": "good to know"}
 
 
@@ -216,7 +217,8 @@ class _Places:
     def can_draw(self, f: Finding) -> bool:
         """Whether looking is better than reading for this finding."""
         if f.recording:
-            return f.check in _SIGNAL or f.check in _CLOCK
+            info = self._recordings[f.recording]
+            return info.stop - info.start >= _DRAWN_ROWS and (f.check in _SIGNAL or f.check in _CLOCK)
         return bool(f.stream) and f.check in (*_CLOCK, "stuck", "flat", "drift", "garbage")
 
     def draw(self, f: Finding) -> Iterator[Figure]:
