@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from plushsense.apps.api import evaluate, load, simulate, train
+    from plushsense.apps.checking import check_dataset
     from plushsense.apps.estimator import PlushClassifier
     from plushsense.apps.reporting import write_report
     from plushsense.apps.retraining import forget
@@ -51,6 +52,7 @@ _WHERE = {
     "check_backup": "plushsense.dataset.backup",
     "restore": "plushsense.dataset.backup",
     "pseudonymise": "plushsense.dataset.pseudonymise",
+    "check_dataset": "plushsense.apps.checking",
     "PlushClassifier": "plushsense.apps.estimator",
     "open_device": "plushsense.devices.opening",
     "StreamClassifier": "plushsense.live.stream",
@@ -70,6 +72,7 @@ __all__ = [
     "WindowSpec",
     "backup",
     "check_backup",
+    "check_dataset",
     "cut_windows",
     "evaluate",
     "forget",

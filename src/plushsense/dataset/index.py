@@ -164,7 +164,7 @@ def _stream_info(folder: Path, head: DatasetHead, read: _Read) -> StreamInfo:
     frames = read.result.frames
     steps = np.diff(frames.device_ms)
     broken = (steps < 0) | (steps > head.layout.gap_ms)
-    said = findings(Examined(frames, head.layout, None, None))
+    said = findings(Examined(frames, head.layout, None, None, stream=True))
     return StreamInfo(
         id=_stream_id(folder, read),
         subject=read.subject,

@@ -74,6 +74,15 @@ def write_report(
     """
     target = check_place(path)
     page = render(title=title, dataset=dataset, evaluations=evaluations, models=models, simulated=simulated)
+    return put_page(target, page)
+
+
+def put_page(target: Path, page: str) -> Path:
+    """Write a page to a place that `check_place` allowed, in one step.
+
+    Raises:
+        ConfigError: when the disk refuses.
+    """
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         draft = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.part")
@@ -98,11 +107,6 @@ def render(
     simulated: bool,
 ) -> str:
     """The report as one HTML text; arguments as in ``write_report``."""
-    jinja2 = need("jinja2", "train")
-    environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    source = resources.files("plushsense.reports").joinpath("report.html.j2").read_text(encoding="utf-8")
     named = [
         {
             **evaluation,
@@ -116,7 +120,8 @@ def render(
     # Wholly: tables say it once, on top. Partly: every simulated row bears a mark.
     wholly = simulated and all(evaluation["simulated"] for evaluation in named)
     any_simulated = simulated or any(part["simulated"] for part in (*named, *cards))
-    page: str = environment.from_string(source).render(
+    return fill(
+        "report.html.j2",
         title=title,
         made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         simulated=any_simulated,
@@ -131,6 +136,23 @@ def render(
         evaluations=[_evaluation(f"E{i}", evaluation) for i, evaluation in enumerate(named, start=1)],
         models=cards,
         contexts=words.CONTEXT_WORDS,
+    )
+
+
+def fill(template: str, **values: Any) -> str:
+    """A page from one of the templates beside this file, in the style of all pages; texts are escaped.
+
+    Raises:
+        MissingExtraError: when jinja2 is not installed.
+    """
+    jinja2 = need("jinja2", "reports")
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    room = resources.files("plushsense.reports")
+    style = need("markupsafe", "reports").Markup(room.joinpath("page.css").read_text(encoding="utf-8"))
+    page: str = environment.from_string(room.joinpath(template).read_text(encoding="utf-8")).render(
+        style=style, **values
     )
     return page
 

@@ -25,6 +25,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "backup": ("backup", "one file that restores a data set, with a check"),
     "restore": ("restore", "bring a data set back from a backup"),
     "forget": ("forget", "take a person out of a data set, for good"),
+    "check": ("check", "what may be wrong in a data set, what to do about it, and decisions as marks"),
     "info": ("info", "what a data set or a model bundle holds"),
     "trim": ("trim", "where each gesture begins: suggested, then accepted, adjusted or undone"),
     "stats": ("stats", "how long gestures last, before and after trimming"),

@@ -1,0 +1,223 @@
+"""Figures of a check: a gesture's recordings over each other, and the place in a recording that a finding means."""
+
+from __future__ import annotations
+
+import io
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.extras import need
+from plushsense.core.recfile import Frames
+from plushsense.core.signal import Layout
+from plushsense.dataset.quality.outline import LEVEL_KINDS
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# Okabe and Ito's colours, told apart with any colour vision; grey is what is usual.
+COLOURS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+GREY, BAND, MARK = "#9aa0a6", "#e8f0fa", "#d55e00"
+_POINTS = 1500
+_LINE_POINTS = 160
+_CHANNELS = 13
+
+
+@dataclass(frozen=True)
+class Line:
+    """A recording in an overlay: ``seconds`` and ``size`` (T,) of its deviation; ``name`` where it is odd."""
+
+    seconds: NDArray[np.float64]
+    size: NDArray[np.float64]
+    lasts: float
+    name: str = ""
+
+
+def _figure(width: float, height: float) -> Figure:
+    made: Figure = need("matplotlib.figure", "reports").Figure(figsize=(width, height), layout="constrained")
+    return made
+
+
+def away(frames: Frames, layout: Layout, scale: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How far each channel is from its rest in the recording, (T, C), in units of ``scale``.
+
+    Rest is the low of channels that have a baseline, and the median of others; garbage is drawn to the valid range.
+    """
+    values = np.clip(frames.values, layout.valid_min_int, layout.valid_max_int)
+    level = np.array([c.kind in LEVEL_KINDS for c in layout.channels])
+    low, middle = np.percentile(values, (10, 50), axis=0)
+    found: NDArray[np.float64] = (values - np.where(level, low, middle)) / scale
+    return found
+
+
+def deviation(frames: Frames, layout: Layout, scale: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How far all channels together are from their rest, (T,): root of the summed squares."""
+    size: NDArray[np.float64] = np.sqrt(np.square(away(frames, layout, scale)).sum(axis=1))
+    return size
+
+
+def line(frames: Frames, layout: Layout, scale: NDArray[np.float64], lasts: float, name: str = "") -> Line:
+    """A recording for an overlay, thinned: of each stretch its highest value."""
+    size = deviation(frames, layout, scale)
+    seconds = np.linspace(0.0, lasts, len(size))
+    step = -(-len(size) // _LINE_POINTS)
+    if step > 1:
+        whole = len(size) // step * step
+        size, seconds = size[:whole].reshape(-1, step).max(axis=1), seconds[:whole:step]
+    return Line(seconds, size, lasts, name)
+
+
+def overlay(gesture: str, lines: Sequence[Line], mean_s: float, tolerance: float) -> Figure:
+    """All recordings of a gesture over each other, the odd ones in colour and named; below, how long each lasts."""
+    figure = _figure(9.2, 4.3)
+    top, strip = figure.subplots(2, 1, height_ratios=(3.2, 1), sharex=True)
+    named = [one for one in lines if one.name]
+    # One that never stopped would squeeze all others to the left.
+    end = max([1.8 * mean_s, *(one.lasts for one in lines if one.lasts < 4 * mean_s)], default=1.0)
+    for one in lines:
+        if not one.name:
+            top.plot(one.seconds, one.size, color=GREY, linewidth=0.6, alpha=0.35)
+    for i, one in enumerate(named):
+        style = "-" if i < len(COLOURS) else "--"
+        top.plot(one.seconds, one.size, style, color=COLOURS[i % len(COLOURS)], linewidth=1.4, label=one.name)
+    heights = [s for one in lines for s in (np.percentile(one.size, 99.5),) if one.size.size]
+    top.set_ylim(0, 1.25 * float(np.percentile(heights, 98)) if heights else 1.0)
+    top.set_ylabel("deviation from rest\n(1 = usual)", fontsize=9)
+    top.set_title(f"{gesture}: {len(lines)} recordings", fontsize=10, parse_math=False)
+    if named:
+        shown = top.legend(fontsize=7.5, frameon=True, framealpha=0.85, loc="upper right")
+        for text in shown.get_texts():
+            text.set_parse_math(False)
+    strip.axvspan((1 - tolerance) * mean_s, (1 + tolerance) * mean_s, color=BAND, zorder=0)
+    strip.axvline(mean_s, color=COLOURS[1], linewidth=1.0)
+    # A fixed spread, so that dots do not hide each other and the same data give the same picture.
+    rest = [one.lasts for one in lines if not one.name]
+    strip.plot(rest, (np.arange(len(rest)) * 0.618) % 1.0, "o", color=GREY, markersize=2.6, alpha=0.7)
+    for i, one in enumerate(named):
+        at = min(one.lasts, end)
+        strip.plot(
+            at,
+            0.2 + 0.6 * ((i * 0.618) % 1.0),
+            ">" if one.lasts > end else "D",
+            color=COLOURS[i % len(COLOURS)],
+            markersize=5,
+            zorder=3,
+        )
+    strip.set_yticks([])
+    strip.set_ylim(-0.15, 1.15)
+    strip.set_xlim(0, end * 1.01)
+    strip.set_xlabel(
+        f"seconds; below: how long each lasts, the mean {mean_s:.2f} s, and ±{100 * tolerance:.0f} % of it shaded",
+        fontsize=9,
+    )
+    for axes in (top, strip):
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.tick_params(labelsize=8)
+    return figure
+
+
+def _thinned(rows: int) -> NDArray[np.int64]:
+    return np.unique(np.linspace(0, rows - 1, min(rows, _POINTS)).astype(np.int64))
+
+
+def signals(
+    frames: Frames,
+    layout: Layout,
+    rows: Sequence[tuple[int, int]] = (),
+    channels: Sequence[int] = (),
+    *,
+    first_row: int = 0,
+    title: str = "",
+    scale: NDArray[np.float64] | None = None,
+) -> Figure:
+    """The channels of a recording by row, with places marked; only ``channels`` where they are named.
+
+    Channels of several kinds are drawn from their rest, each divided by its ``scale``.
+    """
+    figure = _figure(7.4, 2.2)
+    axes = figure.add_subplot()
+    shown = list(channels) or list(range(layout.n_channels))
+    kinds = {layout.channels[c].unit for c in shown} | {layout.channels[c].kind for c in shown}
+    at = _thinned(len(frames))
+    mixed = scale is not None and len(kinds) > 2
+    values: NDArray[Any] = np.clip(frames.values, layout.valid_min_int, layout.valid_max_int)
+    values = away(frames, layout, scale) if mixed and scale is not None else values * [c.step for c in layout.channels]
+    for i, c in enumerate(shown[:_CHANNELS]):
+        y = values[:, c]
+        style = ("-", "--", ":")[i // len(COLOURS)]
+        axes.plot(
+            at + first_row + 1,
+            y[at],
+            style,
+            color=COLOURS[(i + 1) % len(COLOURS)],
+            linewidth=0.9,
+            label=layout.names[c],
+        )
+    _mark(axes, rows)
+    axes.set_ylabel("from rest (1 = usual)" if mixed else layout.channels[shown[0]].unit, fontsize=8)
+    axes.legend(
+        fontsize=6.5, ncols=1 if len(shown) < 7 else 2, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5)
+    )
+    return _finished(figure, axes, title)
+
+
+def clock(frames: Frames, rows: Sequence[tuple[int, int]] = (), *, first_row: int = 0, title: str = "") -> Figure:
+    """The time from each row to the next by the device clock, with places marked."""
+    figure = _figure(7.4, 2.2)
+    axes = figure.add_subplot()
+    steps = np.diff(frames.device_ms)
+    # The far ones must not be thinned away.
+    far = np.argsort(np.abs(steps - np.median(steps)))[-200:] if len(steps) else np.empty(0, dtype=np.int64)
+    at = np.unique(np.concatenate([_thinned(len(steps)), far])) if len(steps) else far
+    axes.plot(at + first_row + 2, steps[at], color=COLOURS[1], linewidth=0.8)
+    _mark(axes, rows)
+    if len(steps) and (steps.max() > 2000 or steps.min() < -2000):
+        axes.set_yscale("symlog", linthresh=100)
+        far_power = int(np.log10(np.abs(steps).max()))
+        powers = range(2, far_power + 1, 1 + far_power // 5)
+        axes.set_yticks([-(10.0**p) for p in powers if steps.min() < -100] + [0.0] + [10.0**p for p in powers])
+        axes.minorticks_off()
+    axes.set_ylabel("ms since row before", fontsize=8)
+    return _finished(figure, axes, title)
+
+
+def baselines(lows: NDArray[np.float64], layout: Layout, channels: Sequence[int], *, title: str = "") -> Figure:
+    """The low level of channels over a session, one value for every 10 s."""
+    figure = _figure(7.4, 2.2)
+    axes = figure.add_subplot()
+    minutes = np.arange(len(lows)) / 6
+    for i, c in enumerate(channels[: len(COLOURS)]):
+        axes.plot(minutes, lows[:, c], color=COLOURS[i], linewidth=1.2, label=layout.names[c])
+    axes.legend(fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))
+    axes.set_ylabel(f"low level ({layout.channels[channels[0]].unit})", fontsize=8)
+    _finished(figure, axes, title)
+    axes.set_xlabel("minutes of the session", fontsize=8)
+    return figure
+
+
+def _mark(axes: Any, rows: Sequence[tuple[int, int]]) -> None:
+    for first, last in rows:
+        axes.axvspan(first + 1, max(last, first + 1), color=MARK, alpha=0.25, linewidth=0)
+        axes.axvline(first + 1, color=MARK, linewidth=0.8)
+
+
+def _finished(figure: Figure, axes: Any, title: str) -> Figure:
+    axes.set_xlabel("row", fontsize=8)
+    axes.tick_params(labelsize=7.5)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.margins(x=0.01)
+    if title:
+        axes.set_title(textwrap.fill(title, 105), fontsize=8, loc="left", parse_math=False)
+    return figure
+
+
+def png(figure: Figure, dpi: int = 90) -> bytes:
+    """A figure as PNG; the same data give the same bytes."""
+    out = io.BytesIO()
+    metadata: Mapping[str, Any] = {"Software": None}
+    figure.savefig(out, format="png", dpi=dpi, metadata=metadata)
+    return out.getvalue()

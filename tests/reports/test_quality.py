@@ -1,0 +1,127 @@
+"""The page of a check: complete in itself, escaped, bounded, and with the odd recordings named."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from plushsense.core.recfile import Frames, format_rows, recording_filename, write_recording
+from plushsense.core.signal import load_layout
+from plushsense.dataset.importers import import_recordings
+from plushsense.dataset.quality.checking import Checked, check
+from plushsense.reports import quality, quality_figures
+
+ACCEL = load_layout("accel-3")
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> Checked:
+    """Six people; one recording never stopped, one with a gap, one stuck; a label that would break a page."""
+    folder = tmp_path_factory.mktemp("page")
+    rng = np.random.default_rng(0)
+    for person in range(6):
+        where = folder / "src" / f"P{person + 1}"
+        where.mkdir(parents=True)
+        at = 1000
+        parts = []
+        for k, label in enumerate(("Wave & <b>", "Wave & <b>", "Tap", "Tap")):
+            rows = 3000 if (person, k) == (1, 0) else 200 + int(rng.integers(0, 20))
+            wave = 4000 * np.sin(np.arange(rows) / 9) * np.sin(np.pi * np.arange(rows) / rows) ** 2
+            values = np.rint(np.outer(wave, [1, 0.5, -0.3]) + rng.normal(0, 60, (rows, 3))).astype(np.int64)
+            clock = at + np.arange(rows, dtype=np.int64) * 10
+            if (person, k) == (2, 0):
+                clock[90:] += 400
+            if (person, k) == (3, 2):
+                values[30:190, 1] = 7
+            at = int(clock[-1]) + 2000
+            frames = Frames(values, clock, clock + 10**12)
+            parts.append(frames)
+            write_recording(where / recording_filename(label, 10**12 + at, rows), frames, ACCEL)
+        stream = Frames(
+            np.concatenate([p.values for p in parts]),
+            np.concatenate([p.device_ms for p in parts]),
+            np.concatenate([p.device_ms for p in parts]) + 10**12,
+        )
+        (where / "fulldatastream.csv").write_text(format_rows(stream, ACCEL))
+    return check(import_recordings(folder / "src", folder / "DS", layout=ACCEL, name="<script>").dataset)
+
+
+@pytest.fixture(scope="module")
+def page(result: Checked) -> str:
+    return quality.render(result)
+
+
+def test_the_page_asks_for_nothing_outside_itself(page: str) -> None:
+    assert not re.findall(r'(?:src|href)="(?!data:|#)[^"]*"', page)
+    assert "<script" not in page
+    assert "&lt;script&gt;" in page, "the data set's name is shown, escaped"
+    assert '<meta name="generator" content="PlushSense">' in page
+
+
+def test_each_finding_is_there_and_what_needs_a_decision_first(result: Checked, page: str) -> None:
+    assert {"never-stopped", "gaps", "stuck"} <= {f.check for f in result.findings}
+    for name in {f.check for f in result.findings}:
+        assert f'<h2 id="{name}">' in page
+    decide = page[page.index("<h2>To decide</h2>") : page.index("<h2>Gesture by gesture</h2>")]
+    for f in result.undecided:
+        assert f.recording.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;") in decide
+    overlays = page[page.index("<h2>Gesture by gesture</h2>") : page.index('<h2 id="')]
+    assert overlays.count("<img") == 2, "a picture a gesture"
+
+
+def test_the_odd_recordings_are_named_in_the_overlay(result: Checked) -> None:
+    (gesture,) = [f.gesture for f in result.of("never-stopped")]
+    figure = quality.gesture_figure(result, gesture)
+    legend = figure.axes[0].get_legend()
+    assert legend is not None
+    named = [text.get_text() for text in legend.get_texts()]
+    assert any("P2/" in n and "never-stopped" in n for n in named)
+    assert len(figure.axes[0].lines) == 12, "a line a recording"
+    _, high = figure.axes[0].get_xlim()
+    assert high < 10, "the one of 30 s does not squeeze the others"
+
+
+def test_accepted_findings_are_not_named(result: Checked) -> None:
+    accepted = replace(result, findings=tuple(replace(f, accepted=True) for f in result.findings))
+    (gesture,) = {f.gesture for f in result.of("never-stopped")}
+    assert quality.gesture_figure(accepted, gesture).axes[0].get_legend() is None
+    page = quality.render(accepted)
+    assert page.count('<tr class="accepted">') == len(result.findings)
+
+
+def test_pictures_are_bounded_and_the_page_says_so(result: Checked, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(quality, "PICTURE_BYTES", 150_000)
+    page = quality.render(result)
+    assert len(page) < 300_000
+    left_out = re.search(r"<strong>(\d+) pictures were left out</strong>", page)
+    assert left_out is not None
+    assert int(left_out[1]) > 0
+    assert "This picture was left out" in page
+
+
+def test_a_check_is_drawn_so_often_at_most(result: Checked, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(quality, "PLOTS", 1)
+    (gaps,) = [s for s in re.split("<h2 ", quality.render(result)) if s.startswith('id="gaps"')]
+    assert gaps.count("<img") == 2, "the clock and the signal of one recording"
+    assert "6 more findings of this check are not drawn" in gaps
+
+
+def test_the_place_is_marked_in_rows_of_the_file(result: Checked) -> None:
+    (stuck,) = [f for f in result.of("stuck") if f.recording]
+    info = next(r for r in result.dataset.recordings if r.id == stuck.recording)
+    frames = result.dataset.read(info)
+    figure = quality_figures.signals(frames, ACCEL, stuck.rows, stuck.channels)
+    (axes,) = figure.axes
+    assert [line.get_label() for line in axes.lines if not line.get_label().startswith("_")] == ["y"]
+    (span,) = axes.patches
+    assert (span.get_x(), span.get_x() + span.get_width()) == (31, 190)
+
+
+def test_the_same_data_give_the_same_bytes(result: Checked) -> None:
+    gesture = result.dataset.gestures.labels[0]
+    assert quality_figures.png(quality.gesture_figure(result, gesture)) == quality_figures.png(
+        quality.gesture_figure(result, gesture)
+    )
