@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 from pathlib import Path
 
@@ -41,3 +42,11 @@ def pty_possible() -> None:
             os.close(end)
     except (ImportError, OSError) as cause:
         missing("pty", f"no pseudo-terminal here: {cause}")
+
+
+@pytest.fixture(scope="session")
+def publish_tools() -> None:
+    """The validators of a package (extra publish), and scikit-learn (extra baselines)."""
+    for module in ("mlcroissant", "frictionless", "rocrate", "datacite", "sklearn"):
+        if importlib.util.find_spec(module) is None:
+            missing("publish", f"{module} is not installed")

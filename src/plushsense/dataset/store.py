@@ -19,7 +19,7 @@ import io
 import json
 import os
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Self, TypeVar
@@ -166,7 +166,7 @@ class DatasetHead:
     consent: str = ""
     source: str = ""
     simulated: bool = False
-    about: About = About()
+    about: About = field(default_factory=About)
 
     def to_toml(self) -> str:
         """The file's text."""

@@ -22,6 +22,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "simulate": ("simulate", "recordings of virtual people, as the authors' recorder would leave them"),
     "import": ("importing", "make a data set from recordings"),
     "info": ("info", "what a data set or a model bundle holds"),
+    "publish": ("publish", "a package that strangers can find, open and cite, proved by validators"),
     "arch": ("arch", "count a network: parameters, receptive field, multiply-accumulates, state"),
     "train": ("train", "train one network and save it as a bundle"),
     "evaluate": ("evaluate", "how good it is, on people it never met"),
@@ -36,6 +37,7 @@ STOPPED = {
     "evaluate": "finished folds are kept, and the same command goes on from there",
     "simulate": "nothing was written",
     "import": "nothing was written",
+    "publish": "there is no zip; a folder that was written whole can be proved with  plushsense publish --check OUT",
     "train": "no bundle was written",
     "report": "no page was written",
 }

@@ -40,7 +40,7 @@ def datacite(d: Description) -> dict[str, Any]:
         "version": d.version,
     }
     if d.about.doi:
-        document["identifiers"] = [{"identifier": d.about.doi, "identifierType": "DOI"}]
+        document["doi"] = d.about.doi
     if d.about.paper:
         document["relatedIdentifiers"] = [
             {"relatedIdentifier": d.about.paper, "relatedIdentifierType": "DOI", "relationType": "IsDescribedBy"}

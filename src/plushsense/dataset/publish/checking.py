@@ -15,6 +15,7 @@ import csv
 import json
 import re
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -295,7 +296,11 @@ def _crate(p: Package) -> None:
     if document is None:
         return
     rocrate = need("rocrate.rocrate", EXTRA)
-    crate = rocrate.ROCrate(str(p.root))
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        crate = rocrate.ROCrate(str(p.root))
+    for warning in said:
+        p.say(as_crate.FILE, str(warning.message))
     for key in ("name", "description", "datePublished", "license"):
         if not crate.root_dataset.get(key):
             p.say(as_crate.FILE, f"the crate has no {key}")

@@ -226,7 +226,7 @@ class _Writing:
             lacking += sum(read_recording(folder / r.file, layout).frames.host_ms is None for r in self.kept)
         if lacking:
             self.notes.append(
-                f"{lacking} files have no column of the computer's clock: it is left out of all, the toy's clock stays."
+                f"Left out: the computer's clock, since {_count(lacking, 'file')} lacked it; the toy's clock stays."
             )
         return lacking == 0
 
@@ -277,7 +277,8 @@ class _Writing:
             write_people(self.folder, people.values())
         left = sorted(columns - set(self.options.columns)) + ["consent"] * any(p.consent for p in known.values())
         if left:
-            self.notes.append(f"Of {PEOPLE} these columns are left out: {', '.join(left)}.")
+            # How many, not which: a column's name may tell something already.
+            self.notes.append(f"Left out: {_count(len(left), 'column')} of the people's table.")
         return people
 
     def _write_marks(self, ids: dict[str, str]) -> None:
@@ -301,25 +302,34 @@ class _Writing:
         out = [r for r in self.source.recordings if r.excluded]
         if out and not self.options.excluded and not self.labelled:
             still = " Their rows still stand in the session's stream." if self.streams else ""
-            self.notes.append(f"{len(out)} recordings that were excluded are left out.{still}")
+            self.notes.append(f"Left out: {_count(len(out), 'excluded recording')}.{still}")
         elif out:
-            self.notes.append(f"{len(out)} recordings are marked as excluded, and are in the package.")
+            self.notes.append(f"In the package, but marked as excluded: {_count(len(out), 'recording')}.")
         if self.source.streams and not self.streams:
-            self.notes.append(f"{len(self.source.streams)} session streams are left out.")
+            self.notes.append(f"Left out: {_count(len(self.source.streams), 'session stream')}.")
         trimmed = sum((r.start, r.stop) != (0, r.rows) for r in published.recordings)
         if trimmed:
-            self.notes.append(f"{trimmed} recordings are trimmed: the files hold all rows, start and stop say which.")
+            self.notes.append(
+                f"Trimmed: {_count(trimmed, 'recording')}; the files hold all rows, start and stop say which remain."
+            )
         renamed = [code for code, public in self.codes.items() if code != public]
         if renamed:
-            self.notes.append(f"{len(renamed)} subject codes that look like a number or a missing value got a 'P'.")
+            self.notes.append(
+                f"Renamed: {_count(len(renamed), 'subject code')} that looked like a number or nothing, now with "
+                "a P in front."
+            )
         if self.streams and published.recordings and not self.labelled:
             lost = sum(o.stream_row >= 0 and n.stream_row < 0 for n, o in _pairs(published, origin))
             if lost:
-                self.notes.append(f"{lost} recordings are no longer found in their stream.")
+                self.notes.append(f"No longer found in their stream: {_count(lost, 'recording')}.")
 
 
 def _pairs(published: Dataset, origin: dict[str, RecordingInfo]) -> list[tuple[RecordingInfo, RecordingInfo]]:
     return [(r, origin[r.id]) for r in published.recordings]
+
+
+def _count(n: int, what: str) -> str:
+    return f"{n} {what}{'' if n == 1 else 's'}"
 
 
 def _folder_of(file: str) -> str:

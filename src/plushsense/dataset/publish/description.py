@@ -181,11 +181,15 @@ def channel_column(channel: Channel) -> Column:
         else f"; physical value = (raw - {channel.offset:g}) * {channel.scale:g} {channel.unit}"
     )
     step = "" if channel.step == 1.0 else f"; in steps of {channel.step:g}"
+    valid = f"valid from {_plain(channel.valid_min)} to {_plain(channel.valid_max)}"
     return Column(
         channel.name,
         INTEGER if channel.step == 1.0 else NUMBER,
-        f"{channel.kind}, raw reading{physical}{step}; valid from {channel.valid_min:g} to {channel.valid_max:g}, "
-        "what is outside is kept as it was read",
+        f"{channel.kind}, raw reading{physical}{step}; {valid}, what is outside is kept as it was read",
         channel.unit,
         (channel.valid_min, channel.valid_max),
     )
+
+
+def _plain(value: float) -> str:
+    return str(int(value)) if value == int(value) else str(value)

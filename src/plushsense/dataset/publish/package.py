@@ -105,11 +105,11 @@ def complete_head(
         lines.append('consent = "what the people agreed to"')
         flags.append('--consent "what the people agreed to"')
     if not head.about.contact:
-        lines.append('[about] contact = { name = "Your Name", email = "you@example.org" }')
+        lines.append('in a table [about]  contact = { name = "Your Name", email = "you@example.org" }')
         flags.append('--contact "Your Name <you@example.org>"')
     if lines:
         raise DatasetError(
-            f"'{where}' cannot be published without licence, contact and consent statement: add to {where / HEAD}  "
+            f"'{where}' cannot be published without licence, contact and consent statement: set in '{where / HEAD}'  "
             f"{'  and  '.join(lines)}  or say  {' '.join(flags)}"
         )
     if not _VERSION.fullmatch(head.version):
@@ -132,6 +132,23 @@ def need_tools() -> None:
     """
     for module in ("mlcroissant", "frictionless", "rocrate", "datacite"):
         need(module, EXTRA)
+
+
+def refuse_place(dataset: Dataset, out: Path) -> Path:
+    """Where the zip beside ``out`` will be.
+
+    Raises:
+        DatasetError: when something is there already, or ``out`` lies in the data set.
+    """
+    real = out.resolve()
+    target = real.with_name(real.name + ".zip")
+    if real.exists() and (not real.is_dir() or any(real.iterdir())):
+        raise DatasetError(f"'{out}' already holds something: give a new or empty folder, nothing is overwritten.")
+    if target.exists():
+        raise DatasetError(f"'{target}' is already there: nothing is overwritten, give another OUT.")
+    if dataset.path.resolve() in (real, *real.parents):
+        raise DatasetError(f"'{out}' lies in the data set itself: give a folder elsewhere.")
+    return target
 
 
 def publish(
@@ -162,12 +179,7 @@ def publish(
     began = time.perf_counter()
     need_tools()
     tell = tell or (lambda what, done, total: None)
-    out = Path(out)
-    target = out.resolve().with_name(out.resolve().name + ".zip")
-    if target.exists():
-        raise DatasetError(f"'{target}' is already there: nothing is overwritten, give another OUT.")
-    if dataset.path.resolve() in (out.resolve(), *out.resolve().parents):
-        raise DatasetError(f"'{out}' lies in the data set itself: give a folder elsewhere.")
+    target = refuse_place(dataset, out)
     options = options or Options()
     day = published or date.today().isoformat()
     with whole_folder(out, DatasetError) as work:

@@ -199,4 +199,4 @@ def _gestures(d: Dataset) -> Iterable[Row]:
 
 def _channels(d: Dataset) -> Iterable[Row]:
     for c in d.layout.channels:
-        yield c.name, c.kind, c.unit, *(f"{v:g}" for v in (c.offset, c.scale, c.step, c.valid_min, c.valid_max))
+        yield c.name, c.kind, c.unit, *(repr(v) for v in (c.offset, c.scale, c.step, c.valid_min, c.valid_max))
