@@ -339,11 +339,14 @@ def _folder_of(file: str) -> str:
 
 def _codes(folders: list[str]) -> dict[str, str]:
     """Public codes by folder: as they are, but none that a reader takes for a number or for nothing."""
+    # "none" is nobody, by our own convention.
+    fine = {f for f in folders if f == "none" or not _NOT_A_CODE.fullmatch(f)}
     codes: dict[str, str] = {}
+    taken = {f.casefold() for f in fine}
     for folder in sorted(set(folders)):
         public = folder
-        # "none" is nobody, by our own convention.
-        while (_NOT_A_CODE.fullmatch(public) and public != "none") or public in codes.values():
+        while folder not in fine and (public == folder or public.casefold() in taken):
             public = f"P{public}"
+        taken.add(public.casefold())
         codes[folder] = public
     return codes
