@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from datetime import date
@@ -17,6 +18,7 @@ from plushsense.core.folders import whole_folder
 from plushsense.core.gestures import NOBODY
 from plushsense.core.recfile import SIMULATION_MARK
 from plushsense.dataset.about import Contact
+from plushsense.dataset.people import PersonInfo
 from plushsense.dataset.publish import as_bids, as_crate, as_croissant, as_datacite, as_datapackage
 from plushsense.dataset.publish.archive import files_of, write_checksums, write_zip
 from plushsense.dataset.publish.checking import Checked, check_folder
@@ -36,6 +38,8 @@ from plushsense.dataset.store import HEAD, UNKNOWN_SUBJECT, Dataset, DatasetHead
 
 Tell = Callable[[str, int, int], None]
 EXTRA = "publish"
+# Who is one of fewer people of the same age group and gender can be picked out by these alone.
+FEWEST_ALIKE = 3
 _VERSION = re.compile(r"(0|[1-9]\d*)\.(0|[1-9]\d*)\.(0|[1-9]\d*)([-+][0-9A-Za-z.+-]+)?")
 _LICENCE_FILES = ("LICENSE", "LICENSE.txt", "LICENSE.md", "LICENCE", "LICENCE.txt", "COPYING")
 
@@ -209,7 +213,7 @@ def publish(
         d,
         checked,
         time.perf_counter() - began,
-        _warnings(dataset, d),
+        _warnings(dataset, d, contents.people),
     )
 
 
@@ -253,8 +257,15 @@ def _with_files(work: Path, d: Description) -> Description:
     return replace(d, files=entries)
 
 
-def _warnings(source: Dataset, d: Description) -> list[str]:
+def _warnings(source: Dataset, d: Description, people: dict[str, PersonInfo]) -> list[str]:
     said = []
+    groups = Counter((p.age_group, p.gender, *p.more.values()) for p in people.values() if p.age_group or p.gender)
+    rare = sum(n for n in groups.values() if n < FEWEST_ALIKE)
+    if rare:
+        said.append(
+            f"{rare} people are of an age group and gender that fewer than {FEWEST_ALIKE} people share, so these alone "
+            "may tell who they are: use coarser groups in subjects.csv"
+        )
     spoken = [s for s in d.dataset.subjects if not any(c.isdigit() for c in s)]
     if spoken:
         said.append(
