@@ -92,6 +92,15 @@ def test_the_clock_alone_may_tell_and_movement_does_not_see_it(tmp_path: Path) -
     assert "4 of them almost surely (P1, P2, P3, P4)" in short(found)
 
 
+def test_people_of_one_clock_are_not_named_by_the_order_of_their_codes(tmp_path: Path) -> None:
+    found = reidentify(people(tmp_path, style=0.0, hold=0.0, rates_ms=(10, 10, 10, 13)), trees=30)
+    clock = found.find("recordings", "clock")
+    assert clock is not None
+    assert clock.clear == ["P4"]
+    assert 0.4 < clock.top1["mean"] < 0.6
+    assert max(clock.by_person[p] for p in ("P1", "P2", "P3")) < 0.7
+
+
 def test_across_sessions_the_way_of_holding_does_not_help(tmp_path: Path) -> None:
     dataset = people(tmp_path, style=0.0, hold=4000.0, sessions=2)
     assert {r.session for r in dataset.recordings} == {"s0", "s1"}

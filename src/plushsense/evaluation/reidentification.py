@@ -64,7 +64,8 @@ class Trial:
     """How often one program named the right person in one design.
 
     ``top1`` and ``top5`` are ``{mean, sd, ci95}`` over people (bootstrap over people); ``by_person`` is each one's
-    top-1, ``chance`` and ``chance5`` what guessing would reach.
+    top-1, ``precision`` how often the program is right when it says that person, ``chance`` and ``chance5`` what
+    guessing would reach.
     """
 
     design: str
@@ -76,6 +77,12 @@ class Trial:
     chance: float
     chance5: float
     by_person: dict[str, float]
+    precision: dict[str, float]
+
+    @property
+    def clear(self) -> list[str]:
+        """People who are almost surely named, and hardly ever wrongly."""
+        return [p for p, share in self.by_person.items() if min(share, self.precision[p]) >= CLEARLY]
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, ready for JSON."""
@@ -254,6 +261,8 @@ def _trial(
     names, truth = np.unique(person, return_inverse=True)
     top1 = np.full(len(truth), np.nan)
     top5 = np.full(len(truth), np.nan)
+    named = np.full(len(truth), -1)
+    rng = np.random.default_rng([seed, 0x7E])
     for turn in np.unique(group[group >= 0]):
         test = np.flatnonzero(group == turn)
         train = np.flatnonzero(group != turn)
@@ -263,13 +272,18 @@ def _trial(
             continue
         model = forest.ExtraTreesClassifier(trees, class_weight="balanced", random_state=seed, n_jobs=1)
         model.fit(x[train], truth[train])
-        likely = model.classes_[np.argsort(-model.predict_proba(x[test]), axis=1, kind="stable")]
+        # Equal likelihoods, as of people with the same clock, are drawn by lot: else the first code would win them all.
+        chances = np.round(model.predict_proba(x[test]), 9)
+        likely = model.classes_[np.argsort(-(chances + 1e-10 * rng.random(chances.shape)), axis=1)]
+        named[test] = likely[:, 0]
         hit = likely == truth[test][:, None]
         top1[test] = hit[:, 0]
         top5[test] = hit[:, :5].any(axis=1)
     tested = np.isfinite(top1)
     people = np.unique(truth[tested])
     mine = {str(names[k]): float(top1[tested & (truth == k)].mean()) for k in people}
+    said = {str(names[k]): named[tested] == k for k in people}
+    right = {p: float(top1[tested][at].mean()) if at.any() else 0.0 for p, at in said.items()}
     five = [float(top5[tested & (truth == k)].mean()) for k in people]
     return Trial(
         design,
@@ -281,4 +295,5 @@ def _trial(
         1.0 / len(names),
         min(1.0, 5.0 / len(names)),
         mine,
+        right,
     )

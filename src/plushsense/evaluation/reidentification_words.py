@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from plushsense.evaluation.reidentification import CLEARLY, DESIGNS, FOLDS, SEES, Reidentified, Trial
+from plushsense.evaluation.reidentification import DESIGNS, FOLDS, SEES, Reidentified, Trial
 
 LIMITS = """\
 - The program is simple, and one made for the purpose may do better: this is a lower bound of the risk.
@@ -80,7 +80,7 @@ def _clock(found: Reidentified) -> str:
     trial = found.find("recordings", "clock")
     if trial is None:
         return ""
-    clear = sorted(name for name, share in trial.by_person.items() if share >= CLEARLY)
+    clear = trial.clear
     told = f"; {len(clear)} of them almost surely ({', '.join(clear)})" if clear else ""
     return (
         f"The sampling clock alone, nothing of the touch, tells {_hundred(trial.top1['mean'])} of 100: people were "
