@@ -85,8 +85,8 @@ def _clock(found: Reidentified) -> str:
     return (
         f"The sampling clock alone, nothing of the touch, tells {_hundred(trial.top1['mean'])} of 100: people were "
         f"recorded at different rates{told}."
-        if trial.top1["mean"] > 1.5 * trial.chance
-        else f"The sampling clock alone tells {_hundred(trial.top1['mean'])} of 100: next to nothing."
+        if trial.top1["mean"] > 2 * trial.chance
+        else f"The sampling clock alone tells {_hundred(trial.top1['mean'])} of 100: little or nothing."
     )
 
 

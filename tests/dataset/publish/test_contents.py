@@ -37,22 +37,27 @@ def test_streams_with_a_label_on_every_row_and_a_wall_clock(tmp_path: Path) -> N
     for person in ("s01", "s02"):
         folder = tmp_path / "src" / person
         folder.mkdir(parents=True)
-        rows = ["x_acc,y_acc,z_acc,x_gyro,y_gyro,z_gyro,timestamp,label"]
-        for i in range(120):
-            label = "SEATED" if i < 50 else "WALKING"
-            rows.append(f"{-4.1602 + i / 7},0.5,-9.25,0.0028,-0.0138,{i},{NOW + 10 * i},{label}")
-        (folder / f"{person}_20231114_sp.csv").write_text("\n".join(rows) + "\n")
+        # The second session is the first by its name: time decides.
+        for name, began in (("b_20231114", NOW), ("a_20231115", NOW + 86_400_000)):
+            rows = ["x_acc,y_acc,z_acc,x_gyro,y_gyro,z_gyro,timestamp,label"]
+            for i in range(120):
+                label = "SEATED" if i < 50 else "WALKING"
+                rows.append(f"{-4.1602 + i / 7},0.5,-9.25,0.0028,-0.0138,{i},{began + 10 * i},{label}")
+            (folder / f"{person}_{name}_sp.csv").write_text("\n".join(rows) + "\n")
     dataset = bring(tmp_path / "src", tmp_path / "DS", "phone-6")
     append_marks(dataset.path, [Mark(dataset.recordings[0].id, "exclude", "me")])
     dataset = open_dataset(dataset.path)
     back = sound(made_of(dataset, tmp_path / "out"))
-    assert [(r.gesture, r.rows, r.excluded) for r in back.recordings] == [
-        ("SEATED", 50, True),
-        ("WALKING", 70, False),
-        ("SEATED", 50, False),
-        ("WALKING", 70, False),
+    assert [(r.session, r.gesture, r.rows) for r in back.recordings[:4]] == [
+        ("session-1", "SEATED", 50),
+        ("session-1", "WALKING", 70),
+        ("session-2", "SEATED", 50),
+        ("session-2", "WALKING", 70),
     ]
-    for old, new in zip(dataset.recordings, back.recordings, strict=True):
+    assert [r.excluded for r in back.recordings] == [False, False, True] + [False] * 5
+    assert [p.name for p in sorted((back.path / "streams" / "s01").iterdir())] == ["session-1.csv", "session-2.csv"]
+    in_time = sorted(dataset.recordings, key=lambda r: (r.subject, r.start_ms))
+    for old, new in zip(in_time, back.recordings, strict=True):
         before, after = dataset.read(old), back.read(new)
         assert np.array_equal(before.values, after.values)
         assert np.array_equal(np.diff(before.device_ms), np.diff(after.device_ms))
