@@ -132,8 +132,8 @@ def _always(d: Description) -> tuple[str, ...]:
     return (
         "Not here: the recorder's sidecar files and session logs, notes, device addresses, consent references, the "
         "original file and session names, and who made a mark, when and why.",
-        "Files are written anew with plain columns; every value is the integer that was read, decimals in the steps that "
-        "`channels.csv` tells. Lines that could not be read are left out.",
+        "Files are written anew with plain columns; every value is the integer that was read, decimals in the steps of "
+        "`channels.csv`. Lines that could not be read are left out.",
     )
 
 
