@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 from pathlib import Path
 
@@ -58,3 +59,11 @@ def lsl_possible() -> None:
     else:
         if not found:
             missing("lsl", "no LSL loopback here: a stream published on this machine is not found")
+
+
+@pytest.fixture(scope="session")
+def publish_tools() -> None:
+    """The validators of a package (extra publish), and scikit-learn (extra baselines)."""
+    for module in ("mlcroissant", "frictionless", "rocrate", "datacite", "sklearn"):
+        if importlib.util.find_spec(module) is None:
+            missing("publish", f"{module} is not installed")

@@ -19,7 +19,7 @@ import io
 import json
 import os
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Self, TypeVar
@@ -31,6 +31,7 @@ from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.recfile import Frames, read_recording, read_stream
 from plushsense.core.signal import Layout
 from plushsense.core.tomlfile import read_toml, refuse_unknown
+from plushsense.dataset.about import About
 
 FORMAT_VERSION = 1
 HEAD = "dataset.toml"
@@ -165,6 +166,7 @@ class DatasetHead:
     consent: str = ""
     source: str = ""
     simulated: bool = False
+    about: About = field(default_factory=About)
 
     def to_toml(self) -> str:
         """The file's text."""
@@ -176,6 +178,7 @@ class DatasetHead:
             "consent": self.consent,
             "source": self.source,
             "simulated": self.simulated,
+            **({"about": about} if (about := self.about.to_table()) else {}),
             "layout": self.layout.to_dict(),
             "gesture_set": self.gestures.to_dict(),
         }
@@ -199,12 +202,13 @@ class DatasetHead:
         version = table.pop("format", None)
         if version != FORMAT_VERSION:
             raise DatasetError(f"'{path}' has the format {version}; this version reads {FORMAT_VERSION}.")
-        known = ("name", "version", "licence", "consent", "source", "simulated", "layout", "gesture_set")
+        known = ("name", "version", "licence", "consent", "source", "simulated", "about", "layout", "gesture_set")
         refuse_unknown(table, known, f"'{path}'", DatasetError)
         try:
             layout = Layout.from_dict(table.pop("layout"), f"layout in '{path}'")
             gestures = GestureSet.from_dict(table.pop("gesture_set"), f"gesture set in '{path}'")
-            return cls(layout=layout, gestures=gestures, **table)
+            about = About.from_table(table.pop("about", {}), f"[about] in '{path}'")
+            return cls(layout=layout, gestures=gestures, about=about, **table)
         except (KeyError, TypeError) as cause:
             raise DatasetError(f"'{path}' lacks something: {cause}.") from None
 

@@ -29,6 +29,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "info": ("info", "what a data set or a model bundle holds"),
     "trim": ("trim", "where each gesture begins: suggested, then accepted, adjusted or undone"),
     "stats": ("stats", "how long gestures last, before and after trimming"),
+    "publish": ("publish", "a package that strangers can find, open and cite, proved by validators"),
     "arch": ("arch", "count a network: parameters, receptive field, multiply-accumulates, state"),
     "train": ("train", "train one network and save it as a bundle"),
     "evaluate": ("evaluate", "how good it is, on people it never met"),
@@ -48,6 +49,7 @@ STOPPED = {
     "backup": "no backup was written",
     "restore": "nothing was written",
     "forget": "the same command finishes what was begun",
+    "publish": "there is no zip; a folder that was written whole can be proved with  plushsense publish --check OUT",
     "train": "no bundle was written",
     "report": "no page was written",
 }

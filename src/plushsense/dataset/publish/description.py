@@ -1,0 +1,195 @@
+"""One description of a package, from which every metadata file is written, so that they cannot disagree."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from plushsense.core.signal import DEVICE_MS, HOST_MS, Channel, Layout
+from plushsense.dataset.about import About, Creator
+from plushsense.dataset.publish.licences import Licence
+from plushsense.dataset.store import Dataset
+
+INTEGER, NUMBER, TEXT, YES_NO = "integer", "number", "string", "boolean"
+SIMULATION = "SIMULATION: recordings of a virtual toy. Nobody touched anything; they say nothing about a real toy."
+
+DATA = "data"
+RECORDINGS_TABLE = "recordings.csv"
+STREAMS_TABLE = "streams.csv"
+SUBJECTS_TABLE = "subjects.csv"
+GESTURES_TABLE = "gestures.csv"
+CHANNELS_TABLE = "channels.csv"
+CHECKSUMS = "checksums.sha256"
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table: its kind (`INTEGER`, …), what it means, its unit, and the range of valid values."""
+
+    name: str
+    kind: str
+    text: str
+    unit: str = ""
+    valid: tuple[float, float] | None = None
+    refers: str = ""
+    """``table.column`` that its values stand in."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of the package: one file, or (``files``) many of the same columns."""
+
+    name: str
+    text: str
+    columns: tuple[Column, ...]
+    file: str = ""
+    files: tuple[str, ...] = ()
+    glob: str = ""
+    key: str = ""
+
+
+@dataclass(frozen=True)
+class FileEntry:
+    """A file of the package."""
+
+    path: str
+    bytes: int
+    sha256: str
+    media: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Description:
+    """The package: who, what, which tables; ``published`` is the day, ISO."""
+
+    dataset: Dataset
+    licence: Licence
+    about: About
+    consent: str
+    published: str
+    tables: tuple[Table, ...]
+    notes: tuple[str, ...] = ()
+    """What was left out or changed on the way, one sentence each."""
+    files: tuple[FileEntry, ...] = field(default=())
+
+    @property
+    def name(self) -> str:
+        """A short name for files and identifiers."""
+        kept = "".join(c if c.isascii() and c.isalnum() else "-" for c in self.dataset.head.name.lower())
+        return "-".join(part for part in kept.split("-") if part) or "dataset"
+
+    @property
+    def version(self) -> str:
+        """Version of the data set, MAJOR.MINOR.PATCH."""
+        return self.dataset.head.version
+
+    @property
+    def simulated(self) -> bool:
+        """Whether nobody touched anything."""
+        return self.dataset.head.simulated
+
+    @property
+    def title(self) -> str:
+        """The title, which says SIMULATION where it is one."""
+        title = self.about.title or self.dataset.head.name
+        return f"SIMULATION: {title}" if self.simulated and not title.startswith("SIMULATION") else title
+
+    @property
+    def text(self) -> str:
+        """The description in a paragraph."""
+        d = self.dataset
+        counted = (
+            f"{len(d.recordings)} recordings of {len(d.gestures)} gestures by {len(d.subjects)} people on "
+            f"'{d.layout.title}': {d.layout.n_channels} channels at about {d.layout.rate_hz:g} Hz"
+            f"{f', and {len(d.streams)} whole session streams' if d.streams else ''}."
+        )
+        parts = [SIMULATION if self.simulated else "", self.about.description, counted]
+        return " ".join(p for p in parts if p)
+
+    @property
+    def keywords(self) -> tuple[str, ...]:
+        """Keywords, which say simulation where it is one."""
+        return (*self.about.keywords, *(("simulation",) if self.simulated else ())) or ("touch gestures",)
+
+    @property
+    def creators(self) -> tuple[Creator, ...]:
+        """Who made it; the contact where nobody else is named."""
+        return self.about.creators or (Creator(self.about.contact.name),)
+
+    @property
+    def citation(self) -> str:
+        """How to cite it, in one line."""
+        names = "; ".join(c.name for c in self.creators)
+        where = f" https://doi.org/{self.about.doi}" if self.about.doi else f" {self.about.homepage}".rstrip()
+        return f"{names} ({self.published[:4]}): {self.title}, version {self.version} [data set].{where}"
+
+    @property
+    def url(self) -> str:
+        """Where it lives; "" when nobody said."""
+        return f"https://doi.org/{self.about.doi}" if self.about.doi else self.about.homepage
+
+
+_MEDIA = {
+    ".csv": "text/csv",
+    ".tsv": "text/tab-separated-values",
+    ".json": "application/json",
+    ".jsonl": "application/jsonlines",
+    ".md": "text/markdown",
+    ".toml": "application/toml",
+    ".txt": "text/plain",
+    ".xml": "application/xml",
+    ".sha256": "text/plain",
+}
+
+
+def file_entry(root: Path, path: Path, text: str) -> FileEntry:
+    """What is to be said of a file of the package in ``root``."""
+    data = path.read_bytes()
+    relative = path.relative_to(root).as_posix()
+    return FileEntry(relative, len(data), hashlib.sha256(data).hexdigest(), _MEDIA.get(path.suffix, "text/plain"), text)
+
+
+def sample_columns(layout: Layout, labelled: bool) -> tuple[Column, ...]:
+    """The columns of a recording's or stream's file, in file order."""
+    columns = []
+    for key in layout.csv.columns:
+        if key == HOST_MS:
+            columns.append(
+                Column(
+                    key, INTEGER, "time at which the computer took the row in; shifted, the date is fictitious", "ms"
+                )
+            )
+        elif key == DEVICE_MS:
+            columns.append(
+                Column(key, INTEGER, "the toy's clock: the truth for rate, gaps and losses; a fall is a restart", "ms")
+            )
+        elif key == "label":
+            if labelled:
+                columns.append(Column(key, TEXT, "gesture at this row"))
+        else:
+            columns.append(channel_column(layout.channels[layout.index(key)]))
+    return tuple(columns)
+
+
+def channel_column(channel: Channel) -> Column:
+    """A measured channel as a column."""
+    physical = (
+        ""
+        if channel.offset == 0.0 and channel.scale == 1.0
+        else f"; physical value = (raw - {channel.offset:g}) * {channel.scale:g} {channel.unit}"
+    )
+    step = "" if channel.step == 1.0 else f"; in steps of {channel.step:g}"
+    valid = f"valid from {_plain(channel.valid_min)} to {_plain(channel.valid_max)}"
+    return Column(
+        channel.name,
+        INTEGER if channel.step == 1.0 else NUMBER,
+        f"{channel.kind}, raw reading{physical}{step}; {valid}, what is outside is kept as it was read",
+        channel.unit,
+        (channel.valid_min, channel.valid_max),
+    )
+
+
+def _plain(value: float) -> str:
+    return str(int(value)) if value == int(value) else str(value)

@@ -1,0 +1,299 @@
+"""How well a simple program tells the person from the touch: what a data officer must know before data are published.
+
+The attacker is given recordings under the people's codes and one new recording, and says whose it is. It reads
+statistics of each recording (those of the paper's baselines: mean, standard deviation, minimum, maximum, RMS, energy,
+band power 0–1 Hz and 1–3 Hz of every channel) with extremely randomised trees (Geurts, Ernst & Wehenkel 2006). A
+stronger program may do better: the figures are a lower bound of the risk, never a proof of anonymity.
+
+Each person counts alike: top-1 and top-5 are averaged over people, so that chance is one in so many people.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import BadInput
+from plushsense.core.extras import need
+from plushsense.core.gestures import NOBODY
+from plushsense.core.recfile import Frames
+from plushsense.core.signal import Layout
+from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
+from plushsense.scoring.metrics import summary
+from plushsense.windows.clock import resample
+from plushsense.windows.features import magnitude
+
+Floats = NDArray[np.float64]
+Texts = NDArray[np.str_]
+Progress = Callable[[int, int], None]
+
+BANDS_HZ = ((0.0, 1.0), (1.0, 3.0))
+COARSE_HZ = 25.0
+FOLDS = 5
+FEWEST_RECORDINGS = 2
+CLEARLY = 0.8
+
+# What each program sees, and what it thereby leaves out.
+SEES = {
+    "everything": "statistics of every channel, and the clock's rate and jitter",
+    "touch": "statistics of every channel, not the clock",
+    "movement": (
+        f"only how the channels change: no level (so not how the toy is held), averaged to {COARSE_HZ:g} Hz (so not "
+        "the device's noise and sampling rate)"
+    ),
+    "clock": "only the clock's rate and jitter, nothing of the touch",
+}
+DESIGNS = {
+    "recordings": "a new recording of the same sessions and gestures",
+    "gestures": "a recording of a gesture that the program never saw",
+    "sessions": "a recording of a session that the program never saw",
+}
+_PLAN = (
+    ("recordings", ("everything", "touch", "movement", "clock")),
+    ("gestures", ("everything", "movement")),
+    ("sessions", ("everything", "movement")),
+)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """How often one program named the right person in one design.
+
+    ``top1`` and ``top5`` are ``{mean, sd, ci95}`` over people (bootstrap over people); ``by_person`` is each one's
+    top-1, ``precision`` how often the program is right when it says that person, ``chance`` and ``chance5`` what
+    guessing would reach.
+    """
+
+    design: str
+    sees: str
+    people: int
+    recordings: int
+    top1: dict[str, Any]
+    top5: dict[str, Any]
+    chance: float
+    chance5: float
+    by_person: dict[str, float]
+    precision: dict[str, float]
+
+    @property
+    def clear(self) -> list[str]:
+        """People who are almost surely named, and hardly ever wrongly."""
+        return [p for p, share in self.by_person.items() if min(share, self.precision[p]) >= CLEARLY]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, ready for JSON."""
+        return dict(vars(self))
+
+
+@dataclass(frozen=True)
+class Reidentified:
+    """What was tried; ``skipped`` says which designs the data do not allow, and why.
+
+    ``of_one_person`` are gestures that only one person made: their label alone names that person.
+    """
+
+    trials: tuple[Trial, ...]
+    people: int
+    recordings: int
+    sessions: int
+    skipped: dict[str, str]
+    of_one_person: tuple[str, ...]
+    seed: int
+    trees: int
+    simulated: bool
+
+    def find(self, design: str, sees: str) -> Trial | None:
+        """One trial; None where it was not possible."""
+        return next((t for t in self.trials if (t.design, t.sees) == (design, sees)), None)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, ready for JSON."""
+        return {
+            "people": self.people,
+            "recordings": self.recordings,
+            "sessions": self.sessions,
+            "trials": [t.to_dict() for t in self.trials],
+            "skipped": self.skipped,
+            "gestures_of_one_person": list(self.of_one_person),
+            "seed": self.seed,
+            "trees": self.trees,
+            "simulated": self.simulated,
+        }
+
+
+def reidentify(dataset: Dataset, *, seed: int = 1, trees: int = 150, progress: Progress | None = None) -> Reidentified:
+    """Try to tell the people of a data set apart; excluded recordings, nobody's and the unknown's are left out.
+
+    Args:
+        seed: the same seed gives the same figures.
+        progress: called with fits done, and in all.
+
+    Raises:
+        BadInput: with fewer than two people of at least two recordings each.
+        MissingExtraError: without scikit-learn.
+    """
+    forest = need("sklearn.ensemble", "baselines")
+    used = [r for r in dataset.used if r.subject not in (NOBODY, UNKNOWN_SUBJECT)]
+    counts: dict[str, int] = {}
+    for r in used:
+        counts[r.subject] = counts.get(r.subject, 0) + 1
+    used = [r for r in used if counts[r.subject] >= FEWEST_RECORDINGS]
+    if len({r.subject for r in used}) < 2:
+        raise BadInput(
+            f"Whether people can be recognised needs two people of at least {FEWEST_RECORDINGS} recordings each: "
+            "leave it out with --no-reidentification."
+        )
+    seen = [features(dataset.read(r), dataset.layout) for r in used]
+    whole = [i for i, s in enumerate(seen) if s is not None]
+    table = {name: np.stack([s[name] for s in seen if s is not None]) for name in SEES}
+    person = np.array([used[i].subject for i in whole])
+    gesture = np.array([used[i].gesture for i in whole])
+    session = np.array([used[i].session for i in whole])
+    rng = np.random.default_rng([seed, 0x1D])
+    groups = {
+        "recordings": _dealt(person, rng),
+        "gestures": _gesture_groups(gesture),
+        "sessions": _turns(person, session),
+    }
+    skipped = _impossible(gesture, groups["sessions"])
+    plan = [(design, sees) for design, names in _PLAN if design not in skipped for sees in names]
+    trials = []
+    for done, (design, sees) in enumerate(plan):
+        if progress is not None:
+            progress(done, len(plan))
+        trials.append(_trial(design, sees, table[sees], person, groups[design], forest, seed, trees))
+    if progress is not None:
+        progress(len(plan), len(plan))
+    sessions = len(set(zip(person.tolist(), session.tolist(), strict=True)))
+    alone = [g for g in np.unique(gesture) if len(np.unique(person[gesture == g])) == 1]
+    return Reidentified(
+        tuple(trials),
+        len(np.unique(person)),
+        len(person),
+        sessions,
+        skipped,
+        tuple(map(str, alone)),
+        seed,
+        trees,
+        dataset.head.simulated,
+    )
+
+
+def features(frames: Frames, layout: Layout) -> dict[str, Floats] | None:
+    """What each program sees of one recording; None for one too short to say anything of.
+
+    Statistics are taken of the longest stretch without a gap, at even samples.
+    """
+    segments = resample(frames, layout)
+    longest = max(segments, key=len, default=None)
+    if longest is None or len(longest) < 4:
+        return None
+    parts = [magnitude(longest.data[:, [layout.index(n) for n in d.of]])[:, None] for d in layout.derived]
+    x = np.concatenate([longest.data, *parts], axis=1).astype(np.float64)
+    touch = _statistics(x, layout.rate_hz)
+    block = max(1, round(layout.rate_hz / COARSE_HZ))
+    rows = len(x) // block
+    coarse = x[: rows * block].reshape(rows, block, -1).mean(axis=1) if rows >= 4 else x
+    movement = _statistics(coarse - coarse.mean(axis=0), layout.rate_hz / block)
+    clock = _clock(frames.device_ms)
+    return {"everything": np.concatenate([touch, clock]), "touch": touch, "movement": movement, "clock": clock}
+
+
+def _statistics(x: Floats, rate_hz: float) -> Floats:
+    """The paper's eight of each column: (T, C) → (8 C,)."""
+    spectrum = np.abs(np.fft.rfft(x - x.mean(axis=0), axis=0)) ** 2 / len(x)
+    frequency = np.fft.rfftfreq(len(x), 1.0 / rate_hz)
+    bands = [spectrum[(frequency >= low) & (frequency < high)].sum(axis=0) for low, high in BANDS_HZ]
+    energy = (x**2).sum(axis=0)
+    rms = np.sqrt(energy / len(x))
+    return np.concatenate([x.mean(axis=0), x.std(axis=0), x.min(axis=0), x.max(axis=0), rms, energy, *bands])
+
+
+def _clock(device_ms: NDArray[np.int64]) -> Floats:
+    steps = np.diff(device_ms)
+    steps = steps[(steps >= 0) & (steps <= 1000)]
+    if not len(steps):
+        return np.zeros(4)
+    return np.array([steps.mean(), np.median(steps), steps.std(), float(np.mean(steps == np.median(steps)))])
+
+
+def _dealt(person: Texts, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Each person's recordings dealt over the folds, at random."""
+    group = np.zeros(len(person), dtype=np.int64)
+    for name in np.unique(person):
+        mine = rng.permutation(np.flatnonzero(person == name))
+        group[mine] = np.arange(len(mine)) % FOLDS
+    return group
+
+
+def _gesture_groups(gesture: Texts) -> NDArray[np.int64]:
+    _, which = np.unique(gesture, return_inverse=True)
+    return np.asarray(which % FOLDS, dtype=np.int64)
+
+
+def _turns(person: Texts, session: Texts) -> NDArray[np.int64]:
+    """Of people of several sessions, the number of the session, which is a turn to be tested; −1 of the others."""
+    group = np.full(len(person), -1, dtype=np.int64)
+    for name in np.unique(person):
+        mine = person == name
+        names, which = np.unique(session[mine], return_inverse=True)
+        if len(names) > 1:
+            group[mine] = which
+    return group
+
+
+def _impossible(gesture: Texts, turns: NDArray[np.int64]) -> dict[str, str]:
+    skipped = {}
+    if len(np.unique(gesture)) < 2:
+        skipped["gestures"] = "there is only one gesture"
+    if not (turns >= 0).any():
+        skipped["sessions"] = "nobody has more than one session"
+    return skipped
+
+
+def _trial(
+    design: str, sees: str, x: Floats, person: Texts, group: NDArray[np.int64], forest: Any, seed: int, trees: int
+) -> Trial:
+    names, truth = np.unique(person, return_inverse=True)
+    top1 = np.full(len(truth), np.nan)
+    top5 = np.full(len(truth), np.nan)
+    named = np.full(len(truth), -1)
+    rng = np.random.default_rng([seed, 0x7E])
+    for turn in np.unique(group[group >= 0]):
+        test = np.flatnonzero(group == turn)
+        train = np.flatnonzero(group != turn)
+        # Who left nothing to learn from cannot be named.
+        test = test[np.isin(truth[test], truth[train])]
+        if not len(test):
+            continue
+        model = forest.ExtraTreesClassifier(trees, class_weight="balanced", random_state=seed, n_jobs=1)
+        model.fit(x[train], truth[train])
+        # Equal likelihoods, as of people with the same clock, are drawn by lot: else the first code would win them all.
+        chances = np.round(model.predict_proba(x[test]), 9)
+        likely = model.classes_[np.argsort(-(chances + 1e-10 * rng.random(chances.shape)), axis=1)]
+        named[test] = likely[:, 0]
+        hit = likely == truth[test][:, None]
+        top1[test] = hit[:, 0]
+        top5[test] = hit[:, :5].any(axis=1)
+    tested = np.isfinite(top1)
+    people = np.unique(truth[tested])
+    mine = {str(names[k]): float(top1[tested & (truth == k)].mean()) for k in people}
+    said = {str(names[k]): named[tested] == k for k in people}
+    right = {p: float(top1[tested][at].mean()) if at.any() else 0.0 for p, at in said.items()}
+    five = [float(top5[tested & (truth == k)].mean()) for k in people]
+    return Trial(
+        design,
+        sees,
+        len(names),
+        int(tested.sum()),
+        summary(list(mine.values())),
+        summary(five),
+        1.0 / len(names),
+        min(1.0, 5.0 / len(names)),
+        mine,
+        right,
+    )

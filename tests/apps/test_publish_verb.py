@@ -1,0 +1,99 @@
+"""``plushsense publish`` as a user types it."""
+
+from __future__ import annotations
+
+import json
+import stat
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from plushsense.dataset.store import Dataset
+
+Cli = Callable[..., Any]
+CONTACT = ("--contact", "Ada <ada@example.org>")
+SAID = (*CONTACT, "--licence", "CC-BY-4.0", "--consent", "all agreed")
+
+pytestmark = pytest.mark.usefixtures("publish_tools")
+
+
+def test_from_refusal_to_a_valid_package(cli: Cli, dataset: Dataset, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    ran = cli("publish", dataset.path, out)
+    assert ran.status == 2
+    assert ran.err.count("\n") == 1
+    for word in ("licence", "consent", "contact", "dataset.toml", "--contact"):
+        assert word in ran.err
+    head = (dataset.path / "dataset.toml").read_bytes()
+    found = cli("publish", dataset.path, out, *SAID, "--json").json
+    assert found["valid"] is True
+    assert found["files"] == len([p for p in out.rglob("*") if p.is_file()])
+    assert (found["recordings"], found["subjects"], found["problems"]) == (30, 5, [])
+    assert (dataset.path / "dataset.toml").read_bytes() == head, "nothing is written back unless asked"
+    assert "The right" not in (out / "reidentification.md").read_text()
+    said = (out / "README.md").read_text()
+    assert "a simple program names the right one of 5 people" in said
+    assert json.loads((out / "reidentification.json").read_text())["people"] == 5
+    checked = cli("publish", "--check", found["zip"], "--json")
+    assert (checked.status, checked.json["valid"]) == (0, True)
+    (out / "gestures.csv").write_text("Shake\n")
+    damaged = cli("publish", "--check", out)
+    assert damaged.status == 1
+    assert "checksums: gestures.csv: was changed" in damaged.err
+    assert "not valid" in damaged.out
+    assert cli("publish", dataset.path, out, *SAID).status == 2
+
+
+def test_saving_and_leaving_the_report_out(cli: Cli, dataset: Dataset, tmp_path: Path) -> None:
+    key = tmp_path / "key.txt"
+    ran = cli("publish", dataset.path, tmp_path / "a", *SAID, "--save", "--no-reidentification", "--key", key)
+    assert ran.status == 0, ran.err
+    assert "valid" in ran.out
+    assert not (tmp_path / "a" / "reidentification.md").exists()
+    assert "**not looked at**" in (tmp_path / "a" / "README.md").read_text()
+    if sys.platform != "win32":
+        assert stat.S_IMODE(key.stat().st_mode) == 0o600
+    again = cli("publish", dataset.path, tmp_path / "b", "--no-reidentification", "--key", key)
+    assert again.status == 0, "licence, contact and consent were saved"
+    assert (tmp_path / "a.zip").read_bytes() == (tmp_path / "b.zip").read_bytes()
+    assert cli("info", dataset.path, "--json").json["licence"] == "CC-BY-4.0"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("publish",), "needs DATASET and OUT"),
+        (("publish", "DS"), "needs DATASET and OUT"),
+        (("publish", "DS", "OUT", "--check", "X"), "not both"),
+        (("publish", "--check", "nowhere"), "is no package"),
+        (("publish", "nowhere", "OUT"), "There is no folder"),
+        (("publish", "DS", "OUT", *CONTACT, "--consent", "yes", "--licence", "CC BY"), "Did you mean 'CC-BY-"),
+        (("publish", "DS", "OUT", "--contact", "Ada"), "write it as"),
+        (("publish", "DS", "OUT", *SAID, "--key", "DS/key"), "keep it elsewhere"),
+        (("publish", "DS", "OUT", *SAID, "--key", "bad.key"), "is no key"),
+        (("publish", "DS", "OUT", *SAID, "--no-reidentification", "--allow-columns", "hand"), "no column 'hand'"),
+    ],
+)
+def test_refusals_are_sentences(
+    cli: Cli, dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], said: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "bad.key").write_text("not hex")
+    ran = cli(*words)
+    assert ran.status == 2
+    assert said in ran.err
+    assert ran.err.count("\n") == 1
+    assert not (tmp_path / "OUT").exists()
+
+
+def test_without_scikit_learn_the_install_command_is_told(
+    cli: Cli, dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "sklearn.ensemble", None)
+    monkeypatch.setitem(sys.modules, "sklearn", None)
+    ran = cli("publish", dataset.path, tmp_path / "out", *SAID)
+    assert ran.status == 2
+    assert "pip install 'plushsense[baselines]'" in ran.err
