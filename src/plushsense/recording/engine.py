@@ -171,6 +171,17 @@ class Recorder:
             )
 
     @property
+    def toy_s(self) -> float:
+        """How long the toy has been heard, by its own clock, in seconds."""
+        with self._changed:
+            return self._toy_ms / 1000.0
+
+    @property
+    def over(self) -> str:
+        """Why nothing comes from the toy any more; "" while it may."""
+        return self._over
+
+    @property
     def begins_ms(self) -> int | None:
         """When the toy's clock will be at the end of the countdown; None while there is none, or no clock yet."""
         with self._changed:
@@ -323,6 +334,11 @@ class Recorder:
                 last = self._takes.get(self._last_key, "") if self._last_key else ""
                 self._log("note", text=text, gesture=step.gesture, repetition=step.repetition, file=last)
                 self._say("Noted.")
+
+    def say(self, text: str) -> None:
+        """Put a sentence on every screen."""
+        with self._telling():
+            self._say(text)
 
     def close(self) -> None:
         """End the session's work for now: all is written, a running recording is broken off. Twice is harmless."""
@@ -621,7 +637,12 @@ class Recorder:
         frames = to_frames(take.frames, layout.n_channels)
         with self._changed:
             saved_ms = self._now_ms()
-        more = {"saved_ms": saved_ms, "speed": self._speed, "software": self._software}
+        more = {
+            "saved_ms": saved_ms,
+            "device": self.device.url,
+            "speed": self._speed,
+            "software": self._software,
+        }
         beside = sidecar(take, frames, layout, head, job.counters, job.ended, **more)
         path = save_take(self.session.folder, frames, layout, step.gesture, saved_ms, beside)
         says = {"rows": len(frames), "lost": take.lost, "gaps": len(take.gaps), "ended": job.ended}

@@ -20,6 +20,7 @@ from plushsense.core.errors import PlushSenseError, nearest
 VERBS: dict[str, tuple[str, str]] = {
     "demo": ("demo", "the whole path on a virtual toy, in a few minutes"),
     "simulate": ("simulate", "recordings of virtual people, as the authors' recorder would leave them"),
+    "record": ("record", "record a session with a toy: prompts, countdown, nothing lost"),
     "import": ("importing", "make a data set from recordings"),
     "info": ("info", "what a data set or a model bundle holds"),
     "arch": ("arch", "count a network: parameters, receptive field, multiply-accumulates, state"),
@@ -36,6 +37,7 @@ STOPPED = {
     "evaluate": "finished folds are kept, and the same command goes on from there",
     "simulate": "nothing was written",
     "import": "nothing was written",
+    "record": "what was recorded is kept, and the same command goes on from there",
     "train": "no bundle was written",
     "report": "no page was written",
 }

@@ -92,7 +92,9 @@ class VirtualDevice(Device):
 
 
 def open_url(address: Address, layout: Layout) -> VirtualDevice:
-    """Open ``virtual://?person=7&seed=1&speed=1``; session, lost, garbled, glitch, seconds, gestures (with commas), too."""
+    """Open ``virtual://?person=7&seed=1&speed=1``; also session, lost, garbled, glitch, seconds,
+    gestures (with commas).
+    """
     address.check_keys(("person", "seed", "session", "speed", "lost", "garbled", "glitch", "seconds", "gestures"))
     text = address.query.get("gestures", "")
     spec = ToySpec(
