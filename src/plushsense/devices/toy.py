@@ -22,6 +22,8 @@ _STALL_S = 0.5
 """A reader that takes nothing for so long is not there: lines are dropped, as on a real serial line."""
 _HURRIED_STALL_S = 10.0
 """The same for a toy that runs faster than real time: it must not run away from a reader that only writes a file."""
+_HURRIED_QUEUE = 512
+"""Bytes that such a toy on a pseudo terminal leaves unread, so that the system's buffers do not hold seconds of it."""
 
 
 @dataclass
@@ -38,12 +40,19 @@ class _Outlet:
     """A non-blocking end: waits for a slow reader, drops lines when nobody reads, never leaves half a line."""
 
     def __init__(
-        self, write: Callable[[bytes], int], fileno: int, *, absent: bool = False, stall_s: float = _STALL_S
+        self,
+        write: Callable[[bytes], int],
+        fileno: int,
+        *,
+        absent: bool = False,
+        stall_s: float = _STALL_S,
+        unread: Callable[[], int] | None = None,
     ) -> None:
         self._write = write
         self._fileno = fileno
         self._absent = absent
         self._stall_s = stall_s
+        self._unread = unread
         self._rest = b""
 
     def send(self, data: bytes, stop: threading.Event) -> bool:
@@ -51,6 +60,9 @@ class _Outlet:
         whole = self._rest + data
         pending = whole
         deadline = time.monotonic() + (0.0 if self._absent else self._stall_s)
+        if self._unread is not None and not self._absent:
+            while self._unread() > _HURRIED_QUEUE and time.monotonic() < deadline and not stop.wait(0.0005):
+                pass
         while pending:
             try:
                 pending = pending[self._write(pending) :]
@@ -167,7 +179,8 @@ def serve_pty(
     """Serve the virtual toy on a pseudo terminal that looks like a serial port, until ``stop`` is set.
 
     Linux and macOS. ``on_ready`` gets the URL (``serial:///dev/pts/5``). Arguments and errors otherwise as
-    `serve_tcp`, but speed 0 is not for a port that nobody may be reading.
+    `serve_tcp`, but speed 0 is not for a port that nobody may be reading. A toy faster than real time waits up to 10 s
+    for a slow reader, so that what is lost is lost for other reasons than its haste.
 
     Raises:
         DeviceError: on Windows, which has no pseudo terminals.
@@ -187,7 +200,14 @@ def serve_pty(
         os.set_blocking(master, False)
         counters = ToyCounters()
         stop = stop or threading.Event()
-        outlet = _Outlet(lambda data: os.write(master, data), master, absent=True, stall_s=_stall_s(speed))
+        hurried = speed > 1.0
+        outlet = _Outlet(
+            lambda data: os.write(master, data),
+            master,
+            absent=not hurried,
+            stall_s=_stall_s(speed),
+            unread=(lambda: _unread(slave)) if hurried else None,
+        )
         if on_ready is not None:
             on_ready(f"serial://{os.ttyname(slave)}")
         _run(stream, lambda data: outlet.send(data, stop), counters, speed, seconds, on_performed, on_sent, stop)
@@ -195,6 +215,18 @@ def serve_pty(
         os.close(master)
         os.close(slave)
     return counters
+
+
+def _unread(slave: int) -> int:
+    """Bytes that wait to be read on a pseudo terminal."""
+    if sys.platform == "win32":
+        return 0
+    import fcntl
+    import struct
+    import termios
+
+    waiting = fcntl.ioctl(slave, termios.FIONREAD, b"\0" * 4)
+    return int(struct.unpack("i", waiting)[0])
 
 
 def _stall_s(speed: float) -> float:
@@ -216,6 +248,8 @@ def _run(
     first_ms: int | None = None
     batch, lines = bytearray(), 0
 
+    largest = 4096 if speed <= 1.0 else _HURRIED_QUEUE
+
     def flush() -> None:
         nonlocal lines
         if batch:
@@ -236,7 +270,7 @@ def _run(
         if seconds and line.device_ms - first_ms >= seconds * 1000.0:
             break
         due = pacer.due_s(line.device_ms)
-        if due > 0.0 or len(batch) > 4096:
+        if due > 0.0 or len(batch) > largest:
             flush()
             if due > 0.0 and stop.wait(due):
                 break

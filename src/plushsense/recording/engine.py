@@ -1,7 +1,7 @@
 """The recorder: an engine that a terminal or a web page drives with a few commands and looks at through a status.
 
-Three threads share the work, so that none waits for another: one takes the toy's frames in, one writes them to the
-disk, and whoever calls a command is answered at once. All times of a session run on the toy's own clock, so that a
+Nobody waits for another: one thread takes the toy's frames in, the keeper's write, and whoever calls a command is
+answered at once. All times of a session run on the toy's own clock, so that a
 virtual toy at twenty times the speed counts down in a twentieth of the time, and a toy that is unplugged during the
 countdown does not start a recording of nothing.
 """
@@ -20,16 +20,14 @@ from typing import Any, Literal, Self
 from plushsense.core.errors import DatasetError, PlushSenseError
 from plushsense.core.recfile import STREAM_NAME
 from plushsense.devices.base import Counters, Device, Frame, LossMeter, now_ms
+from plushsense.recording.course import Course, key_of
+from plushsense.recording.keeper import Keeper
 from plushsense.recording.meter import Meter
-from plushsense.recording.protocol import Step
-from plushsense.recording.session import Key, OpenSession
+from plushsense.recording.session import OpenSession
 from plushsense.recording.sessionfile import Event, SessionHead
 from plushsense.recording.status import State, Status
 from plushsense.recording.take import Take, gap_entry, sidecar
 from plushsense.recording.writer import StreamFile, save_take, to_frames
-
-FLUSH_S = 0.5
-"""The stream on disk is at most so old, by the computer's clock and by the toy's, whichever comes first."""
 
 _AWAY_S = 1.0
 
@@ -43,13 +41,6 @@ class Auto:
 
     take_s: float = 5.0
     rest_s: float = 1.0
-
-
-@dataclass(frozen=True)
-class _Save:
-    take: Take
-    ended: Ended
-    counters: Counters
 
 
 class Recorder:
@@ -76,7 +67,6 @@ class Recorder:
         self.session = session
         self.device = device
         self.protocol = session.protocol
-        self.steps = self.protocol.steps()
         self._speed = speed
         self._auto = auto
         self._software = software
@@ -84,10 +74,7 @@ class Recorder:
         self._listeners: list[Listener] = []
         self._news: list[str] = []
         standing = session.standing
-        self._takes: dict[Key, str] = dict(standing.takes)
-        self._skipped: set[Key] = set(standing.skipped)
-        self._aside: dict[Key, list[str]] = {k: list(v) for k, v in standing.aside.items()}
-        self._last_key: Key | None = next(reversed(self._takes), None)
+        self._course = Course(self.protocol.steps(), standing)
         self._rows = standing.rows
         self._base_ms = max(now_ms(), standing.host_ms + 1000 if speed != 1.0 else 0)
         self._toy_ms = 0.0
@@ -98,21 +85,17 @@ class Recorder:
         self._lost = 0
         self._gaps: list[dict[str, Any]] = []
         self._meter = Meter(session.layout)
-        self._pending: list[Frame] = []
-        self._pending_s = self._pending_ms = 0.0
-        self._jobs: list[Event | _Save] = []
         self._take: Take | None = None
         self._since_ms = 0.0
         self._state: State = "idle"
         self._paused = False
-        self._at = 0
         self._message = ""
         self._over = ""
         self._failed = ""
         self._closing = False
-        self._stream: StreamFile | None = None
+        self._came: list[Frame] = []
+        self._keeper: Keeper | None = None
         self._reader = threading.Thread(target=self._read, name="plushsense-reader", daemon=True)
-        self._writer = threading.Thread(target=self._write, name="plushsense-writer", daemon=True)
 
     @classmethod
     def open(cls, folder: Path, device: Device, head: SessionHead | None = None, **options: Any) -> Recorder:
@@ -132,8 +115,7 @@ class Recorder:
     def status(self) -> Status:
         """Everything there is to show, at this moment."""
         with self._changed:
-            step = self.steps[self._at]
-            key = (step.gesture, step.repetition)
+            course = self._course
             counters = self.device.counters
             away = getattr(self.device, "state", "connected") == "waiting"
             quality = self._meter.quality(time.monotonic(), away)
@@ -143,14 +125,14 @@ class Recorder:
             elapsed = max(passed, self._wall_s()) if running else 0.0
             return Status(
                 state=self._state,
-                step=step,
-                steps=len(self.steps),
+                step=course.step,
+                steps=len(course.steps),
                 repetitions=self.protocol.repetitions,
-                following=self._following(),
-                done=len(self._takes),
-                skipped=len(self._skipped),
-                redone=sum(map(len, self._aside.values())),
-                already=self._takes.get(key, ""),
+                following=course.following(),
+                done=len(course.takes),
+                skipped=len(course.skipped),
+                redone=course.redone,
+                already=course.takes.get(key_of(course.step), ""),
                 countdown_s=left,
                 elapsed_s=elapsed,
                 left_s=max(0.0, self.protocol.longest_s - passed) if running else 0.0,
@@ -164,7 +146,7 @@ class Recorder:
                 reconnects=counters.reconnects,
                 gaps=len(self._gaps),
                 rows=self._rows,
-                file=self._takes.get(self._last_key, "") if self._last_key else "",
+                file=course.last_file,
                 message=self._message,
                 failed=self._failed,
                 folder=str(self.session.folder),
@@ -210,10 +192,11 @@ class Recorder:
             DatasetError: when the stream cannot be opened.
         """
         try:
-            self._stream = StreamFile(self.session.folder / STREAM_NAME, self.session.layout)
+            stream = StreamFile(self.session.folder / STREAM_NAME, self.session.layout)
         except OSError as cause:
             self.session.close()
             raise self._refusal(cause) from None
+        self._keeper = Keeper(stream, self.session.log, hurried=self._speed != 1.0, on_fail=self._fail)
         with self._changed:
             self._log(
                 "open",
@@ -225,7 +208,6 @@ class Recorder:
             )
             self._advance("; ".join(self.session.standing.mended), from_start=True)
         self._reader.start()
-        self._writer.start()
 
     def space(self) -> None:
         """Start the countdown; stop the recording, not within the protocol's shortest_s; cancel a countdown."""
@@ -254,14 +236,13 @@ class Recorder:
             elif self._state == "recording":
                 self._abandon("redo", "Broken off: it is to be made again.")
             elif self._state in ("idle", "paused", "finished"):
-                key = self._last_key
-                file = self._takes.pop(key, "") if key else ""
-                if key is None or not file:
+                key = self._course.last
+                if key is None:
                     self._say("There is no recording to make again: go back to it (b).")
                     return
-                self._set_aside(key, file, why)
-                self._last_key = None
-                self._at = next(s.number for s in self.steps if (s.gesture, s.repetition) == key)
+                file = self._course.set_aside(key)
+                more = {"why": why} if why else {}
+                self._log("redo", file=file, gesture=key[0], repetition=key[1], **more)
                 self._ready(f"'{key[0]}', {key[1]}, is to be made again; skip (s) keeps it after all.")
 
     def skip(self) -> None:
@@ -272,18 +253,15 @@ class Recorder:
             if self._state == "recording":
                 self._say("Recording: space stops it, r breaks it off.")
             elif self._state in ("idle", "paused"):
-                step = self.steps[self._at]
-                key = (step.gesture, step.repetition)
+                key = key_of(self._course.step)
                 said = ""
-                if key not in self._takes:
-                    if self._aside.get(key):
-                        file = self._aside[key].pop()
-                        self._takes[key] = self._restored(key, file)
-                        said = "The earlier recording is kept."
-                    else:
-                        self._skipped.add(key)
-                        self._log("skip", gesture=step.gesture, repetition=step.repetition)
-                        said = f"Skipped '{step.gesture}', {step.repetition}; go back to it with b."
+                if file := self._course.keep(key):
+                    self._log("keep", file=file, gesture=key[0], repetition=key[1])
+                    said = "The earlier recording is kept."
+                elif key not in self._course.takes:
+                    self._course.skipped.add(key)
+                    self._log_step("skip")
+                    said = f"Skipped '{key[0]}', {key[1]}; go back to it with b."
                 self._advance(said)
 
     def go(self, number: int) -> None:
@@ -294,16 +272,15 @@ class Recorder:
             if self._state == "recording":
                 self._say("Recording: space stops it, r breaks it off.")
             elif self._state in ("idle", "paused", "finished"):
-                self._at = min(max(0, number), len(self.steps) - 1)
-                step = self.steps[self._at]
-                self._log("go", gesture=step.gesture, repetition=step.repetition)
-                there = (step.gesture, step.repetition) in self._takes
+                self._course.at = min(max(0, number), len(self._course.steps) - 1)
+                self._log_step("go")
+                there = key_of(self._course.step) in self._course.takes
                 self._ready("This one is recorded: space makes it again, s goes on." if there else "")
 
     def back(self) -> None:
         """Go one recording back."""
         with self._telling():
-            self.go(self._at - 1 if self._state != "finished" else len(self.steps) - 1)
+            self.go(self._course.at - 1 if self._state != "finished" else self._course.at)
 
     def pause(self) -> None:
         """Pause: nothing starts until `resume`; the stream is kept all the while."""
@@ -330,9 +307,7 @@ class Recorder:
         text = " ".join(text.split())
         with self._telling():
             if text:
-                step = self.steps[self._at]
-                last = self._takes.get(self._last_key, "") if self._last_key else ""
-                self._log("note", text=text, gesture=step.gesture, repetition=step.repetition, file=last)
+                self._log_step("note", text=text, file=self._course.last_file)
                 self._say("Noted.")
 
     def say(self, text: str) -> None:
@@ -350,12 +325,10 @@ class Recorder:
             if not self._closing:
                 self._log("close", rows=self._rows)
             self._closing = True
-            self._changed.notify_all()
-        for thread in (self._reader, self._writer):
-            if thread.is_alive() and thread is not threading.current_thread():
-                thread.join()
-        if self._stream is not None:
-            self._stream.close()
+        if self._reader.is_alive():
+            self._reader.join()
+        if self._keeper is not None:
+            self._keeper.close()
         self.session.close()
         with self._telling():
             if self._state != "stopped":
@@ -389,9 +362,13 @@ class Recorder:
                     listener(what, self.status())
 
     def _log(self, what: str, **more: Any) -> None:
-        self._jobs.append(Event(what, self._now_ms(), more))
+        if self._keeper is not None:
+            self._keeper.do(Event(what, self._now_ms(), more))
         self._news.append(what)
-        self._changed.notify_all()
+
+    def _log_step(self, what: str, **more: Any) -> None:
+        step = self._course.step
+        self._log(what, gesture=step.gesture, repetition=step.repetition, **more)
 
     def _say(self, text: str) -> None:
         self._message = text
@@ -414,23 +391,12 @@ class Recorder:
     def _silent(self) -> bool:
         return time.monotonic() - self._heard_s > _AWAY_S or getattr(self.device, "state", "") == "waiting"
 
-    def _open_steps(self, after: int) -> list[Step]:
-        """Steps without a recording, from ``after`` on and then from the beginning."""
-        order = [*self.steps[after:], *self.steps[:after]]
-        return [s for s in order if (k := (s.gesture, s.repetition)) not in self._takes and k not in self._skipped]
-
-    def _following(self) -> Step | None:
-        return next(iter(s for s in self._open_steps(self._at + 1) if s.number != self._at), None)
-
     def _advance(self, message: str = "", from_start: bool = False) -> None:
         """On to the next recording that is to be made, or to the end."""
-        left = self._open_steps(0 if from_start else self._at + 1)
-        if left:
-            self._at = left[0].number
+        if self._course.advance(from_start):
             self._ready(message)
         else:
-            self._at = len(self.steps) - 1
-            self._log("finished", recordings=len(self._takes), skipped=len(self._skipped))
+            self._log("finished", recordings=len(self._course.takes), skipped=len(self._course.skipped))
             self._paused = False
             self._enter("stopped" if self._over else "finished", message)
 
@@ -441,41 +407,25 @@ class Recorder:
             self._enter("paused" if self._paused else "idle", message)
 
     def _begin(self) -> None:
-        step = self.steps[self._at]
-        self._log(
-            "countdown",
-            gesture=step.gesture,
-            repetition=step.repetition,
-            countdown_s=self.protocol.countdown_s,
-            device_ms=self._last.device_ms if self._last else None,
-        )
+        now = self._last.device_ms if self._last else None
+        self._log_step("countdown", countdown_s=self.protocol.countdown_s, device_ms=now)
         self._enter("countdown", "")
 
     def _cancel(self, message: str) -> None:
-        step = self.steps[self._at]
-        self._log("cancel", gesture=step.gesture, repetition=step.repetition)
+        self._log_step("cancel")
         self._enter("idle", message)
 
     def _first_row(self, frame: Frame) -> None:
-        step = self.steps[self._at]
         counters = Counters(**self.device.counters.to_dict())
-        self._take = Take(step, self._rows, self._toy_ms, time.monotonic(), counters)
-        self._log(
-            "start",
-            gesture=step.gesture,
-            repetition=step.repetition,
-            row=self._rows,
-            host_ms=frame.host_ms,
-            device_ms=frame.device_ms,
-        )
+        self._take = Take(self._course.step, self._rows, self._toy_ms, time.monotonic(), counters)
+        self._log_step("start", row=self._rows, host_ms=frame.host_ms, device_ms=frame.device_ms)
         self._enter("recording", "")
 
     def _abandon(self, why: str, message: str) -> None:
         take = self._take
         assert take is not None
         self._take = None
-        step = take.step
-        self._log("abandon", gesture=step.gesture, repetition=step.repetition, why=why, rows=len(take.frames))
+        self._log_step("abandon", why=why, rows=len(take.frames))
         self._ready(message)
 
     def _stop(self, ended: Ended) -> None:
@@ -486,18 +436,11 @@ class Recorder:
         if away or (self._speed == 1.0 and silent_ms > 1000.0 * _AWAY_S):
             take.gaps.append(gap_entry(len(take.frames), take.frames[-1], None, silent_ms, "nothing came any more"))
         self._take = None
-        self._jobs.append(_Save(take, ended, Counters(**self.device.counters.to_dict())))
+        counters = Counters(**self.device.counters.to_dict())
         self._enter("saving", "")
-
-    def _set_aside(self, key: Key, file: str, why: str) -> None:
-        self._aside.setdefault(key, []).append(file)
-        more = {"why": why} if why else {}
-        self._log("redo", file=file, gesture=key[0], repetition=key[1], **more)
-
-    def _restored(self, key: Key, file: str) -> str:
-        self._log("keep", file=file, gesture=key[0], repetition=key[1])
-        self._last_key = key
-        return file
+        self._hand_on()
+        if self._keeper is not None:
+            self._keeper.do(lambda: self._save(take, ended, counters))
 
     # Taking in ------------------------------------------------------------------------------------------------
 
@@ -513,12 +456,11 @@ class Recorder:
                     for frame in frames:
                         self._one(frame)
                     if frames:
+                        self._hand_on()
                         self._heard_s = time.monotonic()
                         self._meter.heard(self.device.counters, self._heard_s)
-                        self._changed.notify_all()
-                    # A toy that runs faster than the clock must not run away from the disk.
-                    while self._speed != 1.0 and self._pending and not self._closing:
-                        self._changed.wait(0.05)
+                if self._keeper is not None:
+                    self._keeper.wait_written()
         except PlushSenseError as cause:
             over = str(cause)
         except Exception as cause:  # noqa: BLE001 (a thread that dies unseen would lose the rest of the session)
@@ -551,9 +493,7 @@ class Recorder:
         elif self._take is not None:
             self._take.lost += missing
         self._last = frame
-        if not self._pending:
-            self._pending_s, self._pending_ms = time.monotonic(), self._toy_ms
-        self._pending.append(frame)
+        self._came.append(frame)
         self._rows += 1
         if self._take is not None:
             self._take.frames.append(frame)
@@ -566,6 +506,12 @@ class Recorder:
         elif self._state == "idle" and self._auto is not None and waited >= self._auto.rest_s:
             self._begin()
 
+    def _hand_on(self) -> None:
+        """Give the keeper what has come, before anything that must stand behind it."""
+        if self._keeper is not None and self._came:
+            self._keeper.add(self._came, self._toy_ms)
+        self._came = []
+
     def _returned(self) -> bool:
         """Whether the toy was away since the frame before."""
         before, self._reconnects = self._reconnects, self.device.counters.reconnects
@@ -577,9 +523,7 @@ class Recorder:
         reason = away[-1].reason if away and away[-1].host_ms_end is not None and missing_ms > 500 else began_anew
         entry = gap_entry(self._rows, last, frame, missing_ms, reason)
         self._gaps.append(entry)
-        step = self.steps[self._at]
-        during = {"gesture": step.gesture, "repetition": step.repetition} if self._take is not None else {}
-        self._log("gap", **entry, **during)
+        (self._log_step if self._take is not None else self._log)("gap", **entry)
         if self._take is not None:
             self._take.gaps.append(gap_entry(len(self._take.frames), last, frame, missing_ms, reason))
         if missing_ms >= 1000.0 * _AWAY_S:
@@ -593,77 +537,29 @@ class Recorder:
 
     # Writing --------------------------------------------------------------------------------------------------
 
-    def _write(self) -> None:
-        """The writer's thread: the stream first, then what was finished, then what happened."""
-        while True:
-            with self._changed:
-                while not (self._jobs or self._closing or self._due()):
-                    self._changed.wait(0.1)
-                frames, self._pending = self._pending, []
-                jobs, self._jobs = self._jobs, []
-                last = self._closing and not self._reader.is_alive()
-                self._changed.notify_all()
-                if self._closing and not last:
-                    self._changed.wait(0.01)
-            try:
-                assert self._stream is not None
-                self._stream.write(frames)
-                events: list[Event] = []
-                for job in jobs:
-                    if isinstance(job, _Save):
-                        self.session.log.write(events)
-                        events = []
-                        self._save(job)
-                    else:
-                        events.append(job)
-                self.session.log.write(events)
-            except Exception as cause:  # noqa: BLE001 (whatever stops the writing must stop the session, loudly)
-                self._fail(cause)
-                return
-            if last and not self._jobs:
-                return
-
-    def _due(self) -> bool:
-        if not self._pending:
-            return False
-        old = time.monotonic() - self._pending_s >= FLUSH_S or self._toy_ms - self._pending_ms >= 1000.0 * FLUSH_S
-        return old or self._speed != 1.0
-
-    def _save(self, job: _Save) -> None:
-        """One recording to the disk, then on to the next."""
-        take, layout, head = job.take, self.session.layout, self.session.head
-        step = take.step
-        key = (step.gesture, step.repetition)
+    def _save(self, take: Take, ended: Ended, counters: Counters) -> None:
+        """One recording to the disk (in the keeper's thread), then on to the next."""
+        layout, key = self.session.layout, key_of(take.step)
         frames = to_frames(take.frames, layout.n_channels)
         with self._changed:
             saved_ms = self._now_ms()
-        more = {
-            "saved_ms": saved_ms,
-            "device": self.device.url,
-            "speed": self._speed,
-            "software": self._software,
-        }
-        beside = sidecar(take, frames, layout, head, job.counters, job.ended, **more)
-        path = save_take(self.session.folder, frames, layout, step.gesture, saved_ms, beside)
-        says = {"rows": len(frames), "lost": take.lost, "gaps": len(take.gaps), "ended": job.ended}
+            earlier = self._course.takes.get(key)
+        more = {"device": self.device.url, "saved_ms": saved_ms, "speed": self._speed, "software": self._software}
+        beside = sidecar(take, frames, layout, self.session.head, counters, ended, **more)
+        path = save_take(self.session.folder, frames, layout, key[0], saved_ms, beside)
+        says = {"rows": len(frames), "lost": take.lost, "gaps": len(take.gaps), "ended": ended}
         events = [Event("take", saved_ms, {"file": path.name, "gesture": key[0], "repetition": key[1]} | says)]
-        earlier = self._takes.get(key)
         if earlier:
             events.append(Event("redo", saved_ms, {"file": earlier, "gesture": key[0], "repetition": key[1]}))
         self.session.log.write(events)
         said = ""
-        if job.ended == "longest":
+        if ended == "longest":
             said = f"Nobody stopped it: it ended by itself after {self.protocol.longest_s:g} s; r makes it again."
         elif take.gaps:
             longest = max(g["missing_ms"] for g in take.gaps) / 1000.0
             said = f"This recording has a hole of {longest:.1f} s; it is kept, r makes it again."
         with self._telling():
-            if earlier:
-                self._aside.setdefault(key, []).append(earlier)
-            self._takes.pop(key, None)
-            self._takes[key] = path.name
-            self._skipped.discard(key)
-            self._last_key = key
+            self._course.made(key, path.name)
             self._news.append("take")
             self._advance(said)
 
@@ -671,7 +567,7 @@ class Recorder:
         why = getattr(cause, "strerror", None) or cause
         return DatasetError(
             f"'{self.session.folder}' cannot be written any more ({why}): the session has stopped. "
-            f"What was recorded until then is kept ({len(self._takes)} recordings); "
+            f"What was recorded until then is kept ({len(self._course.takes)} recordings); "
             "make room, and give the same command to go on."
         )
 

@@ -1,0 +1,96 @@
+"""The paper's session, 17 gestures three times each, over a pseudo terminal: in one piece, and killed on the way."""
+
+from __future__ import annotations
+
+import json
+import random
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.recording.conftest import LAYOUT, Toy, check_whole, kill, pty_toy, recording, recordings, result
+
+from plushsense.core.recfile import STREAM_NAME, parse_name, read_stream
+from plushsense.dataset.importers import import_recordings
+from plushsense.devices.virtual.session import GESTURES
+from plushsense.recording.sessionfile import SESSION_LOG, read_events
+
+SPEED = 60.0
+pytestmark = pytest.mark.usefixtures("pty_possible")
+
+
+def test_51_recordings_that_import_again(tmp_path: Path) -> None:
+    out, folder = tmp_path / "out", tmp_path / "out" / "S01" / "1"
+    with pty_toy(folder / SESSION_LOG, SPEED) as toy:
+        said = result(recording(out, toy, SPEED, "--age-group", "child"))
+    assert {k: said[k] for k in ("recordings", "skipped", "redone", "lost", "gaps", "finished", "resumed")} == {
+        "recordings": 51, "skipped": 0, "redone": 0, "lost": 0, "gaps": [], "finished": True, "resumed": False,
+    }  # fmt: skip
+    assert check_whole(folder, toy) == 51
+    made = [n.label for p in recordings(folder) if (n := parse_name(p.name)) is not None]
+    assert {label: made.count(label) for label in GESTURES} == dict.fromkeys(GESTURES, 3)
+    _hand_follows_prompt(folder, toy)
+    summary = import_recordings(out, tmp_path / "ds", layout="plush-15")
+    assert summary.recordings == 51
+    assert summary.streams == 1
+    flags = {flag for r in summary.dataset.recordings for flag in r.flags}
+    assert flags == set()
+    located = {r.file.rsplit("/", 1)[-1]: r.stream_row for r in summary.dataset.recordings}
+    assert located == {p.name: json.loads(p.with_suffix(".json").read_text())["stream_row"] for p in recordings(folder)}
+
+
+def _hand_follows_prompt(folder: Path, toy: Toy) -> None:
+    """What the virtual person did during a recording is what was asked for, nearly always in time."""
+    right = 0
+    for path in recordings(folder):
+        beside = json.loads(path.with_suffix(".json").read_text())
+        first, last = beside["device_ms"]
+        during = [p.label for p in toy.performed if first <= p.start_ms <= last]
+        assert during in ([], [beside["gesture"]])
+        right += during == [beside["gesture"]]
+    assert right >= 48
+
+
+def kill_and_check(out: Path, toy: Toy, after_s: float) -> dict[str, float]:
+    """Record, kill -9 after so long, and look at what is there: how much of the stream is missing, in ms."""
+    folder = out / "S01" / "1"
+    process = recording(out, toy, SPEED)
+    until = time.monotonic() + 30
+    rows = (folder / STREAM_NAME).stat().st_size if (folder / STREAM_NAME).exists() else 0
+    while not (folder / STREAM_NAME).exists() or (folder / STREAM_NAME).stat().st_size <= rows:
+        assert time.monotonic() < until
+        assert process.poll() is None
+        time.sleep(0.01)
+    time.sleep(after_s)
+    done = len(recordings(folder))
+    sent_ms = toy.last_ms
+    kill(process)
+    stream = read_stream(folder / STREAM_NAME, LAYOUT)
+    before = [e for e in read_events(folder) if e.what in ("start", "take", "abandon", "unfinished")]
+    return {
+        "recordings": done,
+        "missing_ms": sent_ms - int(stream.frames.device_ms[-1]),
+        "torn": float(stream.malformed),
+        "in_a_recording": float(bool(before) and before[-1].what == "start"),
+    }
+
+
+def test_killed_three_times(tmp_path: Path) -> None:
+    """At most the last second of the stream is missing, no finished recording is damaged, and it goes on to the end."""
+    out, folder = tmp_path / "out", tmp_path / "out" / "S01" / "1"
+    moments = random.Random()
+    with pty_toy(folder / SESSION_LOG, SPEED) as toy:
+        for _ in range(3):
+            found = kill_and_check(out, toy, moments.uniform(0.1, 2.0))
+            assert found["missing_ms"] <= 1000
+            assert len(recordings(folder)) >= found["recordings"]
+        said = result(recording(out, toy, SPEED))
+    assert (said["recordings"], said["finished"], said["resumed"]) == (51, True, True)
+    assert check_whole(folder, toy) == 51
+    assert not [p.name for p in folder.iterdir() if p.suffix in (".part", ".new", ".torn", ".lock")]
+    # What is missing lies between two runs, nowhere else.
+    stream = read_stream(folder / STREAM_NAME, LAYOUT).frames
+    opened = {e.more["row"] for e in read_events(folder) if e.what == "open"}
+    gaps = set((np.flatnonzero(np.abs(np.diff(stream.device_ms)) > 15) + 1).tolist())
+    assert gaps <= opened
