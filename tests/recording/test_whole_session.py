@@ -52,10 +52,10 @@ def _hand_follows_prompt(folder: Path, toy: Toy) -> None:
     assert right >= 48
 
 
-def kill_and_check(out: Path, toy: Toy, after_s: float) -> dict[str, float]:
+def kill_and_check(out: Path, toy: Toy, after_s: float, speed: float = SPEED) -> dict[str, float]:
     """Record, kill -9 after so long, and look at what is there: how much of the stream is missing, in ms."""
     folder = out / "S01" / "1"
-    process = recording(out, toy, SPEED)
+    process = recording(out, toy, speed)
     until = time.monotonic() + 30
     rows = (folder / STREAM_NAME).stat().st_size if (folder / STREAM_NAME).exists() else 0
     while not (folder / STREAM_NAME).exists() or (folder / STREAM_NAME).stat().st_size <= rows:
@@ -94,3 +94,12 @@ def test_killed_three_times(tmp_path: Path) -> None:
     opened = {e.more["row"] for e in read_events(folder) if e.what == "open"}
     gaps = set((np.flatnonzero(np.abs(np.diff(stream.device_ms)) > 15) + 1).tolist())
     assert gaps <= opened
+
+
+def test_killed_at_real_speed(tmp_path: Path) -> None:
+    """At real speed rows are collected for half a second: then, too, at most the last second is missing."""
+    folder = tmp_path / "out" / "S01" / "1"
+    with pty_toy(folder / SESSION_LOG, 1.0) as toy:
+        found = kill_and_check(tmp_path / "out", toy, 2.0 + random.random(), 1.0)
+    assert found["missing_ms"] <= 1000
+    assert len(read_stream(folder / STREAM_NAME, LAYOUT).frames) > 150

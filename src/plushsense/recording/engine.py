@@ -485,8 +485,9 @@ class Recorder:
         frame = Frame(host, came.device_ms, came.values)
         missing = self._loss.push(came.device_ms)
         self._lost += missing
-        if last is not None and (step_ms < 0 or step_ms > layout.gap_ms or self._returned()):
-            self._gap(last, frame, max(step_ms, on_host))
+        returned = self._returned()
+        if last is not None and (step_ms < 0 or step_ms > layout.gap_ms or returned):
+            self._gap(last, frame, max(step_ms, on_host, 0), returned)
         self._meter.push(came.device_ms)
         if self._state == "countdown" and self._toy_ms - self._since_ms >= 1000.0 * self.protocol.countdown_s:
             self._first_row(frame)
@@ -517,10 +518,11 @@ class Recorder:
         before, self._reconnects = self._reconnects, self.device.counters.reconnects
         return self._reconnects > before
 
-    def _gap(self, last: Frame, frame: Frame, missing_ms: float) -> None:
-        began_anew = "the toy's clock began anew" if frame.device_ms < last.device_ms else "nothing came"
-        away = [g for g in getattr(self.device, "gaps", ()) if g.reason]
-        reason = away[-1].reason if away and away[-1].host_ms_end is not None and missing_ms > 500 else began_anew
+    def _gap(self, last: Frame, frame: Frame, missing_ms: float, returned: bool) -> None:
+        reason = "the toy's clock began anew" if frame.device_ms < last.device_ms else "nothing came"
+        if returned:
+            known = [gap.reason for gap in getattr(self.device, "gaps", ())]
+            reason = known[-1] if known and known[-1] else "the toy was away and came back"
         entry = gap_entry(self._rows, last, frame, missing_ms, reason)
         self._gaps.append(entry)
         (self._log_step if self._take is not None else self._log)("gap", **entry)
