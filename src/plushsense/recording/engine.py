@@ -292,7 +292,7 @@ class Recorder:
             elif self._state == "idle":
                 self._paused = True
                 self._log("pause")
-                self._enter("paused", "Paused.")
+                self._enter("paused", "")
 
     def resume(self) -> None:
         """End a pause."""

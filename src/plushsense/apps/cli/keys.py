@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import os
 import queue
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Protocol
@@ -53,17 +55,22 @@ class _Posix:
 
     script = False
 
+    def __init__(self) -> None:
+        self._decoder = codecs.getincrementaldecoder("utf-8")("replace")
+        self._waiting: deque[str] = deque()
+
     def get(self, timeout_s: float) -> str | None:
         import select
 
         fd = sys.stdin.fileno()
-        if not select.select([fd], [], [], timeout_s)[0]:
-            return None
-        data = os.read(fd, 64)
-        if not data:
-            return END
-        # Arrow and function keys come as a sequence that begins with Escape: they are no letters.
-        return "" if data.startswith(b"\x1b") and len(data) > 1 else data.decode("utf-8", "replace")[0]
+        if not self._waiting and select.select([fd], [], [], timeout_s)[0]:
+            data = os.read(fd, 1024)
+            if not data:
+                return END
+            # Arrow and function keys come as a sequence that begins with Escape: they are no letters.
+            if not (data.startswith(b"\x1b") and len(data) > 1):
+                self._waiting.extend(self._decoder.decode(data))
+        return self._waiting.popleft() if self._waiting else None
 
 
 class _Windows:

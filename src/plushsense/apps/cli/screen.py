@@ -18,7 +18,7 @@ _WIDEST = 90
 KEYS = {
     "idle": "SPACE start   s skip   r last one again   b back   p pause   n note   q quit",
     "countdown": "SPACE cancel",
-    "recording": "SPACE stop   r break off and make it again   n note",
+    "recording": "SPACE stop   r break off and make it again   n note   q quit",
     "saving": "",
     "paused": "p go on   n note   q quit",
     "finished": "q close   r last one again   b back   n note",
@@ -31,7 +31,7 @@ def _state(s: Status) -> tuple[str, str]:
     if s.state == "idle":
         if s.signal == "none":
             return "WAITING FOR THE TOY: switch it on, bring it near", _RED
-        return "READY.  Press SPACE; the recording begins after the countdown", _BLUE
+        return "READY.  Press SPACE, then wait for the countdown", _BLUE
     if s.state == "countdown":
         return f"GET READY … {math.ceil(s.countdown_s)}", _BLUE
     if s.state == "recording":
@@ -50,15 +50,15 @@ def _state(s: Status) -> tuple[str, str]:
 def _toy(s: Status) -> str:
     words = {
         "good": "good",
-        "fair": "fair: some lines are lost",
-        "poor": "POOR: many lines are lost",
-        "none": "NOTHING",
+        "fair": "fair: some readings are lost; bring the toy nearer",
+        "poor": f"{_RED}POOR: many readings are lost; bring the toy nearer, check its battery{_OFF}",
+        "none": f"{_RED}NONE: the toy is silent{_OFF}",
     }
     heard = f"{s.rate_hz:.0f} readings a second, jitter {s.jitter_ms:.1f} ms" if s.rate_hz else "no readings"
     return (
-        f"Signal {words[s.signal]}   {heard}\n"
-        f"Lost {s.lost}   unreadable {s.malformed}   out of range {s.garbage}   "
-        f"came back {s.reconnects}×   gaps {s.gaps}"
+        f"Signal {words[s.signal]}\n"
+        f"{_DIM}{heard}   lost {s.lost}   unreadable {s.malformed}   out of range {s.garbage}   "
+        f"gaps {s.gaps}   reconnected {s.reconnects}{_OFF}"
     )
 
 
@@ -135,7 +135,7 @@ class Screen:
         sys.stderr.flush()
 
     def close(self) -> None:
-        """Leave the last picture and give the cursor back."""
+        """Clear the screen, so that nothing on it looks as if it were still going on, and give the cursor back."""
         if self._terminal:
-            sys.stderr.write("\x1b[?25h")
+            sys.stderr.write("\x1b[2J\x1b[H\x1b[?25h")
             sys.stderr.flush()
