@@ -41,3 +41,20 @@ def pty_possible() -> None:
             os.close(end)
     except (ImportError, OSError) as cause:
         missing("pty", f"no pseudo-terminal here: {cause}")
+
+
+@pytest.fixture(scope="session")
+def lsl_possible() -> None:
+    """The lab streaming layer, and a network on which a stream of this process is found."""
+    try:
+        import pylsl
+
+        info = pylsl.StreamInfo(f"probe-{os.getpid()}", "Touch", 1, 0.0, "int32", f"probe-{os.getpid()}")
+        outlet = pylsl.StreamOutlet(info)
+        found = pylsl.resolve_byprop("name", info.name(), timeout=3.0)
+        del outlet
+    except (ImportError, RuntimeError) as cause:
+        missing("lsl", f"no LSL here: {cause}")
+    else:
+        if not found:
+            missing("lsl", "no LSL loopback here: a stream published on this machine is not found")

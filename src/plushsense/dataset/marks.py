@@ -16,6 +16,7 @@ from plushsense.core.errors import DatasetError, nearest
 from plushsense.core.tomlfile import refuse_unknown
 
 MARKS = "marks.jsonl"
+BY_HAND, SUGGESTED = "hand", "suggested"
 ACTIONS = ("trim", "untrim", "exclude", "include", "accept", "unaccept")
 
 
@@ -24,7 +25,8 @@ class Mark:
     """One decision: ``trim`` keeps rows ``start`` to ``stop``; ``untrim``, ``include`` and ``unaccept`` undo.
 
     ``accept`` says that what the check ``check`` found is known and no fault. ``recording`` is the id of a recording or
-    a stream, or "" for the data set as a whole.
+    a stream, or "" for the data set as a whole. ``how`` a trim came about: "hand" set by a person, "suggested" accepted
+    as suggested; "" in marks from before that was kept, which count as set by hand.
     """
 
     recording: str
@@ -35,21 +37,30 @@ class Mark:
     stop: int = -1
     when: str = ""
     check: str = ""
+    how: str = ""
 
 
 @dataclass(frozen=True)
 class Standing:
-    """Where the marks leave one recording; ``accepted`` are the checks whose findings somebody accepted."""
+    """Where the marks leave one recording; ``accepted`` are the checks whose findings somebody accepted, ``how`` is the
+    standing trim's.
+    """
 
     excluded: bool = False
     start: int = 0
     stop: int = -1
     accepted: frozenset[str] = frozenset()
+    how: str = ""
+
+    @property
+    def trimmed(self) -> bool:
+        """Whether a trim stands, be it one that keeps the whole recording."""
+        return bool(self.how) or (self.start, self.stop) != (0, -1)
 
 
 def _checked(mark: Mark, where: str) -> Mark:
     """The mark, when its values are of the right type and range."""
-    for key in ("recording", "action", "who", "why", "when", "check"):
+    for key in ("recording", "action", "who", "why", "when", "check", "how"):
         if not isinstance(getattr(mark, key), str):
             raise DatasetError(f"{where}: {key} is {getattr(mark, key)!r}; it must be a text.")
     if mark.action not in ACTIONS:
@@ -63,6 +74,10 @@ def _checked(mark: Mark, where: str) -> Mark:
     if bool(mark.check) != (mark.action in ("accept", "unaccept")):
         raise DatasetError(
             f"{where}: a mark '{mark.action}' with check '{mark.check}'; accept and unaccept name a check."
+        )
+    if mark.how not in ("", BY_HAND, SUGGESTED) or (mark.how and mark.action != "trim"):
+        raise DatasetError(
+            f"{where}: a mark '{mark.action}' made by '{mark.how}'; a trim may be by {BY_HAND} or {SUGGESTED}."
         )
     if 0 <= mark.stop <= mark.start:
         raise DatasetError(f"{where}: rows {mark.start} to {mark.stop} keep nothing; stop must be above start, or -1.")
@@ -126,9 +141,9 @@ def read_marks(folder: Path) -> dict[str, Standing]:
         now = standing.get(mark.recording, Standing())
         match mark.action:
             case "trim":
-                now = replace(now, start=mark.start, stop=mark.stop)
+                now = replace(now, start=mark.start, stop=mark.stop, how=mark.how)
             case "untrim":
-                now = replace(now, start=0, stop=-1)
+                now = replace(now, start=0, stop=-1, how="")
             case "exclude":
                 now = replace(now, excluded=True)
             case "include":

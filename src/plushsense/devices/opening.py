@@ -14,19 +14,23 @@ from urllib.parse import unquote
 from plushsense.core.errors import ConfigError, DeviceError, nearest
 from plushsense.core.signal import Layout, load_layout
 from plushsense.devices.base import Device
+from plushsense.devices.reconnect import ReconnectingDevice
 
 DEFAULT_LAYOUT = "plush-15"
 
 SCHEMES: dict[str, str] = {
     "serial": "plushsense.devices.serial",
+    "ble": "plushsense.devices.ble",
     "tcp": "plushsense.devices.tcp",
+    "lsl": "plushsense.devices.lsl",
     "replay": "plushsense.devices.replay",
     "virtual": "plushsense.devices.virtual.device",
 }
 """Scheme to the room with its ``open_url(address, layout) -> Device``; imported when it is needed."""
 
 EXAMPLES = (
-    "serial:///dev/ttyUSB0?baud=115200, serial://COM3, tcp://host:port, replay:///path/stream.csv, virtual://?person=7"
+    "serial:///dev/ttyUSB0?baud=115200, serial://COM3, ble://AA:BB:CC:DD:EE:FF, ble://name:PlushName, tcp://host:port, "
+    "lsl://NAME, replay:///path/stream.csv, virtual://?person=7"
 )
 
 
@@ -112,23 +116,45 @@ def _split_query(rest: str, url: str) -> tuple[str, dict[str, str]]:
     return place, query
 
 
-def open_device(url: str | os.PathLike[str], layout: Layout | str | None = None) -> Device:
+# What ends in order where a connection only breaks off.
+_ENDING = ("replay", "virtual")
+
+
+def open_device(
+    url: str | os.PathLike[str],
+    layout: Layout | str | None = None,
+    *,
+    reconnect: bool = False,
+    reconnect_s: float | None = None,
+) -> Device:
     """Open a toy by its URL.
 
-    ``serial:///dev/ttyUSB0?baud=115200``, ``serial://COM3``, ``tcp://host:port``,
-    ``replay:///path/stream.csv?speed=1``, ``virtual://?person=7&seed=1&speed=1``; a bare path is a replay.
-    ``?layout=`` goes on any of them and wins over the argument; the default is plush-15.
+    ``serial:///dev/ttyUSB0?baud=115200``, ``serial://COM3``, ``ble://AA:BB:CC:DD:EE:FF``, ``ble://name:PlushName``,
+    ``tcp://host:port``, ``lsl://NAME``, ``replay:///path/stream.csv?speed=1``, ``virtual://?person=7&seed=1&speed=1``;
+    a bare path is a replay. ``?layout=`` goes on any of them and wins over the argument; the default is plush-15.
+
+    Args:
+        layout: a layout, its name or the path of its file.
+        reconnect: give a `ReconnectingDevice`: a toy that went away is opened again, and the gap is kept.
+        reconnect_s: how long to wait for it then, seconds; None: for ever.
 
     Raises:
         ConfigError: for a scheme or setting that is unknown or out of range.
         LayoutError: for an unknown layout.
-        DeviceError: for a port, host or file that is not there.
+        DeviceError: for a port, host, stream or file that is not there.
+        MissingExtraError: for a scheme whose optional package is not installed.
     """
     address = parse_url(os.fspath(url))
     chosen: Layout | str = address.query.get("layout") or layout or DEFAULT_LAYOUT
     resolved = chosen if isinstance(chosen, Layout) else load_layout(chosen)
     room = importlib.import_module(SCHEMES[address.scheme])
-    device = room.open_url(address, resolved)
-    if not isinstance(device, Device):
-        raise DeviceError(f"'{address.url}': the scheme {address.scheme} opened nothing that is a toy.")
-    return device
+
+    def opened() -> Device:
+        device = room.open_url(address, resolved)
+        if not isinstance(device, Device):
+            raise DeviceError(f"'{address.url}': the scheme {address.scheme} opened nothing that is a toy.")
+        return device
+
+    if not reconnect:
+        return opened()
+    return ReconnectingDevice(address.url, resolved, opened, for_s=reconnect_s, ends=address.scheme in _ENDING)

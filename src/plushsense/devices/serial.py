@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import sys
 from pathlib import Path
 
 import serial as pyserial
@@ -16,6 +17,13 @@ from plushsense.devices.opening import Address
 from plushsense.devices.wire import LineParser
 
 BAUD = 115_200
+
+# SerialException is an OSError; a port that vanishes while it is set up or read shows as one of the others.
+_FAULTS: tuple[type[Exception], ...] = (OSError, TypeError, ValueError)
+if sys.platform != "win32":
+    import termios
+
+    _FAULTS = (*_FAULTS, termios.error)
 
 
 def serial_ports() -> list[tuple[str, str]]:
@@ -32,7 +40,7 @@ class SerialDevice(Device):
             # Two readers would share the port's bytes between them: refuse the second (Windows always does).
             alone = True if os.name == "posix" else None
             self._port = pyserial.Serial(port, baud, timeout=0.1, exclusive=alone)
-        except (OSError, ValueError) as cause:  # SerialException is an OSError
+        except _FAULTS as cause:
             raise DeviceError(_refusal(url, port, cause)) from None
         self._parser = LineParser(layout, self.counters, joining=True)
 
@@ -41,7 +49,7 @@ class SerialDevice(Device):
         try:
             waiting = self._port.in_waiting
             data = self._port.read(max(1, min(waiting, 65536)))
-        except (OSError, TypeError, ValueError) as cause:  # pyserial trips over its own closed port
+        except _FAULTS as cause:  # pyserial also trips over its own closed port
             if self.closed:
                 return None
             self._parser.finish()
@@ -50,7 +58,7 @@ class SerialDevice(Device):
         return [Frame(host, line.device_ms, line.values) for line in self._parser.feed(data)]
 
     def _shut(self) -> None:
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(*_FAULTS):
             self._port.close()
 
 

@@ -13,6 +13,8 @@ from plushsense.devices.opening import Address
 from plushsense.devices.wire import LineParser
 
 CONNECT_S = 5.0
+_KEEPALIVE = {"TCP_KEEPIDLE": 3, "TCP_KEEPALIVE": 3, "TCP_KEEPINTVL": 1, "TCP_KEEPCNT": 3}
+"""Seconds of silence, seconds between probes, probes; TCP_KEEPALIVE is what macOS calls the first."""
 
 
 class TcpDevice(Device):
@@ -32,6 +34,7 @@ class TcpDevice(Device):
             silent = isinstance(cause, TimeoutError)
             reason = "no answer" if silent else getattr(cause, "strerror", None) or cause
             raise DeviceError(f"'{url}' cannot be reached: {reason}.") from None
+        _notice_silence(self._socket)
         self._socket.settimeout(0.1)
         self._parser = LineParser(layout, self.counters)
 
@@ -39,11 +42,12 @@ class TcpDevice(Device):
         """What has arrived, waiting at most 0.1 s; None when the other side closed in order."""
         try:
             data = self._socket.recv(65536)
-        except TimeoutError:
-            return []
         except OSError as cause:
             if self.closed:
                 return None
+            if isinstance(cause, TimeoutError) and cause.errno is None:  # ours; the network's has a number
+                return []
+            self._parser.finish()
             raise DeviceError(f"'{self.url}' went away: {cause.strerror or cause}.") from None
         if not data:
             self._parser.finish()
@@ -55,6 +59,15 @@ class TcpDevice(Device):
         with contextlib.suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()
+
+
+def _notice_silence(connection: socket.socket) -> None:
+    """Let the system ask after a toy that says nothing: one without power closes no connection. Found out in 6 s."""
+    with contextlib.suppress(OSError):
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        for name, value in _KEEPALIVE.items():
+            if hasattr(socket, name):
+                connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
 
 
 def open_url(address: Address, layout: Layout) -> TcpDevice:

@@ -16,6 +16,7 @@ _INTEGER = re.compile(rb"[+-]?[0-9]{1,18}\Z")
 _DECIMAL = re.compile(rb"[+-]?(?:[0-9]{1,18}(?:\.[0-9]{0,18})?|\.[0-9]{1,18})(?:[eE][+-]?[0-9]{1,2})?\Z")
 _SEPARATORS = bytes.maketrans(b",;\t", b"   ")
 _LIMIT = 2**53
+_LONGEST_DELAY_MS = 2**31
 
 
 @dataclass(frozen=True)
@@ -33,8 +34,9 @@ class ParsedLine:
 class LineParser:
     """Bytes in any pieces to frames.
 
-    Fields are separated by any run of spaces, tabs, commas or semicolons, lines by ``\\n`` or ``\\r\\n``. Where a
-    layout's wire has no ``device_ms`` the delays are added up (a lost line then leaves no trace in the clock).
+    Fields are separated by any run of spaces, tabs, commas or semicolons, lines by ``\\n``, ``\\r`` or both. Where a
+    layout's wire has no ``device_ms`` the delays are added up (a lost line then leaves no trace in the clock); one
+    above 2³¹ ms is no delay but noise.
     Channels with a step of 1 take integers only, others decimals too. Empty lines are nothing.
 
     Args:
@@ -52,6 +54,7 @@ class LineParser:
         self._pending = bytearray()
         self._skipping = False
         self._clock_ms = 0
+        self._begun = False
         self._loss = LossMeter()
         self._fields = len(layout.wire)
         self._channels = [(layout.index(name), layout.wire.index(name)) for name in layout.names]
@@ -64,6 +67,8 @@ class LineParser:
     def feed(self, data: bytes) -> list[ParsedLine]:
         """The frames that end within these bytes; the rest of the last line is kept for the next call."""
         parsed: list[ParsedLine] = []
+        # Also a lone \r ends a line: two halves joined by a lost \n are then never read as one frame.
+        data = data.replace(b"\r", b"\n")
         start = 0
         while True:
             end = data.find(b"\n", start)
@@ -113,8 +118,11 @@ class LineParser:
             device_ms = numbers[self._clock_at]
         else:
             # The first delay refers to a frame nobody saw: the clock starts at 0.
-            self._clock_ms += numbers[self._delay_at] if self.counters.frames else 0
+            self._clock_ms += numbers[self._delay_at] if self._begun else 0
+            if self._clock_ms > _LIMIT:
+                self._clock_ms = 0
             device_ms = self._clock_ms
+        self._begun = True
         values = tuple(numbers[at] for _, at in self._channels)
         garbage = any(not low <= v <= high for v, (low, high) in zip(values, self._valid, strict=True))
         self.counters.frames += 1
@@ -133,6 +141,8 @@ class LineParser:
                 if number is None or number < 0:
                     return None
                 numbers[at] = number
+        if self._clock_at < 0 and numbers[self._delay_at] > _LONGEST_DELAY_MS:
+            return None
         for index, at in self._channels:
             step = self._steps[index]
             number = _integer(fields[at]) if step == 1.0 else _steps(fields[at], step)

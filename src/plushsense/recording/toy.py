@@ -18,8 +18,7 @@ def open_toy(url: str, layout: Layout | str | None = None) -> Device:
     Raises:
         ConfigError, LayoutError, DeviceError: as `plushsense.devices.opening.open_device`.
     """
-    # SWITCH with devices/reconnect merged:  return open_device(url, layout, reconnect=True)
-    return open_device(url, layout)
+    return open_device(url, layout, reconnect=True)
 
 
 def is_virtual(url: str) -> bool:

@@ -15,7 +15,8 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--device",
         required=True,
         metavar="URL",
-        help="the toy: serial:///dev/ttyUSB0, tcp://host:port, replay:///path/stream.csv?speed=0, virtual://?person=7",
+        help="the toy: serial:///dev/ttyUSB0, ble://name:PlushName, tcp://host:port, lsl://NAME, "
+        "replay:///path/stream.csv?speed=0, virtual://?person=7 (plushsense devices lists what is there)",
     )
     parser.add_argument("--model", required=True, metavar="BUNDLE", help="a .plush bundle")
     parser.add_argument(
@@ -33,6 +34,9 @@ def add(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="time constant of the smoothing, seconds; 0: off (default: the bundle's)",
     )
+    parser.add_argument(
+        "--reconnect", action="store_true", help="wait for a toy that goes away, and go on when it is back"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -47,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
     bundle = Bundle.load(args.model)
     decide = DecideSpec(args.smoothing) if args.smoothing is not None else None
     classifier = StreamClassifier(bundle, decide)
-    with open_device(args.device, bundle.layout) as device:
+    with open_device(args.device, bundle.layout, reconnect=args.reconnect) as device:
         say(
             f"reading {args.device}; {bundle.arch.symbol}, a decision every "
             f"{classifier.step_s * 1000:.0f} ms; Ctrl-C ends"

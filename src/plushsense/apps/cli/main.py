@@ -23,10 +23,13 @@ VERBS: dict[str, tuple[str, str]] = {
     "record": ("record", "record a session with a toy: prompts, countdown, nothing lost"),
     "import": ("importing", "make a data set from recordings"),
     "info": ("info", "what a data set or a model bundle holds"),
+    "trim": ("trim", "where each gesture begins: suggested, then accepted, adjusted or undone"),
+    "stats": ("stats", "how long gestures last, before and after trimming"),
     "arch": ("arch", "count a network: parameters, receptive field, multiply-accumulates, state"),
     "train": ("train", "train one network and save it as a bundle"),
     "evaluate": ("evaluate", "how good it is, on people it never met"),
     "report": ("report", "one HTML page from evaluations and bundles"),
+    "devices": ("devices", "what toys are there, and the URL that opens each"),
     "live": ("live", "read a toy and say what it feels, 20 times a second"),
     "toy": ("toy", "a virtual toy that speaks the wire format over a pty or TCP"),
 }

@@ -1,4 +1,4 @@
-"""``plushsense toy --serial-pty | --tcp PORT``"""
+"""``plushsense toy --serial-pty | --tcp PORT | --lsl NAME``"""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     where = parser.add_mutually_exclusive_group(required=True)
     where.add_argument("--serial-pty", action="store_true", help="a pseudo terminal that looks like a serial port")
     where.add_argument("--tcp", type=int, metavar="PORT", help="a port of 127.0.0.1; 0 takes a free one")
+    where.add_argument("--lsl", metavar="NAME", help="a stream of this name on the lab streaming layer")
     parser.add_argument(
         "--person", type=int, default=101, metavar="N", help="which virtual person plays (101: in no data set)"
     )
@@ -58,6 +59,8 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    from functools import partial
+
     from plushsense.core.signal import load_layout
     from plushsense.devices.toy import ToyCounters, serve_pty, serve_tcp
     from plushsense.devices.virtual.cues import LogCues
@@ -80,36 +83,32 @@ def run(args: argparse.Namespace) -> int:
             truth.write(json.dumps(gesture.to_dict(), ensure_ascii=False) + "\n")
             truth.flush()
 
+    serve = serve_pty if args.serial_pty else partial(serve_tcp, args.tcp)
+    if args.lsl is not None:
+        from plushsense.devices.lsl_outlet import serve_lsl
+
+        serve = partial(serve_lsl, args.lsl)
     layout = load_layout(args.layout)
     counters = ToyCounters()
     cues = LogCues(args.follow) if args.follow else None
     try:
-        if args.serial_pty:
-            counters = serve_pty(
-                spec,
-                layout=layout,
-                speed=args.speed,
-                seconds=args.seconds,
-                on_ready=ready,
-                on_performed=performed,
-                cues=cues,
-            )
-        else:
-            counters = serve_tcp(
-                args.tcp,
-                spec,
-                layout=layout,
-                speed=args.speed,
-                seconds=args.seconds,
-                on_ready=ready,
-                on_performed=performed,
-                cues=cues,
-            )
+        counters = serve(
+            spec,
+            layout=layout,
+            speed=args.speed,
+            seconds=args.seconds,
+            on_ready=ready,
+            on_performed=performed,
+            cues=cues,
+        )
     except KeyboardInterrupt:
         say("stopped")
         return 0
     finally:
         if truth is not None:
             truth.close()
-    say(f"sent {counters.sent} lines, {counters.dropped} found no reader")
+    if args.lsl is not None:
+        say(f"published {counters.sent} frames")  # who took them, LSL does not say
+    else:
+        say(f"sent {counters.sent} lines, {counters.dropped} found no reader")
     return 0

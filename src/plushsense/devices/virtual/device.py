@@ -8,7 +8,7 @@ from collections.abc import Callable
 from plushsense.core.signal import Layout
 from plushsense.devices.base import Device, Frame, Pacer, now_ms
 from plushsense.devices.opening import Address
-from plushsense.devices.virtual.cues import Cue
+from plushsense.devices.virtual.cues import Cue, Cues
 from plushsense.devices.virtual.stream import Line, Performed, ToySpec, ToyStream
 from plushsense.devices.wire import LineParser
 
@@ -43,9 +43,9 @@ class VirtualDevice(Device):
         """The device clock at the first line, the zero of a live run's times; None before it."""
         return self._first_ms
 
-    def follow(self) -> None:
-        """From now on the person only does what `perform` says; call it before the first `read`."""
-        self._stream.cues = self._next_cue
+    def follow(self, cues: Cues | None = None) -> None:
+        """From now on the person only does what ``cues`` or `perform` say; call it before the first `read`."""
+        self._stream.cues = cues or self._next_cue
 
     def perform(self, label: str, begin_ms: int | None = None) -> None:
         """Have the person make a gesture, so that the hand comes when the toy's clock is ``begin_ms``."""

@@ -1,0 +1,252 @@
+"""Where a gesture begins and ends inside its recording, read from how much the signals move.
+
+Offline, base install only. The recorder starts with a key and the person begins when ready, so a recording holds a
+little rest, the gesture, a little rest. Every step counts in units of the device's own noise:
+
+1. each sensor's speed (change over 0.1 s, lightly smoothed), over its speed at rest; a vector's axes count as one
+   sensor. Contact sensors (capacitive, proximity) also by how far they are from the level before the touch, since
+   a hand that holds still is no rest. The activity is that of the most active sensor.
+2. rest is what the session's stream held just before the recording (the countdown), where it is known, else the
+   quietest stretch of the recording; never much noisier than the quietest stretch.
+3. contrast = activity at its height over activity at rest. Thresholds stand at a share of the way from rest to
+   height *in decibels*, so that they fit a faint scratch and a throw alike.
+4. from the first and last clear activity, walk outwards until it is quiet.
+
+The confidence falls with low contrast, with a begin that moves when the threshold does (a slow drift into the
+gesture), and is 0 where no begin is visible. How good it is on real recordings: docs/trim.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.recfile import Frames
+from plushsense.core.signal import Layout
+
+Floats: TypeAlias = NDArray[np.float64]
+
+CONTEXT_S = 2.5
+"""How much of the stream before a recording is rest: the countdown is 3 s, and begins with the knock of its key."""
+
+_CONTACT = ("capacitive", "proximity")
+
+
+@dataclass(frozen=True)
+class OnsetSpec:
+    """The numbers of the method. Shares are of the way from rest to height, on a logarithmic scale.
+
+    ``onset_at``, ``offset_at``: where the walk outwards ends; ``clear_at``: what is clear activity. ``quiet_s`` of
+    quiet end the walk. ``least_contrast``: below it nothing happens. Activity shorter than ``least_s`` is a knock.
+    """
+
+    smooth_s: float = 0.05
+    half_s: float = 0.05
+    onset_at: float = 0.4
+    offset_at: float = 0.5
+    clear_at: float = 0.6
+    quiet_s: float = 0.08
+    stretch_s: float = 0.4
+    level_s: float = 0.25
+    join_s: float = 0.3
+    least_share: float = 0.05
+    least_s: float = 0.2
+    least_contrast: float = 4.0
+    noise_factor: float = 1.5
+
+
+SPEC = OnsetSpec()
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """Rows ``start`` to ``stop`` of a recording hold the gesture, as far as the signals tell.
+
+    Where no onset is visible (it moves already at the first row, or nothing happens at all) ``start`` is 0 and its
+    confidence 0; likewise ``stop`` is the end. ``contrast``: height over rest. ``why`` says what was not visible.
+    """
+
+    start: int
+    stop: int
+    onset_visible: bool
+    offset_visible: bool
+    onset_confidence: float
+    offset_confidence: float
+    contrast: float
+    why: str = ""
+
+
+def suggest(frames: Frames, layout: Layout, before: Frames | None = None, spec: OnsetSpec = SPEC) -> Suggestion:
+    """Suggest where the gesture in ``frames`` begins and ends.
+
+    Args:
+        frames: the whole recording, untrimmed.
+        before: what the stream held just before, about `CONTEXT_S`; rows from before a gap are not used.
+    """
+    n = len(frames)
+    nothing = Suggestion(0, n, False, False, 0.0, 0.0, 1.0, "too short")
+    period_s = _period_s(frames)
+    if n * period_s < 2 * spec.least_s or n < 5:
+        return nothing
+    rest, activity, floor = _activity(frames, layout, before, period_s, spec)
+    contrast = float(np.quantile(activity, 0.95)) / floor
+    nothing = replace(nothing, contrast=contrast, why="nothing stands out from the noise")
+    if contrast < spec.least_contrast:
+        return nothing
+    first, last = _clear(activity, floor * contrast**spec.clear_at, period_s, spec)
+    quiet = max(1, round(spec.quiet_s / period_s))
+
+    def onset(share: float) -> int:
+        return _walk_back(activity[: first + 1], rest, floor * contrast**share, quiet)
+
+    def offset(share: float) -> int:
+        return n - _walk_back(activity[last:][::-1], activity[:0], floor * contrast**share, quiet)
+
+    start, stop = onset(spec.onset_at), offset(spec.offset_at)
+    if (stop - start) * period_s < spec.least_s:
+        return replace(nothing, why="only a knock")
+    # How far the answer moves when the threshold does is how sharp the edge is.
+    loose = [onset(spec.onset_at + d) for d in (-0.15, 0.1)], [offset(spec.offset_at + d) for d in (-0.1, 0.1)]
+    spread = [period_s * (max(at, *moved) - min(at, *moved)) for at, moved in zip((start, stop), loose, strict=True)]
+    trust = min(1.0, max(0.0, np.log(contrast / spec.least_contrast) / np.log(20.0 / spec.least_contrast)))
+    said = [
+        "it moves already at the first row" if start == 0 else "",
+        "it moves still at the last row" if stop == n else "",
+    ]
+    return Suggestion(
+        start,
+        stop,
+        start > 0,
+        stop < n,
+        round(float(trust * np.exp(-spread[0] / 0.5)), 2) if start > 0 else 0.0,
+        round(float(trust * np.exp(-spread[1] / 0.5)), 2) if stop < n else 0.0,
+        contrast,
+        "; ".join(filter(None, said)),
+    )
+
+
+def _period_s(frames: Frames) -> float:
+    steps = np.diff(frames.device_ms)
+    forward = steps[steps > 0]
+    return float(np.median(forward)) / 1000.0 if len(forward) else 0.01
+
+
+def _activity(
+    frames: Frames, layout: Layout, before: Frames | None, period_s: float, spec: OnsetSpec
+) -> tuple[Floats, Floats, float]:
+    """Activity before and in the recording, (k,) and (n,), in units of the noise; and what it is at rest."""
+    values = frames.values
+    past = _unbroken(before, frames, layout, period_s) if before is not None else values[:0]
+    k = len(past) if len(past) * period_s >= spec.stretch_s else 0
+    if k:
+        values = np.concatenate([past, values])
+    smooth = _mean(_median3(_valid(values, layout)), max(1, round(spec.smooth_s / period_s)))
+    n, half = len(smooth), max(1, round(spec.half_s / period_s))
+    at = np.arange(n)
+    ahead, behind = np.minimum(at + half, n - 1), np.maximum(at - half, 0)
+    # At the edges the span is shorter, the speed is not.
+    change = (smooth[ahead] - smooth[behind]) * (2 * half / (ahead - behind))[:, None]
+    speed = np.stack([np.sqrt((change[:, s] ** 2).mean(axis=1)) for s in _sensors(layout)], axis=1)
+    calm = _quietest((speed / np.maximum(np.median(speed, axis=0), 0.5)).mean(axis=1), spec.stretch_s / period_s)
+    # Somebody who moves about in the countdown is no measure of the noise.
+    quiet = np.median(speed[calm], axis=0)
+    noise = np.minimum(np.median(speed[:k], axis=0), spec.noise_factor * quiet) if k else quiet
+    # Half a count: below that an integer sensor shows nothing.
+    parts = [speed / np.maximum(noise, 0.5)]
+    contact = [i for i, c in enumerate(layout.channels) if c.kind in _CONTACT]
+    if contact:
+        parts.append(_off_level(smooth[:, contact], parts[0].mean(axis=1), k, calm, period_s, spec))
+    activity = np.concatenate(parts, axis=1).max(axis=1)
+    still = float(np.median(activity[calm]))
+    floor = min(float(np.median(activity[:k])), spec.noise_factor * still) if k else still
+    return activity[:k], activity[k:], max(floor, 0.3)
+
+
+def _off_level(x: Floats, busy: Floats, k: int, calm: slice, period_s: float, spec: OnsetSpec) -> Floats:
+    """How far contact sensors are from their level before the touch, in units of how they wander at rest.
+
+    The level is taken where it is calmest around the start: a second hand that steadies the toy comes before it.
+    """
+    width = max(3, round(spec.level_s / period_s))
+    begin = max(0, k - round(0.7 / period_s))
+    end = max(begin + width, k + min(round(1.0 / period_s), (len(x) - k) // 3))
+    at = _quietest(busy[begin:end], width)
+    level = np.median(x[begin + at.start : begin + at.stop], axis=0)
+    rest = (x[:k] if k else x[calm])[:: max(1, width // 2)]
+    wander = np.median(np.abs(np.diff(rest, axis=0)), axis=0) if len(rest) > 3 else np.ones(x.shape[1])
+    return np.asarray(np.abs(x - level) / np.maximum(wander, 1.0))
+
+
+def _unbroken(before: Frames, frames: Frames, layout: Layout, period_s: float) -> NDArray[np.int64]:
+    """The rows before that run without a gap or a clock reset into the recording."""
+    if not len(before):
+        return before.values
+    steps = np.diff(np.append(before.device_ms, frames.device_ms[0]))
+    breaks = np.flatnonzero((steps < 0) | (steps > max(layout.gap_ms, 3000 * period_s)))
+    return before.values[int(breaks[-1]) + 1 if len(breaks) else 0 :]
+
+
+def _valid(values: NDArray[np.int64], layout: Layout) -> Floats:
+    """Sensor garbage bridged by a straight line."""
+    bad = (values < layout.valid_min_int) | (values > layout.valid_max_int)
+    x = values.astype(np.float64)
+    for c in np.flatnonzero(bad.any(axis=0)):
+        good = np.flatnonzero(~bad[:, c])
+        x[:, c] = np.interp(np.arange(len(x)), good, x[good, c]) if len(good) else 0.0
+    return x
+
+
+def _median3(x: Floats) -> Floats:
+    """Running median of three rows: one row out of line, a garbled byte, is no movement."""
+    around = np.stack([np.vstack([x[:1], x[:-1]]), x, np.vstack([x[1:], x[-1:]])])
+    return np.asarray(np.median(around, axis=0))
+
+
+def _sensors(layout: Layout) -> list[list[int]]:
+    """Channels that count as one sensor: the axes of a vector together, every other channel alone."""
+    vectors = [[layout.index(axis) for axis in vector] for vector in layout.vectors]
+    taken = {i for vector in vectors for i in vector}
+    return [*vectors, *([i] for i in range(layout.n_channels) if i not in taken)]
+
+
+def _mean(x: Floats, width: int) -> Floats:
+    """Centred moving mean over ``width`` rows; the edges are repeated."""
+    padding = [(width // 2, width - 1 - width // 2), *[(0, 0)] * (x.ndim - 1)]
+    sums = np.cumsum(np.insert(np.pad(x, padding, mode="edge"), 0, 0.0, axis=0), axis=0)
+    return np.asarray((sums[width:] - sums[:-width]) / width)
+
+
+def _quietest(busy: Floats, width: float) -> slice:
+    """The stretch of ``width`` rows that is least busy."""
+    w = min(len(busy), max(3, round(width)))
+    sums = np.cumsum(np.insert(busy, 0, 0.0))
+    at = int(np.argmin(sums[w:] - sums[:-w]))
+    return slice(at, at + w)
+
+
+def _clear(activity: Floats, threshold: float, period_s: float, spec: OnsetSpec) -> tuple[int, int]:
+    """First and last row of clear activity; a knock (the key that stops the recording) is none."""
+    hot = np.flatnonzero(activity >= threshold)
+    breaks = np.flatnonzero(np.diff(hot) * period_s > spec.join_s)
+    firsts, lasts = hot[np.append(0, breaks + 1)], hot[np.append(breaks, len(hot) - 1)]
+    weight = np.add.reduceat(activity, np.stack([firsts, lasts + 1], 1).ravel().clip(max=len(activity) - 1))[::2]
+    kept = (weight >= spec.least_share * weight.max()) & ((lasts - firsts + 1) * period_s >= 0.06)
+    if not kept.any():
+        kept = weight == weight.max()
+    return int(firsts[kept][0]), int(lasts[kept][-1])
+
+
+def _walk_back(activity: Floats, rest: Floats, threshold: float, quiet: int) -> int:
+    """The row of ``activity`` before which it was below the threshold for ``quiet`` rows; 0 when there is none.
+
+    ``rest`` is what was before its first row.
+    """
+    low = np.concatenate([rest[-quiet:], activity]) < threshold
+    k = len(low) - len(activity)
+    sums = np.cumsum(np.insert(low, 0, 0))
+    at = np.arange(max(1, quiet - k), len(activity))
+    found = np.flatnonzero(sums[at + k] - sums[at + k - quiet] == quiet)
+    return int(at[found[-1]]) if len(found) else 0

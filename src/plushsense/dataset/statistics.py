@@ -1,0 +1,176 @@
+"""How long gestures last, before and after trimming, in all and by age group or gender; and what channels read.
+
+The summary statistics of the authors' ``b_training_data_analysis.m``: mean, median, variance and range by gesture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import DatasetError, nearest
+from plushsense.core.gestures import NOBODY
+from plushsense.dataset.people import PEOPLE, PersonInfo, read_people
+from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset, RecordingInfo
+
+NOT_SAID = "not said"
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Some numbers in short; ``variance`` is the sample variance (n − 1, as MATLAB's), None for one number."""
+
+    mean: float
+    median: float
+    variance: float | None
+    min: float
+    max: float
+
+    @classmethod
+    def of(cls, numbers: Sequence[float]) -> Spread:
+        """The spread of at least one number."""
+        x = np.asarray(numbers, dtype=np.float64)
+        variance = float(x.var(ddof=1)) if len(x) > 1 else None
+        return cls(float(x.mean()), float(np.median(x)), variance, float(x.min()), float(x.max()))
+
+
+@dataclass(frozen=True)
+class Duration:
+    """The durations of one gesture in one group of people ("" for all), whole and after trimming.
+
+    ``before_s`` and ``after_s`` in seconds (variance in s²), ``before_rows`` and ``after_rows`` in rows; ``trimmed``
+    recordings of ``recordings`` have a mark that shortens them.
+    """
+
+    gesture: str
+    group: str
+    recordings: int
+    people: int
+    trimmed: int
+    before_s: Spread
+    after_s: Spread
+    before_rows: Spread
+    after_rows: Spread
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, ready for JSON."""
+        return asdict(self)
+
+
+def duration_table(dataset: Dataset, by: str | None = None) -> list[Duration]:
+    """Durations of the used recordings, a row for each gesture that has any, and for each group of people.
+
+    Seconds are rows over the recording's own measured rate; a recording of a single row has none and is left out.
+
+    Args:
+        by: a column of subjects.csv: age_group, gender, or one of the user's own; ``subject`` for each person.
+
+    Raises:
+        DatasetError: for a column that subjects.csv does not have.
+    """
+    group = _Grouping(dataset, by)
+    cells: dict[tuple[str, str], list[RecordingInfo]] = {}
+    for r in dataset.used:
+        if r.rate_hz > 0:
+            cells.setdefault((r.gesture, group(r.subject)), []).append(r)
+    return [_duration(*key, cells[key]) for key in sorted(cells, key=lambda k: (_class_order(dataset, k[0]), k))]
+
+
+def _class_order(dataset: Dataset, gesture: str) -> int:
+    """Class index; labels that the gesture set does not know come last."""
+    labels = dataset.gestures.labels
+    return labels.index(gesture) if gesture in labels else len(labels)
+
+
+def _duration(gesture: str, group: str, mine: list[RecordingInfo]) -> Duration:
+    return Duration(
+        gesture,
+        group,
+        len(mine),
+        len({r.subject for r in mine} - {NOBODY, UNKNOWN_SUBJECT}),
+        sum(r.stop - r.start < r.rows for r in mine),
+        Spread.of([r.rows / r.rate_hz for r in mine]),
+        Spread.of([(r.stop - r.start) / r.rate_hz for r in mine]),
+        Spread.of([r.rows for r in mine]),
+        Spread.of([r.stop - r.start for r in mine]),
+    )
+
+
+class _Grouping:
+    """Which group a person is in."""
+
+    def __init__(self, dataset: Dataset, by: str | None) -> None:
+        self.by = by.casefold() if by else ""
+        self.people = read_people(dataset.path) if self.by and self.by != "subject" else {}
+        if not self.by or self.by == "subject":
+            return
+        columns = {"age_group", "gender", *(key for p in self.people.values() for key in p.more)}
+        if not self.people:
+            raise DatasetError(
+                f"'{dataset.path}' has no {PEOPLE}, so nothing is known of the people: write one there with columns "
+                "subject,age_group,gender."
+            )
+        if self.by not in columns:
+            raise DatasetError(
+                f"{PEOPLE} of '{dataset.head.name}' has no column '{by}': it has subject, "
+                f"{', '.join(sorted(columns))}.{nearest(self.by, columns)}"
+            )
+
+    def __call__(self, subject: str) -> str:
+        if not self.by:
+            return ""
+        if subject in (NOBODY, UNKNOWN_SUBJECT):
+            return "nobody" if subject == NOBODY else NOT_SAID
+        if self.by == "subject":
+            return subject
+        person = self.people.get(subject, PersonInfo(subject))
+        own = {"age_group": person.age_group, "gender": person.gender} | person.more
+        return own.get(self.by) or NOT_SAID
+
+
+@dataclass(frozen=True)
+class ChannelSummary:
+    """What one channel read during one gesture: mean and standard deviation over all valid rows, in the raw unit."""
+
+    gesture: str
+    channel: str
+    unit: str
+    rows: int
+    mean: float
+    sd: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, ready for JSON."""
+        return asdict(self)
+
+
+def channel_table(dataset: Dataset) -> list[ChannelSummary]:
+    """Mean and standard deviation of each channel by gesture, over the used recordings after trimming.
+
+    Reads every recording. Rows outside a channel's valid range do not count; all rows weigh alike, so a recording that
+    nobody stopped weighs much.
+    """
+    layout = dataset.layout
+    steps = np.array([c.step for c in layout.channels])
+    sums: dict[str, NDArray[np.float64]] = {}
+    for r in sorted(dataset.used, key=lambda r: (r.stream, r.id)):
+        raw = dataset.read(r).values
+        valid = (raw >= layout.valid_min_int) & (raw <= layout.valid_max_int)
+        x = np.where(valid, raw * steps, 0.0)
+        part = np.stack([valid.sum(axis=0), x.sum(axis=0), (x * x).sum(axis=0)])
+        sums[r.gesture] = sums[r.gesture] + part if r.gesture in sums else part
+    out = []
+    for gesture in sorted(sums, key=lambda label: (_class_order(dataset, label), label)):
+        count, total, squares = sums[gesture]
+        mean = total / np.maximum(count, 1)
+        sd = np.sqrt(np.maximum(squares / np.maximum(count, 1) - mean**2, 0.0))
+        out += [
+            ChannelSummary(gesture, c.name, c.unit, int(count[i]), float(mean[i]), float(sd[i]))
+            for i, c in enumerate(layout.channels)
+            if count[i]
+        ]
+    return out

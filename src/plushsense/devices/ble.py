@@ -1,0 +1,327 @@
+"""A toy over Bluetooth Low Energy: the wire format in the notifications of a UART-like service (through bleak)."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import queue
+import re
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+from urllib.parse import unquote
+
+from plushsense.core.errors import ConfigError, DeviceError
+from plushsense.core.extras import need
+from plushsense.core.signal import Layout
+from plushsense.devices.base import Device, Frame, now_ms
+from plushsense.devices.opening import Address
+from plushsense.devices.wire import LineParser
+
+UART_SERVICE = "6e400001-b5a3-f393-e0a9-e50e24dcca9e"
+UART_TX = "6e400003-b5a3-f393-e0a9-e50e24dcca9e"
+"""Nordic UART service: what the toy sends is notified here (Nordic Semiconductor, nRF Connect SDK, "NUS")."""
+
+FIND_S = 10.0
+_CONNECT_S = 20.0
+_MAC = re.compile(r"[0-9A-F]{2}(?:[:-][0-9A-F]{2}){5}\Z", re.IGNORECASE)
+_UUID = re.compile(r"[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{12}\Z")
+
+
+@dataclass(frozen=True)
+class BleTarget:
+    """Which toy, and where it speaks.
+
+    Attributes:
+        name: as advertised; or else
+        address: as the system gives it: six bytes, on macOS a UUID.
+        service: UUID of the service.
+        tx: UUID of the characteristic that notifies; None: the only one of the service that does.
+        find_s: how long to look for it, seconds.
+    """
+
+    name: str | None = None
+    address: str | None = None
+    service: str = UART_SERVICE
+    tx: str | None = UART_TX
+    find_s: float = FIND_S
+
+
+@dataclass(frozen=True)
+class Backends:
+    """Bleak's own hooks: client and scanner classes in place of the platform's; None: the platform's."""
+
+    client: type[Any] | None = None
+    scanner: type[Any] | None = None
+
+
+@dataclass(frozen=True)
+class Seen:
+    """One device that advertises: address, name ("" for none), signal strength in dBm, advertised services."""
+
+    address: str
+    name: str
+    rssi: int
+    services: tuple[str, ...]
+
+
+_started = threading.Lock()
+_loops: list[asyncio.AbstractEventLoop] = []
+
+
+def bluetooth_loop() -> asyncio.AbstractEventLoop:
+    """The event loop of all Bluetooth, one for the program: bleak keeps its connection to the system in it."""
+    with _started:
+        if not _loops:
+            loop = asyncio.new_event_loop()
+            threading.Thread(target=loop.run_forever, name="plushsense-ble", daemon=True).start()
+            _loops.append(loop)
+        return _loops[0]
+
+
+class BleDevice(Device):
+    """Frames from the notifications of a Bluetooth toy. One that disconnects raises DeviceError.
+
+    bleak lives in an event loop in a thread of its own (`bluetooth_loop`); `read` takes what that has put aside.
+    Notifications cut the lines anywhere; the first line is joined in its middle, as on a serial port.
+    """
+
+    def __init__(self, url: str, layout: Layout, target: BleTarget, backends: Backends | None = None) -> None:
+        super().__init__(url, layout)
+        self._bleak = need("bleak", extra="ble")
+        self._target = target
+        self._backends = backends or Backends()
+        self._parser = LineParser(layout, self.counters, joining=True)
+        self._heard: queue.SimpleQueue[tuple[int, bytes] | None] = queue.SimpleQueue()
+        self._over: asyncio.Event | None = None
+        self._loop = bluetooth_loop()
+        opened: Future[None] = Future()
+        self._talk = asyncio.run_coroutine_threadsafe(self._work(opened), self._loop)
+        try:
+            opened.result()
+        except BaseException:
+            self.close()  # also when the user has stopped waiting
+            raise
+
+    def read(self) -> list[Frame] | None:
+        """What has arrived, waiting at most 0.1 s."""
+        frames: list[Frame] = []
+        wait = True
+        while not self.closed:
+            try:
+                heard = self._heard.get(timeout=0.1) if wait else self._heard.get_nowait()
+            except queue.Empty:
+                return frames
+            if heard is None:
+                if self.closed:
+                    return None
+                self._heard.put(None)  # for the next call, when frames came before the end
+                if frames:
+                    return frames
+                self._parser.finish()
+                raise DeviceError(f"'{self.url}' went away (disconnected): was it switched off or out of reach?")
+            host, data = heard
+            frames += [Frame(host, line.device_ms, line.values) for line in self._parser.feed(data)]
+            wait = False
+        return None
+
+    def _shut(self) -> None:
+        self._loop.call_soon_threadsafe(self._end)
+        self._heard.put(None)
+        with contextlib.suppress(TimeoutError):
+            self._talk.result(5.0)
+
+    def _end(self) -> None:
+        if self._over is not None:
+            self._over.set()
+
+    async def _work(self, opened: Future[None]) -> None:
+        """Find, connect, listen; until the toy has gone or `close` was called."""
+        self._over = over = asyncio.Event()
+        if self.closed:
+            over.set()
+        steps = asyncio.ensure_future(self._listen(over, opened))
+        stop = asyncio.ensure_future(over.wait())
+        try:
+            # Closing also ends a search or a connection that is still under way.
+            await asyncio.wait((steps, stop), return_when=asyncio.FIRST_COMPLETED)
+            if not steps.done() and not opened.done():
+                steps.cancel()
+            stop.cancel()
+            await asyncio.wait((steps,))
+            cause = None if steps.cancelled() else steps.exception()
+            if not opened.done():
+                broken = cause
+                if not isinstance(cause, Exception):
+                    broken = DeviceError(f"'{self.url}' broke off while it was being connected; try again.")
+                elif not isinstance(cause, DeviceError):
+                    broken = DeviceError(f"'{self.url}': {in_words(cause)}.")
+                opened.set_exception(broken)
+        finally:
+            self._heard.put(None)
+
+    async def _listen(self, over: asyncio.Event, opened: Future[None]) -> None:
+        device = await self._find()
+        chosen = {} if self._backends.client is None else {"backend": self._backends.client}
+        client = self._bleak.BleakClient(
+            device, lambda _: self._loop.call_soon_threadsafe(over.set), timeout=_CONNECT_S, **chosen
+        )
+        try:
+            await asyncio.wait_for(client.connect(), _CONNECT_S)
+        except TimeoutError:
+            raise DeviceError(
+                f"'{self.url}' is there but does not let itself be connected within {_CONNECT_S:g} s: "
+                "is another computer or phone connected to it?"
+            ) from None
+        try:
+            characteristic = self._characteristic(list(client.services))
+            await client.start_notify(characteristic, lambda _, data: self._heard.put((now_ms(), bytes(data))))
+            opened.set_result(None)
+            await over.wait()
+        finally:
+            with contextlib.suppress(Exception):
+                await asyncio.wait_for(client.disconnect(), 3.0)
+
+    async def _find(self) -> Any:
+        """The device as the scanner knows it; connecting to a bare address is not reliable (bleak's manual)."""
+        target = self._target
+        found: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
+        names: dict[str, str] = {}
+
+        def advertised(device: Any, data: Any) -> None:
+            name = data.local_name or device.name or ""
+            names[device.address] = name
+            wanted = _same(device.address, target.address) if target.address else name == target.name
+            if wanted and not found.done():
+                found.set_result(device)
+
+        with contextlib.suppress(TimeoutError):
+            async with _scanner(self._bleak, self._backends, advertised):
+                return await asyncio.wait_for(asyncio.shield(found), target.find_s)
+        there = [f"{name} ({address})" for address, name in sorted(names.items(), key=lambda kv: kv[1]) if name]
+        if there:
+            here = f"there are {', '.join(there[:8])}" + (f" and {len(there) - 8} more" if len(there) > 8 else "")
+        else:
+            here = f"there are {len(names)} without a name" if names else "nothing advertises here"
+        what = f"named '{target.name}'" if target.address is None else f"with the address {target.address}"
+        raise DeviceError(
+            f"'{self.url}': no Bluetooth device {what} advertised within {target.find_s:g} s; {here}; "
+            "is it switched on, near, and not connected elsewhere?"
+        )
+
+    def _characteristic(self, services: list[Any]) -> Any:
+        target = self._target
+        service = next((s for s in services if s.uuid.lower() == target.service), None)
+        if service is None:
+            raise DeviceError(
+                f"'{self.url}' has no service {target.service}; it has {_listed(s.uuid for s in services)}: "
+                "write ?service=UUID&tx=UUID."
+            )
+        notifying = [c for c in service.characteristics if {"notify", "indicate"} & set(c.properties)]
+        if target.tx is None and len(notifying) == 1:
+            return notifying[0]
+        match = next((c for c in notifying if c.uuid.lower() == target.tx), None)
+        if match is None:
+            wrong = "names none of those" if target.tx is None else f"{target.tx} is none of those"
+            raise DeviceError(
+                f"'{self.url}': of service {target.service} the characteristics that notify are "
+                f"{_listed(c.uuid for c in notifying)}, and the URL's tx {wrong}: write &tx=UUID."
+            )
+        return match
+
+
+def scan(seconds: float, backends: Backends | None = None) -> list[Seen]:
+    """What advertises within so many seconds, the nearest first.
+
+    Raises:
+        DeviceError: when Bluetooth cannot be used, in one sentence.
+        MissingExtraError: without bleak.
+    """
+    bleak = need("bleak", extra="ble")
+    seen: dict[str, Seen] = {}
+
+    def advertised(device: Any, data: Any) -> None:
+        name = data.local_name or device.name or ""
+        services = tuple(str(uuid).lower() for uuid in data.service_uuids)
+        seen[device.address] = Seen(device.address, name, int(data.rssi), services)
+
+    async def look() -> None:
+        async with _scanner(bleak, backends or Backends(), advertised):
+            await asyncio.sleep(seconds)
+
+    try:
+        asyncio.run_coroutine_threadsafe(look(), bluetooth_loop()).result()
+    except Exception as cause:  # noqa: BLE001 (backends raise what their system raises)
+        words = in_words(cause)
+        raise DeviceError(f"{words[0].upper()}{words[1:]}.") from None
+    return sorted(seen.values(), key=lambda s: (-s.rssi, s.name, s.address))
+
+
+def _scanner(bleak: ModuleType, backends: Backends, advertised: Callable[[Any, Any], None]) -> Any:
+    chosen = {} if backends.scanner is None else {"backend": backends.scanner}
+    return bleak.BleakScanner(detection_callback=advertised, **chosen)
+
+
+def in_words(cause: Exception) -> str:
+    """What bleak or the system under it complains about, for a person; without a stop at the end."""
+    reason = str(getattr(getattr(cause, "reason", None), "name", ""))
+    text = " ".join(" ".join(str(part) for part in cause.args).split()) or type(cause).__name__
+    low = text.lower()
+    if reason == "POWERED_OFF" or "turned off" in low or "not powered" in low or "org.bluez.error.notready" in low:
+        return "Bluetooth is switched off: switch it on"
+    if reason.startswith("DENIED") or "accessdenied" in low or "not authorized" in low:
+        return "this program may not use Bluetooth: allow it in the system's settings"
+    if reason in ("NO_BLUETOOTH", "NO_BLE_CENTRAL_ROLE") or re.search(r"no bluetooth|adapters? (was )?not found", low):
+        return "this computer has no Bluetooth adapter that can be used"
+    if isinstance(cause, OSError) or "serviceunknown" in low:
+        why = getattr(cause, "strerror", None) or text
+        return f"Bluetooth cannot be used here: its system service does not answer ({why})"
+    return f"Bluetooth says: {text.rstrip('.')}"
+
+
+def _same(address: str, wanted: str) -> bool:
+    return address.replace("-", ":").lower() == wanted.replace("-", ":").lower()
+
+
+def _listed(uuids: Any) -> str:
+    texts = sorted(uuids)
+    return ", ".join(texts) if texts else "none"
+
+
+def _uuid(address: Address, key: str) -> str | None:
+    text = address.query.get(key)
+    if text is None:
+        return None
+    full = text.lower()
+    if re.fullmatch(r"[0-9a-f]{4}", full):
+        full = f"0000{full}-0000-1000-8000-00805f9b34fb"  # the short form of the Bluetooth base UUID
+    if _UUID.match(full) is None:
+        raise ConfigError(
+            f"'{address.url}': {key} is '{text}'; accepted is a UUID like {UART_SERVICE}, or 4 hex digits."
+        )
+    return full
+
+
+def open_url(address: Address, layout: Layout) -> BleDevice:
+    """Open ``ble://AA:BB:CC:DD:EE:FF?service=UUID&tx=UUID`` or ``ble://name:PlushName?find_s=10``."""
+    address.check_keys(("service", "tx", "find_s"))
+    place = unquote(address.place).strip("/")
+    named, colon, name = place.partition(":")
+    by_name = named.lower() == "name" and colon != ""
+    if not (name.strip() if by_name else _MAC.match(place) or _UUID.match(place.lower())):
+        raise DeviceError(
+            f"'{address.url}' names no Bluetooth toy: write ble://AA:BB:CC:DD:EE:FF, the UUID that macOS gives in its "
+            "place, or ble://name:PlushName (plushsense devices lists them)."
+        )
+    service, tx = _uuid(address, "service"), _uuid(address, "tx")
+    target = BleTarget(
+        name if by_name else None,
+        None if by_name else place,
+        service or UART_SERVICE,
+        tx or (UART_TX if service in (None, UART_SERVICE) else None),
+        address.number("find_s", FIND_S, 0.1, 600.0),
+    )
+    return BleDevice(address.url, layout, target)

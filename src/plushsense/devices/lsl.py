@@ -1,0 +1,240 @@
+"""A toy, or any other sensor, that publishes on the lab streaming layer (LSL, through pylsl)."""
+
+from __future__ import annotations
+
+import math
+import os
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+from urllib.parse import quote, unquote
+
+from plushsense.core.errors import ConfigError, DeviceError
+from plushsense.core.extras import need
+from plushsense.core.signal import DEVICE_MS, Layout
+from plushsense.devices.base import Device, Frame, LossMeter, now_ms
+from plushsense.devices.opening import Address
+
+FIND_S = 5.0
+KEYS = {"name": "name", "type": "type", "source": "source_id"}
+"""What a URL may look for, and the property of a stream that this is."""
+
+_LIMIT = 2**53
+_BACK_MS = 1000
+_FRACTIONS = 100
+_lock = threading.Lock()
+
+
+def load_pylsl() -> ModuleType:
+    """pylsl, with liblsl's chatter on standard error turned off (unless the user has configured liblsl).
+
+    Raises:
+        MissingExtraError: without the package.
+        DeviceError: when it finds no liblsl.
+    """
+    with _lock:
+        try:
+            pylsl = need("pylsl", extra="lsl")
+        except RuntimeError as cause:
+            raise DeviceError(f"LSL cannot be used here: {' '.join(str(cause).split()).rstrip('.')}.") from None
+        mine = ("lsl_api.cfg", "~/lsl_api/lsl_api.cfg", "/etc/lsl_api/lsl_api.cfg")
+        configured = os.environ.get("LSLAPICFG") or any(Path(p).expanduser().exists() for p in mine)
+        if not configured and hasattr(pylsl, "set_config_content") and not hasattr(pylsl, "_plushsense_quiet"):
+            pylsl.set_config_content("[log]\nlevel = -3\n")
+            pylsl._plushsense_quiet = True  # type: ignore[attr-defined]
+        return pylsl
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Where in a sample the channels stand, in layout order, and the toy's own clock (None: it is not there)."""
+
+    channels: tuple[int, ...]
+    clock: int | None = None
+
+
+def match_columns(layout: Layout, labels: list[str] | None, width: int, what: str) -> Columns:
+    """By label, in any order, when the stream's labels are the layout's; by position when there are none such.
+
+    By position fits a stream as wide as the layout's channels or as its wire. Case and outer spaces of labels do not
+    count, and a stream may carry more than the layout asks for.
+
+    Raises:
+        DeviceError: for a stream that does not fit, in one sentence.
+    """
+    texts = [label.strip().casefold() for label in labels or ()]
+    known = [name.casefold() for name in layout.names]
+    if len(texts) == width and set(known) & set(texts):
+        missing = [name for name, key in zip(layout.names, known, strict=True) if key not in texts]
+        double = [name for name, key in zip(layout.names, known, strict=True) if texts.count(key) > 1]
+        if missing or double:
+            fault = f"lacks {', '.join(missing)}" if missing else f"has {', '.join(double)} more than once"
+            raise DeviceError(
+                f"{what} {fault}; it carries {', '.join(labels or ())}: "
+                f"choose the layout that fits with ?layout= (asked for was {layout.name})."
+            )
+        return Columns(tuple(texts.index(key) for key in known), texts.index(DEVICE_MS) if DEVICE_MS in texts else None)
+    if width == layout.n_channels:
+        return Columns(tuple(range(width)))
+    if width == len(layout.wire):
+        clock = layout.wire.index(DEVICE_MS) if DEVICE_MS in layout.wire else None
+        return Columns(tuple(layout.wire.index(name) for name in layout.names), clock)
+    named = f" ({', '.join(texts[:6])}{', …' if len(texts) > 6 else ''})" if texts else ""
+    raise DeviceError(
+        f"{what} has {width} channels{named}, and layout {layout.name} needs {layout.n_channels}, or the "
+        f"{len(layout.wire)} of its wire: choose the layout that fits with ?layout=."
+    )
+
+
+class LslDevice(Device):
+    """Frames from an LSL stream. One whose source is gone raises DeviceError.
+
+    ``device_ms`` is the stream's channel of that name where there is one (the toy's own clock; `LslOutlet` sends it).
+    Else it is the LSL time stamp, which counts on the sender's clock, in whole milliseconds; a stamp up to 1 s earlier
+    than the one before takes that one's time, so that the clock does not run back; a larger step back is a restart.
+    Values are as sent, in integer steps of the layout; a sample with a value that is not finite, or not whole where the
+    step is 1, is counted as malformed.
+    """
+
+    def __init__(self, url: str, layout: Layout, key: str, value: str, find_s: float = FIND_S) -> None:
+        super().__init__(url, layout)
+        self._pylsl = load_pylsl()
+        self._lock = threading.Lock()
+        self._loss = LossMeter()
+        self._last_ms: int | None = None
+        low, high = layout.valid_min_int.tolist(), layout.valid_max_int.tolist()
+        self._valid = list(zip(low, high, strict=True))
+        self._steps = [c.step for c in layout.channels]
+        found = self._find(key, value, find_s)
+        if found.channel_format() == self._pylsl.cf_string:
+            raise DeviceError(f"'{url}' is a stream of texts; a toy sends numbers: name another stream.")
+        # Not recovering by itself: going away is said, and coming back is ReconnectingDevice's.
+        self._inlet: Any = self._pylsl.StreamInlet(found, recover=False)
+        try:
+            labels = stream_labels(self._inlet.info(timeout=FIND_S))
+            self._columns = match_columns(layout, labels, found.channel_count(), f"The stream '{url}'")
+            self._inlet.open_stream(timeout=FIND_S)
+        except RuntimeError:  # pylsl's TimeoutError and LostError, which it keeps elsewhere in each version
+            raise DeviceError(
+                f"'{url}' is announced but does not answer: is its program still running, and no firewall between?"
+            ) from None
+        if found.channel_format() == self._pylsl.cf_float32 and self._columns.clock is not None:
+            # 24 bits hold milliseconds exactly for less than five hours.
+            self._columns = Columns(self._columns.channels)
+
+    def _find(self, key: str, value: str, find_s: float) -> Any:
+        mark = '"' if "'" in value else "'"
+        predicate = f"{KEYS[key]}={mark}{value}{mark}"
+        found = self._pylsl.resolve_bypred(predicate, 1, find_s)
+        if found:  # and whether it is the only one
+            found = {s.uid(): s for s in (*found, *self._pylsl.resolve_bypred(predicate, 2, 0.3))}
+        if len(found) == 1:
+            return next(iter(found.values()))
+        if found:
+            sources = ", ".join(f"'{s.source_id()}' on {s.hostname()}" for s in found.values())
+            raise DeviceError(f"'{self.url}' fits {len(found)} streams, of {sources}: name one by lsl://source:ID.")
+        there = ", ".join(f"{s.name()} ({s.type() or 'no type'})" for s in self._pylsl.resolve_streams(0.5))
+        raise DeviceError(
+            f"'{self.url}': no LSL stream has the {key} '{value}' within {find_s:g} s; "
+            f"{f'there are {there}' if there else 'there is none on this network'}."
+        )
+
+    def read(self) -> list[Frame] | None:
+        """What has arrived, waiting at most 0.1 s."""
+        with self._lock:
+            if self.closed:
+                return None
+            try:
+                first, stamp = self._inlet.pull_sample(timeout=0.1)
+                if first is None:
+                    return []
+                samples, stamps = self._inlet.pull_chunk(timeout=0.0, max_samples=512)
+            except RuntimeError:
+                raise DeviceError(f"'{self.url}' went away: has its program ended, or is it out of reach?") from None
+        host = now_ms()
+        frames = [
+            frame
+            for sample, at in zip((first, *samples), (stamp, *stamps), strict=True)
+            if (frame := self._frame(host, sample, at)) is not None
+        ]
+        if not self.counters.frames and self.counters.malformed >= _FRACTIONS:
+            raise ConfigError(
+                f"'{self.url}' sends values that layout {self.layout.name} cannot count in its steps (fractions, or no "
+                "numbers): write a layout whose channels have a step that is small enough."
+            )
+        return frames
+
+    def _frame(self, host: int, sample: list[float], stamp: float) -> Frame | None:
+        columns = self._columns
+        values = [_steps(sample[at], step) for at, step in zip(columns.channels, self._steps, strict=True)]
+        device_ms: int | None
+        if columns.clock is None:
+            device_ms = round(stamp * 1000.0) if math.isfinite(stamp) else None
+            last = self._last_ms
+            if device_ms is not None and last is not None and 0 < last - device_ms <= _BACK_MS:
+                device_ms = last
+        else:
+            device_ms = _steps(sample[columns.clock], 1.0)
+        if device_ms is None or not 0 <= device_ms <= _LIMIT or None in values:
+            self.counters.malformed += 1
+            return None
+        self._last_ms = device_ms
+        whole = tuple(v for v in values if v is not None)
+        self.counters.frames += 1
+        self.counters.garbage += any(not low <= v <= high for v, (low, high) in zip(whole, self._valid, strict=True))
+        self.counters.lost += self._loss.push(device_ms)
+        return Frame(host, device_ms, whole)
+
+    def _shut(self) -> None:
+        with self._lock:  # liblsl must not lose an inlet that is being read
+            self._inlet.close_stream()
+            self._inlet = None
+
+
+def _steps(value: float, step: float) -> int | None:
+    """A value in integer steps; None for one that is no number or, at a step of 1, not whole."""
+    if not math.isfinite(value):
+        return None
+    number = value / step
+    if not -_LIMIT <= number <= _LIMIT or (step == 1.0 and number != round(number)):
+        return None
+    return round(number)
+
+
+def stream_labels(info: Any) -> list[str] | None:
+    """The labels in a full stream description, in order; None where there are none."""
+    labels: list[str] = []
+    channel = info.desc().child("channels").child("channel")
+    while not channel.empty() and len(labels) < 10_000:
+        labels.append(channel.child_value("label"))
+        channel = channel.next_sibling("channel")
+    return labels if any(labels) else None
+
+
+def name_url(name: str) -> str:
+    """The URL that opens a stream by its name, whatever that is."""
+    prefix = "name:" if name.partition(":")[0].lower() in KEYS else ""
+    return f"lsl://{prefix}{quote(name)}"
+
+
+def stream_url(info: Any, *, unique_name: bool = True) -> str:
+    """The URL that opens a stream: by name where that is unique, else by its source."""
+    source = info.source_id()
+    return name_url(info.name()) if unique_name or not source else f"lsl://source:{quote(source)}"
+
+
+def open_url(address: Address, layout: Layout) -> LslDevice:
+    """Open ``lsl://NAME``, ``lsl://type:EEG`` or ``lsl://source:ID``; ``?find_s=5`` bounds the search."""
+    address.check_keys(("find_s",))
+    place = unquote(address.place).removesuffix("/")
+    key, colon, value = place.partition(":")
+    if not colon or key.lower() not in KEYS:
+        key, value = "name", place  # a name may hold a colon of its own
+    if not value or ("'" in value and '"' in value):
+        raise DeviceError(
+            f"'{address.url}' names no LSL stream: write lsl://NAME, lsl://type:EEG or lsl://source:ID "
+            "(plushsense devices lists them)."
+        )
+    return LslDevice(address.url, layout, key.lower(), value, address.number("find_s", FIND_S, 0.1, 600.0))

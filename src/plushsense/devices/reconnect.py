@@ -1,0 +1,196 @@
+"""A toy that may go away and come back: unplugged, switched off, out of reach. The gap is kept, not hidden."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Literal
+
+from plushsense.core.errors import DeviceError
+from plushsense.core.signal import Layout
+from plushsense.devices.base import Counters, Device, Frame, now_ms
+
+State = Literal["connected", "waiting"]
+
+RETRY_S = 0.5
+
+
+@dataclass
+class Gap:
+    """A time without the toy, from the last frame before it to the first one after.
+
+    Attributes:
+        host_ms_begin: of the last frame before; when it went away, if there was none.
+        host_ms_end: of the first frame after; None while it lasts.
+        device_ms_before: the toy's clock at the last frame before; None if there was none.
+        device_ms_after: the toy's clock at the first frame after: it goes on after a pulled cable and begins anew
+            after a restart. None while the gap lasts.
+        reason: what went wrong, in one sentence.
+    """
+
+    host_ms_begin: int
+    host_ms_end: int | None = None
+    device_ms_before: int | None = None
+    device_ms_after: int | None = None
+    reason: str = ""
+
+    def to_dict(self) -> dict[str, int | str | None]:
+        """Plain values, ready for JSON."""
+        return asdict(self)
+
+
+class ReconnectingDevice(Device):
+    """Frames of a toy that is opened again, every 0.5 s, whenever it went away after it once was there.
+
+    Counters go on over all connections; ``lost`` counts within each of them, and what a gap swallowed is in ``gaps``.
+    While the toy is away `read` returns no frames, each time after about 0.1 s.
+
+    Args:
+        url: for messages.
+        layout: of the frames.
+        open_inner: opens the toy; the first failure raises, later ones are tried again.
+        for_s: how long to wait for the toy before DeviceError; None: for ever.
+        ends: whether the end of the inner frames is the end (a file); else it counts as going away (a server that
+            closed the connection).
+
+    Attributes:
+        state: "connected" or "waiting".
+        gaps: all so far; the last one is open (``host_ms_end`` None) until a frame has come.
+        inner: the open device behind this one; None while waiting.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        layout: Layout,
+        open_inner: Callable[[], Device],
+        *,
+        for_s: float | None = None,
+        ends: bool = False,
+    ) -> None:
+        super().__init__(url, layout)
+        self.state: State = "connected"
+        self.gaps: list[Gap] = []
+        self._open_inner = open_inner
+        self._for_s = for_s
+        self._ends = ends
+        self._before = Counters()
+        self._last: Frame | None = None
+        self._lock = threading.Lock()
+        self._awake = threading.Event()
+        self._waiting_since = 0.0
+        self._found: Device | Exception | None = None
+        self.inner: Device | None = open_inner()
+        self._count()
+
+    def read(self) -> list[Frame] | None:
+        """What has arrived, waiting at most about 0.1 s; an empty list while the toy is away.
+
+        Raises:
+            DeviceError: when it did not come back within ``for_s``.
+        """
+        if self.closed:
+            return None
+        inner = self.inner
+        if inner is None:
+            return self._wait()
+        try:
+            frames = inner.read()
+        except DeviceError as cause:
+            if self.closed:
+                return None
+            return self._lost(inner, str(cause))
+        self._count()
+        if frames is None:
+            if self.closed or self._ends:
+                return None
+            return self._lost(inner, f"'{self.url}' closed the connection.")
+        if frames:
+            gap = self.gaps[-1] if self.gaps else None
+            if gap is not None and gap.host_ms_end is None:
+                gap.host_ms_end, gap.device_ms_after = frames[0].host_ms, frames[0].device_ms
+            self._last = frames[-1]
+        return frames
+
+    def _count(self) -> None:
+        inner = self.inner
+        if inner is None:
+            return
+        for name in ("frames", "lost", "malformed", "garbage"):
+            setattr(self.counters, name, getattr(self._before, name) + getattr(inner.counters, name))
+
+    def _lost(self, inner: Device, reason: str) -> list[Frame]:
+        self._count()
+        self._before = Counters(**self.counters.to_dict())
+        # Gone again before a frame came: it is still the same gap, and the next try is not made at once.
+        again = bool(self.gaps) and self.gaps[-1].host_ms_end is None
+        if not again:
+            last = self._last
+            begin, before = (last.host_ms, last.device_ms) if last is not None else (now_ms(), None)
+            self.gaps.append(Gap(begin, device_ms_before=before, reason=reason))
+            self._waiting_since = time.monotonic()
+        with self._lock:
+            self.inner = None
+            self.state = "waiting"
+        # Closing and opening may take seconds (a scan, a silent host): not in the thread that reads.
+        self._awake.clear()
+        threading.Thread(target=self._seek, args=(inner, again), name="plushsense-reconnect", daemon=True).start()
+        return []
+
+    def _seek(self, gone: Device, pause: bool) -> None:
+        """Try until the toy is there, the device is closed or an error comes that trying again will not mend."""
+        gone.close()
+        while not self.closed:
+            if pause:
+                self._awake.wait(RETRY_S)
+                pause = False
+                continue
+            found: Device | Exception
+            try:
+                found = self._open_inner()
+            except DeviceError:
+                pause = True
+                continue
+            except Exception as cause:  # noqa: BLE001 (raised where it is read, not lost in this thread)
+                found = cause
+            with self._lock:
+                if not self.closed:
+                    self._found = found
+                    self._awake.set()
+                    return
+            if isinstance(found, Device):
+                found.close()
+
+    def _wait(self) -> list[Frame] | None:
+        if not self._awake.wait(0.1):
+            waited = time.monotonic() - self._waiting_since
+            if self._for_s is not None and waited >= self._for_s:
+                self.close()
+                raise DeviceError(
+                    f"'{self.url}' went away and did not come back within {self._for_s:g} s: "
+                    "plug it in or switch it on, and begin again."
+                )
+            return []
+        with self._lock:
+            if self.closed:
+                return None
+            found, self._found = self._found, None
+            if isinstance(found, Device):
+                self.inner = found
+                self.state = "connected"
+                self.counters.reconnects += 1
+        if isinstance(found, Exception):
+            self.close()
+            raise found
+        return []
+
+    def _shut(self) -> None:
+        self._awake.set()
+        with self._lock:
+            found, self._found = self._found, None
+            inner = self.inner
+        for device in (inner, found):
+            if isinstance(device, Device):
+                device.close()

@@ -1,0 +1,38 @@
+from pathlib import Path
+
+import numpy as np
+
+from plushsense.dataset.importers import import_recordings
+from plushsense.dataset.store import Dataset
+from plushsense.dataset.trim import accept, renewed, trims
+from plushsense.recording.simulate import simulate
+from plushsense.reports.trims import PER_PAGE, save_trims, trim_page
+
+
+def _dataset(folder: Path) -> Dataset:
+    simulate(folder / "raw", people=1, repetitions=2, at_rest=0, gestures=("Head stroke 1", "Hold strong"))
+    return import_recordings(folder / "raw", folder / "DS", layout="plush-15").dataset
+
+
+def test_dotted_where_suggested_and_solid_where_marked(tmp_path: Path) -> None:
+    dataset = _dataset(tmp_path)
+    found = trims(dataset)
+    seen = next(t for t in found if t.suggestion.onset_visible)
+    accept(dataset, [seen], "K")
+    (marked,) = renewed(dataset, [seen])
+    for trim, expected in ((seen, {":"}), (marked, {":", "-"})):
+        axes = trim_page(dataset, [trim], offset=False).axes[0]
+        upright = [line for line in axes.lines if len(line.get_xdata()) == 2]
+        assert {line.get_linestyle() for line in upright} == expected
+        assert all(np.ptp(np.asarray(line.get_xdata())) == 0 for line in upright)
+        assert upright[0].get_xdata()[0] == trim.seconds[trim.suggestion.start]
+        assert len(axes.lines) - len(upright) == 13, "every channel"
+
+
+def test_pages(tmp_path: Path) -> None:
+    dataset = _dataset(tmp_path)
+    found = trims(dataset) * 4
+    assert len(found) > PER_PAGE
+    assert [p.name for p in save_trims(dataset, found, tmp_path / "pages")] == ["trim-001.png", "trim-002.png"]
+    (one,) = save_trims(dataset, found, tmp_path / "deep" / "one.png")
+    assert one.read_bytes().startswith(b"\x89PNG")
