@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import shutil
 import sys
 import textwrap
 
@@ -54,10 +53,10 @@ def _toy(s: Status) -> str:
         "poor": f"{_RED}POOR: many readings are lost; bring the toy nearer, check its battery{_OFF}",
         "none": f"{_RED}NONE: the toy is silent{_OFF}",
     }
-    heard = f"{s.rate_hz:.0f} readings a second, jitter {s.jitter_ms:.1f} ms" if s.rate_hz else "no readings"
+    heard = f"   {s.rate_hz:.0f} readings a second" if s.rate_hz else ""
     return (
-        f"Signal {words[s.signal]}\n"
-        f"{_DIM}{heard}   lost {s.lost}   unreadable {s.malformed}   out of range {s.garbage}   "
+        f"Signal {words[s.signal]}{heard}\n"
+        f"{_DIM}jitter {s.jitter_ms:.1f} ms   lost {s.lost}   unreadable {s.malformed}   out of range {s.garbage}   "
         f"gaps {s.gaps}   reconnected {s.reconnects}{_OFF}"
     )
 
@@ -102,14 +101,15 @@ class Screen:
         if self._terminal:
             if sys.platform == "win32":
                 os.system("")  # wakes the console's escape sequences
-            sys.stderr.write("\x1b[?25l\x1b[2J")
+            sys.stderr.write("\x1b[?25l\x1b[?7l\x1b[2J")  # no cursor, no wrapped lines
         else:
             recorder.listen(self._line)
 
     def draw(self, status: Status, typing: str | None = None) -> None:
         """Show this moment."""
         if self._terminal:
-            size = shutil.get_terminal_size()
+            # Standard output may be a file: it is the screen's size that counts.
+            size = os.get_terminal_size(sys.stderr.fileno())
             shown = lines(status, self._title, typing, min(_WIDEST, size.columns - 1))[: size.lines - 1]
             sys.stderr.write("\x1b[H" + "".join(f"{line}\x1b[K\n" for line in shown) + "\x1b[J")
             sys.stderr.flush()
@@ -137,5 +137,5 @@ class Screen:
     def close(self) -> None:
         """Clear the screen, so that nothing on it looks as if it were still going on, and give the cursor back."""
         if self._terminal:
-            sys.stderr.write("\x1b[2J\x1b[H\x1b[?25h")
+            sys.stderr.write("\x1b[2J\x1b[H\x1b[?7h\x1b[?25h")
             sys.stderr.flush()
