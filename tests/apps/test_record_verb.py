@@ -8,13 +8,15 @@ import select
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
-from tests.apps.conftest import Cli
 
 from plushsense.recording.sessionfile import SessionHead, read_events
 
+Cli = Callable[..., Any]
 COMMAND = [sys.executable, "-m", "plushsense.apps.cli.main", "record"]
 URL = "virtual://?speed=0&lost=0&garbled=0&glitch=0"
 KEYS = {

@@ -19,17 +19,15 @@ from typing import Any, Literal, Self
 
 from plushsense.core.errors import DatasetError, PlushSenseError
 from plushsense.core.recfile import STREAM_NAME
-from plushsense.devices.base import Counters, Device, Frame, LossMeter, now_ms
+from plushsense.devices.base import Counters, Device, Frame, now_ms
 from plushsense.recording.course import Course, key_of
+from plushsense.recording.intake import AWAY_S, Intake
 from plushsense.recording.keeper import Keeper
-from plushsense.recording.meter import Meter
 from plushsense.recording.session import OpenSession
 from plushsense.recording.sessionfile import Event, SessionHead
 from plushsense.recording.status import State, Status
 from plushsense.recording.take import Take, gap_entry, sidecar
 from plushsense.recording.writer import StreamFile, save_take, to_frames
-
-_AWAY_S = 1.0
 
 Listener = Callable[[str, Status], None]
 Ended = Literal["space", "auto", "longest", "toy"]
@@ -75,16 +73,7 @@ class Recorder:
         self._news: list[str] = []
         standing = session.standing
         self._course = Course(self.protocol.steps(), standing)
-        self._rows = standing.rows
-        self._base_ms = max(now_ms(), standing.host_ms + 1000 if speed != 1.0 else 0)
-        self._toy_ms = 0.0
-        self._last: Frame | None = None
-        self._heard_s = float("-inf")
-        self._reconnects = device.counters.reconnects
-        self._loss = LossMeter()
-        self._lost = 0
-        self._gaps: list[dict[str, Any]] = []
-        self._meter = Meter(session.layout)
+        self._intake = Intake(device, session.layout, speed, standing.rows, standing.host_ms)
         self._take: Take | None = None
         self._since_ms = 0.0
         self._state: State = "idle"
@@ -117,12 +106,9 @@ class Recorder:
         with self._changed:
             course = self._course
             counters = self.device.counters
-            away = getattr(self.device, "state", "connected") == "waiting"
-            quality = self._meter.quality(time.monotonic(), away)
-            passed = (self._toy_ms - self._since_ms) / 1000.0
+            quality = self._intake.quality()
+            passed = self._passed_s()
             counting, running = self._state == "countdown", self._state == "recording"
-            left = max(0.0, self.protocol.countdown_s - passed) if counting else 0.0
-            elapsed = max(passed, self._wall_s()) if running else 0.0
             return Status(
                 state=self._state,
                 step=course.step,
@@ -133,19 +119,19 @@ class Recorder:
                 skipped=len(course.skipped),
                 redone=course.redone,
                 already=course.takes.get(key_of(course.step), ""),
-                countdown_s=left,
-                elapsed_s=elapsed,
+                countdown_s=max(0.0, self.protocol.countdown_s - passed) if counting else 0.0,
+                elapsed_s=max(passed, self._wall_s()) if running else 0.0,
                 left_s=max(0.0, self.protocol.longest_s - passed) if running else 0.0,
                 rate_hz=quality.rate_hz,
                 jitter_ms=quality.jitter_ms,
                 signal=quality.signal,
-                away=away,
-                lost=self._lost,
+                away=self._intake.away,
+                lost=self._intake.lost,
                 malformed=counters.malformed,
                 garbage=counters.garbage,
                 reconnects=counters.reconnects,
-                gaps=len(self._gaps),
-                rows=self._rows,
+                gaps=len(self._intake.gaps),
+                rows=self._intake.rows,
                 file=course.last_file,
                 message=self._message,
                 failed=self._failed,
@@ -156,7 +142,7 @@ class Recorder:
     def toy_s(self) -> float:
         """How long the toy has been heard, by its own clock, in seconds."""
         with self._changed:
-            return self._toy_ms / 1000.0
+            return self._intake.toy_ms / 1000.0
 
     @property
     def over(self) -> str:
@@ -167,16 +153,16 @@ class Recorder:
     def begins_ms(self) -> int | None:
         """When the toy's clock will be at the end of the countdown; None while there is none, or no clock yet."""
         with self._changed:
-            if self._state != "countdown" or self._last is None:
+            last = self._intake.last
+            if self._state != "countdown" or last is None:
                 return None
-            left = 1000.0 * self.protocol.countdown_s - (self._toy_ms - self._since_ms)
-            return self._last.device_ms + round(left)
+            return last.device_ms + round(1000.0 * (self.protocol.countdown_s - self._passed_s()))
 
     @property
     def gaps(self) -> list[dict[str, Any]]:
         """Holes in the stream since this recorder began, as in the sidecars; ``after_row`` counts the stream's rows."""
         with self._changed:
-            return list(self._gaps)
+            return list(self._intake.gaps)
 
     def wait(self, *states: State, timeout_s: float | None = None) -> bool:
         """Wait until the state is one of these, "stopped" included; False when the time ran out."""
@@ -204,7 +190,7 @@ class Recorder:
                 device=self.device.url,
                 speed=self._speed,
                 resumed=self.session.standing.resumed,
-                row=self._rows,
+                row=self._intake.rows,
             )
             self._advance("; ".join(self.session.standing.mended), from_start=True)
         self._reader.start()
@@ -213,15 +199,14 @@ class Recorder:
         """Start the countdown; stop the recording, not within the protocol's shortest_s; cancel a countdown."""
         with self._telling():
             if self._state == "idle":
-                if self._silent():
+                if self._intake.silent:
                     self._say("Nothing comes from the toy: is it switched on and near?")
                 else:
                     self._begin()
             elif self._state == "countdown":
                 self._cancel("The countdown was cancelled.")
             elif self._state == "recording" and self._take is not None:
-                passed = max(self._toy_ms - self._since_ms, 1000.0 * self._wall_s())
-                if passed < 1000.0 * self.protocol.shortest_s:
+                if max(self._passed_s(), self._wall_s()) < self.protocol.shortest_s:
                     self._say("That was too quick for a stop: still recording.")
                 else:
                     self._stop("space")
@@ -323,7 +308,7 @@ class Recorder:
             elif self._state == "recording" and not self._failed:
                 self._abandon("quit", "")
             if not self._closing:
-                self._log("close", rows=self._rows)
+                self._log("close", rows=self._intake.rows)
             self._closing = True
         if self._reader.is_alive():
             self._reader.join()
@@ -363,7 +348,7 @@ class Recorder:
 
     def _log(self, what: str, **more: Any) -> None:
         if self._keeper is not None:
-            self._keeper.do(Event(what, self._now_ms(), more))
+            self._keeper.do(Event(what, self._intake.now_ms(), more))
         self._news.append(what)
 
     def _log_step(self, what: str, **more: Any) -> None:
@@ -377,19 +362,17 @@ class Recorder:
 
     def _enter(self, state: State, message: str) -> None:
         self._state = state
-        self._since_ms = self._toy_ms
+        self._since_ms = self._intake.toy_ms
         self._message = message
         self._news.append(state)
         self._changed.notify_all()
 
-    def _now_ms(self) -> int:
-        return now_ms() if self._speed == 1.0 else self._base_ms + round(self._toy_ms)
-
     def _wall_s(self) -> float:
         return time.monotonic() - self._take.from_s if self._take is not None else 0.0
 
-    def _silent(self) -> bool:
-        return time.monotonic() - self._heard_s > _AWAY_S or getattr(self.device, "state", "") == "waiting"
+    def _passed_s(self) -> float:
+        """Since the state was entered, by the toy's clock."""
+        return (self._intake.toy_ms - self._since_ms) / 1000.0
 
     def _advance(self, message: str = "", from_start: bool = False) -> None:
         """On to the next recording that is to be made, or to the end."""
@@ -407,7 +390,7 @@ class Recorder:
             self._enter("paused" if self._paused else "idle", message)
 
     def _begin(self) -> None:
-        now = self._last.device_ms if self._last else None
+        now = self._intake.last.device_ms if self._intake.last else None
         self._log_step("countdown", countdown_s=self.protocol.countdown_s, device_ms=now)
         self._enter("countdown", "")
 
@@ -415,10 +398,10 @@ class Recorder:
         self._log_step("cancel")
         self._enter("idle", message)
 
-    def _first_row(self, frame: Frame) -> None:
+    def _first_row(self, frame: Frame, row: int) -> None:
         counters = Counters(**self.device.counters.to_dict())
-        self._take = Take(self._course.step, self._rows, self._toy_ms, time.monotonic(), counters)
-        self._log_step("start", row=self._rows, host_ms=frame.host_ms, device_ms=frame.device_ms)
+        self._take = Take(self._course.step, row, time.monotonic(), counters)
+        self._log_step("start", row=row, host_ms=frame.host_ms, device_ms=frame.device_ms)
         self._enter("recording", "")
 
     def _abandon(self, why: str, message: str) -> None:
@@ -431,9 +414,8 @@ class Recorder:
     def _stop(self, ended: Ended) -> None:
         take = self._take
         assert take is not None
-        silent_ms = 1000.0 * (time.monotonic() - self._heard_s)
-        away = getattr(self.device, "state", "") == "waiting"
-        if away or (self._speed == 1.0 and silent_ms > 1000.0 * _AWAY_S):
+        if self._intake.away or (self._speed == 1.0 and self._intake.silent):
+            silent_ms = self._intake.silent_ms
             take.gaps.append(gap_entry(len(take.frames), take.frames[-1], None, silent_ms, "nothing came any more"))
         self._take = None
         counters = Counters(**self.device.counters.to_dict())
@@ -457,8 +439,7 @@ class Recorder:
                         self._one(frame)
                     if frames:
                         self._hand_on()
-                        self._heard_s = time.monotonic()
-                        self._meter.heard(self.device.counters, self._heard_s)
+                        self._intake.heard()
                 if self._keeper is not None:
                     self._keeper.wait_written()
         except PlushSenseError as cause:
@@ -474,62 +455,40 @@ class Recorder:
             elif self._state not in ("saving", "stopped"):
                 self._enter("stopped", over)
 
-    def _one(self, came: Frame) -> None:
-        """One frame: stamped, kept, and what it brings about."""
-        layout, last = self.session.layout, self._last
-        step_ms = came.device_ms - last.device_ms if last else 0
-        on_host = came.host_ms - last.host_ms if last and self._speed == 1.0 else 0
-        passed = step_ms if step_ms >= 0 else max(on_host, round(1000.0 / layout.rate_hz))
-        self._toy_ms += passed
-        host = came.host_ms if self._speed == 1.0 else self._base_ms + round(self._toy_ms)
-        frame = Frame(host, came.device_ms, came.values)
-        missing = self._loss.push(came.device_ms)
-        self._lost += missing
-        returned = self._returned()
-        if last is not None and (step_ms < 0 or step_ms > layout.gap_ms or returned):
-            self._gap(last, frame, max(step_ms, on_host, 0), returned)
-        self._meter.push(came.device_ms)
-        if self._state == "countdown" and self._toy_ms - self._since_ms >= 1000.0 * self.protocol.countdown_s:
-            self._first_row(frame)
+    def _one(self, frame: Frame) -> None:
+        """One frame, and what it brings about."""
+        row = self._intake.rows
+        frame, missing, gap = self._intake.take_in(frame)
+        if gap is not None:
+            self._gap(gap)
+        if self._state == "countdown" and self._passed_s() >= self.protocol.countdown_s:
+            self._first_row(frame, row)
         elif self._take is not None:
             self._take.lost += missing
-        self._last = frame
         self._came.append(frame)
-        self._rows += 1
         if self._take is not None:
             self._take.frames.append(frame)
-        waited = (self._toy_ms - self._since_ms) / 1000.0
         if self._state == "recording":
-            if self._auto is not None and waited >= self._auto.take_s:
+            if self._auto is not None and self._passed_s() >= self._auto.take_s:
                 self._stop("auto")
-            elif waited >= self.protocol.longest_s:
+            elif self._passed_s() >= self.protocol.longest_s:
                 self._stop("longest")
-        elif self._state == "idle" and self._auto is not None and waited >= self._auto.rest_s:
+        elif self._state == "idle" and self._auto is not None and self._passed_s() >= self._auto.rest_s:
             self._begin()
 
     def _hand_on(self) -> None:
         """Give the keeper what has come, before anything that must stand behind it."""
         if self._keeper is not None and self._came:
-            self._keeper.add(self._came, self._toy_ms)
+            self._keeper.add(self._came, self._intake.toy_ms)
         self._came = []
 
-    def _returned(self) -> bool:
-        """Whether the toy was away since the frame before."""
-        before, self._reconnects = self._reconnects, self.device.counters.reconnects
-        return self._reconnects > before
-
-    def _gap(self, last: Frame, frame: Frame, missing_ms: float, returned: bool) -> None:
-        reason = "the toy's clock began anew" if frame.device_ms < last.device_ms else "nothing came"
-        if returned:
-            known = [gap.reason for gap in getattr(self.device, "gaps", ())]
-            reason = known[-1] if known and known[-1] else "the toy was away and came back"
-        entry = gap_entry(self._rows, last, frame, missing_ms, reason)
-        self._gaps.append(entry)
-        (self._log_step if self._take is not None else self._log)("gap", **entry)
+    def _gap(self, gap: dict[str, Any]) -> None:
+        """A hole in the stream: kept with the session and the recording, and told."""
+        (self._log_step if self._take is not None else self._log)("gap", **gap)
         if self._take is not None:
-            self._take.gaps.append(gap_entry(len(self._take.frames), last, frame, missing_ms, reason))
-        if missing_ms >= 1000.0 * _AWAY_S:
-            said = f"The toy was away for {missing_ms / 1000.0:.1f} s"
+            self._take.gaps.append(gap | {"after_row": len(self._take.frames)})
+        if gap["missing_ms"] >= 1000.0 * AWAY_S:
+            said = f"The toy was away for {gap['missing_ms'] / 1000.0:.1f} s"
             if self._state == "countdown":
                 self._cancel(f"{said}: press space again.")
             elif self._state == "recording":
@@ -544,7 +503,7 @@ class Recorder:
         layout, key = self.session.layout, key_of(take.step)
         frames = to_frames(take.frames, layout.n_channels)
         with self._changed:
-            saved_ms = self._now_ms()
+            saved_ms = self._intake.now_ms()
             earlier = self._course.takes.get(key)
         more = {"device": self.device.url, "saved_ms": saved_ms, "speed": self._speed, "software": self._software}
         beside = sidecar(take, frames, layout, self.session.head, counters, ended, **more)

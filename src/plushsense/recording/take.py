@@ -27,7 +27,7 @@ class Take:
 
     Attributes:
         row: of the session's stream, at which it begins.
-        from_ms: the toy's running time at its first row.
+        from_s: the computer's monotonic clock at its first row.
         before: the counters at that time; lines spoilt since then are this recording's.
         lost: frames that its own rows say are missing.
         gaps: see `gap_entry`.
@@ -35,7 +35,6 @@ class Take:
 
     step: Step
     row: int
-    from_ms: float
     from_s: float
     before: Counters
     frames: list[Frame] = field(default_factory=list)
