@@ -63,6 +63,17 @@ def test_keys_from_a_script(tmp_path: Path) -> None:
     assert (said["recordings"], said["finished"], said["resumed"], said["session"]) == (3, True, True, "1")
 
 
+def test_an_input_that_never_ends_does_not_hold_it_up(tmp_path: Path) -> None:
+    process = subprocess.Popen(
+        [*COMMAND, str(tmp_path), "--device", URL, "--subject", "S01", "--protocol", "quick", "--auto", "1", "--json"],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert process.stdin is not None and process.stdout is not None and process.stderr is not None
+    assert process.wait(30) == 0
+    assert json.loads(process.stdout.read())["finished"] is True
+    assert "Fatal" not in process.stderr.read()
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo terminals")
 def test_a_person_at_a_terminal(tmp_path: Path, pty_possible: None) -> None:
     import pty

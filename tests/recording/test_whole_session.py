@@ -28,6 +28,8 @@ from plushsense.devices.virtual.stream import Performed, ToySpec
 from plushsense.recording.sessionfile import SESSION_LOG, read_events
 
 SPEED = 60.0
+KILL_SPEED = 8.0
+"""For the kills: a second of the toy is then 125 ms, which a busy machine may well take to run the next process."""
 pytestmark = pytest.mark.usefixtures("pty_possible")
 LAYOUT = load_layout("plush-15")
 QUIET = ToySpec(person=7, lost=0.0, garbled=0.0, glitch=0.0)
@@ -41,6 +43,7 @@ class Toy:
     url: str = ""
     pieces: list[bytes] = field(default_factory=list)
     performed: list[Performed] = field(default_factory=list)
+    readers: list[subprocess.Popen[str]] = field(default_factory=list)
 
     @property
     def last_ms(self) -> int:
@@ -74,6 +77,10 @@ def pty_toy(log: Path, speed: float, spec: ToySpec = QUIET) -> Iterator[Toy]:
     try:
         yield toy
     finally:
+        # One that a failed test leaves would wait for its port, and take the next toy's.
+        for reader in toy.readers:
+            reader.kill()
+            reader.wait(10)
         stop.set()
         thread.join(15)
         assert not thread.is_alive()
@@ -81,13 +88,15 @@ def pty_toy(log: Path, speed: float, spec: ToySpec = QUIET) -> Iterator[Toy]:
 
 def recording(out: Path, toy: Toy, speed: float, *words: str) -> subprocess.Popen[str]:
     """``plushsense record`` as a program of its own, pressing its own space bar."""
-    return subprocess.Popen(
+    process = subprocess.Popen(
         [
             sys.executable, "-m", "plushsense.apps.cli.main", "record", str(out), "--device", toy.url,
             "--subject", "S01", "--speed", str(speed), "--auto", "4", "--json", *words,
         ],
         stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
+    toy.readers.append(process)
+    return process
 
 
 def result(process: subprocess.Popen[str], timeout_s: float = 120.0) -> dict[str, Any]:
@@ -170,10 +179,17 @@ def _hand_follows_prompt(folder: Path, toy: Toy) -> None:
     assert right >= 48
 
 
-def kill_and_check(out: Path, toy: Toy, after_s: float, speed: float = SPEED) -> dict[str, float]:
+def hasty(folder: Path) -> tuple[str, ...]:
+    """The paper's 17 gestures three times, each only a second long: options of the recorder."""
+    own = folder / "hasty.toml"
+    own.write_text('name = "hasty"\ngesture_set = "plush-18"\ncountdown_s = 0.5\n', encoding="utf-8")
+    return ("--protocol", str(own), "--auto", "1")
+
+
+def kill_and_check(out: Path, toy: Toy, after_s: float, speed: float, *words: str) -> dict[str, float]:
     """Record, kill -9 after so long, and look at what is there: how much of the stream is missing, in ms."""
     folder = out / "S01" / "1"
-    process = recording(out, toy, speed)
+    process = recording(out, toy, speed, *words)
     until = time.monotonic() + 30
     rows = (folder / STREAM_NAME).stat().st_size if (folder / STREAM_NAME).exists() else 0
     while not (folder / STREAM_NAME).exists() or (folder / STREAM_NAME).stat().st_size <= rows:
@@ -198,12 +214,13 @@ def test_killed_three_times(tmp_path: Path) -> None:
     """At most the last second of the stream is missing, no finished recording is damaged, and it goes on to the end."""
     out, folder = tmp_path / "out", tmp_path / "out" / "S01" / "1"
     moments = random.Random()
-    with pty_toy(folder / SESSION_LOG, SPEED) as toy:
+    words = hasty(tmp_path)
+    with pty_toy(folder / SESSION_LOG, KILL_SPEED) as toy:
         for _ in range(3):
-            found = kill_and_check(out, toy, moments.uniform(0.1, 2.0))
+            found = kill_and_check(out, toy, moments.uniform(0.1, 4.5), KILL_SPEED, *words)
             assert found["missing_ms"] <= 1000
             assert len(recordings(folder)) >= found["recordings"]
-        said = result(recording(out, toy, SPEED))
+        said = result(recording(out, toy, KILL_SPEED, *words))
     assert (said["recordings"], said["finished"], said["resumed"]) == (51, True, True)
     assert check_whole(folder, toy) == 51
     assert not [p.name for p in folder.iterdir() if p.suffix in (".part", ".new", ".torn", ".lock")]

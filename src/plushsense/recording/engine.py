@@ -101,6 +101,11 @@ class Recorder:
         """Call ``listener(what, status)`` at every change, from whichever thread made it; it must not block."""
         self._listeners.append(listener)
 
+    def unlisten(self, listener: Listener) -> None:
+        """Call it no more: a page that was closed or loaded again."""
+        with contextlib.suppress(ValueError):
+            self._listeners.remove(listener)
+
     def status(self) -> Status:
         """Everything there is to show, at this moment."""
         with self._changed:
@@ -341,7 +346,7 @@ class Recorder:
         with self._changed:
             news, self._news = self._news, []
         for what in news:
-            for listener in self._listeners:
+            for listener in tuple(self._listeners):
                 # A screen that fails must not end a recording.
                 with contextlib.suppress(Exception):
                     listener(what, self.status())

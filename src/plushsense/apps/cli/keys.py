@@ -38,9 +38,13 @@ class _Script:
         threading.Thread(target=self._work, name="plushsense-keys", daemon=True).start()
 
     def _work(self) -> None:
+        # Not through sys.stdin: a thread that waits in it would stop the program from ending.
+        decoder = codecs.getincrementaldecoder("utf-8")("replace")
         with contextlib.suppress(OSError, ValueError):
-            while text := sys.stdin.read(1):
-                self._came.put(text)
+            fd = sys.stdin.fileno()
+            while data := os.read(fd, 1024):
+                for text in decoder.decode(data):
+                    self._came.put(text)
         self._came.put(END)
 
     def get(self, timeout_s: float) -> str | None:
