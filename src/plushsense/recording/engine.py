@@ -15,22 +15,22 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, Self
+from typing import Any, Self
 
-from plushsense.core.errors import DatasetError, PlushSenseError
+from plushsense.core.errors import PlushSenseError
 from plushsense.core.recfile import STREAM_NAME
 from plushsense.devices.base import Counters, Device, Frame, now_ms
 from plushsense.recording.course import Course, key_of
 from plushsense.recording.intake import AWAY_S, Intake
 from plushsense.recording.keeper import Keeper
+from plushsense.recording.saving import keep_take, refusal
 from plushsense.recording.session import OpenSession
 from plushsense.recording.sessionfile import Event, SessionHead
 from plushsense.recording.status import State, Status
-from plushsense.recording.take import Take, gap_entry, sidecar
-from plushsense.recording.writer import StreamFile, save_take, to_frames
+from plushsense.recording.take import Ended, Take, gap_entry
+from plushsense.recording.writer import StreamFile
 
 Listener = Callable[[str, Status], None]
-Ended = Literal["space", "auto", "longest", "toy"]
 
 
 @dataclass(frozen=True)
@@ -186,7 +186,7 @@ class Recorder:
             stream = StreamFile(self.session.folder / STREAM_NAME, self.session.layout)
         except OSError as cause:
             self.session.close()
-            raise self._refusal(cause) from None
+            raise refusal(self.session, len(self._course.takes), cause) from None
         self._keeper = Keeper(stream, self.session.log, hurried=self._speed != 1.0, on_fail=self._fail)
         with self._changed:
             self._log(
@@ -505,43 +505,22 @@ class Recorder:
 
     def _save(self, take: Take, ended: Ended, counters: Counters) -> None:
         """One recording to the disk (in the keeper's thread), then on to the next."""
-        layout, key = self.session.layout, key_of(take.step)
-        frames = to_frames(take.frames, layout.n_channels)
+        key = key_of(take.step)
         with self._changed:
             saved_ms = self._intake.now_ms()
-            earlier = self._course.takes.get(key)
-        more = {"device": self.device.url, "saved_ms": saved_ms, "speed": self._speed, "software": self._software}
-        beside = sidecar(take, frames, layout, self.session.head, counters, ended, **more)
-        path = save_take(self.session.folder, frames, layout, key[0], saved_ms, beside)
-        says = {"rows": len(frames), "lost": take.lost, "gaps": len(take.gaps), "ended": ended}
-        events = [Event("take", saved_ms, {"file": path.name, "gesture": key[0], "repetition": key[1]} | says)]
-        if earlier:
-            events.append(Event("redo", saved_ms, {"file": earlier, "gesture": key[0], "repetition": key[1]}))
-        self.session.log.write(events)
-        said = ""
-        if ended == "longest":
-            said = f"Nobody stopped it: it ended by itself after {self.protocol.longest_s:g} s; r makes it again."
-        elif take.gaps:
-            longest = max(g["missing_ms"] for g in take.gaps) / 1000.0
-            said = f"This recording has a hole of {longest:.1f} s; it is kept, r makes it again."
+            earlier = self._course.takes.get(key, "")
+        more = {"device": self.device.url, "speed": self._speed, "software": self._software}
+        file, said = keep_take(self.session, take, counters, ended, saved_ms, earlier, **more)
         with self._telling():
-            self._course.made(key, path.name)
+            self._course.made(key, file)
             self._news.append("take")
             self._advance(said)
-
-    def _refusal(self, cause: Exception) -> DatasetError:
-        why = getattr(cause, "strerror", None) or cause
-        return DatasetError(
-            f"'{self.session.folder}' cannot be written any more ({why}): the session has stopped. "
-            f"What was recorded until then is kept ({len(self._course.takes)} recordings); "
-            "make room, and give the same command to go on."
-        )
 
     def _fail(self, cause: Exception) -> None:
         with contextlib.suppress(OSError):
             self.session.log.write([Event("failed", now_ms(), {"why": str(cause)})])
         with self._telling():
-            self._failed = str(self._refusal(cause))
+            self._failed = str(refusal(self.session, len(self._course.takes), cause))
             self._closing = True
             self._take = None
             self._enter("stopped", self._failed)

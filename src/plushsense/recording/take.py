@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -13,12 +13,8 @@ from plushsense.devices.base import Counters, Frame
 from plushsense.recording.protocol import Step
 from plushsense.recording.sessionfile import FORMAT_VERSION, SessionHead
 
-ENDED = {
-    "space": "the space bar",
-    "auto": "the recorder pressed its own space bar (--auto)",
-    "longest": "nobody stopped it: it reached the protocol's longest_s",
-    "toy": "the toy's data ended",
-}
+Ended = Literal["space", "auto", "longest", "toy"]
+"""What ended a recording: the space bar, the recorder's own press (--auto), the protocol's longest_s, the toy's end."""
 
 
 @dataclass
@@ -61,7 +57,7 @@ def measured_rate_hz(device_ms: Any) -> float:
 
 
 def sidecar(
-    take: Take, frames: Frames, layout: Layout, head: SessionHead, counters: Counters, ended: str, **more: Any
+    take: Take, frames: Frames, layout: Layout, head: SessionHead, counters: Counters, ended: Ended, **more: Any
 ) -> dict[str, Any]:
     """What stands beside a recording: whose, what, by which clocks, over which line, and what went wrong."""
     assert frames.host_ms is not None
