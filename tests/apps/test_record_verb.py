@@ -172,9 +172,9 @@ def test_sessions_are_not_mixed(cli: Cli, tmp_path: Path) -> None:
 
 def test_a_missing_consent_is_said_once(cli: Cli, tmp_path: Path, real_toy_url: str) -> None:
     words = ["record", tmp_path, "--device", real_toy_url, "--subject", "S01", "--protocol", "quick"]
-    assert "no consent reference" in cli(*words).err
-    assert "no consent reference" not in cli(*words).err
-    assert "no consent reference" not in cli(*words, "--consent", "C-7").err
+    assert "No consent reference" in cli(*words).err
+    assert "No consent reference" not in cli(*words).err
+    assert "No consent reference" not in cli(*words, "--consent", "C-7").err
     head = SessionHead.read(tmp_path / "S01" / "1")
     assert head is not None
     assert (head.consent, head.simulated) == ("C-7", False)

@@ -97,14 +97,18 @@ def run(args: argparse.Namespace) -> int:
     if layout is None and known is not None:
         layout = Layout.from_dict(known.layout, f"layout in '{folder}'")
     with open_toy(with_speed(args.device, speed), layout) as device:
-        session = OpenSession(folder, _head(args, subject, folder.name, known is None, device.layout, speed))
+        head = _head(args, subject, folder.name, known is None, device.layout, speed)
+        notices = _notices(args, head, known is None)
+        for notice in notices:
+            say(f"warning: {notice}")
+        session = OpenSession(folder, head)
         for sentence in session.standing.mended:
             say(f"mended: {sentence}")
         auto = Auto(args.auto) if args.auto is not None else None
         recorder = Recorder(session, device, speed=speed, auto=auto, software=f"plushsense {__version__}")
         prompt_virtual(recorder)
         title = f"{subject}, session {folder.name}: {session.protocol.title}"
-        screen = Screen(recorder, title)
+        screen = Screen(recorder, title, notices)
         try:
             with recorder, keys() as typed:
                 _drive(recorder, typed, screen, auto is not None)
@@ -193,10 +197,6 @@ def _head(
         raise ConfigError("--words goes with --protocol: a session that goes on keeps the words it began with.")
     protocol = load_protocol(named, args.words) if named is not None else None
     simulated = args.simulated or is_virtual(args.device) or speed != 1.0
-    if "/dev/pts/" in args.device and not simulated:
-        say("warning: this port is a pseudo terminal; if it is `plushsense toy`, stop and add --simulated.")
-    if fresh and protocol is not None and not (args.consent or protocol.needs_nobody or simulated):
-        say("warning: no consent reference (--consent): recorded as missing, and publishing will refuse it.")
     return SessionHead(
         subject=subject,
         session=session,
@@ -210,6 +210,18 @@ def _head(
         software=f"plushsense {__version__}",
         simulated=simulated,
     )
+
+
+def _notices(args: argparse.Namespace, head: SessionHead, fresh: bool) -> list[str]:
+    """What should be known before anything is recorded."""
+    from plushsense.core.gestures import NOBODY
+
+    said = []
+    if "/dev/pts/" in args.device and not head.simulated:
+        said.append("This port is a pseudo terminal: if it is `plushsense toy`, quit and add --simulated.")
+    if fresh and not (head.consent or head.subject == NOBODY or head.simulated):
+        said.append("No consent reference (--consent): recorded as missing, and publishing will refuse it.")
+    return said
 
 
 def _drive(recorder: Recorder, typed: Keys, screen: Screen, auto: bool) -> None:

@@ -6,6 +6,7 @@ import math
 import os
 import sys
 import textwrap
+from collections.abc import Sequence
 
 from plushsense.recording.engine import Recorder
 from plushsense.recording.status import Status
@@ -61,12 +62,14 @@ def _toy(s: Status) -> str:
     )
 
 
-def lines(s: Status, title: str, typing: str | None, width: int) -> list[str]:
+def lines(s: Status, title: str, notices: Sequence[str], typing: str | None, width: int) -> list[str]:
     """The screen as lines, no wider than ``width``."""
     rule = "─" * width
     done = f"{s.done} of {s.steps} recorded" + (f", {s.skipped} skipped" if s.skipped else "")
     state, colour = _state(s)
-    out = [f"{_BOLD}{title}{_OFF}", f"{done}", _bar(s, width), ""]
+    out = [f"{_BOLD}{title}{_OFF}"]
+    out += [f"{_RED}{text}{_OFF}" for notice in notices for text in textwrap.wrap(notice, width)]
+    out += [f"{done}", _bar(s, width), ""]
     if s.state not in ("finished", "stopped"):
         again = "   (recorded; this makes it again)" if s.already else ""
         out.append(f"  {_BOLD}{s.step.gesture}{_OFF}   {s.step.repetition} of {s.repetitions}{again}")
@@ -94,14 +97,17 @@ def _bar(s: Status, width: int) -> str:
 class Screen:
     """Shows a recorder on standard error: redrawn in place on a terminal, else a line for every change."""
 
-    def __init__(self, recorder: Recorder, title: str) -> None:
+    def __init__(self, recorder: Recorder, title: str, notices: Sequence[str] = ()) -> None:
+        """``notices``: what the person must know all the while."""
         self._title = title
+        self._notices = notices
         self._terminal = sys.stderr.isatty()
         self._said = self._message = ""
         if self._terminal:
             if sys.platform == "win32":
                 os.system("")  # wakes the console's escape sequences
-            sys.stderr.write("\x1b[?25l\x1b[?7l\x1b[2J")  # no cursor, no wrapped lines
+            # A screen of its own, no cursor, no wrapped lines.
+            sys.stderr.write("\x1b[?1049h\x1b[?25l\x1b[?7l\x1b[2J")
         else:
             recorder.listen(self._line)
 
@@ -110,7 +116,7 @@ class Screen:
         if self._terminal:
             # Standard output may be a file: it is the screen's size that counts.
             size = os.get_terminal_size(sys.stderr.fileno())
-            shown = lines(status, self._title, typing, min(_WIDEST, size.columns - 1))[: size.lines - 1]
+            shown = lines(status, self._title, self._notices, typing, min(_WIDEST, size.columns - 1))[: size.lines - 1]
             sys.stderr.write("\x1b[H" + "".join(f"{line}\x1b[K\n" for line in shown) + "\x1b[J")
             sys.stderr.flush()
 
@@ -135,7 +141,7 @@ class Screen:
         sys.stderr.flush()
 
     def close(self) -> None:
-        """Clear the screen, so that nothing on it looks as if it were still going on, and give the cursor back."""
+        """Give the terminal back as it was."""
         if self._terminal:
-            sys.stderr.write("\x1b[2J\x1b[H\x1b[?7h\x1b[?25h")
+            sys.stderr.write("\x1b[?7h\x1b[?25h\x1b[?1049l")
             sys.stderr.flush()
