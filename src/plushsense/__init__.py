@@ -19,10 +19,13 @@ if TYPE_CHECKING:
     from plushsense.apps.api import evaluate, load, simulate, train
     from plushsense.apps.estimator import PlushClassifier
     from plushsense.apps.reporting import write_report
+    from plushsense.apps.retraining import forget
     from plushsense.core.gestures import GestureSet, load_gestures
     from plushsense.core.signal import Layout, load_layout
+    from plushsense.dataset.backup import backup, check_backup, restore
     from plushsense.dataset.importers import import_recordings
     from plushsense.dataset.index import open_dataset
+    from plushsense.dataset.pseudonymise import pseudonymise
     from plushsense.devices.opening import open_device
     from plushsense.live.stream import StreamClassifier
     from plushsense.models.arch import Arch
@@ -43,6 +46,11 @@ _WHERE = {
     "load": "plushsense.apps.api",
     "simulate": "plushsense.apps.api",
     "write_report": "plushsense.apps.reporting",
+    "forget": "plushsense.apps.retraining",
+    "backup": "plushsense.dataset.backup",
+    "check_backup": "plushsense.dataset.backup",
+    "restore": "plushsense.dataset.backup",
+    "pseudonymise": "plushsense.dataset.pseudonymise",
     "PlushClassifier": "plushsense.apps.estimator",
     "open_device": "plushsense.devices.opening",
     "StreamClassifier": "plushsense.live.stream",
@@ -60,14 +68,19 @@ __all__ = [
     "PlushClassifier",
     "StreamClassifier",
     "WindowSpec",
+    "backup",
+    "check_backup",
     "cut_windows",
     "evaluate",
+    "forget",
     "import_recordings",
     "load",
     "load_gestures",
     "load_layout",
     "open_dataset",
     "open_device",
+    "pseudonymise",
+    "restore",
     "simulate",
     "train",
     "write_report",

@@ -140,7 +140,8 @@ def find_gesture_recorder(
     nobodys = _nobodys_folders(files, gestures)
     for path in files:
         if subjects is not None:
-            subject = _mapped(path, source, subjects)
+            # A mapping of people need not list what nobody touched.
+            subject = _mapped(path, source, subjects) or (NOBODY if path.parent in nobodys else None)
         elif path.parent in nobodys:
             subject = NOBODY
         elif by_label:

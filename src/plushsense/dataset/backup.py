@@ -1,0 +1,306 @@
+"""One file that brings a data set back: a zip with a manifest, checked after it was written and before it is used.
+
+In it is everything that people made: raw files, session files, marks, the people's table, evaluations, and whatever
+else lies there. Left out is what is made anew: ``cache/`` and the index. The same data set gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import stat
+import uuid
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path, PurePosixPath
+from typing import IO, Any
+
+from plushsense.core.errors import DatasetError
+from plushsense.core.folders import whole_folder
+from plushsense.dataset.contents import contents
+from plushsense.dataset.index import open_dataset, rebuild
+from plushsense.dataset.store import HEAD, Dataset
+
+MANIFEST = "plushsense-backup.json"
+FORMAT = "plushsense-backup"
+VERSION = 1
+_CHUNK = 1 << 20
+_WHEN = (1980, 1, 1, 0, 0, 0)
+_LEFT_OUT = ("cache", "index", "working")
+# A manifest has about 150 bytes a file.
+_MANIFEST_LIMIT = 1 << 28
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Backup:
+    """What is in a backup; ``hash`` is the data set's, ``left_out`` the links, which are not followed."""
+
+    file: str
+    name: str
+    files: int
+    bytes: int
+    recordings: int
+    subjects: int
+    hash: str
+    left_out: tuple[str, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, ready for JSON."""
+        return asdict(self) | {"left_out": list(self.left_out)}
+
+
+def backup(dataset: str | Path, file: str | Path, progress: Progress | None = None) -> Backup:
+    """Write a data set into one new zip file, and read it again to see that it is whole.
+
+    Args:
+        progress: called with (bytes done, bytes in all); the second half is the reading.
+
+    Raises:
+        DatasetError: when ``file`` is there already or lies in the data set, a file changes meanwhile, or what was
+            written does not read back; then no file is left.
+    """
+    folder, target = Path(dataset), Path(file)
+    if target.exists() or target.is_symlink():
+        raise DatasetError(f"'{target}' is already there: a backup never replaces another; give a new name.")
+    if folder.resolve() in target.resolve().parents:
+        raise DatasetError(f"'{target}' lies in the data set itself: give a place outside of '{folder}'.")
+    source = open_dataset(folder)
+    part = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.part")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        found = [c for c in contents(folder) if c.kind not in _LEFT_OUT]
+        kept = [c.path for c in found if c.kind != "link"]
+        total = 2 * sum((folder / path).stat().st_size for path in kept)
+        done = 0
+        files = []
+        with part.open("xb") as out:
+            with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+                for path in kept:
+                    files.append(_store(archive, folder, path))
+                    done += files[-1]["bytes"]
+                    if progress is not None:
+                        progress(done, total)
+                _put(archive, MANIFEST, _manifest(source, files))
+            out.flush()
+            os.fsync(out.fileno())
+        _verified(part, lambda n: progress(total // 2 + n, total) if progress is not None else None)
+        if target.exists():
+            raise DatasetError(f"'{target}' appeared meanwhile: a backup never replaces another; give a new name.")
+        os.replace(part, target)
+    except OSError as cause:
+        raise DatasetError(
+            f"The backup '{target}' cannot be made ({cause.strerror or cause}; '{cause.filename or target}'): "
+            "check the path and the disk."
+        ) from None
+    finally:
+        part.unlink(missing_ok=True)
+    return _said(
+        target, json.loads(_manifest(source, files)), tuple(c.path.as_posix() for c in found if c.kind == "link")
+    )
+
+
+def check_backup(file: str | Path, progress: Progress | None = None) -> Backup:
+    """Read a backup through: every file that it says is there, none besides, and each as it was.
+
+    Raises:
+        DatasetError: naming what is missing, damaged or no backup at all.
+    """
+    path = Path(file)
+    total = path.stat().st_size if path.is_file() else 0
+    manifest = _verified(path, lambda n: progress(min(n, total), total) if progress is not None else None)
+    return _said(path, manifest)
+
+
+def restore(file: str | Path, dest: str | Path, progress: Progress | None = None) -> Dataset:
+    """Bring a data set back into a new or empty folder; it appears whole or not at all.
+
+    Raises:
+        DatasetError: for a damaged backup, one whose files would leave ``dest``, or a ``dest`` that holds something.
+    """
+    path, folder = Path(file), Path(dest)
+    with _opened(path) as (archive, manifest):
+        total = sum(entry["bytes"] for entry in manifest["files"])
+        done = 0
+        with whole_folder(folder, DatasetError, last=HEAD) as work:
+            for entry in manifest["files"]:
+                target = work / entry["path"]
+                target.parent.mkdir(parents=True, exist_ok=True)
+                with target.open("xb") as out:
+                    _read(path, archive, entry, out)
+                done += entry["bytes"]
+                if progress is not None:
+                    progress(done, total)
+            again = rebuild(work).dataset
+            if again.hash != manifest["hash"]:
+                raise DatasetError(
+                    f"The backup '{path}' restores another data set than was saved ({len(again.recordings)} "
+                    f"recordings of {manifest['recordings']}): restore it with the PlushSense that wrote it."
+                )
+    return open_dataset(folder)
+
+
+def _manifest(source: Dataset, files: list[dict[str, Any]]) -> str:
+    table = {
+        "format": FORMAT,
+        "version": VERSION,
+        "name": source.head.name,
+        "recordings": len(source.recordings),
+        "subjects": len(source.subjects),
+        "hash": source.hash,
+        "files": files,
+    }
+    return json.dumps(table, ensure_ascii=False, indent=0) + "\n"
+
+
+def _info(name: str) -> zipfile.ZipInfo:
+    # Without the disk's times and modes, so that the same data set gives the same bytes.
+    info = zipfile.ZipInfo(name, _WHEN)
+    info.compress_type = zipfile.ZIP_DEFLATED
+    info.create_system = 3
+    info.external_attr = (stat.S_IFREG | 0o644) << 16
+    return info
+
+
+def _put(archive: zipfile.ZipFile, name: str, text: str) -> None:
+    archive.writestr(_info(name), text.encode("utf-8"))
+
+
+def _store(archive: zipfile.ZipFile, folder: Path, path: PurePosixPath) -> dict[str, Any]:
+    digest = hashlib.sha256()
+    size = 0
+    with (folder / path).open("rb") as file:
+        before = os.fstat(file.fileno())
+        with archive.open(_info(path.as_posix()), "w", force_zip64=before.st_size >= 1 << 31) as member:
+            while chunk := file.read(_CHUNK):
+                digest.update(chunk)
+                size += len(chunk)
+                member.write(chunk)
+        after = os.fstat(file.fileno())
+    if size != before.st_size or (before.st_mtime_ns, before.st_size) != (after.st_mtime_ns, after.st_size):
+        raise DatasetError(f"'{folder / path}' changed while it was saved: make the backup when nothing is recorded.")
+    return {"path": path.as_posix(), "bytes": size, "sha256": digest.hexdigest()}
+
+
+def _said(file: Path, manifest: dict[str, Any], left_out: tuple[str, ...] = ()) -> Backup:
+    files = manifest["files"]
+    return Backup(
+        str(file),
+        manifest["name"],
+        len(files),
+        sum(entry["bytes"] for entry in files),
+        manifest["recordings"],
+        manifest["subjects"],
+        manifest["hash"],
+        left_out,
+    )
+
+
+def _damaged(path: Path, why: object) -> DatasetError:
+    return DatasetError(f"The backup '{path}' is damaged ({why}): take another copy of it.")
+
+
+# Whatever a damaged zip can make its reader raise.
+_BROKEN = (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError, KeyError, IndexError, OverflowError)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[zipfile.ZipFile, dict[str, Any]]]:
+    """A backup with its manifest, once its members are known to be those of the manifest."""
+    try:
+        archive = zipfile.ZipFile(path)
+    except FileNotFoundError:
+        raise DatasetError(f"There is no backup '{path}': check the path.") from None
+    except OSError as cause:
+        raise DatasetError(f"The backup '{path}' cannot be read ({cause.strerror or cause}).") from None
+    except _BROKEN as cause:
+        raise DatasetError(f"'{path}' is no backup of PlushSense, or a damaged one ({cause}).") from None
+    with archive:
+        members = archive.infolist()
+        names = [info.filename for info in members]
+        if MANIFEST not in names:
+            raise DatasetError(f"'{path}' is no backup of PlushSense (it holds no {MANIFEST}), or a damaged one.")
+        for info in members:
+            if reason := _refused(info):
+                raise DatasetError(f"The backup '{path}' is not used: '{info.filename}' in it is {reason}.")
+        if len(set(names)) != len(names):
+            raise _damaged(path, "a name stands in it twice")
+        manifest = _manifest_of(path, archive)
+        listed = {entry["path"] for entry in manifest["files"]}
+        if odd := sorted(listed ^ (set(names) - {MANIFEST})):
+            said = "is missing" if odd[0] in listed else "is not in the manifest"
+            raise _damaged(path, f"'{odd[0]}' {said}")
+        yield archive, manifest
+
+
+def _refused(info: zipfile.ZipInfo) -> str:
+    """Why a member is not taken out; "" where nothing is wrong with it."""
+    name = info.filename
+    parts = name.split("/")
+    # The reader cuts a name at a zero byte; the original name tells.
+    if name.startswith("/") or "\\" in name or re.match(r"[A-Za-z]:", name) or "\0" in info.orig_filename:
+        return "an absolute path or one of another system"
+    if any(part in ("", ".", "..") for part in parts):
+        return "a folder, or a path that leaves its place"
+    kind = stat.S_IFMT(info.external_attr >> 16)
+    if kind not in (0, stat.S_IFREG):
+        return "a link or no plain file"
+    return ""
+
+
+def _manifest_of(path: Path, archive: zipfile.ZipFile) -> dict[str, Any]:
+    try:
+        if archive.getinfo(MANIFEST).file_size > _MANIFEST_LIMIT:
+            raise ValueError("its manifest is too long")
+        table = json.loads(archive.read(MANIFEST))
+        if table["format"] != FORMAT:
+            raise ValueError("its manifest is of something else")
+        if table["version"] != VERSION:
+            raise DatasetError(
+                f"The backup '{path}' has the version {table['version']!r}; this PlushSense reads {VERSION}."
+            )
+        kinds = {"name": str, "recordings": int, "subjects": int, "hash": str, "files": list}
+        entry_kinds = {"path": str, "bytes": int, "sha256": str}
+        whole = all(isinstance(table[k], kind) for k, kind in kinds.items()) and all(
+            isinstance(entry[k], kind) for entry in table["files"] for k, kind in entry_kinds.items()
+        )
+        if not whole:
+            raise ValueError("its manifest lacks something")
+    except (*_BROKEN, TypeError, NotImplementedError, OSError, RecursionError) as cause:
+        raise _damaged(path, cause) from None
+    return dict(table)
+
+
+def _read(path: Path, archive: zipfile.ZipFile, entry: dict[str, Any], out: IO[bytes] | None = None) -> None:
+    """Read a member through, into ``out`` if given; it must be what the manifest says, and not a byte longer."""
+    digest = hashlib.sha256()
+    size = 0
+    try:
+        with archive.open(entry["path"]) as member:
+            while chunk := member.read(_CHUNK):
+                size += len(chunk)
+                if size > entry["bytes"]:
+                    break
+                digest.update(chunk)
+                if out is not None:
+                    out.write(chunk)
+    except (*_BROKEN, NotImplementedError) as cause:
+        raise _damaged(path, f"'{entry['path']}': {cause}") from None
+    if size != entry["bytes"] or digest.hexdigest() != entry["sha256"]:
+        raise _damaged(path, f"'{entry['path']}' is not what was saved")
+
+
+def _verified(path: Path, tell: Callable[[int], None]) -> dict[str, Any]:
+    with _opened(path) as (archive, manifest):
+        done = 0
+        for entry in manifest["files"]:
+            _read(path, archive, entry)
+            done += entry["bytes"]
+            tell(done)
+    return manifest

@@ -1,0 +1,44 @@
+import sys
+from pathlib import Path
+
+import pytest
+
+from plushsense.dataset.contents import contents, folders_of_people, same_code
+
+
+def test_every_file_has_a_kind_and_its_person(tmp_path: Path) -> None:
+    kinds = {
+        "dataset.toml": ("head", ""),
+        "marks.jsonl": ("marks", ""),
+        "marks.jsonl.lock": ("working", ""),
+        "subjects.csv": ("people", ""),
+        "recordings.csv": ("index", ""),
+        "index.json": ("index", ""),
+        "notes.txt": ("other", ""),
+        "recordings/P1/a_1_2.CSV": ("raw", "P1"),
+        "recordings/P1/1/a_1_2.json": ("words", "P1"),
+        "recordings/P1/1/photo.png": ("other", "P1"),
+        "streams/P2/1/session.jsonl": ("words", "P2"),
+        "streams/P2/1/fulldatastream.csv": ("raw", "P2"),
+        "sessions/P2/x.json": ("words", "P2"),
+        "sessions/P3/x.json": ("words", ""),
+        "cache/P1/x.npz": ("cache", ""),
+        "evaluations/P1/evaluation.json": ("evaluation", ""),
+    }
+    for name in kinds:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("")
+    assert {str(c.path): (c.kind, c.person) for c in contents(tmp_path)} == kinds
+    assert folders_of_people(tmp_path) == ["P1", "P2"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs links")
+def test_links_are_named_and_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "loop").symlink_to(tmp_path, target_is_directory=True)
+    (tmp_path / "nowhere.csv").symlink_to(tmp_path / "gone")
+    assert [(str(c.path), c.kind) for c in contents(tmp_path)] == [("loop", "link"), ("nowhere.csv", "link")]
+
+
+def test_one_code_in_two_spellings() -> None:
+    assert same_code("p 01", ["P02", "P_01"]) == "P_01"
+    assert same_code("P01", ["P011"]) == ""
