@@ -269,8 +269,9 @@ class Recorder:
 
     def back(self) -> None:
         """Go one recording back."""
-        with self._telling():
-            self.go(self._course.at - 1 if self._state != "finished" else self._course.at)
+        with self._changed:
+            number = self._course.at - (self._state != "finished")
+        self.go(number)
 
     def pause(self) -> None:
         """Pause: nothing starts until `resume`; the stream is kept all the while."""
