@@ -13,6 +13,7 @@ from plushsense.core.signal import DEVICE_MS, Layout, load_layout
 from plushsense.devices.base import Device, Frame
 from plushsense.devices.lsl import load_pylsl, name_url
 from plushsense.devices.toy import ToyCounters
+from plushsense.devices.virtual.cues import Cues
 from plushsense.devices.virtual.device import VirtualDevice
 from plushsense.devices.virtual.stream import Performed, ToySpec
 
@@ -134,6 +135,7 @@ def serve_lsl(
     seconds: float = 0.0,
     on_ready: Callable[[str], None] | None = None,
     on_performed: Callable[[Performed], None] | None = None,
+    cues: Cues | None = None,
     stop: threading.Event | None = None,
 ) -> ToyCounters:
     """Publish the virtual toy as an LSL stream until ``stop`` is set; arguments as `toy.serve_tcp`.
@@ -154,6 +156,8 @@ def serve_lsl(
 
     toy = VirtualDevice("virtual://", layout or load_layout("plush-15"), spec or ToySpec(), speed, seconds)
     toy.on_performed = begun
+    if cues is not None:
+        toy.follow(cues)
     with toy, LslOutlet(toy.layout, name) as outlet:
         if on_ready is not None:
             on_ready(outlet.url)

@@ -14,11 +14,16 @@ from dataclasses import dataclass
 from plushsense.core.errors import ConfigError, DeviceError
 from plushsense.core.signal import Layout, load_layout
 from plushsense.devices.base import Pacer
+from plushsense.devices.virtual.cues import Cues
 from plushsense.devices.virtual.stream import Performed, ToySpec, ToyStream
 
 HOST = "127.0.0.1"
 _STALL_S = 0.5
 """A reader that takes nothing for so long is not there: lines are dropped, as on a real serial line."""
+_HURRIED_STALL_S = 10.0
+"""The same for a toy that runs faster than real time: it must not run away from a reader that only writes a file."""
+_HURRIED_QUEUE = 512
+"""Bytes that such a toy on a pseudo terminal leaves unread, so that the system's buffers do not hold seconds of it."""
 
 
 @dataclass
@@ -34,17 +39,30 @@ class ToyCounters:
 class _Outlet:
     """A non-blocking end: waits for a slow reader, drops lines when nobody reads, never leaves half a line."""
 
-    def __init__(self, write: Callable[[bytes], int], fileno: int, *, absent: bool = False) -> None:
+    def __init__(
+        self,
+        write: Callable[[bytes], int],
+        fileno: int,
+        *,
+        absent: bool = False,
+        stall_s: float = _STALL_S,
+        unread: Callable[[], int] | None = None,
+    ) -> None:
         self._write = write
         self._fileno = fileno
         self._absent = absent
+        self._stall_s = stall_s
+        self._unread = unread
         self._rest = b""
 
     def send(self, data: bytes, stop: threading.Event) -> bool:
         """Send lines; False when they were dropped. OSError when the reader's end is gone."""
         whole = self._rest + data
         pending = whole
-        deadline = time.monotonic() + (0.0 if self._absent else _STALL_S)
+        deadline = time.monotonic() + (0.0 if self._absent else self._stall_s)
+        if self._unread is not None and not self._absent:
+            while self._unread() > _HURRIED_QUEUE and time.monotonic() < deadline and not stop.wait(0.0005):
+                pass
         while pending:
             try:
                 pending = pending[self._write(pending) :]
@@ -73,6 +91,8 @@ def serve_tcp(
     seconds: float = 0.0,
     on_ready: Callable[[str], None] | None = None,
     on_performed: Callable[[Performed], None] | None = None,
+    on_sent: Callable[[bytes], None] | None = None,
+    cues: Cues | None = None,
     stop: threading.Event | None = None,
 ) -> ToyCounters:
     """Serve the virtual toy on ``127.0.0.1:port``, to one reader after another, until ``stop`` is set.
@@ -85,6 +105,8 @@ def serve_tcp(
         speed: 1 real time, 0 as fast as the reader takes it (the toy then waits for a reader).
         seconds: of device time after which it ends; 0: never.
         on_performed: hears of each gesture as it begins.
+        on_sent: gets the lines that were sent, not those that found no reader.
+        cues: what the person is told to do; None: it plays by itself.
 
     Raises:
         DeviceError: when the port is taken or not allowed.
@@ -95,7 +117,7 @@ def serve_tcp(
         raise ConfigError(f"The port is {port}; a whole number from 0 (a free one) to 65535 is accepted.")
     if not speed >= 0.0:
         raise ConfigError(f"The toy's speed is {speed}; it must be 0 (as fast as possible) or above.")
-    stream = ToyStream(spec, layout)
+    stream = ToyStream(spec, layout, cues)
     try:
         server = socket.create_server((HOST, port))
     except OSError as cause:
@@ -123,7 +145,7 @@ def serve_tcp(
                     continue
                 client.setblocking(False)
                 client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                outlet = _Outlet(client.send, client.fileno())
+                outlet = _Outlet(client.send, client.fileno(), stall_s=_stall_s(speed))
                 counters.connections += 1
             if client is None or outlet is None:
                 return False
@@ -135,7 +157,7 @@ def serve_tcp(
                 return False
 
         try:
-            _run(stream, send, counters, speed, seconds, on_performed, stop)
+            _run(stream, send, counters, speed, seconds, on_performed, on_sent, stop)
         finally:
             if client is not None:
                 client.close()
@@ -150,12 +172,15 @@ def serve_pty(
     seconds: float = 0.0,
     on_ready: Callable[[str], None] | None = None,
     on_performed: Callable[[Performed], None] | None = None,
+    on_sent: Callable[[bytes], None] | None = None,
+    cues: Cues | None = None,
     stop: threading.Event | None = None,
 ) -> ToyCounters:
     """Serve the virtual toy on a pseudo terminal that looks like a serial port, until ``stop`` is set.
 
     Linux and macOS. ``on_ready`` gets the URL (``serial:///dev/pts/5``). Arguments and errors otherwise as
-    `serve_tcp`, but speed 0 is not for a port that nobody may be reading.
+    `serve_tcp`, but speed 0 is not for a port that nobody may be reading. A toy faster than real time waits up to 10 s
+    for a slow reader, so that what is lost is lost for other reasons than its haste.
 
     Raises:
         DeviceError: on Windows, which has no pseudo terminals.
@@ -167,7 +192,7 @@ def serve_pty(
 
     if not speed > 0.0:
         raise ConfigError(f"The toy's speed on a pseudo terminal is {speed:g}; it must be above 0.")
-    stream = ToyStream(spec or ToySpec(), layout or load_layout("plush-15"))
+    stream = ToyStream(spec or ToySpec(), layout or load_layout("plush-15"), cues)
     master, slave = pty.openpty()
     try:
         # Raw: no echo, no changed line ends. The slave stays open here, so that readers may come and go.
@@ -175,14 +200,37 @@ def serve_pty(
         os.set_blocking(master, False)
         counters = ToyCounters()
         stop = stop or threading.Event()
-        outlet = _Outlet(lambda data: os.write(master, data), master, absent=True)
+        hurried = speed > 1.0
+        outlet = _Outlet(
+            lambda data: os.write(master, data),
+            master,
+            absent=not hurried,
+            stall_s=_stall_s(speed),
+            unread=(lambda: _unread(slave)) if hurried else None,
+        )
         if on_ready is not None:
             on_ready(f"serial://{os.ttyname(slave)}")
-        _run(stream, lambda data: outlet.send(data, stop), counters, speed, seconds, on_performed, stop)
+        _run(stream, lambda data: outlet.send(data, stop), counters, speed, seconds, on_performed, on_sent, stop)
     finally:
         os.close(master)
         os.close(slave)
     return counters
+
+
+def _unread(slave: int) -> int:
+    """Bytes that wait to be read on a pseudo terminal."""
+    if sys.platform == "win32":
+        return 0
+    import fcntl
+    import struct
+    import termios
+
+    waiting = fcntl.ioctl(slave, termios.FIONREAD, b"\0" * 4)
+    return int(struct.unpack("i", waiting)[0])
+
+
+def _stall_s(speed: float) -> float:
+    return _STALL_S if speed <= 1.0 else _HURRIED_STALL_S
 
 
 def _run(
@@ -192,6 +240,7 @@ def _run(
     speed: float,
     seconds: float,
     on_performed: Callable[[Performed], None] | None,
+    on_sent: Callable[[bytes], None] | None,
     stop: threading.Event,
 ) -> None:
     """Send line after line when its time on the device clock has come; times are reckoned from the start."""
@@ -199,11 +248,15 @@ def _run(
     first_ms: int | None = None
     batch, lines = bytearray(), 0
 
+    largest = 4096 if speed <= 1.0 else _HURRIED_QUEUE
+
     def flush() -> None:
         nonlocal lines
         if batch:
             if send(bytes(batch)):
                 counters.sent += lines
+                if on_sent is not None:
+                    on_sent(bytes(batch))
             else:
                 counters.dropped += lines
             batch.clear()
@@ -217,7 +270,7 @@ def _run(
         if seconds and line.device_ms - first_ms >= seconds * 1000.0:
             break
         due = pacer.due_s(line.device_ms)
-        if due > 0.0 or len(batch) > 4096:
+        if due > 0.0 or len(batch) > largest:
             flush()
             if due > 0.0 and stop.wait(due):
                 break

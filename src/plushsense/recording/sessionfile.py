@@ -90,8 +90,12 @@ class SessionHead:
 class Event:
     """One thing that happened: ``what`` in a word, ``at_ms`` by the computer's clock, and its particulars.
 
-    ``take`` (finished: ``file``, ``gesture``, ``repetition``), ``redo`` (``file``: that recording is not to be used),
-    ``skip``, ``note``, ``pause``, ``resume``, ``gap``, … A reader passes over words that it does not know.
+    ``open`` and ``close`` (a program took the session up, and left it), ``countdown`` (``gesture``, ``repetition``,
+    ``countdown_s``), ``start`` (the first row), ``take`` (finished: ``file``, ``gesture``, ``repetition``),
+    ``abandon`` (broken off on purpose: its rows are in the stream only), ``unfinished`` (broken off by a crash),
+    ``redo`` (``file``: that recording is not to be used), ``keep`` (``file``: it is after all), ``skip``, ``go`` (back
+    to another recording), ``note``, ``pause``, ``resume``, ``gap``, ``mended`` (what a crash had left), ``failed``,
+    ``finished``. A reader passes over words that it does not know.
     """
 
     what: str
@@ -121,8 +125,11 @@ def read_events(folder: Path) -> Iterator[Event]:
 
 def set_aside(folder: Path) -> dict[str, str]:
     """Recordings of a session that are not to be used, by file name, with the reason: those that were made again."""
-    return {
-        str(event.more["file"]): str(event.more.get("why") or "recorded again")
-        for event in read_events(folder)
-        if event.what == "redo" and event.more.get("file")
-    }
+    aside: dict[str, str] = {}
+    for event in read_events(folder):
+        file = str(event.more.get("file") or "")
+        if event.what == "redo" and file:
+            aside[file] = str(event.more.get("why") or "recorded again")
+        elif event.what == "keep":
+            aside.pop(file, None)
+    return aside

@@ -20,6 +20,7 @@ from plushsense.core.errors import PlushSenseError, nearest
 VERBS: dict[str, tuple[str, str]] = {
     "demo": ("demo", "the whole path on a virtual toy, in a few minutes"),
     "simulate": ("simulate", "recordings of virtual people, as the authors' recorder would leave them"),
+    "record": ("record", "record a session with a toy: prompts, countdown, nothing lost"),
     "import": ("importing", "make a data set from recordings"),
     "pseudonymise": ("pseudonymise", "a copy of a data set with random codes and moved dates"),
     "backup": ("backup", "one file that restores a data set, with a check"),
@@ -45,6 +46,7 @@ STOPPED = {
     "evaluate": "finished folds are kept, and the same command goes on from there",
     "simulate": "nothing was written",
     "import": "nothing was written",
+    "record": "what was recorded is kept, and the same command goes on from there",
     "pseudonymise": "nothing was written",
     "backup": "no backup was written",
     "restore": "nothing was written",

@@ -37,6 +37,18 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="share of lines that are garbled, 0 to 0.9 (0.0003)",
     )
     parser.add_argument(
+        "--glitch",
+        type=float,
+        metavar="P",
+        help="share of frames in which a sensor reads nonsense, 0 to 0.9 (0.00002)",
+    )
+    parser.add_argument(
+        "--follow",
+        metavar="LOG",
+        help="make the gestures that a recorder asks for: the session.jsonl that `plushsense record` writes "
+        "(it need not be there yet); default: plays by itself",
+    )
+    parser.add_argument(
         "--seconds",
         type=float,
         default=0.0,
@@ -51,10 +63,11 @@ def run(args: argparse.Namespace) -> int:
 
     from plushsense.core.signal import load_layout
     from plushsense.devices.toy import ToyCounters, serve_pty, serve_tcp
+    from plushsense.devices.virtual.cues import LogCues
     from plushsense.devices.virtual.stream import Performed, ToySpec
 
     gestures = tuple(g.strip() for g in args.gestures.split(",")) if args.gestures else ()
-    spec = ToySpec(args.person, args.seed, lost=args.lost, garbled=args.garbled, gestures=gestures)
+    spec = ToySpec(args.person, args.seed, lost=args.lost, garbled=args.garbled, glitch=args.glitch, gestures=gestures)
     try:
         truth = Path(args.truth).open("a", encoding="utf-8") if args.truth else None
     except OSError as cause:
@@ -77,9 +90,16 @@ def run(args: argparse.Namespace) -> int:
         serve = partial(serve_lsl, args.lsl)
     layout = load_layout(args.layout)
     counters = ToyCounters()
+    cues = LogCues(args.follow) if args.follow else None
     try:
         counters = serve(
-            spec, layout=layout, speed=args.speed, seconds=args.seconds, on_ready=ready, on_performed=performed
+            spec,
+            layout=layout,
+            speed=args.speed,
+            seconds=args.seconds,
+            on_ready=ready,
+            on_performed=performed,
+            cues=cues,
         )
     except KeyboardInterrupt:
         say("stopped")

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from plushsense.core.signal import Layout
 from plushsense.devices.base import Device, Frame, Pacer, now_ms
 from plushsense.devices.opening import Address
+from plushsense.devices.virtual.cues import Cue, Cues
 from plushsense.devices.virtual.stream import Line, Performed, ToySpec, ToyStream
 from plushsense.devices.wire import LineParser
 
@@ -27,7 +28,9 @@ class VirtualDevice(Device):
         self.spec = spec
         self.performed: list[Performed] = []
         self.on_performed: Callable[[Performed], None] | None = None
-        self._lines = iter(ToyStream(spec, layout))
+        self._stream = ToyStream(spec, layout)
+        self._lines = iter(self._stream)
+        self._cue: Cue | None = None
         self._parser = LineParser(layout, self.counters)
         self._pacer = Pacer(speed)
         self._seconds = seconds
@@ -39,6 +42,18 @@ class VirtualDevice(Device):
     def first_ms(self) -> int | None:
         """The device clock at the first line, the zero of a live run's times; None before it."""
         return self._first_ms
+
+    def follow(self, cues: Cues | None = None) -> None:
+        """From now on the person only does what ``cues`` or `perform` say; call it before the first `read`."""
+        self._stream.cues = cues or self._next_cue
+
+    def perform(self, label: str, begin_ms: int | None = None) -> None:
+        """Have the person make a gesture, so that the hand comes when the toy's clock is ``begin_ms``."""
+        self._cue = Cue(label, begin_ms)
+
+    def _next_cue(self) -> Cue | None:
+        cue, self._cue = self._cue, None
+        return cue
 
     def read(self) -> list[Frame] | None:
         """The frames that are due, waiting at most about 0.1 s; None after ``seconds``."""
@@ -77,8 +92,10 @@ class VirtualDevice(Device):
 
 
 def open_url(address: Address, layout: Layout) -> VirtualDevice:
-    """Open ``virtual://?person=7&seed=1&speed=1``; also session, lost, garbled, seconds, gestures (with commas)."""
-    address.check_keys(("person", "seed", "session", "speed", "lost", "garbled", "seconds", "gestures"))
+    """Open ``virtual://?person=7&seed=1&speed=1``; also session, lost, garbled, glitch, seconds,
+    gestures (with commas).
+    """
+    address.check_keys(("person", "seed", "session", "speed", "lost", "garbled", "glitch", "seconds", "gestures"))
     text = address.query.get("gestures", "")
     spec = ToySpec(
         person=address.whole("person", 1),
@@ -86,6 +103,7 @@ def open_url(address: Address, layout: Layout) -> VirtualDevice:
         session=address.whole("session", 1000),
         lost=address.number("lost", 0.0, 0.0, 0.9) if "lost" in address.query else None,
         garbled=address.number("garbled", 0.0, 0.0, 0.9) if "garbled" in address.query else None,
+        glitch=address.number("glitch", 0.0, 0.0, 0.9) if "glitch" in address.query else None,
         gestures=tuple(g.strip() for g in text.split(",") if g.strip()),
     )
     return VirtualDevice(

@@ -10,7 +10,9 @@ import numpy as np
 
 from plushsense.core.errors import ConfigError, nearest
 from plushsense.core.signal import DELAY_MS, DEVICE_MS, Layout
-from plushsense.devices.virtual.motions import AT_REST
+from plushsense.devices.virtual.cues import Cues
+from plushsense.devices.virtual.holding import PICK_S
+from plushsense.devices.virtual.motions import AT_REST, split_label
 from plushsense.devices.virtual.people import draw_person
 from plushsense.devices.virtual.session import GESTURES, Episode, Session
 from plushsense.devices.virtual.world import CHANNELS, WORLD, World
@@ -18,6 +20,9 @@ from plushsense.devices.virtual.world import CHANNELS, WORLD, World
 _ALIASES = {"x": "acc_x", "y": "acc_y", "z": "acc_z"}
 _NOISE = bytes(range(128, 256)) + b"#?~\x00\x7f"
 _LIVE_WAIT_S = (0.4, 1.6)
+_LISTEN_S = 0.1
+_LONGEST_WAIT_S = 10.0
+_LEAD_S = 0.6
 
 
 @dataclass(frozen=True)
@@ -49,6 +54,7 @@ class ToySpec:
     Attributes:
         person, seed, session: the same numbers give the same bytes.
         lost, garbled: share of the lines, 0 to 1; None is the world's own.
+        glitch: share of the frames in which an electrode reads nonsense; None is the world's own.
         gestures: performed over and over in this order; none: all of the paper's at random.
     """
 
@@ -57,6 +63,7 @@ class ToySpec:
     session: int = 1000
     lost: float | None = None
     garbled: float | None = None
+    glitch: float | None = None
     gestures: tuple[str, ...] = ()
     world: World = WORLD
 
@@ -64,7 +71,7 @@ class ToySpec:
         for name, number in (("person", self.person), ("seed", self.seed), ("session", self.session)):
             if number < 0:
                 raise ConfigError(f"The virtual toy's {name} is {number}; a whole number from 0 on is accepted.")
-        for name, value in (("lost", self.lost), ("garbled", self.garbled)):
+        for name, value in (("lost", self.lost), ("garbled", self.garbled), ("glitch", self.glitch)):
             if value is not None and not 0.0 <= value <= 0.9:
                 raise ConfigError(f"The virtual toy's {name} is {value}; a share from 0 to 0.9 is accepted.")
         known = (AT_REST, *GESTURES)
@@ -107,19 +114,41 @@ def _garble(line: bytes, rng: np.random.Generator) -> bytes:
 
 
 class ToyStream:
-    """The lines of a virtual toy without end: iterate over it."""
+    """The lines of a virtual toy without end: iterate over it.
 
-    def __init__(self, spec: ToySpec, layout: Layout) -> None:
+    With ``cues`` its person waits to be told what to do (set it before the first line); else it plays by itself.
+    """
+
+    def __init__(self, spec: ToySpec, layout: Layout, cues: Cues | None = None) -> None:
         self.spec = spec
         self.layout = layout
+        self.cues = cues
         self._columns = channel_columns(layout)
         person = draw_person(spec.person, spec.seed, spec.world)
-        self._session = Session(person, spec.seed, spec.session, spec.world, wait_s=_LIVE_WAIT_S)
+        world = spec.world if spec.glitch is None else dataclasses.replace(spec.world, glitch=spec.glitch)
+        self._session = Session(person, spec.seed, spec.session, world, wait_s=_LIVE_WAIT_S)
         self._rng = np.random.default_rng([spec.seed, spec.person, spec.session, 0x10])
 
     def __iter__(self) -> Iterator[Line]:
-        for episode in self._session.play(self.spec.gestures):
+        # Asked only now: a recorder may set the cues after it has opened the toy.
+        episodes = self._session.play(self.spec.gestures) if self.cues is None else self._told(self.cues)
+        for episode in episodes:
             yield from self._lines(episode)
+
+    def _told(self, cues: Cues) -> Iterator[Episode]:
+        """Nothing until a cue comes, then its gesture, so that the hand comes when the recording begins."""
+        session = self._session
+        while True:
+            cue = cues()
+            if cue is None or cue.label not in GESTURES:  # nobody touches a toy at rest
+                yield session.idle(_LISTEN_S)
+                continue
+            family, in_hands = split_label(cue.label)
+            lead = _LEAD_S + (PICK_S if in_hands and family != "Hold in hands" else 0.0)
+            wait = 0.0 if cue.begin_ms is None else (cue.begin_ms - session.clock_ms) / 1000.0 - lead
+            wait = min(max(0.0, wait), _LONGEST_WAIT_S)
+            session.wait_s = (wait, wait)
+            yield session.perform(cue.label)
 
     def _lines(self, episode: Episode) -> Iterator[Line]:
         world, n = self.spec.world, len(episode)

@@ -1,0 +1,447 @@
+"""The recorder's commands and states, on the virtual toy as fast as it goes."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from plushsense.core.errors import DatasetError, DeviceError
+from plushsense.core.recfile import STREAM_NAME, read_recording, read_stream
+from plushsense.core.signal import load_layout
+from plushsense.devices.base import Device, Frame
+from plushsense.devices.opening import open_device
+from plushsense.devices.reconnect import ReconnectingDevice
+from plushsense.recording.engine import Auto, Recorder
+from plushsense.recording.protocol import load_protocol
+from plushsense.recording.session import OpenSession
+from plushsense.recording.sessionfile import SessionHead, read_events, set_aside
+from plushsense.recording.status import Status
+from plushsense.recording.toy import prompt_virtual
+
+LAYOUT = load_layout("plush-15")
+PROTOCOL = load_protocol("quick")
+SPEED = 50.0
+URL = f"virtual://?speed={SPEED:g}&lost=0&garbled=0&glitch=0"
+
+
+def head(**changes: Any) -> SessionHead:
+    protocol = replace(PROTOCOL, **changes)
+    return SessionHead("S01", "1", 5, LAYOUT.to_dict(), protocol.to_dict(), simulated=True)
+
+
+@contextmanager
+def recorder(
+    folder: Path, device: Device | None = None, auto: Auto | None = None, **changes: Any
+) -> Iterator[Recorder]:
+    with (
+        device or open_device(URL) as toy,
+        Recorder.open(folder, toy, head(**changes), speed=SPEED, auto=auto) as made,
+    ):
+        until(lambda: made.status().signal != "none")
+        yield made
+
+
+def until(true: Callable[[], bool]) -> None:
+    limit = time.monotonic() + 20
+    while not true():
+        assert time.monotonic() < limit
+        time.sleep(0.002)
+
+
+def take(r: Recorder, seconds: float = 1.0) -> Status:
+    """Make the recording that is asked for; returns what the screen shows then."""
+    r.space()
+    assert r.status().state == "countdown"
+    assert r.wait("recording", timeout_s=20)
+    until(lambda: r.status().elapsed_s >= seconds)
+    r.space()
+    assert r.wait("idle", "finished", timeout_s=20)
+    return r.status()
+
+
+def whats(folder: Path) -> list[str]:
+    return [e.what for e in read_events(folder)]
+
+
+def test_one_recording(tmp_path: Path) -> None:
+    seen: list[str] = []
+    with recorder(tmp_path) as r:
+        assert (r.status().state, r.status().step.gesture, r.status().done) == ("idle", "Back stroke 1", 0)
+        r.listen(lambda what, _: seen.append(what))
+        status = take(r)
+        assert (status.done, status.step.gesture, status.steps) == (1, "Head stroke 1", 4)
+        assert status.following is not None and status.following.gesture == "Hold strong"
+        assert status.rate_hz == pytest.approx(100, abs=3)
+        assert 0.2 < status.jitter_ms < 1.0
+        assert (status.signal, status.lost, status.malformed, status.garbage) == ("good", 0, 0, 0)
+    assert r.status().state == "stopped"
+    assert [w for w in seen if w in ("countdown", "recording", "saving", "take")] == [
+        "countdown", "countdown", "recording", "saving", "take",
+    ]  # fmt: skip
+    assert whats(tmp_path) == ["open", "countdown", "start", "take", "close"]
+    path = tmp_path / status.file
+    beside = json.loads(path.with_suffix(".json").read_text())
+    assert beside["ended"] == "space"
+    assert beside["rate_hz"] == pytest.approx(100, abs=1)
+    lines = path.read_text().splitlines()[1:]
+    stream = (tmp_path / STREAM_NAME).read_text().splitlines()
+    assert lines == stream[beside["stream_row"] : beside["stream_row"] + len(lines)]
+    start = next(e for e in read_events(tmp_path) if e.what == "start")
+    countdown = next(e for e in read_events(tmp_path) if e.what == "countdown")
+    assert start.more["device_ms"] - countdown.more["device_ms"] == pytest.approx(3000, abs=12)
+    assert beside["device_ms"][0] == start.more["device_ms"]
+
+
+def test_space_cancels_a_countdown_and_does_not_stop_too_soon(tmp_path: Path) -> None:
+    with recorder(tmp_path, shortest_s=2.0) as r:
+        r.space()
+        r.space()
+        assert (r.status().state, r.status().message) == ("idle", "The countdown was cancelled.")
+        r.space()
+        r.wait("recording", timeout_s=20)
+        r.space()
+        assert (r.status().state, r.status().message) == (
+            "recording",
+            "That was too quick for a stop: still recording.",
+        )
+        until(lambda: r.status().elapsed_s >= 2.0)
+        r.space()
+        r.wait("idle", timeout_s=20)
+        assert r.status().done == 1
+
+
+def test_redo_sets_the_last_one_aside_and_skip_brings_it_back(tmp_path: Path) -> None:
+    with recorder(tmp_path) as r:
+        first = take(r).file
+        r.redo("sneezed")
+        assert (r.status().step.gesture, r.status().done, r.status().redone) == ("Back stroke 1", 0, 1)
+        r.redo()
+        assert "no recording to make again" in r.status().message
+        r.skip()
+        assert (r.status().step.gesture, r.status().done, r.status().redone) == ("Head stroke 1", 1, 0)
+        r.redo("sneezed")
+        again = take(r).file
+        assert again != first
+    assert set_aside(tmp_path) == {first: "sneezed"}
+    assert (tmp_path / first).exists()
+    with recorder(tmp_path) as r:
+        assert (r.status().step.gesture, r.status().done, r.status().redone) == ("Head stroke 1", 1, 1)
+
+
+def test_a_running_one_is_broken_off(tmp_path: Path) -> None:
+    with recorder(tmp_path) as r:
+        r.space()
+        r.wait("recording", timeout_s=20)
+        for refused in (r.skip, r.pause, r.back):
+            refused()
+            assert (r.status().state, "Recording" in r.status().message) == ("recording", True)
+        r.redo()
+        assert (r.status().state, r.status().step.gesture, r.status().done) == ("idle", "Back stroke 1", 0)
+        r.space()
+        r.wait("recording", timeout_s=20)
+    assert whats(tmp_path) == ["open", *2 * ["countdown", "start", "abandon"], "close"]
+    assert [e.more["why"] for e in read_events(tmp_path) if e.what == "abandon"] == ["redo", "quit"]
+    assert not list(tmp_path.glob("Back*"))
+
+
+def test_back_makes_one_again_only_when_the_new_one_is_there(tmp_path: Path) -> None:
+    with recorder(tmp_path) as r:
+        first = take(r).file
+        r.skip()
+        r.back()
+        assert r.status().step.gesture == "Head stroke 1"
+        r.back()
+        assert (r.status().step.gesture, r.status().already) == ("Back stroke 1", first)
+        r.space()
+        r.space()
+        assert r.status().already == first
+        status = take(r)
+        assert (status.done, status.redone, status.skipped, status.step.gesture) == (1, 1, 1, "Hold strong")
+        r.go(1)
+        assert take(r).skipped == 0
+    assert set_aside(tmp_path) == {first: "recorded again"}
+
+
+def test_pause_note_and_the_end(tmp_path: Path) -> None:
+    with recorder(tmp_path) as r:
+        r.pause()
+        r.space()
+        assert (r.status().state, r.status().message) == ("paused", "Paused: go on first (p).")
+        r.resume()
+        r.note("  the child\n laughs ")
+        for _ in range(3):
+            r.skip()
+        assert take(r).state == "finished"
+        assert r.wait("finished", timeout_s=0)
+    assert next(e.more["text"] for e in read_events(tmp_path) if e.what == "note") == "the child laughs"
+    assert whats(tmp_path)[-2:] == ["finished", "close"]
+    with recorder(tmp_path) as r:
+        assert (r.status().state, r.status().done, r.status().skipped) == ("finished", 1, 3)
+        r.back()
+        assert (r.status().state, r.status().step.gesture) == ("idle", "Tail tap 1")
+
+
+def test_a_recording_that_nobody_stops_ends_by_itself(tmp_path: Path) -> None:
+    with recorder(tmp_path, longest_s=2.0) as r:
+        r.space()
+        r.wait("recording", timeout_s=20)
+        r.wait("idle", timeout_s=20)
+        status = r.status()
+        assert (status.done, "Nobody stopped it" in status.message) == (1, True)
+    beside = json.loads((tmp_path / status.file).with_suffix(".json").read_text())
+    assert (beside["ended"], beside["auto_stopped"]) == ("longest", True)
+    assert beside["device_ms"][1] - beside["device_ms"][0] == pytest.approx(2000, abs=12)
+
+
+def test_it_presses_its_own_space_bar(tmp_path: Path) -> None:
+    device = open_device(URL)
+    with device, Recorder.open(tmp_path, device, head(), speed=SPEED, auto=Auto(1.5, 0.5)) as r:
+        assert r.wait("finished", timeout_s=30)
+        assert r.status().done == 4
+    for path in tmp_path.glob("*_*.json"):
+        beside = json.loads(path.read_text())
+        assert beside["ended"] == "auto"
+        assert beside["device_ms"][1] - beside["device_ms"][0] == pytest.approx(1500, abs=12)
+
+
+def test_the_virtual_person_does_what_is_asked_for(tmp_path: Path) -> None:
+    with open_device(URL) as device:
+        r = Recorder.open(tmp_path, device, head(), speed=SPEED, auto=Auto(4.0))
+        prompt_virtual(r)
+        with r:
+            assert r.wait("finished", timeout_s=30)
+        performed = list(device.performed)  # type: ignore[attr-defined]
+    assert [p.label for p in performed] == list(PROTOCOL.gestures)
+    for path in tmp_path.glob("*_*.json"):
+        beside = json.loads(path.read_text())
+        (mine,) = [p for p in performed if p.label == beside["gesture"]]
+        assert 0 < mine.start_ms - beside["device_ms"][0] < 2000
+
+
+class Plug(Device):
+    """A virtual toy on a plug that is pulled for a while of the toy's time; the toy goes on meanwhile."""
+
+    def __init__(self, toy: Device, from_ms: int, for_ms: int) -> None:
+        super().__init__(toy.url, toy.layout)
+        self.toy, self._from, self._until = toy, from_ms, from_ms + for_ms
+        # Looking for it takes as long as it is away.
+        while (now := toy.read() or [Frame(0, 0, ())])[-1].device_ms >= from_ms > 0:
+            if now[-1].device_ms >= self._until:
+                self._from = sys.maxsize
+                break
+
+    def read(self) -> list[Frame] | None:
+        frames = self.toy.read() or []
+        if frames and frames[-1].device_ms >= self._from:
+            raise DeviceError("'x' went away: was it unplugged?")
+        return frames
+
+
+def test_unplugged_for_five_seconds_during_a_gesture(tmp_path: Path) -> None:
+    with open_device(URL) as toy:
+        first: list[Frame] = []
+        while not first:
+            first = toy.read() or []
+        # The recording runs from about 4 s on to about 14 s: rest, countdown, and ten seconds of gesture.
+        from_ms = first[-1].device_ms + 7000
+        device = ReconnectingDevice("x", LAYOUT, lambda: Plug(toy, from_ms, 5000))
+        seen: list[Status] = []
+        r = Recorder.open(tmp_path, device, head(), speed=SPEED, auto=Auto(10.0, 1.0))
+        r.listen(lambda what, status: seen.append(status))
+        with device, r:
+            until(lambda: r.status().done == 1)
+            status = r.status()
+        assert any("this recording has a hole" in s.message for s in seen)
+    assert (status.gaps, status.reconnects) == (1, 1)
+    beside = json.loads(next(tmp_path.glob("*_*.json")).read_text())
+    (gap,) = beside["gaps"]
+    # What the toy said just before and just after the plug was pulled may be lost with it.
+    assert 5000 <= gap["missing_ms"] < 7000
+    assert (beside["reconnects"], gap["reason"]) == (1, "'x' went away: was it unplugged?")
+    (event,) = [e for e in read_events(tmp_path) if e.what == "gap"]
+    assert (event.more["gesture"], event.more["missing_ms"]) == ("Back stroke 1", gap["missing_ms"])
+    frames = read_recording(next(tmp_path.glob("Back*.csv")), LAYOUT).frames
+    hole = int(np.argmax(np.diff(frames.device_ms)))
+    assert hole + 1 == gap["after_row"]
+    assert [int(frames.device_ms[hole]), int(frames.device_ms[hole + 1])] == gap["device_ms"]
+    assert len(frames) == beside["rows"]
+    assert frames.device_ms[-1] - frames.device_ms[0] == pytest.approx(10_000, abs=12)
+
+
+class Breaking(Device):
+    """A toy that goes away for good after some frames."""
+
+    def __init__(self, inner: Device, frames: int) -> None:
+        super().__init__(inner.url, inner.layout)
+        self.inner, self.counters, self._left = inner, inner.counters, frames
+
+    def read(self) -> list[Frame] | None:
+        frames = self.inner.read() or []
+        self._left -= len(frames)
+        if self._left < 0:
+            raise DeviceError("'x' went away: was it unplugged or switched off?")
+        return frames
+
+
+def test_a_toy_that_goes_for_good_leaves_its_recording(tmp_path: Path) -> None:
+    with open_device(URL) as inner:
+        device = Breaking(inner, 600)
+        with Recorder.open(tmp_path, device, head(), speed=SPEED, auto=Auto(30.0, 0.5)) as r:
+            assert r.wait(timeout_s=20)
+            assert (r.status().message, r.status().done) == ("'x' went away: was it unplugged or switched off?", 1)
+    beside = json.loads(next(tmp_path.glob("*_*.json")).read_text())
+    assert beside["ended"] == "toy"
+
+
+def test_space_without_a_signal_is_answered(tmp_path: Path) -> None:
+    class Mute(Device):
+        def read(self) -> list[Frame] | None:
+            time.sleep(0.01)
+            return []
+
+    with Mute("x", LAYOUT) as device, Recorder.open(tmp_path, device, head()) as r:
+        r.space()
+        assert (r.status().state, r.status().signal) == ("idle", "none")
+        assert "Nothing comes from the toy" in r.status().message
+
+
+def test_commands_from_many_threads_lose_nothing(tmp_path: Path) -> None:
+    """Two pages and a keyboard at once: whatever they press, files, log and stream agree."""
+    with recorder(tmp_path, repetitions=50, countdown_s=0.1, shortest_s=0.1) as r:
+        done = time.monotonic() + 2.0
+
+        def press(seed: int) -> None:
+            rng = np.random.default_rng(seed)
+            commands = [r.space, r.space, r.space, r.redo, r.skip, r.back, r.pause, r.resume, lambda: r.note("x")]
+            while time.monotonic() < done:
+                commands[int(rng.integers(len(commands)))]()
+                r.status()
+                time.sleep(0.001)
+
+        threads = [threading.Thread(target=press, args=(n,)) for n in range(3)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        r.wait("idle", "paused", "recording", "countdown", "finished", timeout_s=5)
+        at_end = r.status()
+    assert not at_end.failed
+    stream = (tmp_path / STREAM_NAME).read_text().splitlines()
+    clock = read_stream(tmp_path / STREAM_NAME, LAYOUT).frames.device_ms
+    assert np.diff(clock).max() <= 12
+    takes = [e.more for e in read_events(tmp_path) if e.what == "take"]
+    assert takes
+    assert {t["file"] for t in takes} == {p.name for p in tmp_path.glob("* *_*.csv")}
+    for path in tmp_path.glob("* *_*.csv"):
+        beside = json.loads(path.with_suffix(".json").read_text())
+        lines = path.read_text().splitlines()[1:]
+        assert lines == stream[beside["stream_row"] : beside["stream_row"] + len(lines)]
+    session = OpenSession(tmp_path)
+    session.close()
+    assert session.standing.mended == []
+    assert (len(session.standing.takes), len(session.standing.skipped)) == (at_end.done, at_end.skipped)
+
+
+FULL = """
+import resource, signal, sys
+from pathlib import Path
+from plushsense.apps.cli.main import main
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), resource.RLIM_INFINITY))
+sys.exit(main(["record", sys.argv[1], "--device", sys.argv[3], "--subject", "S01", "--auto", "2", "--json"]))
+"""
+
+
+def check_full(done: subprocess.CompletedProcess[str], out: Path) -> None:
+    """It stopped with one sentence, what is there is whole, and with room it goes on to the end."""
+    assert done.returncode == 2, done.stderr
+    assert "Traceback" not in done.stderr
+    (sentence,) = [line for line in done.stderr.splitlines() if line.startswith("plushsense: ")]
+    assert "cannot be written any more" in sentence
+    assert "make room, and give the same command" in sentence
+    said = json.loads(done.stdout)
+    assert (said["finished"], "cannot be written" in said["stopped"]) == (False, True)
+    folder = out / "S01" / "1"
+    assert (folder / STREAM_NAME).read_bytes().endswith(b"\n")
+    stream = (folder / STREAM_NAME).read_text().splitlines()
+    files = sorted(p for p in folder.glob("* *_*.csv"))
+    assert len(files) == said["recordings"] > 0
+    for path in files:
+        beside = json.loads(path.with_suffix(".json").read_text())
+        lines = path.read_text().splitlines()[1:]
+        assert len(lines) == beside["rows"]
+        assert lines == stream[beside["stream_row"] : beside["stream_row"] + len(lines)]
+    assert not [p for p in folder.iterdir() if p.name.endswith((".part", ".new"))]
+
+
+def resumed(out: Path, before: dict[str, bytes]) -> None:
+    with open_device(URL) as device:
+        session = OpenSession(out / "S01" / "1")
+        with Recorder(session, device, speed=SPEED, auto=Auto(1.0, 0.2)) as r:
+            assert r.wait("finished", timeout_s=60)
+            assert r.status().done == 51
+    for name, data in before.items():
+        assert (out / "S01" / "1" / name).read_bytes() == data
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no limit on the size of a file")
+def test_a_disk_that_takes_no_more(tmp_path: Path) -> None:
+    """A limit on the size of files stands for a full disk: it is the stream that does not fit any more."""
+    words = [sys.executable, "-c", FULL, str(tmp_path), "400000", URL]
+    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=60, stdin=subprocess.DEVNULL)
+    check_full(done, tmp_path)
+    resumed(tmp_path, {p.name: p.read_bytes() for p in (tmp_path / "S01" / "1").glob("* *_*.csv")})
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 1 MB."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    if not hasattr(os, "geteuid") or os.geteuid() != 0:
+        pytest.skip("only root may mount a small file system")
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(place)], capture_output=True, text=True, check=False
+    )
+    if mounted.returncode != 0:
+        pytest.skip(f"no small file system here: {mounted.stderr.strip()}")
+    yield place
+    subprocess.run(["umount", str(place)], check=True)
+
+
+def test_a_full_disk(small_disk: Path) -> None:
+    words = [
+        sys.executable, "-m", "plushsense.apps.cli.main", "record", str(small_disk), "--device", URL,
+        "--subject", "S01", "--auto", "2", "--json",
+    ]  # fmt: skip
+    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=60, stdin=subprocess.DEVNULL)
+    check_full(done, small_disk)
+    # Still full: refused in one sentence again, and nothing is lost by trying.
+    before = {p.name: p.read_bytes() for p in (small_disk / "S01" / "1").glob("* *_*.csv")}
+    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=60, stdin=subprocess.DEVNULL)
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr
+    subprocess.run(["mount", "-o", "remount,size=64m", str(small_disk)], check=True)
+    resumed(small_disk, before)
+
+
+def test_a_stream_that_cannot_be_opened_is_one_sentence(tmp_path: Path) -> None:
+    with open_device(URL) as device:
+        made = Recorder.open(tmp_path, device, head())
+        (tmp_path / STREAM_NAME).mkdir()
+        with pytest.raises(DatasetError, match="cannot be written"):
+            made.start()
+    (tmp_path / STREAM_NAME).rmdir()
+    OpenSession(tmp_path).close()

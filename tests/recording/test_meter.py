@@ -1,0 +1,55 @@
+import pytest
+
+from plushsense.core.signal import load_layout
+from plushsense.devices.base import Counters
+from plushsense.recording.meter import SIGNAL, Meter, Quality
+
+
+def metered(step_ms: int, seconds: float, lost: int = 0, malformed: int = 0) -> Quality:
+    """A toy that speaks every ``step_ms`` for so long; what goes wrong comes in the second half."""
+    meter, counters = Meter(load_layout("plush-15")), Counters()
+    n = round(1000 * seconds / step_ms)
+    for i in range(n):
+        meter.push(1000 + i * step_ms + (i % 2))
+        counters.frames += 1
+        if i == n // 2:
+            counters.lost, counters.malformed = lost, malformed
+        if i % 5 == 0:
+            meter.heard(counters, i * step_ms / 1000)
+    return meter.quality(seconds)
+
+
+def test_rate_and_jitter_are_the_toys_own() -> None:
+    quality = metered(10, 5)
+    assert quality.rate_hz == pytest.approx(100, abs=0.5)
+    assert quality.jitter_ms == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("step_ms", "lost", "malformed", "word"),
+    [
+        (10, 0, 0, "good"),
+        (10, 1, 0, "good"),
+        (10, 3, 2, "fair"),
+        (10, 40, 0, "poor"),
+        (10, 0, 40, "poor"),
+        (13, 0, 0, "poor"),
+    ],
+)
+def test_one_word_for_the_person(step_ms: int, lost: int, malformed: int, word: str) -> None:
+    assert metered(step_ms, 5, lost, malformed).signal == word
+    assert word in SIGNAL
+
+
+def test_silence_is_said() -> None:
+    meter = Meter(load_layout("plush-15"))
+    assert meter.quality(0.0).signal == "none"
+    for i in range(100):
+        meter.push(10 * i)
+    meter.heard(Counters(frames=100), 1.0)
+    assert meter.quality(1.5).signal == "good"
+    assert meter.quality(1.5, away=True).signal == "none"
+    assert meter.quality(2.5) == Quality()
+    meter.push(60_000)
+    meter.heard(Counters(frames=101), 60.0)
+    assert meter.quality(60.0).signal == "none", "after a pause it begins anew"

@@ -1,0 +1,100 @@
+import json
+from pathlib import Path
+
+import pytest
+
+from plushsense.core.errors import ConfigError, GestureError
+from plushsense.devices.virtual.session import GESTURES
+from plushsense.recording.protocol import Protocol, load_protocol, protocol_names
+
+
+def own(folder: Path, text: str) -> Path:
+    path = folder / "own.toml"
+    path.write_text('name = "own"\ngesture_set = "plush-18"\n' + text, encoding="utf-8")
+    return path
+
+
+def test_the_papers_session() -> None:
+    paper = load_protocol("plush-17")
+    assert paper.gestures == GESTURES
+    assert len(paper.steps()) == 51
+    assert [(s.gesture, s.repetition) for s in paper.steps()[:4]] == [
+        ("Back stroke 1", 1), ("Back stroke 1", 2), ("Back stroke 1", 3), ("Back stroke 2", 1),
+    ]  # fmt: skip
+    assert (paper.countdown_s, paper.shortest_s) == (3.0, 0.5)
+    assert paper.steps()[0].prompt == "Stroke the toy's back; the toy stands on a table"
+    assert not paper.needs_nobody
+
+
+@pytest.mark.parametrize("name", protocol_names())
+def test_a_built_in_one_comes_back_from_plain_values(name: str) -> None:
+    protocol = load_protocol(name)
+    assert Protocol.from_dict(json.loads(json.dumps(protocol.to_dict()))) == protocol
+
+
+def test_rest_is_nobodys() -> None:
+    rest = load_protocol("rest")
+    assert rest.needs_nobody
+    assert {s.gesture for s in rest.steps()} == {"At rest"}
+
+
+def test_words_for_children() -> None:
+    assert load_protocol("plush-17", "child").prompts["Hold strong"] == "Give the toy a big hug"
+    with pytest.raises(ConfigError, match=r"no wording 'chld'.*Did you mean 'child'"):
+        load_protocol("plush-17", "chld")
+
+
+def test_a_users_own(tmp_path: Path) -> None:
+    text = 'gestures = ["tail_hit 1", "At rest"]\norder = "round"\nrepetitions = 2\n[prompts]\n"At rest" = "Leave it"\n'
+    protocol = load_protocol(own(tmp_path, text))
+    assert [(s.gesture, s.repetition) for s in protocol.steps()] == [
+        ("Tail hit 1", 1), ("At rest", 1), ("Tail hit 1", 2), ("At rest", 2),
+    ]  # fmt: skip
+    assert protocol.prompts["At rest"] == "Leave it"
+    assert protocol.nobody == ("At rest",)
+    assert not protocol.needs_nobody
+
+
+def test_a_gesture_set_beside_it_is_found(tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_text('name = "mine"\ngestures = [{ label = "Poke" }]\n', encoding="utf-8")
+    path = tmp_path / "own.toml"
+    path.write_text('name = "own"\ngesture_set = "mine.toml"\n', encoding="utf-8")
+    protocol = load_protocol(path)
+    assert protocol.prompts == {"Poke": "Poke"}
+    (tmp_path / "mine.toml").unlink()
+    assert Protocol.from_dict(protocol.to_dict()) == protocol
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("repetition = 3", "Unknown key 'repetition'.*Did you mean 'repetitions'"),
+        ("repetitions = 0", "whole number, 1 to 1000"),
+        ("repetitions = true", "whole number, 1 to 1000"),
+        ('order = "rounds"', "Did you mean 'round'"),
+        ("countdown_s = -1", "0 to 60 seconds"),
+        ("longest_s = nan", "must be a number"),
+        ("shortest_s = 5\nlongest_s = 4", "must be below"),
+        ('gestures = ["Tail kick"]', "Tail kick"),
+        ('gestures = ["Tail pull", "tail_pull"]', "every gesture once"),
+        ("gestures = 3", "list of labels"),
+        ('[prompts]\n"Tail pull" = 3', "must be a text"),
+        ('[prompts]\n"Tail kick" = "x"', "Tail kick"),
+    ],
+)
+def test_a_slip_is_one_sentence(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises((ConfigError, GestureError), match=said):
+        load_protocol(own(tmp_path, text + "\n"))
+
+
+def test_a_label_that_no_file_can_be_called_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_text('name = "mine"\ngestures = [{ label = "a/b" }]\n', encoding="utf-8")
+    path = tmp_path / "own.toml"
+    path.write_text('name = "own"\ngesture_set = "mine.toml"\n', encoding="utf-8")
+    with pytest.raises(ConfigError, match="cannot stand in a file name"):
+        load_protocol(path)
+
+
+def test_an_unknown_name_is_one_sentence() -> None:
+    with pytest.raises(ConfigError, match="Did you mean 'plush-17'"):
+        load_protocol("plush17")

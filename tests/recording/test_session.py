@@ -1,0 +1,232 @@
+"""Taking up a session's folder: new, finished, interrupted, damaged, held by somebody else."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from plushsense.core.errors import DatasetError
+from plushsense.core.recfile import STREAM_NAME
+from plushsense.core.signal import load_layout
+from plushsense.devices.base import Frame
+from plushsense.recording.protocol import load_protocol
+from plushsense.recording.session import (
+    LOCK,
+    OpenSession,
+    check_session,
+    check_subject,
+    is_finished,
+    new_session,
+    next_session,
+    session_names,
+)
+from plushsense.recording.sessionfile import SESSION_LOG, Event, SessionHead, read_events, set_aside
+from plushsense.recording.writer import StreamFile, save_take, to_frames
+
+ACCEL = load_layout("accel-3")
+HEAD = SessionHead(
+    "S01", "1", 5, json.loads(json.dumps(ACCEL.to_dict())), load_protocol("quick").to_dict(), consent="C-1"
+)
+ROWS = [Frame(1000 + i, 10 * i, (i, i, i)) for i in range(20)]
+
+
+def made(folder: Path, key: tuple[str, int], saved_ms: int, log: bool = True) -> Path:
+    """A recording as the recorder leaves it."""
+    more = {"gesture": key[0], "repetition": key[1]}
+    path = save_take(folder, to_frames(ROWS[5:9], 3), ACCEL, key[0], saved_ms, more)
+    if log:
+        with (folder / SESSION_LOG).open("a", encoding="utf-8") as file:
+            file.write(Event("take", saved_ms, more | {"file": path.name}).to_line())
+    return path
+
+
+def opened(folder: Path, *events: Event) -> OpenSession:
+    """Take the session up, with these events in its log before."""
+    with (folder / SESSION_LOG).open("a", encoding="utf-8") as file:
+        file.writelines(e.to_line() for e in events)
+    session = OpenSession(folder)
+    session.close()
+    return session
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A session that was begun and has a stream."""
+    folder = tmp_path / "S01" / "1"
+    OpenSession(folder, HEAD).close()
+    stream = StreamFile(folder / STREAM_NAME, ACCEL)
+    stream.write(ROWS)
+    stream.close()
+    return folder
+
+
+def test_a_new_one(tmp_path: Path) -> None:
+    session = OpenSession(tmp_path / "S01" / "1", HEAD)
+    assert (session.standing.resumed, session.standing.takes, session.standing.mended) == (False, {}, [])
+    assert session.protocol.name == "quick"
+    session.close()
+    session.close()
+    assert SessionHead.read(tmp_path / "S01" / "1") == HEAD
+    assert not (tmp_path / "S01" / "1" / LOCK).exists()
+
+
+def test_it_goes_on_where_it_stood(folder: Path) -> None:
+    first, second = made(folder, ("Back stroke 1", 1), 50), made(folder, ("Head stroke 1", 1), 60)
+    skip = Event("skip", 70, {"gesture": "Hold strong", "repetition": 1})
+    standing = opened(folder, skip, Event("redo", 80, {"file": second.name})).standing
+    assert standing.takes == {("Back stroke 1", 1): first.name}
+    assert standing.skipped == {("Hold strong", 1)}
+    assert standing.aside == {("Head stroke 1", 1): [second.name]}
+    assert (standing.rows, standing.host_ms, standing.resumed, standing.mended) == (20, 1019, True, [])
+    assert opened(folder, Event("keep", 90, {"file": second.name})).standing.takes[("Head stroke 1", 1)] == second.name
+
+
+def test_a_torn_stream_is_cut_to_whole_lines_and_the_log_keeps_the_rest(folder: Path) -> None:
+    path = folder / STREAM_NAME
+    whole = path.read_bytes()
+    path.write_bytes(whole + b"1020, 20")
+    standing = OpenSession(folder)
+    standing.close()
+    assert path.read_bytes() == whole
+    (event,) = [e for e in read_events(folder) if e.what == "mended"]
+    assert (event.more["bytes"], event.more["text"]) == (8, "1020, 20")
+    assert len(standing.standing.mended) == 1
+    path.write_bytes(b"10")
+    assert opened(folder).standing.rows == 0
+
+
+def test_a_torn_line_of_the_log_is_passed_over(folder: Path) -> None:
+    path = made(folder, ("Back stroke 1", 1), 50)
+    with (folder / SESSION_LOG).open("ab") as file:
+        file.write(b'{"what": "take", "at_ms": 4, "fil')
+    session = OpenSession(folder)
+    session.log.write([Event("note", 1, {"text": "after"})])
+    session.close()
+    assert session.standing.takes == {("Back stroke 1", 1): path.name}
+    assert [e.what for e in read_events(folder)] == ["take", "note"]
+
+
+def test_a_recording_that_the_log_does_not_know_is_taken_in(folder: Path) -> None:
+    """Killed between the recording and its line in the log; it was made again, so the earlier one is set aside."""
+    earlier = made(folder, ("Back stroke 1", 1), 50)
+    later = made(folder, ("Back stroke 1", 1), 60, log=False)
+    assert opened(folder).standing.takes == {("Back stroke 1", 1): later.name}
+    assert set_aside(folder) == {earlier.name: "recorded again"}
+    assert opened(folder).standing.takes == {("Back stroke 1", 1): later.name}
+
+
+def test_what_was_begun_is_to_be_made_again(folder: Path) -> None:
+    start = Event("start", 50, {"gesture": "Hold strong", "repetition": 1, "row": 3})
+    standing = opened(folder, start).standing
+    assert standing.takes == {}
+    assert "is to be made again" in standing.mended[0]
+    assert [e.what for e in read_events(folder)] == ["start", "unfinished"]
+    assert opened(folder).standing.mended == []
+
+
+def test_what_is_half_goes_and_what_is_damaged_is_set_aside(folder: Path) -> None:
+    for name in ("Hold strong_9_4.json.part", "Hold strong_9_4.csv.new", "Hold strong_9_4.json"):
+        (folder / name).write_text("{}")
+    cut = made(folder, ("Head stroke 1", 1), 60)
+    cut.write_bytes(cut.read_bytes()[:-20])
+    gone = made(folder, ("Tail tap 1", 1), 70)
+    gone.unlink()
+    standing = opened(folder).standing
+    assert standing.takes == {}
+    assert len(standing.mended) == 2
+    assert sorted(p.name for p in folder.iterdir()) == [
+        cut.name + ".torn", STREAM_NAME, "session.json", "session.jsonl",
+    ]  # fmt: skip
+
+
+def test_a_second_program_is_refused(folder: Path) -> None:
+    session = OpenSession(folder)
+    code = (
+        "import sys; from pathlib import Path\n"
+        "from plushsense.recording.session import OpenSession\n"
+        "from plushsense.core.errors import DatasetError\n"
+        "try: OpenSession(Path(sys.argv[1]))\n"
+        "except DatasetError as refusal: print(refusal)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(folder)], capture_output=True, text=True, check=True)
+    session.close()
+    assert "Another program is recording" in done.stdout
+    OpenSession(folder).close()
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"protocol": load_protocol("rest").to_dict()}, "protocol 'quick', not 'rest'"),
+        ({"protocol": load_protocol("quick").to_dict() | {"repetitions": 2}}, "another one of that name"),
+        ({"layout": load_layout("plush-15").to_dict()}, "layout 'accel-3', not 'plush-15'"),
+        ({"consent": "C-2"}, "consent 'C-1', not 'C-2'"),
+        ({"subject": "S02"}, "subject 'S01', not 'S02'"),
+        ({"simulated": True}, "real toy"),
+    ],
+)
+def test_another_session_is_not_mixed_in(folder: Path, change: dict[str, object], said: str) -> None:
+    with pytest.raises(DatasetError, match=said):
+        OpenSession(folder, replace(HEAD, **change))  # type: ignore[arg-type]
+    OpenSession(folder, HEAD).close()
+
+
+def test_what_was_left_out_may_be_said_later(folder: Path) -> None:
+    OpenSession(folder, SessionHead("S01", "1", 9, {}, {}, age_group="child")).close()
+    assert SessionHead.read(folder) == replace(HEAD, age_group="child")
+
+
+def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "fulldatastream.csv").write_text("1, 2\n")
+    with pytest.raises(DatasetError, match="nothing is mixed"):
+        OpenSession(tmp_path, HEAD)
+    with pytest.raises(DatasetError, match="holds no session"):
+        OpenSession(tmp_path)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DatasetError, match="cannot be used"):
+        OpenSession(tmp_path / "file" / "x", HEAD)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "fulldatastream.csv"]
+
+
+def test_which_session_comes_next(tmp_path: Path) -> None:
+    person = tmp_path / "S01"
+    assert next_session(person) == "1"
+    for name, started in (("1", 5), ("autumn", 4)):
+        OpenSession(person / name, replace(HEAD, session=name, started_ms=started)).close()
+    assert session_names(person) == ["autumn", "1"]
+    assert (next_session(person), new_session(person)) == ("1", "2")
+    opened(person / "1", Event("finished", 9))
+    assert next_session(person) == "2"
+    opened(person / "1", Event("redo", 10, {"file": "x"}))
+    assert not is_finished(person / "1")
+
+
+@pytest.mark.parametrize("code", ["S01", "none", "7", "P1-b", "child_3", "AB"])
+def test_a_code(code: str) -> None:
+    assert check_subject(code) == code
+
+
+@pytest.mark.parametrize(
+    "code", ["Anna", "Anna Miller", "", "../S01", "S01/x", "a" * 16 + "1", "Jürgen1", "COM1", "-1"]
+)
+def test_no_code(code: str) -> None:
+    with pytest.raises(DatasetError, match="is no code for a person"):
+        check_subject(code)
+
+
+def test_a_sessions_name_is_a_folders_name() -> None:
+    assert check_session("autumn-2") == "autumn-2"
+    for name in ("", "..", "a/b", "a b", "x" * 33):
+        with pytest.raises(DatasetError, match="no name for a session"):
+            check_session(name)
+
+
+def test_the_head_keeps_the_resolved_protocol(folder: Path) -> None:
+    table = json.loads((folder / "session.json").read_text())
+    assert table["protocol"]["prompts"]["Hold strong"].startswith("Hold the toy")
+    assert table["layout"]["name"] == "accel-3"

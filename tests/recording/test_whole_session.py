@@ -1,0 +1,240 @@
+"""The paper's session, 17 gestures three times each, over a pseudo terminal: in one piece, and killed on the way."""
+
+from __future__ import annotations
+
+import json
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from plushsense.core.recfile import STREAM_NAME, parse_name, read_recording, read_stream
+from plushsense.core.signal import load_layout
+from plushsense.dataset.importers import import_recordings
+from plushsense.devices.toy import serve_pty
+from plushsense.devices.virtual.cues import LogCues
+from plushsense.devices.virtual.session import GESTURES
+from plushsense.devices.virtual.stream import Performed, ToySpec
+from plushsense.recording.sessionfile import SESSION_LOG, read_events
+
+SPEED = 60.0
+KILL_SPEED = 8.0
+"""For the kills: a second of the toy is then 125 ms, which a busy machine may well take to run the next process."""
+pytestmark = pytest.mark.usefixtures("pty_possible")
+LAYOUT = load_layout("plush-15")
+QUIET = ToySpec(person=7, lost=0.0, garbled=0.0, glitch=0.0)
+"""A toy whose line loses nothing: what is missing then was lost by the recorder."""
+
+
+@dataclass
+class Toy:
+    """A toy that runs in a thread: its URL, the bytes it sent, and what its person did."""
+
+    url: str = ""
+    pieces: list[bytes] = field(default_factory=list)
+    performed: list[Performed] = field(default_factory=list)
+    readers: list[subprocess.Popen[str]] = field(default_factory=list)
+
+    @property
+    def last_ms(self) -> int:
+        """The toy's clock at the last line that it sent."""
+        return int(self.pieces[-1].split(b"\n")[-2].split()[-2])
+
+    def sent(self) -> dict[int, tuple[int, ...]]:
+        """The values that were sent, by the toy's clock."""
+        rows = [tuple(map(int, line.split())) for line in b"".join(self.pieces).splitlines()]
+        return {row[-2]: row[:-2] for row in rows}
+
+
+@contextmanager
+def pty_toy(log: Path, speed: float, spec: ToySpec = QUIET) -> Iterator[Toy]:
+    """A toy on a pseudo terminal whose person does what the session in ``log`` asks for."""
+    toy, ready, stop = Toy(), threading.Event(), threading.Event()
+
+    def on_ready(url: str) -> None:
+        toy.url = url
+        ready.set()
+
+    def work() -> None:
+        serve_pty(
+            spec, speed=speed, on_ready=on_ready, on_sent=toy.pieces.append, on_performed=toy.performed.append,
+            cues=LogCues(log), stop=stop,
+        )  # fmt: skip
+
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    assert ready.wait(5)
+    try:
+        yield toy
+    finally:
+        # One that a failed test leaves would wait for its port, and take the next toy's.
+        for reader in toy.readers:
+            reader.kill()
+            reader.wait(10)
+        stop.set()
+        thread.join(15)
+        assert not thread.is_alive()
+
+
+def recording(out: Path, toy: Toy, speed: float, *words: str) -> subprocess.Popen[str]:
+    """``plushsense record`` as a program of its own, pressing its own space bar."""
+    process = subprocess.Popen(
+        [
+            sys.executable, "-m", "plushsense.apps.cli.main", "record", str(out), "--device", toy.url,
+            "--subject", "S01", "--speed", str(speed), "--auto", "4", "--json", *words,
+        ],
+        stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    toy.readers.append(process)
+    return process
+
+
+def result(process: subprocess.Popen[str], timeout_s: float = 120.0) -> dict[str, Any]:
+    """What the program says at its end."""
+    out, err = process.communicate(timeout=timeout_s)
+    assert process.returncode == 0, err
+    found: dict[str, Any] = json.loads(out)
+    return found
+
+
+def kill(process: subprocess.Popen[str]) -> None:
+    """``kill -9``"""
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+
+
+def recordings(folder: Path) -> list[Path]:
+    """The finished recordings of a session."""
+    return sorted(p for p in folder.glob("*.csv") if parse_name(p.name) is not None)
+
+
+def check_whole(folder: Path, toy: Toy) -> int:
+    """Every recording is whole, as its name and sidecar say, and is exactly what the toy sent and the stream holds.
+
+    Returns how many there are.
+    """
+    sent = toy.sent()
+    clocks = sorted(sent)
+    at = {clock: n for n, clock in enumerate(clocks)}
+    stream = (folder / STREAM_NAME).read_text(encoding="utf-8").splitlines()
+    for path in recordings(folder):
+        lines = path.read_text(encoding="utf-8").splitlines()
+        name, beside = parse_name(path.name), json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
+        assert name is not None
+        assert name.rows == len(lines) - 1 == beside["rows"]
+        row = beside["stream_row"]
+        assert lines[1:] == stream[row : row + name.rows]
+        frames = read_recording(path, LAYOUT).frames
+        first = at[int(frames.device_ms[0])]
+        assert frames.device_ms.tolist() == clocks[first : first + name.rows]
+        assert [tuple(v) for v in frames.values.tolist()] == [sent[c] for c in frames.device_ms.tolist()]
+        assert (beside["lost"], beside["malformed"], beside["gaps"]) == (0, 0, [])
+    whole = read_stream(folder / STREAM_NAME, LAYOUT)
+    assert whole.malformed == 0
+    assert whole.warnings == []
+    for clock, values in zip(whole.frames.device_ms.tolist(), whole.frames.values.tolist(), strict=True):
+        assert sent[clock] == tuple(values)
+    return len(recordings(folder))
+
+
+def test_51_recordings_that_import_again(tmp_path: Path) -> None:
+    out, folder = tmp_path / "out", tmp_path / "out" / "S01" / "1"
+    with pty_toy(folder / SESSION_LOG, SPEED) as toy:
+        said = result(recording(out, toy, SPEED, "--age-group", "child"))
+    assert {k: said[k] for k in ("recordings", "skipped", "redone", "lost", "gaps", "finished", "resumed")} == {
+        "recordings": 51, "skipped": 0, "redone": 0, "lost": 0, "gaps": [], "finished": True, "resumed": False,
+    }  # fmt: skip
+    assert check_whole(folder, toy) == 51
+    made = [n.label for p in recordings(folder) if (n := parse_name(p.name)) is not None]
+    assert {label: made.count(label) for label in GESTURES} == dict.fromkeys(GESTURES, 3)
+    _hand_follows_prompt(folder, toy)
+    summary = import_recordings(out, tmp_path / "ds", layout="plush-15")
+    assert summary.recordings == 51
+    assert summary.streams == 1
+    flags = {flag for r in summary.dataset.recordings for flag in r.flags}
+    assert flags == set()
+    located = {r.file.rsplit("/", 1)[-1]: r.stream_row for r in summary.dataset.recordings}
+    assert located == {p.name: json.loads(p.with_suffix(".json").read_text())["stream_row"] for p in recordings(folder)}
+
+
+def _hand_follows_prompt(folder: Path, toy: Toy) -> None:
+    """What the virtual person did during a recording is what was asked for, nearly always in time."""
+    right = 0
+    for path in recordings(folder):
+        beside = json.loads(path.with_suffix(".json").read_text())
+        first, last = beside["device_ms"]
+        during = [p.label for p in toy.performed if first <= p.start_ms <= last]
+        assert during in ([], [beside["gesture"]])
+        right += during == [beside["gesture"]]
+    assert right >= 48
+
+
+def hasty(folder: Path) -> tuple[str, ...]:
+    """The paper's 17 gestures three times, each only a second long: options of the recorder."""
+    own = folder / "hasty.toml"
+    own.write_text('name = "hasty"\ngesture_set = "plush-18"\ncountdown_s = 0.5\n', encoding="utf-8")
+    return ("--protocol", str(own), "--auto", "1")
+
+
+def kill_and_check(out: Path, toy: Toy, after_s: float, speed: float, *words: str) -> dict[str, float]:
+    """Record, kill -9 after so long, and look at what is there: how much of the stream is missing, in ms."""
+    folder = out / "S01" / "1"
+    process = recording(out, toy, speed, *words)
+    until = time.monotonic() + 30
+    rows = (folder / STREAM_NAME).stat().st_size if (folder / STREAM_NAME).exists() else 0
+    while not (folder / STREAM_NAME).exists() or (folder / STREAM_NAME).stat().st_size <= rows:
+        assert time.monotonic() < until
+        assert process.poll() is None
+        time.sleep(0.01)
+    time.sleep(after_s)
+    done = len(recordings(folder))
+    sent_ms = toy.last_ms
+    kill(process)
+    stream = read_stream(folder / STREAM_NAME, LAYOUT)
+    before = [e for e in read_events(folder) if e.what in ("start", "take", "abandon", "unfinished")]
+    return {
+        "recordings": done,
+        "missing_ms": sent_ms - int(stream.frames.device_ms[-1]),
+        "torn": float(stream.malformed),
+        "in_a_recording": float(bool(before) and before[-1].what == "start"),
+    }
+
+
+def test_killed_three_times(tmp_path: Path) -> None:
+    """At most the last second of the stream is missing, no finished recording is damaged, and it goes on to the end."""
+    out, folder = tmp_path / "out", tmp_path / "out" / "S01" / "1"
+    moments = random.Random()
+    words = hasty(tmp_path)
+    with pty_toy(folder / SESSION_LOG, KILL_SPEED) as toy:
+        for _ in range(3):
+            found = kill_and_check(out, toy, moments.uniform(0.1, 4.5), KILL_SPEED, *words)
+            assert found["missing_ms"] <= 1000
+            assert len(recordings(folder)) >= found["recordings"]
+        said = result(recording(out, toy, KILL_SPEED, *words))
+    assert (said["recordings"], said["finished"], said["resumed"]) == (51, True, True)
+    assert check_whole(folder, toy) == 51
+    assert not [p.name for p in folder.iterdir() if p.suffix in (".part", ".new", ".torn", ".lock")]
+    # What is missing lies between two runs, nowhere else.
+    stream = read_stream(folder / STREAM_NAME, LAYOUT).frames
+    opened = {e.more["row"] for e in read_events(folder) if e.what == "open"}
+    gaps = set((np.flatnonzero(np.abs(np.diff(stream.device_ms)) > 15) + 1).tolist())
+    assert gaps <= opened
+
+
+def test_killed_at_real_speed(tmp_path: Path) -> None:
+    """At real speed rows are collected for half a second: then, too, at most the last second is missing."""
+    folder = tmp_path / "out" / "S01" / "1"
+    with pty_toy(folder / SESSION_LOG, 1.0) as toy:
+        found = kill_and_check(tmp_path / "out", toy, 2.0 + random.random(), 1.0)
+    assert found["missing_ms"] <= 1000
+    assert len(read_stream(folder / STREAM_NAME, LAYOUT).frames) > 150
