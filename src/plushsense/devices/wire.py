@@ -83,7 +83,7 @@ class LineParser:
 
     def finish(self) -> None:
         """The source has ended: half a line that is still waiting is counted as malformed."""
-        if self._pending.strip() and not self._skipping:
+        if self._pending.translate(_SEPARATORS).strip() and not self._skipping:
             self.counters.malformed += 1
         self._pending.clear()
         self._skipping = False
