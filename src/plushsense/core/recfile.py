@@ -23,11 +23,12 @@ STREAM_NAME = "fulldatastream.csv"
 # Lies in a folder of simulated recordings, so that no score on them can pass for a result.
 SIMULATION_MARK = "SIMULATION.txt"
 _NAME = re.compile(r"^(?P<label>.+)_(?P<epoch>\d{1,18})_(?P<rows>\d{1,12})\.csv$", re.IGNORECASE)
-_SPLIT = re.compile(rb"[;,\t]\s*|\s+")
 _LIMIT = 2.0**53
 # Layouts begin at 1 frame a second: delays over twice that are none.
 _SLOWEST_MS = 2000
 _PAUSE_MS = 60_000
+_BLOCK = 1000
+LONGEST_LABEL = 200
 
 
 @dataclass(frozen=True)
@@ -136,19 +137,32 @@ def _column_keys(first: bytes, layout: Layout, path: Path) -> tuple[list[str], b
     )
 
 
-def _parse_slowly(lines: list[bytes], width: int, label_at: int | None) -> tuple[list[list[float]], list[str], int]:
-    """Rows, labels and the number of malformed lines, for a file that the fast reader refuses."""
+def _cells(line: bytes, separator: str | None, width: int) -> list[bytes]:
+    """The fields of a line; a separator too many at its end is none."""
+    if separator is None:
+        return line.split()
+    cells = [c.strip() for c in line.split(separator.encode())]
+    while len(cells) > width and not cells[-1]:
+        cells.pop()
+    return cells
+
+
+def _parse_slowly(
+    lines: list[bytes], separator: str | None, width: int, label_at: int | None
+) -> tuple[list[list[float]], list[str], int]:
+    """Rows, labels and the number of malformed lines, for lines that the fast reader refuses."""
     rows, labels, malformed = [], [], 0
     for line in lines:
         if not line.strip():
             continue
-        cells = [c for c in _SPLIT.split(line.strip()) if c]
+        cells = _cells(line, separator, width)
         try:
             if len(cells) != width:
                 raise ValueError
             text = cells.pop(label_at).decode("utf-8", "replace") if label_at is not None else ""
-            row = [float(c) for c in cells]
-            if not all(abs(v) < _LIMIT for v in row):
+            # Python alone takes 1_000 for a number.
+            row = [float(c) if b"_" not in c else np.nan for c in cells]
+            if not all(abs(v) < _LIMIT for v in row) or len(text) > LONGEST_LABEL:
                 raise ValueError
         except ValueError:
             malformed += 1
@@ -158,36 +172,67 @@ def _parse_slowly(lines: list[bytes], width: int, label_at: int | None) -> tuple
     return rows, labels, malformed
 
 
+def _parse_fast(data: bytes, separator: str | None, skip: int, width: int) -> NDArray[np.float64] | None:
+    """Numbers (T, width), or None when one line or value does not fit."""
+    try:
+        table = np.loadtxt(io.BytesIO(data), delimiter=separator, skiprows=skip, ndmin=2, comments=None)
+    except ValueError:
+        return None
+    return table if table.shape[1] == width and np.all(np.abs(table) < _LIMIT) else None
+
+
+def _parse_in_blocks(lines: list[bytes], separator: str | None, width: int) -> tuple[list[NDArray[np.float64]], int]:
+    """Blocks of rows and the number of malformed lines: one bad line makes its own block slow, not the whole file."""
+    blocks, malformed = [], 0
+    for at in range(0, len(lines), _BLOCK):
+        block = lines[at : at + _BLOCK]
+        if not any(line.strip() for line in block):
+            continue
+        table = _parse_fast(b"\n".join(block), separator, 0, width)
+        if table is None:
+            rows, _, bad = _parse_slowly(block, separator, width, None)
+            malformed += bad
+            table = np.array(rows).reshape(-1, width)
+        blocks.append(table)
+    return blocks, malformed
+
+
 def _table(
     data: bytes, keys: list[str], skip: int, path: Path
 ) -> tuple[NDArray[np.float64], NDArray[np.str_] | None, int]:
     """All numeric columns (T, columns), the labels where there are any, and how many lines were malformed."""
-    lines = data.split(b"\n")[skip:]
     label_at = keys.index("label") if "label" in keys else None
-    numeric = [i for i in range(len(keys)) if i != label_at]
-    sample = next((line for line in lines if line.strip()), b"")
-    separator = _separator(sample)
+    begin = data.find(b"\n") + 1 if skip else 0
+    while data[begin : begin + 1] == b"\n":
+        begin += 1
+    end = data.find(b"\n", begin)
+    separator = _separator(data[begin:end] if end >= 0 else data[begin:])
+    malformed = 0
     if label_at is None:
-        try:
-            table = np.loadtxt(io.BytesIO(data), delimiter=separator, skiprows=skip, ndmin=2, comments=None)
-            if table.shape[1] == len(keys) and np.all(np.abs(table) < _LIMIT):
-                return table, None, 0
-        except ValueError:
-            pass
-    elif label_at == len(keys) - 1 and separator:
-        parts = [line.rsplit(separator.encode(), 1) for line in lines if line.strip()]
-        try:
-            table = np.loadtxt([p[0].decode() for p in parts], delimiter=separator, ndmin=2, comments=None)
-            if table.shape[1] == len(numeric) and np.all(np.abs(table) < _LIMIT):
-                return table, np.array([p[1].strip().decode() for p in parts]), 0
-        except (ValueError, IndexError):
-            pass
-    rows, labels, malformed = _parse_slowly(lines, len(keys), label_at)
-    if not rows:
-        raise FileFormatError(
-            f"'{path.name}' has no usable row: each must hold {len(keys)} numbers ({', '.join(keys)})."
-        )
-    return np.array(rows), np.array(labels) if label_at is not None else None, malformed
+        table = _parse_fast(data, separator, skip, len(keys))
+        if table is not None:
+            return table, None, 0
+        blocks, malformed = _parse_in_blocks(data.split(b"\n")[skip:], separator, len(keys))
+        table = np.concatenate(blocks) if blocks else np.empty((0, len(keys)))
+        if len(table):
+            return table, None, malformed
+    else:
+        lines = data.split(b"\n")[skip:]
+        if label_at == len(keys) - 1 and separator:
+            parts = [line.rsplit(separator.encode(), 1) for line in lines if line.strip()]
+            try:
+                texts = [p[1].strip().decode() for p in parts]
+                table = _parse_fast(b"\n".join(p[0] for p in parts), separator, 0, len(keys) - 1)
+                if table is not None and len(table) == len(texts) and max(map(len, texts)) <= LONGEST_LABEL:
+                    return table, np.array(texts), 0
+            except (ValueError, IndexError):
+                pass
+        rows, labels, malformed = _parse_slowly(lines, separator, len(keys), label_at)
+        if rows:
+            return np.array(rows), np.array(labels), malformed
+    raise FileFormatError(
+        f"'{path.name}' has no usable row: each must hold {len(keys)} numbers ({', '.join(keys)})."
+    )
 
 
 def _looks_like_delay(column: NDArray[np.int64], host_ms: NDArray[np.int64] | None) -> bool:
@@ -261,7 +306,9 @@ def _read(path: Path, layout: Layout, *, whole_lines: bool = False) -> ReadResul
             warnings.append("no device clock: the host's time is used")
         else:
             raise FileFormatError(f"'{path.name}' has no clock column: {DEVICE_MS}, {DELAY_MS} or {HOST_MS}.")
-    frames = Frames(np.round(values / steps).astype(np.int64), clock, host, labels)
+    # What no integer holds is outside every valid range all the same.
+    whole = np.clip(np.round(values / steps), -_LIMIT, _LIMIT).astype(np.int64)
+    frames = Frames(whole, clock, host, labels)
     return ReadResult(frames, warnings, malformed + cut, header, integrated)
 
 
