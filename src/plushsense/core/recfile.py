@@ -230,9 +230,7 @@ def _table(
         rows, labels, malformed = _parse_slowly(lines, separator, len(keys), label_at)
         if rows:
             return np.array(rows), np.array(labels), malformed
-    raise FileFormatError(
-        f"'{path.name}' has no usable row: each must hold {len(keys)} numbers ({', '.join(keys)})."
-    )
+    raise FileFormatError(f"'{path.name}' has no usable row: each must hold {len(keys)} numbers ({', '.join(keys)}).")
 
 
 def _looks_like_delay(column: NDArray[np.int64], host_ms: NDArray[np.int64] | None) -> bool:

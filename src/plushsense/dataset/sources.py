@@ -1,7 +1,7 @@
 """Finding recordings in a folder that somebody brings: which file is what, and whose.
 
-Three shapes of folder are read: the sessions of our own recorder (`dataset.sessions`), the GestureRecorder's folders (by
-person, or by label after the authors' anonymising step), and folders of CSVs with a label on every row. Outside a
+Three shapes of folder are read: the sessions of our own recorder (`dataset.sessions`), the GestureRecorder's folders
+(by person, or by label after the authors' anonymising step), and folders of CSVs with a label on every row. Outside a
 session, the person is the folder nearest to the file.
 """
 
@@ -94,7 +94,7 @@ def source_files(source: Path) -> list[Path]:
 
 
 def is_simulation(source: Path, files: Iterable[Path]) -> bool:
-    """Whether the virtual toy made these: its mark, or a simulated data set, is in the source or in a folder above."""
+    """Whether the virtual toy made ``files``: its mark, or a simulated data set, is there or above."""
     if any(f.name == SIMULATION_MARK for f in files):
         return True
     for place in (source.resolve(), *source.resolve().parents):

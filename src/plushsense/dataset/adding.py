@@ -1,0 +1,149 @@
+"""Adding recordings to a data set that exists: only what is new by content, and nothing there is touched.
+
+The order of writing leaves a valid data set wherever it stops: the gesture set and the marks first (both mean nothing
+without their recordings), then each file by an atomic rename, the index last; done again, it goes on.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from plushsense.core.errors import DatasetError
+from plushsense.core.gestures import GestureSet
+from plushsense.dataset.copying import Copier, key_of
+from plushsense.dataset.freshness import sha256_of
+from plushsense.dataset.index import Progress, open_dataset, rebuild
+from plushsense.dataset.making import RECORDER, Account, ImportSummary, extended, merged_people, read_all, summary_of
+from plushsense.dataset.marks import MARKS, Mark, append_marks
+from plushsense.dataset.people import PersonInfo, read_people, write_people
+from plushsense.dataset.sources import Search
+from plushsense.dataset.store import HEAD, RECORDINGS, STREAMS, Dataset, write_atomically
+
+CACHE = "cache"
+
+
+@contextmanager
+def _workplace(dest: Path) -> Iterator[Path]:
+    """A folder on the data set's own disk, held by one import at a time; what a killed one left is in the cache."""
+    cache = dest / CACHE
+    cache.mkdir(exist_ok=True)
+    try:
+        with FileLock(cache / "adding.lock", timeout=0):
+            work = Path(tempfile.mkdtemp(prefix="adding-", dir=cache))
+            try:
+                yield work
+            finally:
+                shutil.rmtree(work, ignore_errors=True)
+    except Timeout:
+        raise DatasetError(f"Another import is adding to '{dest}' just now: wait for it to end.") from None
+
+
+def _there(dataset: Dataset) -> Copier:
+    """A copier that knows what the data set has; its work folder is still to be said."""
+    taken: dict[str, str] = {}
+    contents: dict[tuple[str, str], str] = {}
+    for kind, infos in ((RECORDINGS, dataset.recordings), (STREAMS, dataset.streams)):
+        for info in infos:
+            # Recordings that are rows of a stream are no files of their own.
+            if info.file.startswith(f"{kind}/"):
+                taken[key_of(info.file, companion=False)] = info.sha256
+                contents[(kind, info.sha256)] = info.file
+    for kind in (RECORDINGS, STREAMS):
+        for place, _, names in os.walk(dataset.path / kind):
+            for name in names:
+                path = Path(place) / name
+                file = path.relative_to(dataset.path).as_posix()
+                if not name.lower().endswith(".csv"):
+                    taken[key_of(file, companion=True)] = sha256_of(path)
+    return Copier(dataset.path, taken, contents)
+
+
+def _said_before(folder: Path) -> set[str]:
+    """Recordings that the recorder's marks name already: somebody may have decided otherwise since."""
+    said: set[str] = set()
+    try:
+        lines = (folder / MARKS).read_bytes().split(b"\n")
+    except FileNotFoundError:
+        return said
+    for line in lines:
+        try:
+            mark = json.loads(line)
+            if mark["who"] == RECORDER:
+                said.add(str(mark["recording"]))
+        except (ValueError, TypeError, KeyError, RecursionError):
+            continue
+    return said
+
+
+def refuse_mixture(dataset: Dataset, search: Search) -> None:
+    """Refuse to put recordings of the virtual toy among real ones, or the other way round."""
+    if dataset.head.simulated != search.simulated:
+        mine, theirs = ("real", "virtual") if search.simulated else ("virtual", "real")
+        raise DatasetError(
+            f"'{dataset.path}' holds recordings of a {mine} toy and the source those of a {theirs} one: "
+            "keep them apart."
+        )
+
+
+def add(
+    dest: Path,
+    search: Search,
+    gestures: GestureSet | None,
+    people: Mapping[str, PersonInfo],
+    progress: Progress | None,
+) -> ImportSummary:
+    """Add what a search found to the data set ``dest``; ``gestures`` may say more of gestures that are new to it.
+
+    Raises:
+        DatasetError: when the data set cannot be opened or written, or another import is at work.
+    """
+    began = time.perf_counter()
+    with _workplace(dest) as work:
+        dataset = open_dataset(dest)
+        refuse_mixture(dataset, search)
+        copier = _there(dataset)
+        copier.work = work
+        account = Account(search, copier)
+        head = replace(dataset.head, gestures=_with_described(dataset.head.gestures, gestures))
+        built = read_all(account, head, progress)
+        head = replace(head, gestures=extended(head.gestures, built.dataset))
+        subjects = {r.subject for r in (*dataset.recordings, *built.dataset.recordings)}
+        there = read_people(dest)
+        listed, notes = merged_people(there, search.people, people, subjects)
+        account.check()
+        new = set(account.kept)
+        if head.gestures != dataset.head.gestures:
+            write_atomically(dest / HEAD, head.to_toml())
+        known = _said_before(dest)
+        aside = {i: why for i, why in account.set_aside().items() if i not in known}
+        if aside:
+            append_marks(dest, [Mark(i, "exclude", RECORDER, why) for i, why in aside.items()])
+        if {p.subject: p for p in listed} != there:
+            write_people(dest, listed)
+        # Companions first: a recording that is there has its sidecar.
+        for file in sorted(new, key=lambda f: (f.lower().endswith(".csv"), f)):
+            target = dest / file
+            target.parent.mkdir(parents=True, exist_ok=True)
+            if target.exists():
+                raise DatasetError(f"'{target}' appeared while adding: nothing is overwritten, so run it once more.")
+            os.replace(work / file, target)
+        rebuilt = rebuild(dest, head).dataset if new or aside else open_dataset(dest)
+    summary = summary_of(rebuilt, account, search.notes + notes, new)
+    summary.seconds = time.perf_counter() - began
+    return summary
+
+
+def _with_described(mine: GestureSet, more: GestureSet | None) -> GestureSet:
+    """The data set's gestures in their order, and after them those that ``more`` describes and they lack."""
+    new = tuple(g for g in (more.gestures if more is not None else ()) if mine.find(g.label) is None)
+    return GestureSet(mine.name, mine.gestures + new, mine.inferred and not new) if new else mine

@@ -1,0 +1,125 @@
+"""Files of other programs, laid out as the recorder would have left them: a stream, and recordings cut from it.
+
+What is written here becomes the raw file of the data set. The original is not copied in (it may hold other devices,
+dates and names, which nobody could take out again); ``origin.json`` beside the stream names it with its SHA-256.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.recfile import LONGEST_LABEL, STREAM_NAME, Frames, format_rows, recording_filename, write_recording
+from plushsense.core.signal import HOST_MS, Layout
+from plushsense.dataset.sources import COMPANIONS, Found
+from plushsense.dataset.store import RECORDINGS, STREAMS
+
+ORIGIN = "origin.json"
+LARGEST = 2.0**53
+# Float storage moves a value by less than this share of a step; more means that the values are of another scale.
+_ROUNDED = 0.05
+
+
+@dataclass(frozen=True)
+class Cut:
+    """One recording: rows ``start`` to ``stop`` of the session's frames."""
+
+    label: str
+    start: int
+    stop: int
+
+
+@dataclass(frozen=True)
+class Original:
+    """The file that something was converted from, and what to say of it in ``origin.json``."""
+
+    path: Path
+    shown: str
+    more: dict[str, Any]
+
+    def to_json(self) -> str:
+        """The text of ``origin.json``."""
+        with self.path.open("rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+        return json.dumps({"source": self.shown, "sha256": digest} | self.more, ensure_ascii=False, indent=1) + "\n"
+
+
+def whole_steps(values: NDArray[np.float64], layout: Layout) -> tuple[NDArray[np.int64], str]:
+    """Values (T, C) in the layout's units as integer steps, and a sentence when they do not come in such steps."""
+    steps = np.array([c.step for c in layout.channels])
+    scaled = values / steps
+    rounded = np.round(scaled)
+    off = np.mean(np.abs(scaled - rounded) > _ROUNDED, axis=0) if len(values) else np.zeros(len(steps))
+    odd = [f"'{n}' (step {s:g})" for n, s, o in zip(layout.names, steps, off, strict=True) if o > 0.1]
+    said = (
+        f"values do not come in the steps of layout '{layout.name}' and were rounded: {', '.join(odd)}" if odd else ""
+    )
+    return np.clip(rounded, -LARGEST, LARGEST).astype(np.int64), said
+
+
+def usable_rows(*columns: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Rows (T,) in which every value of every column is a number that a file can hold."""
+    good = np.ones(len(columns[0]), dtype=bool)
+    for column in columns:
+        # NaN compares as false.
+        fits = np.abs(column) < LARGEST
+        good &= fits.all(axis=1) if fits.ndim == 2 else fits
+    return good
+
+
+def lay_out(
+    folder: Path,
+    subject: str,
+    session: str,
+    frames: Frames,
+    cuts: Sequence[Cut],
+    layout: Layout,
+    original: Original,
+    *,
+    with_stream: bool,
+) -> Iterator[Found]:
+    """Write one session into the new ``folder``: its recordings, the stream if wanted, and ``origin.json``.
+
+    A layout with a label on every row gets one stream that carries the labels, and no recordings of their own.
+    """
+    folder.mkdir(parents=True)
+    where = f"{original.shown}: {subject}{f', session {session}' if session else ''}"
+    main: Path | None = None
+    if "label" in layout.csv.columns:
+        apart = layout.csv.separator.strip() or " "
+        written = [" ".join(cut.label.replace(apart, "_").split()) for cut in cuts]
+        labels = np.full(len(frames), "", dtype=f"<U{max(map(len, written), default=1)}")
+        for cut, label in zip(cuts, written, strict=True):
+            labels[cut.start : cut.stop] = label
+        frames = Frames(frames.values, frames.device_ms, frames.host_ms, labels)
+        with_stream, cuts = True, ()
+    if with_stream:
+        main = folder / STREAM_NAME
+        with main.open("w", encoding="utf-8", newline="\n") as file:
+            for start in range(0, len(frames), 20_000):
+                file.write(format_rows(frames.slice(start, start + 20_000), layout))
+        yield Found(main, STREAMS, subject, session=session, origin=f"{where}, the whole stream")
+    written_paths: set[Path] = set()
+    clock = frames.device_ms if frames.host_ms is None or HOST_MS not in layout.csv.columns else frames.host_ms
+    for cut in cuts:
+        name = f"{where}, rows {cut.start + 1} to {cut.stop} ('{cut.label[:40]}')"
+        at_ms = abs(int(clock[cut.start]))
+        # Recordings of one label and length whose clocks all begin at 0 would have one name.
+        while (path := folder / recording_filename(cut.label, at_ms, cut.stop - cut.start)) in written_paths:
+            at_ms += 1
+        written_paths.add(path)
+        if len(path.name.encode("utf-8")) > LONGEST_LABEL:
+            yield Found(path, "", origin=name, reason="its label is too long for a file name")
+            continue
+        write_recording(path, frames.slice(cut.start, cut.stop), layout)
+        yield Found(path, RECORDINGS, subject, session=session, origin=name)
+    about = folder / ORIGIN
+    about.write_text(original.to_json(), encoding="utf-8", newline="\n")
+    yield Found(about, COMPANIONS, subject, session=session, origin=f"{where}, {ORIGIN}", beside=main)
