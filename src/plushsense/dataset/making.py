@@ -79,7 +79,7 @@ class Account:
         self.rejected: list[dict[str, str]] = []
         self.left_out: list[dict[str, str]] = []
         self._origin: dict[str, Found] = {}
-        refuse_merged([f for f in search.found if f.kind in (RECORDINGS, STREAMS)], people_there(copier.taken))
+        refuse_merged([f for f in search.found if f.kind in (RECORDINGS, STREAMS)], people_there(copier.contents.values()))
         # A companion goes where its file went.
         for found in sorted(search.found, key=lambda f: f.kind == COMPANIONS):
             if found.kind == LEFT_OUT:
@@ -134,9 +134,9 @@ def identity(file: str) -> str:
     return file.removeprefix(f"{RECORDINGS}/").rpartition(".")[0]
 
 
-def people_there(taken: Iterable[str]) -> set[str]:
-    """Folders of people among the paths that are taken, as they are compared."""
-    return {parts[1] for path in taken if len(parts := path.split("/")) > 2 and parts[0] in (RECORDINGS, STREAMS)}
+def people_there(files: Iterable[str]) -> set[str]:
+    """Folders of people, by the paths of raw files below the data set."""
+    return {parts[1] for path in files if len(parts := path.split("/")) > 2 and parts[0] in (RECORDINGS, STREAMS)}
 
 
 def extended(given: GestureSet | None, dataset: Dataset) -> GestureSet:

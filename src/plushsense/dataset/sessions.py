@@ -148,4 +148,5 @@ def people_of(sessions: Sessions) -> tuple[list[PersonInfo], list[str]]:
 
 def _plain(text: str) -> str:
     """A text as one line that every file can hold."""
-    return " ".join(text.encode("utf-8", "replace").decode("utf-8").split())
+    text = text.encode("utf-8", "replace").decode("utf-8")
+    return " ".join("".join(c if c.isprintable() else " " for c in text).split())

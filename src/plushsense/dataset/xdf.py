@@ -1,8 +1,8 @@
 """XDF files, as LabRecorder writes them: the stream that fits the layout, cut into recordings by the markers.
 
 A marker that names a gesture begins a recording; the next marker, whatever it says, ends it (``end`` and ``stop`` do
-only that), and so does the end of the stream. ``start Tail pull``, ``Tail pull/begin``, ``end Tail pull`` and the like are understood.
-Without a gesture set every marker but ``end`` and ``stop`` is a gesture.
+only that), and so does the end of the stream. ``start Tail pull``, ``Tail pull/begin``, ``end Tail pull`` and the like
+are understood. Without a gesture set every marker but ``end`` and ``stop`` is a gesture.
 """
 
 from __future__ import annotations
