@@ -116,9 +116,10 @@ def _column_keys(first: bytes, layout: Layout, path: Path) -> tuple[list[str], b
     """Column keys in file order, and whether the first line is a header."""
     separator = _separator(first)
     cells = [c.strip() for c in (first.split(separator.encode()) if separator else first.split())]
-    while cells and not cells[-1]:
-        cells.pop()
     columns = list(layout.csv.columns)
+    # A last field that is empty is a separator too many, or no label.
+    while cells and not cells[-1] and not (columns[-1] == "label" and len(cells) == len(columns)):
+        cells.pop()
     header = bool(cells) and not any(_is_number(c) for c in cells)
     if header:
         texts = [c.decode("utf-8", "replace").strip().casefold() for c in cells]

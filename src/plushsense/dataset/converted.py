@@ -16,7 +16,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.recfile import LONGEST_LABEL, STREAM_NAME, Frames, format_rows, recording_filename, write_recording
+from plushsense.core.recfile import (
+    LONGEST_LABEL,
+    STREAM_NAME,
+    Frames,
+    format_header,
+    format_rows,
+    recording_filename,
+    write_recording,
+)
 from plushsense.core.signal import HOST_MS, Layout
 from plushsense.dataset.sources import COMPANIONS, Found
 from plushsense.dataset.store import RECORDINGS, STREAMS
@@ -103,6 +111,8 @@ def lay_out(
     if with_stream:
         main = folder / STREAM_NAME
         with main.open("w", encoding="utf-8", newline="\n") as file:
+            if frames.labels is not None:
+                file.write(format_header(layout))
             for start in range(0, len(frames), 20_000):
                 file.write(format_rows(frames.slice(start, start + 20_000), layout))
         yield Found(main, STREAMS, subject, session=session, origin=f"{where}, the whole stream")

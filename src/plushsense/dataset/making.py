@@ -79,7 +79,9 @@ class Account:
         self.rejected: list[dict[str, str]] = []
         self.left_out: list[dict[str, str]] = []
         self._origin: dict[str, Found] = {}
-        refuse_merged([f for f in search.found if f.kind in (RECORDINGS, STREAMS)], people_there(copier.contents.values()))
+        refuse_merged(
+            [f for f in search.found if f.kind in (RECORDINGS, STREAMS)], people_there(copier.contents.values())
+        )
         # A companion goes where its file went.
         for found in sorted(search.found, key=lambda f: f.kind == COMPANIONS):
             if found.kind == LEFT_OUT:
@@ -207,10 +209,9 @@ def make(
             head = replace(head, gestures=GestureSet.infer(n.label for n in names if n is not None))
         built = read_all(account, head, progress)
         if not built.dataset.recordings:
-            first = next((r["reason"] for r in account.rejected if r["reason"]), "none")
+            reasons = [*built.unreadable.values(), *(r["reason"] for r in account.rejected), *search.notes[-1:], "none"]
             raise DatasetError(
-                f"'{source}' holds no recording that layout '{head.layout.name}' can read. "
-                f"The first: {next(iter(built.unreadable.values()), first)}"
+                f"'{source}' holds no recording that layout '{head.layout.name}' can read. The first: {reasons[0]}"
             )
         head = replace(head, gestures=extended(search.gestures, built.dataset))
         if {r.gesture for r in built.dataset.recordings} - set(head.gestures.labels):

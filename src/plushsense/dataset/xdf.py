@@ -30,6 +30,8 @@ from plushsense.dataset.sources import LEFT_OUT, Found
 
 _MAGIC = b"XDF:"
 _HEADER, _SAMPLES = 2, 3
+# Bringing two clocks together leaves this much between times that were equal.
+_SAME_S = 1e-6
 _SIZES = {"string": 1, "int8": 1, "int16": 2, "int32": 4, "float32": 4, "int64": 8, "double64": 8}
 _BEGIN = re.compile(r"^(?:start|begin)[\s_:/-]+(?P<a>.+)$|^(?P<b>.+)[\s_:/-]+(?:start|begin)$", re.IGNORECASE)
 _END = re.compile(r"^(?:end|stop)(?:[\s_:/-].*)?$|^.*[\s_:/-](?:end|stop)$", re.IGNORECASE | re.DOTALL)
@@ -63,7 +65,7 @@ def cuts_of(
     unknown: list[str] = []
     label, start = "", 0
     for marker in sorted(markers, key=lambda m: m.time_s):
-        row = int(np.searchsorted(rising, marker.time_s, side="left"))
+        row = int(np.searchsorted(rising, marker.time_s - _SAME_S, side="left"))
         if label and row > start:
             cuts.append(Cut(label, start, row))
         label, start = _named(marker.text, gestures), row
@@ -198,7 +200,7 @@ def _labels(stream: dict[str, Any]) -> list[str]:
     desc = (stream["info"].get("desc") or [None])[0]
     channels = (desc.get("channels") or [None])[0] if isinstance(desc, dict) else None
     listed = channels.get("channel") or [] if isinstance(channels, dict) else []
-    return [str((c.get("label") or [""])[0] or "").strip().casefold() if isinstance(c, dict) else "" for c in listed]
+    return [str((c.get("label") or [""])[0] or "") if isinstance(c, dict) else "" for c in listed]
 
 
 def match_columns(layout: Layout, labels: list[str], width: int) -> tuple[list[int], int | None] | str:
@@ -209,7 +211,7 @@ def match_columns(layout: Layout, labels: list[str], width: int) -> tuple[list[i
     """
     texts = dict(zip((h.casefold() for h in layout.csv.header), layout.csv.columns, strict=True))
     texts |= {n.casefold(): n for n in (*layout.names, DEVICE_MS)}
-    keys = [texts.get(label, "") for label in labels] if len(labels) == width else []
+    keys = [texts.get(label.strip().casefold(), "") for label in labels] if len(labels) == width else []
     if set(keys) & set(layout.names):
         missing = [n for n in layout.names if keys.count(n) != 1]
         if missing:
