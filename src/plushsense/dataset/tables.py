@@ -142,6 +142,9 @@ def read_parquet(path: Path, shown: str, layout: Layout, given: Mapping[str, str
         names = choose(there, layout, given, shown)
         with path.open("rb") as file:
             table = pl.read_parquet(file, columns=list(dict.fromkeys(names.values())))
+        nested = next((n for n in table.columns if table[n].dtype.is_nested()), None)
+        if nested is not None:
+            raise FileFormatError(f"'{shown}' has more than one value in a cell of column '{nested}'")
         texts = {r: _parquet_texts(pl, table[n]) for r, n in names.items() if r in _TEXTS}
         numbers = {r: _parquet_numbers(pl, table[n]) for r, n in names.items() if r not in _TEXTS}
         in_ms = table[names["time"]].dtype.is_temporal()
