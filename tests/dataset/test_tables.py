@@ -178,7 +178,7 @@ def test_parquet_dates_and_gaps(tmp_path: Path, parquet: None) -> None:
             "subject": [3] * 40,
             "label": ["Shake"] * 40,
             "time": [begin + timedelta(milliseconds=10 * i) for i in range(40)],
-            "x": [None] + list(range(39)),
+            "x": [None, *list(range(39))],
             "y": list(range(40)),
             "z": [0.0] * 40,
         }

@@ -16,7 +16,7 @@ from plushsense.core.gestures import load_gestures
 from plushsense.core.signal import load_layout
 from plushsense.dataset import xdf
 from plushsense.dataset.importers import import_recordings
-from plushsense.dataset.xdf import Marker, cuts_of, match_columns, whole_chunks, who
+from plushsense.dataset.xdf import Marker, cuts_of, match_columns, who, whole_chunks
 
 ACCEL = load_layout("accel-3")
 PLUSH = load_layout("plush-15")

@@ -23,6 +23,8 @@ STREAM_NAME = "fulldatastream.csv"
 # Lies in a folder of simulated recordings, so that no score on them can pass for a result.
 SIMULATION_MARK = "SIMULATION.txt"
 _NAME = re.compile(r"^(?P<label>.+)_(?P<epoch>\d{1,18})_(?P<rows>\d{1,12})\.csv$", re.IGNORECASE)
+_FULL_LINE = re.compile(rb"\S[^\n]*")
+_LONGEST_LINE = 1_000_000
 _LIMIT = 2.0**53
 # Layouts begin at 1 frame a second: delays over twice that are none.
 _SLOWEST_MS = 2000
@@ -203,11 +205,8 @@ def _table(
 ) -> tuple[NDArray[np.float64], NDArray[np.str_] | None, int]:
     """All numeric columns (T, columns), the labels where there are any, and how many lines were malformed."""
     label_at = keys.index("label") if "label" in keys else None
-    begin = data.find(b"\n") + 1 if skip else 0
-    while data[begin : begin + 1] == b"\n":
-        begin += 1
-    end = data.find(b"\n", begin)
-    separator = _separator(data[begin:end] if end >= 0 else data[begin:])
+    row = _FULL_LINE.search(data, data.find(b"\n") + 1 if skip else 0)
+    separator = _separator(row[0]) if row else None
     malformed = 0
     if label_at is None:
         table = _parse_fast(data, separator, skip, len(keys))
@@ -262,10 +261,7 @@ def _read(path: Path, layout: Layout, *, whole_lines: bool = False) -> ReadResul
     data = data.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     if b"\x00" in data[:4096]:
         raise FileFormatError(f"'{path.name}' is not a text file: a recording is CSV in UTF-8.")
-    first_at = 0
-    while first_at < len(data) and data[first_at : first_at + 1].isspace():
-        first_at += 1
-    data = data[first_at:]
+    data = data.lstrip()
     cut = whole_lines and b"\n" in data and not data.endswith(b"\n")
     if cut:
         data = data[: data.rfind(b"\n") + 1]
@@ -273,6 +269,8 @@ def _read(path: Path, layout: Layout, *, whole_lines: bool = False) -> ReadResul
         raise FileFormatError(f"'{path.name}' is empty: a recording has one row a sample.")
     end = data.find(b"\n")
     first = data if end < 0 else data[:end]
+    if len(first) > _LONGEST_LINE:
+        raise FileFormatError(f"'{path.name}' begins with a line of {len(first)} characters: that is no recording.")
     keys, header = _column_keys(first, layout, path)
     if header and (end < 0 or not data[end:].strip()):
         raise FileFormatError(f"'{path.name}' holds a header and no row.")

@@ -129,7 +129,7 @@ def unpack(path: Path, folder: Path, limits: Limits | None = None) -> list[tuple
     except _DAMAGED as cause:
         raise DatasetError(f"'{path}' is no zip, or a damaged one ({_said(cause)}): get it once more.") from None
     with archive:
-        members = [m for m in archive.infolist() if not m.is_dir()]
+        members = [m for m in archive.infolist() if not m.filename.endswith("/")]
         total = sum(m.file_size for m in members)
         if len(members) > limits.files or total > limits.total_bytes:
             raise DatasetError(
