@@ -19,7 +19,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from plushsense.core.errors import PlushSenseError
-from plushsense.core.recfile import Frames, format_rows, read_recording, read_stream, write_recording
+from plushsense.core.recfile import Frames, format_rows, read_recording, read_stream
 from plushsense.core.signal import load_layout
 from plushsense.dataset.importers import import_recordings
 from plushsense.dataset.index import open_dataset
@@ -51,7 +51,7 @@ class Place:
         return inside
 
     def _files(self, inside: Path) -> set[Path]:
-        near = set(self.root.iterdir()) | {self.root.parent / n for n in os.listdir(self.root.parent)}
+        near = set(self.root.iterdir()) | set(self.root.parent.iterdir())
         return near | {p for p in inside.parent.rglob("*") if p.is_symlink() or p.is_file()}
 
     def imported(self, source: Path, inside: Path, **said: Any) -> bool:
@@ -419,9 +419,7 @@ def test_names_that_are_no_text_and_links(place: Place, tmp_path: Path) -> None:
     put(inside / "src" / "zoe", "Shake_5_30.csv", GOOD)
     for name in (b"Sh\xffake_1_30.csv", b"Shake\n_1_30.csv", b"\x1b[31m_1_30.csv"):
         try:
-            Path(os.fsdecode(os.path.join(os.fsencode(inside / "src" / "zoe"), name))).write_bytes(
-                GOOD + b"1,2,3,4,5\n"
-            )
+            (inside / "src" / "zoe" / os.fsdecode(name)).write_bytes(GOOD + b"1,2,3,4,5\n")
         except OSError:
             continue
     (inside / "src" / "bad\udcff").mkdir()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import itertools
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import DatasetError, FileFormatError
 from plushsense.core.gestures import NOBODY, Gesture, plain_label
-from plushsense.core.recfile import Frames, ReadResult, parse_name, read_recording, read_stream
+from plushsense.core.recfile import Frames, ReadResult, parse_name, read_bytes, read_recording, read_stream
 from plushsense.dataset.freshness import (
     RECORDINGS_INDEX,
     STAMP,
@@ -22,7 +23,6 @@ from plushsense.dataset.freshness import (
     is_fresh,
     missing_files,
     raw_files,
-    sha256_of,
     taken,
     write_stamp,
 )
@@ -130,7 +130,9 @@ def build(folder: Path, head: DatasetHead, progress: Progress | None = None) -> 
         reader = read_stream if kind == STREAMS else read_recording
         relative = path.relative_to(folder).as_posix()
         try:
-            read = _Read(path, path.relative_to(folder / kind).parts[0], reader(path, head.layout), sha256_of(path))
+            data = read_bytes(path)
+            result = reader(path, head.layout, data)
+            read = _Read(path, path.relative_to(folder / kind).parts[0], result, hashlib.sha256(data).hexdigest())
         except FileFormatError as cause:
             unreadable[relative] = str(cause)
             continue
@@ -214,13 +216,16 @@ def _usual_rows(reads: Iterable[tuple[str, int]]) -> dict[str, float]:
 
 def _from_files(folder: Path, head: DatasetHead, recordings: list[_Read], streams: list[_Read]) -> list[RecordingInfo]:
     named = []
+    gestures: dict[str, Gesture | None] = {}
     for read in recordings:
         name = parse_name(read.path.name)
         if name is None:
             raise DatasetError(
                 f"'{read.path}' is not named <label>_<epoch ms>_<rows>.csv: move it out of {RECORDINGS}/."
             )
-        found = head.gestures.find(name.label)
+        if name.label not in gestures:
+            gestures[name.label] = head.gestures.find(name.label)
+        found = gestures[name.label]
         named.append((read, name, found.label if found else name.label))
     usual = _usual_rows((label, len(read.result.frames)) for read, _, label in named)
     by_subject: dict[str, list[_Read]] = {}
@@ -234,7 +239,7 @@ def _from_files(folder: Path, head: DatasetHead, recordings: list[_Read], stream
         frames = read.result.frames
         identity = read.path.relative_to(folder / RECORDINGS).with_suffix("").as_posix()
         flags = read.result.warnings + findings(Examined(frames, head.layout, name.rows, usual[label]))
-        known = head.gestures.find(name.label)
+        known = gestures[name.label]
         if known is None or (known.affect == "none" and not head.gestures.inferred):
             flags.append(f"its label '{name.label}' is not in the gesture set '{head.gestures.name}': no affect")
         if read.sha256 in originals:

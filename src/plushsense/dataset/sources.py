@@ -119,6 +119,8 @@ def _not_a_file(path: Path) -> Found | None:
         path.name.encode("utf-8")
     except UnicodeEncodeError:
         return Found(path, "", reason="its name is not UTF-8: rename it")
+    if any(c < " " or c == "\x7f" for c in path.name):
+        return Found(path, "", reason="its name holds a control character: rename it")
     return None
 
 
