@@ -114,7 +114,7 @@ def from_zip(path: Path, ask: Ask) -> Search:
     if any(folder.rglob(HEAD)):
         raise DatasetError(f"'{path}' holds a data set: unpack it and open the folder, it needs no import.")
     search = from_folder(folder, ask, around=path.resolve().parent)
-    search.found += [Found(path, "", origin=name, reason=reason) for name, reason in refused]
+    search.found += [Found(path, "", origin=shown(Path(name)), reason=reason) for name, reason in refused]
     return search
 
 

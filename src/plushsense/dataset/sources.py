@@ -63,8 +63,9 @@ class Search:
 
 
 def shown(path: Path) -> str:
-    """A path as messages and the index can hold it: what is no text becomes escapes."""
-    return os.fsencode(path).decode("utf-8", "backslashreplace").replace(os.sep, "/")
+    """A path as a message can show it: what is no text, or would act on a terminal, becomes escapes."""
+    text = os.fsencode(path).decode("utf-8", "backslashreplace").replace(os.sep, "/")
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def source_files(source: Path) -> list[Path]:
