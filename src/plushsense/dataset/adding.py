@@ -10,7 +10,6 @@ import json
 import os
 import shutil
 import tempfile
-import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
@@ -107,7 +106,6 @@ def add(
     Raises:
         DatasetError: when the data set cannot be opened or written, or another import is at work.
     """
-    began = time.perf_counter()
     with _workplace(dest) as work:
         dataset = open_dataset(dest)
         refuse_mixture(dataset, search)
@@ -138,9 +136,7 @@ def add(
                 raise DatasetError(f"'{target}' appeared while adding: nothing is overwritten, so run it once more.")
             os.replace(work / file, target)
         rebuilt = rebuild(dest, head).dataset if new or aside else open_dataset(dest)
-    summary = summary_of(rebuilt, account, search.notes + notes, new)
-    summary.seconds = time.perf_counter() - began
-    return summary
+    return summary_of(rebuilt, account, search.notes + notes, new)
 
 
 def _with_described(mine: GestureSet, more: GestureSet | None) -> GestureSet:

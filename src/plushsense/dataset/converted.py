@@ -10,6 +10,7 @@ import hashlib
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +32,9 @@ from plushsense.dataset.store import RECORDINGS, STREAMS
 
 ORIGIN = "origin.json"
 LARGEST = 2.0**53
-# Float storage moves a value by less than this share of a step; more means that the values are of another scale.
-_ROUNDED = 0.05
+# A channel that moves by few steps of its layout is of another scale, when its values lie between the steps.
+_FEW_STEPS = 10.0
+_BETWEEN = 0.05
 
 
 @dataclass(frozen=True)
@@ -52,22 +54,33 @@ class Original:
     shown: str
     more: dict[str, Any]
 
+    @cached_property
+    def sha256(self) -> str:
+        """SHA-256 of the file."""
+        with self.path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+
     def to_json(self) -> str:
         """The text of ``origin.json``."""
-        with self.path.open("rb") as file:
-            digest = hashlib.file_digest(file, "sha256").hexdigest()
-        return json.dumps({"source": self.shown, "sha256": digest} | self.more, ensure_ascii=False, indent=1) + "\n"
+        table = {"source": self.shown, "sha256": self.sha256} | self.more
+        return json.dumps(table, ensure_ascii=False, indent=1) + "\n"
 
 
 def whole_steps(values: NDArray[np.float64], layout: Layout) -> tuple[NDArray[np.int64], str]:
-    """Values (T, C) in the layout's units as integer steps, and a sentence when they do not come in such steps."""
+    """Values (T, C) in the layout's units as integer steps, and a sentence when these are too coarse for them."""
     steps = np.array([c.step for c in layout.channels])
     scaled = values / steps
     rounded = np.round(scaled)
-    off = np.mean(np.abs(scaled - rounded) > _ROUNDED, axis=0) if len(values) else np.zeros(len(steps))
-    odd = [f"'{n}' (step {s:g})" for n, s, o in zip(layout.names, steps, off, strict=True) if o > 0.1]
+    if not len(values):
+        return rounded.astype(np.int64), ""
+    between = np.mean(np.abs(scaled - rounded) > _BETWEEN, axis=0) > 0.1
+    coarse = between & (np.std(scaled, axis=0) < _FEW_STEPS)
+    odd = [f"'{n}'" for n, is_odd in zip(layout.names, coarse, strict=True) if is_odd]
     said = (
-        f"values do not come in the steps of layout '{layout.name}' and were rounded: {', '.join(odd)}" if odd else ""
+        f"{', '.join(odd)}: the values are small fractions of what layout '{layout.name}' counts in and were rounded "
+        "to it: give a layout with a smaller step"
+        if odd
+        else ""
     )
     return np.clip(rounded, -LARGEST, LARGEST).astype(np.int64), said
 

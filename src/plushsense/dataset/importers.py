@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -273,6 +274,7 @@ def import_recordings(
     Raises:
         DatasetError: when there is nothing to import, or ``dest`` holds something already.
     """
+    began = time.perf_counter()
     source, dest = Path(source), Path(dest)
     given = layout if isinstance(layout, Layout) or layout is None else load_layout(layout)
     if gestures is not None and not isinstance(gestures, GestureSet):
@@ -305,21 +307,27 @@ def import_recordings(
         )
         search = search_source(source, ask)
         search.simulated = search.simulated or simulated
-        if head is not None:
+        if head is None:
+            done = make(source, dest, search, _new_head(source, search, name, licence, consent), told, progress)
+        else:
             try:
-                return add(dest, search, gestures, told, progress)
+                done = add(dest, search, gestures, told, progress)
             except OSError as cause:
                 raise DatasetError(
                     f"'{dest}' cannot be added to ({cause.strerror or cause}, {cause.filename}): it is as valid as "
                     "before; check the disk and run it once more."
                 ) from None
-        new = DatasetHead(
-            name=name or (source.resolve().name if source.is_dir() else source.stem),
-            layout=search.layout,
-            gestures=search.gestures or GestureSet("inferred", (), inferred=True),
-            licence=licence,
-            consent=consent,
-            source=search.shape,
-            simulated=search.simulated,
-        )
-        return make(source, dest, search, new, told, progress)
+    done.seconds = time.perf_counter() - began
+    return done
+
+
+def _new_head(source: Path, search: Search, name: str | None, licence: str, consent: str) -> DatasetHead:
+    return DatasetHead(
+        name=name or (source.resolve().name if source.is_dir() else source.stem),
+        layout=search.layout,
+        gestures=search.gestures or GestureSet("inferred", (), inferred=True),
+        licence=licence,
+        consent=consent,
+        source=search.shape,
+        simulated=search.simulated,
+    )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -201,7 +200,6 @@ def make(
     Raises:
         DatasetError: when nothing can be read, or ``dest`` holds something already.
     """
-    began = time.perf_counter()
     with whole_folder(dest, DatasetError, last=HEAD) as work:
         account = Account(search, Copier(work))
         if search.gestures is None:
@@ -227,9 +225,7 @@ def make(
         write(Dataset(work, head, infos, built.dataset.streams))
         account.check()
     dataset = Dataset(dest, head, infos, built.dataset.streams)
-    summary = summary_of(dataset, account, search.notes + notes, set(account.kept))
-    summary.seconds = time.perf_counter() - began
-    return summary
+    return summary_of(dataset, account, search.notes + notes, set(account.kept))
 
 
 def read_all(account: Account, head: DatasetHead, progress: Progress | None) -> Rebuilt:

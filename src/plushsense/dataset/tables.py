@@ -125,7 +125,8 @@ def read_csv(path: Path, shown: str, layout: Layout, given: Mapping[str, str]) -
 
 def _number(text: str) -> float:
     try:
-        return float(text)
+        # Python alone takes 1_000 for a number.
+        return float(text) if "_" not in text else float("nan")
     except ValueError:
         return float("nan")
 
@@ -251,6 +252,7 @@ def read_table(
     group = people * len(session_names) + sessions
     order = np.argsort(group, kind="stable")
     edges = [0, *(np.flatnonzero(np.diff(group[order])) + 1).tolist(), len(order)]
+    original = Original(path, shown, {"columns": columns.names})
     for number, (first, last) in enumerate(itertools.pairwise(edges)):
         mine = order[first:last]
         frames = Frames(whole.values[mine], whole.device_ms[mine], host_ms=_rows(whole.host_ms, mine))
@@ -268,7 +270,7 @@ def read_table(
             frames,
             cuts,
             layout,
-            Original(path, shown, {"columns": columns.names}),
+            original,
             with_stream=not labelled.all(),
         )
 
