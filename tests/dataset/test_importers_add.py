@@ -162,3 +162,15 @@ def test_gestures_that_are_new_keep_their_affect(tmp_path: Path, session_writer:
     assert done.dataset.gestures.get("Kiss").affect == "positive"
     assert done.warnings == []
     assert json.loads(json.dumps(done.to_dict()))["added"] == {"recordings": 1, "streams": 1}
+
+
+def test_what_the_recorder_says_anew_is_marked_anew() -> None:
+    aside = {"a": "sneezed", "b": "sneezed", "c": "", "d": "", "e": "sneezed", "f": ""}
+    decided = {
+        "b": ("exclude", "recorder"),
+        "c": ("exclude", "recorder"),
+        "d": ("exclude", "me"),
+        "e": ("include", "me"),
+    }
+    said = [(m.recording, m.action, m.who) for m in adding._new_marks(aside, decided)]
+    assert said == [("a", "exclude", "recorder"), ("c", "include", "recorder")]

@@ -59,11 +59,15 @@ def test_what_a_crash_left_is_named_and_no_fault(tmp_path: Path, session_writer:
     folder = session_writer(tmp_path / "out")
     (folder / "Tail pull_5_9.csv.part").write_text("1; 2")
     (folder / "session.lock").write_text("")
+    (folder / "Tail pull_6_9.csv.new").write_text("1; 2")
+    (folder / "Tail pull_7_9.csv.torn").write_text("1; 2")
     (folder / "Neck scratch 1_5_9.json").write_text("{")
     (folder / "holiday.png").write_bytes(b"x")
     done = import_recordings(tmp_path / "out", tmp_path / "DS")
     assert {e["file"].rsplit("/", 1)[-1]: e["reason"].split()[0] for e in done.left_out} == {
         "Tail pull_5_9.csv.part": "not",
+        "Tail pull_6_9.csv.new": "not",
+        "Tail pull_7_9.csv.torn": "damaged",
         "session.lock": "a",
         "Neck scratch 1_5_9.json": "the",
     }

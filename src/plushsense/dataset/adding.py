@@ -67,21 +67,32 @@ def _there(dataset: Dataset) -> Copier:
     return Copier(dataset.path, taken, contents)
 
 
-def _said_before(folder: Path) -> set[str]:
-    """Recordings that the recorder's marks name already: somebody may have decided otherwise since."""
-    said: set[str] = set()
+def _decided(folder: Path) -> dict[str, tuple[str, str]]:
+    """The last word on using each recording that is marked: exclude or include, and whose it is."""
+    decided: dict[str, tuple[str, str]] = {}
     try:
         lines = (folder / MARKS).read_bytes().split(b"\n")
     except FileNotFoundError:
-        return said
+        return decided
     for line in lines:
         try:
             mark = json.loads(line)
-            if mark["who"] == RECORDER:
-                said.add(str(mark["recording"]))
+            if mark["action"] in ("exclude", "include"):
+                decided[str(mark["recording"])] = (mark["action"], mark["who"])
         except (ValueError, TypeError, KeyError, RecursionError):
             continue
-    return said
+    return decided
+
+
+def _new_marks(aside: Mapping[str, str], decided: Mapping[str, tuple[str, str]]) -> list[Mark]:
+    """What the recorder says now and did not say before; what a person decided since stands."""
+    marks = []
+    for recording, why in aside.items():
+        action, who = decided.get(recording, ("include", RECORDER))
+        wanted = "exclude" if why else "include"
+        if who == RECORDER and action != wanted:
+            marks.append(Mark(recording, wanted, RECORDER, why or "kept after all"))
+    return marks
 
 
 def refuse_mixture(dataset: Dataset, search: Search) -> None:
@@ -122,10 +133,9 @@ def add(
         new = set(account.kept)
         if head.gestures != dataset.head.gestures:
             write_atomically(dest / HEAD, head.to_toml())
-        known = _said_before(dest)
-        aside = {i: why for i, why in account.set_aside().items() if i not in known}
-        if aside:
-            append_marks(dest, [Mark(i, "exclude", RECORDER, why) for i, why in aside.items()])
+        marks = _new_marks(account.aside(), _decided(dest))
+        if marks:
+            append_marks(dest, marks)
         if {p.subject: p for p in listed} != there:
             write_people(dest, listed)
         # Companions first: a recording that is there has its sidecar.
@@ -135,7 +145,7 @@ def add(
             if target.exists():
                 raise DatasetError(f"'{target}' appeared while adding: nothing is overwritten, so run it once more.")
             os.replace(work / file, target)
-        rebuilt = rebuild(dest, head).dataset if new or aside else open_dataset(dest)
+        rebuilt = rebuild(dest, head).dataset if new or marks else open_dataset(dest)
     return summary_of(rebuilt, account, search.notes + notes, new)
 
 

@@ -124,10 +124,11 @@ class Account:
         accounted = len(self._origin) + len(self.copier.already) + len(self.rejected) + len(self.left_out)
         assert accounted == len(self.search.found), "every source file is imported, left out or rejected"
 
-    def set_aside(self) -> dict[str, str]:
-        """Recordings that the recorder does not want used, by id, with the reason; also those there before."""
+    def aside(self) -> dict[str, str]:
+        """Why the recorder does not want a recording used, "" where it does, by id; also of those there before."""
         places = self.copier.copied | self.copier.already
-        return {identity(places[f.source]): f.aside for f in self.search.found if f.aside and f.source in places}
+        mine = (f for f in self.search.found if f.kind == RECORDINGS and f.source in places)
+        return {identity(places[f.source]): f.aside for f in mine}
 
 
 def identity(file: str) -> str:
@@ -218,8 +219,8 @@ def make(
         listed, notes = merged_people({}, search.people, people, {r.subject for r in built.dataset.recordings})
         if listed:
             write_people(work, listed)
-        if aside := account.set_aside():
-            append_marks(work, [Mark(i, "exclude", RECORDER, why) for i, why in aside.items()])
+        if marks := [Mark(i, "exclude", RECORDER, why) for i, why in account.aside().items() if why]:
+            append_marks(work, marks)
         (work / HEAD).write_text(head.to_toml(), encoding="utf-8")
         infos = with_marks(built.dataset.recordings, read_marks(work))
         write(Dataset(work, head, infos, built.dataset.streams))

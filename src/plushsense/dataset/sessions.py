@@ -17,8 +17,13 @@ from plushsense.dataset.sources import COMPANIONS, LEFT_OUT, Found
 from plushsense.dataset.store import RECORDINGS, STREAMS
 from plushsense.recording.sessionfile import SESSION_HEAD, SESSION_LOG, SIDECAR, SessionHead, set_aside
 
-PART = ".part"
-LOCK = ".lock"
+# What the recorder leaves when it is killed, or is still at work.
+LEFT_OVER = {
+    ".part": "not finished when the recorder stopped; its rows are in the session's stream",
+    ".new": "not finished when the recorder stopped; its rows are in the session's stream",
+    ".torn": "damaged by a crash and set aside by the recorder; its rows are in the session's stream",
+    ".lock": "a lock of the recorder",
+}
 
 Sessions = dict[Path, SessionHead | str]
 
@@ -111,10 +116,8 @@ def _find(place: Path, head: SessionHead, files: list[Path]) -> Iterator[Found]:
             yield found(RECORDINGS, why=aside.get(name, ""))
         elif path.parent == place and name in (SESSION_HEAD, SESSION_LOG):
             yield found(COMPANIONS, beside=stream if stream in files else None)
-        elif name.endswith(PART):
-            yield found(LEFT_OUT, "not finished when the recorder stopped; its rows are in the session's stream")
-        elif name.endswith(LOCK):
-            yield found(LEFT_OUT, "a lock of the recorder")
+        elif path.suffix in LEFT_OVER:
+            yield found(LEFT_OUT, LEFT_OVER[path.suffix])
         elif name.endswith(SIDECAR):
             main = mains.get(path.with_suffix("").as_posix())
             if main is None:
