@@ -139,8 +139,8 @@ def test_a_take_made_again_later_is_set_aside_once(tmp_path: Path, session_write
     append_marks(tmp_path / "DS", [Mark(aside.id, "include", "me", "it is good")])
     done = import_recordings(tmp_path / "out", tmp_path / "DS", add_to=True)
     assert not any(r.excluded for r in done.dataset.recordings), "what a person decided since stands"
-    logs = sorted((tmp_path / "DS" / "streams").rglob("session.jsonl"))
-    assert [p.parent.name for p in logs] == ["again-2", "s1"], "the log that grew is kept beside the first"
+    (log_there,) = (tmp_path / "DS" / "streams").rglob("session.jsonl")
+    assert log_there.read_bytes() == (folder / "session.jsonl").read_bytes(), "the log went on"
     assert len((tmp_path / "DS" / "marks.jsonl").read_text().splitlines()) == 2
 
 
@@ -174,3 +174,31 @@ def test_what_the_recorder_says_anew_is_marked_anew() -> None:
     }
     said = [(m.recording, m.action, m.who) for m in adding._new_marks(aside, decided)]
     assert said == [("a", "exclude", "recorder"), ("c", "include", "recorder")]
+
+
+def test_a_session_that_was_resumed_has_one_stream(tmp_path: Path, session_writer: Writer) -> None:
+    folder = session_writer(tmp_path / "out")
+    stream = folder / "fulldatastream.csv"
+    whole = stream.read_bytes()
+    lines = whole.splitlines(keepends=True)
+    last = max(folder.glob("Hold*"), key=lambda p: p.suffix == ".csv")
+    late = {p: p.read_bytes() for p in folder.glob("Hold*")}
+    for path in late:
+        path.unlink()
+    # Killed in the middle of a line; the recorder cuts that line off when it goes on.
+    stream.write_bytes(b"".join(lines[:140]) + lines[140][:20])
+    import_recordings(tmp_path / "out", tmp_path / "DS")
+    old = tmp_path / "old"
+    (tmp_path / "out").rename(old)
+    session_writer(tmp_path / "out")
+    done = import_recordings(tmp_path / "out", tmp_path / "DS", add_to=True)
+    assert [s.file for s in done.dataset.streams] == ["streams/P01/s1/fulldatastream.csv"]
+    assert (tmp_path / "DS" / "streams" / "P01" / "s1" / "fulldatastream.csv").read_bytes() == whole
+    assert [r.stream_row for r in done.dataset.recordings] == [160, 40]
+    assert any(r.file.endswith(last.name) for r in done.dataset.recordings)
+    again = import_recordings(old, tmp_path / "DS", add_to=True)
+    assert again.dataset.streams == done.dataset.streams, "the shorter one of before is in it"
+    other = [*lines[:3], b"1; 2\n", *lines[4:], *lines[:9]]
+    (old / "P01" / "s1" / "fulldatastream.csv").write_bytes(b"".join(other))
+    again = import_recordings(old, tmp_path / "DS", add_to=True)
+    assert len(again.dataset.streams) == 2, "another stream of the same name is kept beside it"

@@ -1,4 +1,6 @@
-"""Adding recordings to a data set that exists: only what is new by content, and nothing there is touched.
+"""Adding recordings to a data set that exists: only what is new by content, and nothing there is lost.
+
+A session that was resumed since has a longer stream and log, which begin with what is there: these take its place.
 
 The order of writing leaves a valid data set wherever it stops: the gesture set and the marks first (both mean nothing
 without their recordings), then each file by an atomic rename, the index last; done again, it goes on.
@@ -47,8 +49,8 @@ def _workplace(dest: Path) -> Iterator[Path]:
         raise DatasetError(f"Another import is adding to '{dest}' just now: wait for it to end.") from None
 
 
-def _there(dataset: Dataset) -> Copier:
-    """A copier that knows what the data set has; its work folder is still to be said."""
+def _copier(dataset: Dataset, work: Path) -> Copier:
+    """A copier into ``work`` that knows what the data set has."""
     taken: dict[str, str] = {}
     contents: dict[tuple[str, str], str] = {}
     for kind, infos in ((RECORDINGS, dataset.recordings), (STREAMS, dataset.streams)):
@@ -64,7 +66,7 @@ def _there(dataset: Dataset) -> Copier:
                 file = path.relative_to(dataset.path).as_posix()
                 if not name.lower().endswith(".csv"):
                     taken[key_of(file, companion=True)] = sha256_of(path)
-    return Copier(dataset.path, taken, contents)
+    return Copier(work, taken, contents, dataset.path)
 
 
 def _decided(folder: Path) -> dict[str, tuple[str, str]]:
@@ -120,8 +122,7 @@ def add(
     with _workplace(dest) as work:
         dataset = open_dataset(dest)
         refuse_mixture(dataset, search)
-        copier = _there(dataset)
-        copier.work = work
+        copier = _copier(dataset, work)
         account = Account(search, copier)
         head = replace(dataset.head, gestures=_with_described(dataset.head.gestures, gestures))
         built = read_all(account, head, progress)
@@ -142,7 +143,7 @@ def add(
         for file in sorted(new, key=lambda f: (f.lower().endswith(".csv"), f)):
             target = dest / file
             target.parent.mkdir(parents=True, exist_ok=True)
-            if target.exists():
+            if target.exists() and file not in copier.grown:
                 raise DatasetError(f"'{target}' appeared while adding: nothing is overwritten, so run it once more.")
             os.replace(work / file, target)
         rebuilt = rebuild(dest, head).dataset if new or marks else open_dataset(dest)

@@ -8,12 +8,16 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from plushsense.core.errors import DatasetError
+from plushsense.core.recfile import STREAM_NAME
 from plushsense.dataset.index import AGAIN
 from plushsense.dataset.sources import COMPANIONS, Found
 from plushsense.dataset.store import STREAMS, UNKNOWN_SUBJECT
+from plushsense.recording.sessionfile import SESSION_LOG
 
 TWICE = "the same file was already imported"
 ORPHAN = "belongs to '{}', which was not imported"
+# What the recorder only ever writes on.
+APPENDED = (STREAM_NAME, SESSION_LOG)
 _LONGEST = 120
 # Names that Windows keeps for devices, with any suffix.
 DEVICE_NAME = re.compile(r"^(con|prn|aux|nul|com[0-9¹²³]|lpt[0-9¹²³]|conin\$|conout\$)\s*(\.|$)", re.IGNORECASE)
@@ -60,7 +64,8 @@ class Copier:
 
     ``taken`` holds the SHA-256 by path below the data set, as file systems that ignore case see it: of raw files
     without suffix, for these are ids; of companions with it. ``contents`` are the raw files that are there already, by
-    kind and SHA-256: these are not copied again.
+    kind and SHA-256: these are not copied again. ``there`` is that data set's folder: a stream or a log in it that went
+    on since becomes the longer one.
     """
 
     def __init__(
@@ -68,8 +73,12 @@ class Copier:
         work: Path,
         taken: Mapping[str, str] | None = None,
         contents: Mapping[tuple[str, str], str] | None = None,
+        there: Path | None = None,
     ):
         self.work = work
+        self.there = there
+        self.grown: set[str] = set()
+        """Paths below the data set of files that are there, shorter."""
         self.taken = dict(taken or {})
         self.contents = dict(contents or {})
         self.copied: dict[Path, str] = {}
@@ -102,6 +111,12 @@ class Copier:
                     self.already[found.source] = f"{place}/{name}"
                     return ""
                 return TWICE
+            if (longer := self._goes_on(f"{place}/{name}", raw)) is not None:
+                if not longer:
+                    self.already[found.source] = f"{place}/{name}"
+                    return ""
+                self.grown.add(f"{place}/{name}")
+                break
             again += 1
             place = f"{folder}/{AGAIN}{again}"
         self.taken[key] = content
@@ -112,6 +127,21 @@ class Copier:
         if companion and found.beside is not None:
             self.companions.setdefault(self.copied.get(found.beside, ""), []).append(found.source)
         return ""
+
+    def _goes_on(self, file: str, raw: bytes) -> bool | None:
+        """Whether ``raw`` goes on where an append-only file that is there ends; False when that is the longer one.
+
+        None when neither begins with the other. A last line that a crash tore does not count: the recorder ends it.
+        """
+        if self.there is None or file.rpartition("/")[2] not in APPENDED or file in self.grown:
+            return None
+        try:
+            old = (self.there / file).read_bytes()
+        except OSError:
+            return None
+        shorter, longer = sorted((old, raw), key=len)
+        begins = shorter[: shorter.rfind(b"\n") + 1]
+        return longer is raw if begins and longer.startswith(begins) else None
 
     def _folder(self, found: Found) -> str | None:
         """The folder of the data set that a file goes to; None for a companion whose file did not come."""
