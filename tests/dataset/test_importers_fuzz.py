@@ -243,6 +243,34 @@ def test_sessions(
     place.imported(inside / "src", inside)
 
 
+def places(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """The way to every value in nested lists and dicts."""
+    yield path
+    inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, below in inner:
+        yield from places(below, (*path, key))
+
+
+LAYOUT = json.loads(json.dumps(load_layout("plush-15").to_dict()))
+NASTY = JSON | st.sampled_from(
+    [float("inf"), float("nan"), 10**400, -(10**30), 1e308, 5e-324, 0, True, "", "x_y", [], {}]
+)
+
+
+@some(120)
+@given(st.sampled_from([p for p in places(LAYOUT) if p]), NASTY)
+def test_layouts_of_sessions(place: Place, session_writer: Writer, path: tuple[Any, ...], value: Any) -> None:
+    inside = place.fresh()
+    folder = session_writer(inside / "src", gestures=["Tail pull"], rows=20)
+    head = json.loads((folder / "session.json").read_text())
+    at = head["layout"]
+    for key in path[:-1]:
+        at = at[key]
+    at[path[-1]] = value
+    (folder / "session.json").write_text(json.dumps(head))
+    place.imported(inside / "src", inside)
+
+
 MEMBER = st.sampled_from(
     [
         "../evil.csv",

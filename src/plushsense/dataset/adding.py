@@ -35,11 +35,13 @@ CACHE = "cache"
 
 @contextmanager
 def _workplace(dest: Path) -> Iterator[Path]:
-    """A folder on the data set's own disk, held by one import at a time; what a killed one left is in the cache."""
+    """A folder on the data set's own disk, held by one import at a time; what a killed one left is removed."""
     cache = dest / CACHE
     cache.mkdir(exist_ok=True)
     try:
         with FileLock(cache / "adding.lock", timeout=0):
+            for left in cache.glob("adding-*"):
+                shutil.rmtree(left, ignore_errors=True)
             work = Path(tempfile.mkdtemp(prefix="adding-", dir=cache))
             try:
                 yield work

@@ -164,7 +164,9 @@ class _FirstBytes(io.RawIOBase):
         return self._file.tell()
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        return self._file.seek(offset + (self._length if whence == os.SEEK_END else 0), whence % os.SEEK_END)
+        if whence == os.SEEK_END:
+            offset, whence = offset + self._length, os.SEEK_SET
+        return self._file.seek(offset, whence)
 
     def readinto(self, buffer: Any) -> int:
         left = max(0, self._length - self._file.tell())
