@@ -36,7 +36,7 @@ def read_sessions(files: Iterable[Path]) -> Sessions:
             continue
         try:
             head = SessionHead.read(path.parent)
-            if head is not None:
+            if head is not None and head.subject.strip():
                 Layout.from_dict(head.layout, "layout")
         except (BadInput, RecursionError) as cause:
             sessions[path.parent] = f"its {SESSION_HEAD} cannot be used: {cause}"
