@@ -204,3 +204,13 @@ def test_parquet_without_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     (tmp_path / "t.parquet").write_bytes(b"PAR")
     with pytest.raises(FileFormatError, match="no Parquet file"):
         import_recordings(tmp_path / "t.parquet", tmp_path / "DS", layout="accel-3")
+
+
+def test_a_table_that_grew_is_added(tmp_path: Path) -> None:
+    path = table(tmp_path / "all.csv", rows("ana", "Shake", 0, 50))
+    import_recordings(path, tmp_path / "DS", layout="accel-3")
+    table(path, rows("ana", "Shake", 0, 50) + rows("ana", "Wave", 200, 40) + rows("ben", "Wave", 0, 40))
+    done = import_recordings(path, tmp_path / "DS", add_to=True)
+    assert got(done) == [("ana", "1", "Shake", 50), ("ana", "1", "Wave", 40), ("ben", "1", "Wave", 40)]
+    assert (done.added["recordings"], done.already_there) == (2, 1)
+    assert done.rejected == []

@@ -142,7 +142,9 @@ def _column_keys(first: bytes, layout: Layout, path: Path) -> tuple[list[str], b
 
 
 def _cells(line: bytes, separator: str | None, width: int) -> list[bytes]:
-    """The fields of a line; a separator too many at its end is none."""
+    """The fields of a line, none of one without end; a separator too many at its end is none."""
+    if len(line) > _LONGEST_LINE:
+        return []
     if separator is None:
         return line.split()
     cells = [c.strip() for c in line.split(separator.encode())]
