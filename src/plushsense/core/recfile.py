@@ -6,7 +6,6 @@ gone and the separator is ``;``. A stream (``fulldatastream.csv``) has the same 
 
 from __future__ import annotations
 
-import io
 import os
 import re
 from collections.abc import Iterator
@@ -18,20 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import FileFormatError
+from plushsense.core.rows import LIMIT, LONGEST_LINE, parse_table, separator_of
 from plushsense.core.signal import DELAY_MS, DEVICE_MS, HOST_MS, Layout, layout_names, load_layout
 
 STREAM_NAME = "fulldatastream.csv"
 # Lies in a folder of simulated recordings, so that no score on them can pass for a result.
 SIMULATION_MARK = "SIMULATION.txt"
 _NAME = re.compile(r"^(?P<label>.+)_(?P<epoch>\d{1,18})_(?P<rows>\d{1,12})\.csv$", re.IGNORECASE)
-_FULL_LINE = re.compile(rb"\S[^\n]*")
-_LONGEST_LINE = 1_000_000
-_LIMIT = 2.0**53
 # Layouts begin at 1 frame a second: delays over twice that are none.
 _SLOWEST_MS = 2000
 _PAUSE_MS = 60_000
-_BLOCK = 1000
-LONGEST_LABEL = 200
 
 
 @dataclass(frozen=True)
@@ -106,10 +101,6 @@ def _is_number(text: bytes) -> bool:
     return True
 
 
-def _separator(line: bytes) -> str | None:
-    return ";" if b";" in line else "," if b"," in line else None
-
-
 def _suggest_layout(columns: int, layout: Layout) -> str:
     fitting = [n for n in layout_names() if n != layout.name and len(load_layout(n).csv.columns) == columns]
     return f" Layouts with {columns} columns: {', '.join(fitting)}." if fitting else ""
@@ -117,7 +108,7 @@ def _suggest_layout(columns: int, layout: Layout) -> str:
 
 def _column_keys(first: bytes, layout: Layout, path: Path) -> tuple[list[str], bool]:
     """Column keys in file order, and whether the first line is a header."""
-    separator = _separator(first)
+    separator = separator_of(first)
     cells = [c.strip() for c in (first.split(separator.encode()) if separator else first.split())]
     columns = list(layout.csv.columns)
     # A last field that is empty is a separator too many, or no label.
@@ -139,108 +130,6 @@ def _column_keys(first: bytes, layout: Layout, path: Path) -> tuple[list[str], b
         f"'{path.name}' has {len(cells)} columns, but a file of layout '{layout.name}' has {len(columns)} "
         f"({', '.join(columns)}): choose another --layout.{_suggest_layout(len(cells), layout)}"
     )
-
-
-def _cells(line: bytes, separator: str | None, width: int) -> list[bytes]:
-    """The fields of a line, none of one without end; a separator too many at its end is none."""
-    if len(line) > _LONGEST_LINE:
-        return []
-    if separator is None:
-        return line.split()
-    cells = [c.strip() for c in line.split(separator.encode())]
-    while len(cells) > width and not cells[-1]:
-        cells.pop()
-    return cells
-
-
-def _parse_slowly(
-    lines: list[bytes], separator: str | None, width: int, label_at: int | None
-) -> tuple[list[list[float]], list[str], int]:
-    """Rows, labels and the number of malformed lines, for lines that the fast reader refuses."""
-    rows, labels, malformed = [], [], 0
-    for line in lines:
-        if not line.strip():
-            continue
-        cells = _cells(line, separator, width)
-        try:
-            if len(cells) != width:
-                raise ValueError
-            text = cells.pop(label_at).decode("utf-8", "replace") if label_at is not None else ""
-            # Python alone takes 1_000 for a number.
-            row = [float(c) if b"_" not in c else np.nan for c in cells]
-            if not all(abs(v) < _LIMIT for v in row) or len(text) > LONGEST_LABEL:
-                raise ValueError
-        except ValueError:
-            malformed += 1
-            continue
-        rows.append(row)
-        labels.append(text)
-    return rows, labels, malformed
-
-
-def _parse_fast(data: bytes, separator: str | None, skip: int, width: int) -> NDArray[Any] | None:
-    """Numbers (T, width), or None when one line or value does not fit; int64 where all are whole, else float."""
-    begin = data.find(b"\n") + 1 if skip else 0
-    # Whole numbers read in two thirds of the time; some versions of NumPy would cut a fraction off without a word.
-    whole = not any(data.find(sign, begin) >= 0 for sign in (b".", b"e", b"E"))
-    for dtype in (np.int64, np.float64) if whole else (np.float64,):
-        try:
-            table = np.loadtxt(
-                io.BytesIO(data), dtype=dtype, delimiter=separator, skiprows=skip, ndmin=2, comments=None
-            )
-        except ValueError:
-            continue
-        # NaN compares as false; the smallest int64 has no absolute value.
-        fits = table.shape[1] == width and bool(np.all((table > -_LIMIT) & (table < _LIMIT)))
-        return table if fits else None
-    return None
-
-
-def _parse_in_blocks(lines: list[bytes], separator: str | None, width: int) -> tuple[list[NDArray[Any]], int]:
-    """Blocks of rows and the number of malformed lines: one bad line makes its own block slow, not the whole file."""
-    blocks, malformed = [], 0
-    for at in range(0, len(lines), _BLOCK):
-        block = lines[at : at + _BLOCK]
-        if not any(line.strip() for line in block):
-            continue
-        table = _parse_fast(b"\n".join(block), separator, 0, width)
-        if table is None:
-            rows, _, bad = _parse_slowly(block, separator, width, None)
-            malformed += bad
-            table = np.array(rows).reshape(-1, width)
-        blocks.append(table)
-    return blocks, malformed
-
-
-def _table(data: bytes, keys: list[str], skip: int, path: Path) -> tuple[NDArray[Any], NDArray[np.str_] | None, int]:
-    """All numeric columns (T, columns), the labels where there are any, and how many lines were malformed."""
-    label_at = keys.index("label") if "label" in keys else None
-    row = _FULL_LINE.search(data, data.find(b"\n") + 1 if skip else 0)
-    separator = _separator(row[0]) if row else None
-    malformed = 0
-    if label_at is None:
-        table = _parse_fast(data, separator, skip, len(keys))
-        if table is not None:
-            return table, None, 0
-        blocks, malformed = _parse_in_blocks(data.split(b"\n")[skip:], separator, len(keys))
-        table = np.concatenate(blocks) if blocks else np.empty((0, len(keys)))
-        if len(table):
-            return table, None, malformed
-    else:
-        lines = data.split(b"\n")[skip:]
-        if label_at == len(keys) - 1 and separator:
-            parts = [line.rsplit(separator.encode(), 1) for line in lines if line.strip()]
-            try:
-                texts = [p[1].strip().decode() for p in parts]
-                table = _parse_fast(b"\n".join(p[0] for p in parts), separator, 0, len(keys) - 1)
-                if table is not None and len(table) == len(texts) and max(map(len, texts)) <= LONGEST_LABEL:
-                    return table, np.array(texts), 0
-            except (ValueError, IndexError):
-                pass
-        rows, labels, malformed = _parse_slowly(lines, separator, len(keys), label_at)
-        if rows:
-            return np.array(rows), np.array(labels), malformed
-    raise FileFormatError(f"'{path.name}' has no usable row: each must hold {len(keys)} numbers ({', '.join(keys)}).")
 
 
 def _looks_like_delay(column: NDArray[np.int64], host_ms: NDArray[np.int64] | None) -> bool:
@@ -291,12 +180,12 @@ def _read(path: Path, layout: Layout, data: bytes | None, *, whole_lines: bool =
         raise FileFormatError(f"'{path.name}' is empty: a recording has one row a sample.")
     end = data.find(b"\n")
     first = data if end < 0 else data[:end]
-    if len(first) > _LONGEST_LINE:
+    if len(first) > LONGEST_LINE:
         raise FileFormatError(f"'{path.name}' begins with a line of {len(first)} characters: that is no recording.")
     keys, header = _column_keys(first, layout, path)
     if header and (end < 0 or not data[end:].strip()):
         raise FileFormatError(f"'{path.name}' holds a header and no row.")
-    table, labels, malformed = _table(data, keys, 1 if header else 0, path)
+    table, labels, malformed = parse_table(data, keys, 1 if header else 0, path)
     numeric = [k for k in keys if k != "label"]
     warnings: list[str] = ["the last line is cut off: left out"] if cut else []
     if malformed:
@@ -305,7 +194,7 @@ def _read(path: Path, layout: Layout, data: bytes | None, *, whole_lines: bool =
     def as_whole(numbers: NDArray[Any]) -> NDArray[np.int64]:
         # What no integer holds is outside every valid range all the same.
         if numbers.dtype != np.int64:
-            numbers = np.clip(np.round(numbers), -_LIMIT, _LIMIT)
+            numbers = np.clip(np.round(numbers), -LIMIT, LIMIT)
         return np.ascontiguousarray(numbers, dtype=np.int64)
 
     def column(name: str) -> NDArray[np.int64] | None:

@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.recfile import (
-    LONGEST_LABEL,
     STREAM_NAME,
     Frames,
     format_header,
@@ -26,6 +25,7 @@ from plushsense.core.recfile import (
     recording_filename,
     write_recording,
 )
+from plushsense.core.rows import LONGEST_LABEL
 from plushsense.core.signal import HOST_MS, Layout
 from plushsense.dataset.sources import COMPANIONS, Found
 from plushsense.dataset.store import RECORDINGS, STREAMS

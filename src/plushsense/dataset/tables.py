@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from plushsense.core.errors import ConfigError, FileFormatError, nearest
 from plushsense.core.extras import need
 from plushsense.core.gestures import plain_label
-from plushsense.core.recfile import LONGEST_LABEL, Frames
+from plushsense.core.recfile import Frames
+from plushsense.core.rows import LONGEST_LABEL
 from plushsense.core.signal import DEVICE_MS, HOST_MS, Layout
 from plushsense.dataset.converted import Cut, Original, lay_out, usable_rows, whole_steps
 from plushsense.dataset.sources import Found

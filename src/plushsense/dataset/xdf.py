@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 from plushsense.core.errors import FileFormatError
 from plushsense.core.extras import need
 from plushsense.core.gestures import GestureSet
-from plushsense.core.recfile import LONGEST_LABEL, Frames
+from plushsense.core.recfile import Frames
+from plushsense.core.rows import LONGEST_LABEL
 from plushsense.core.signal import DEVICE_MS, Layout
 from plushsense.dataset.converted import Cut, Original, lay_out, usable_rows, whole_steps
 from plushsense.dataset.sources import LEFT_OUT, Found
