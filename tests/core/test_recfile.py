@@ -162,3 +162,45 @@ def test_delays_are_known_in_a_stream_that_was_appended_to(tmp_path: Path) -> No
     read = read_stream(path, load_layout("plush-14"))
     assert read.integrated
     assert np.array_equal(np.diff(read.frames.device_ms), delays[1:])
+
+
+def test_a_bad_line_costs_only_itself(tmp_path: Path) -> None:
+    lines = [f"{10**12 + 10 * i}, {10 * i}, {i}, 2, 3" for i in range(2500)]
+    lines[1203] = "garbage"
+    lines[1204] = "1, 2, 1_000, 4, 5"
+    path = tmp_path / "s.csv"
+    path.write_text("\n".join(lines) + "\n")
+    read = read_stream(path, ACCEL)
+    kept = [i for i in range(2500) if i not in (1203, 1204)]
+    assert read.frames.values[:, 0].tolist() == kept
+    assert read.malformed == 2
+
+
+def test_whole_numbers_and_fractions_read_alike(tmp_path: Path) -> None:
+    whole, fractions = tmp_path / "a_1_3.csv", tmp_path / "b_1_3.csv"
+    whole.write_text("9007199254740991, 0, 1, 2, -3\n5, 10, 4, 5, 6\n")
+    fractions.write_text("9007199254740991, 0, 1.0, 2, -3.4\n5, 1e1, 4, 5, 6.4\n")
+    for one, other in zip(
+        vars(read_recording(whole, ACCEL).frames).values(),
+        vars(read_recording(fractions, ACCEL).frames).values(),
+        strict=True,
+    ):
+        assert np.array_equal(one, other)
+    whole.write_text(f"{2**53}, 0, 1, 2, 3\n{-(2**63)}, 0, 1, 2, 3\n{10**30}, 0, 1, 2, 3\n5, 10, 4, 5, 6\n")
+    assert read_recording(whole, ACCEL).malformed == 3
+
+
+def test_labels_of_two_words_survive_a_bad_line(tmp_path: Path) -> None:
+    path = tmp_path / "x.csv"
+    path.write_text("0,0,0,0,0,0,0,\n0,0,0,0,0,0,10,Tail pull\n0,0,0\n0,0,0,0,0,0,30," + "w" * 300 + "\n")
+    read = read_recording(path, load_layout("phone-6"))
+    assert read.frames.labels is not None
+    assert read.frames.labels.tolist() == ["", "Tail pull"]
+    assert read.malformed == 2
+
+
+def test_bytes_that_were_read_before_are_taken(tmp_path: Path) -> None:
+    read = read_recording(tmp_path / "nowhere.csv", ACCEL, b"1, 0, 1, 2, 3\n")
+    assert read.frames.values.tolist() == [[1, 2, 3]]
+    with pytest.raises(FileFormatError, match="begins with a line of 1000002 characters"):
+        read_recording(tmp_path / "nowhere.csv", ACCEL, b"7" * 1_000_002)

@@ -6,25 +6,24 @@ gone and the separator is ``;``. A stream (``fulldatastream.csv``) has the same 
 
 from __future__ import annotations
 
-import io
 import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import FileFormatError
+from plushsense.core.rows import LIMIT, LONGEST_LINE, parse_table, separator_of
 from plushsense.core.signal import DELAY_MS, DEVICE_MS, HOST_MS, Layout, layout_names, load_layout
 
 STREAM_NAME = "fulldatastream.csv"
 # Lies in a folder of simulated recordings, so that no score on them can pass for a result.
 SIMULATION_MARK = "SIMULATION.txt"
 _NAME = re.compile(r"^(?P<label>.+)_(?P<epoch>\d{1,18})_(?P<rows>\d{1,12})\.csv$", re.IGNORECASE)
-_SPLIT = re.compile(rb"[;,\t]\s*|\s+")
-_LIMIT = 2.0**53
 # Layouts begin at 1 frame a second: delays over twice that are none.
 _SLOWEST_MS = 2000
 _PAUSE_MS = 60_000
@@ -102,22 +101,19 @@ def _is_number(text: bytes) -> bool:
     return True
 
 
-def _separator(line: bytes) -> str | None:
-    return ";" if b";" in line else "," if b"," in line else None
-
-
 def _suggest_layout(columns: int, layout: Layout) -> str:
     fitting = [n for n in layout_names() if n != layout.name and len(load_layout(n).csv.columns) == columns]
     return f" Layouts with {columns} columns: {', '.join(fitting)}." if fitting else ""
 
 
-def _column_keys(first: bytes, layout: Layout, path: Path) -> tuple[list[str], bool]:
+def column_keys(first: bytes, layout: Layout, path: Path) -> tuple[list[str], bool]:
     """Column keys in file order, and whether the first line is a header."""
-    separator = _separator(first)
+    separator = separator_of(first)
     cells = [c.strip() for c in (first.split(separator.encode()) if separator else first.split())]
-    while cells and not cells[-1]:
-        cells.pop()
     columns = list(layout.csv.columns)
+    # A last field that is empty is a separator too many, or no label.
+    while cells and not cells[-1] and not (columns[-1] == "label" and len(cells) == len(columns)):
+        cells.pop()
     header = bool(cells) and not any(_is_number(c) for c in cells)
     if header:
         texts = [c.decode("utf-8", "replace").strip().casefold() for c in cells]
@@ -134,60 +130,6 @@ def _column_keys(first: bytes, layout: Layout, path: Path) -> tuple[list[str], b
         f"'{path.name}' has {len(cells)} columns, but a file of layout '{layout.name}' has {len(columns)} "
         f"({', '.join(columns)}): choose another --layout.{_suggest_layout(len(cells), layout)}"
     )
-
-
-def _parse_slowly(lines: list[bytes], width: int, label_at: int | None) -> tuple[list[list[float]], list[str], int]:
-    """Rows, labels and the number of malformed lines, for a file that the fast reader refuses."""
-    rows, labels, malformed = [], [], 0
-    for line in lines:
-        if not line.strip():
-            continue
-        cells = [c for c in _SPLIT.split(line.strip()) if c]
-        try:
-            if len(cells) != width:
-                raise ValueError
-            text = cells.pop(label_at).decode("utf-8", "replace") if label_at is not None else ""
-            row = [float(c) for c in cells]
-            if not all(abs(v) < _LIMIT for v in row):
-                raise ValueError
-        except ValueError:
-            malformed += 1
-            continue
-        rows.append(row)
-        labels.append(text)
-    return rows, labels, malformed
-
-
-def _table(
-    data: bytes, keys: list[str], skip: int, path: Path
-) -> tuple[NDArray[np.float64], NDArray[np.str_] | None, int]:
-    """All numeric columns (T, columns), the labels where there are any, and how many lines were malformed."""
-    lines = data.split(b"\n")[skip:]
-    label_at = keys.index("label") if "label" in keys else None
-    numeric = [i for i in range(len(keys)) if i != label_at]
-    sample = next((line for line in lines if line.strip()), b"")
-    separator = _separator(sample)
-    if label_at is None:
-        try:
-            table = np.loadtxt(io.BytesIO(data), delimiter=separator, skiprows=skip, ndmin=2, comments=None)
-            if table.shape[1] == len(keys) and np.all(np.abs(table) < _LIMIT):
-                return table, None, 0
-        except ValueError:
-            pass
-    elif label_at == len(keys) - 1 and separator:
-        parts = [line.rsplit(separator.encode(), 1) for line in lines if line.strip()]
-        try:
-            table = np.loadtxt([p[0].decode() for p in parts], delimiter=separator, ndmin=2, comments=None)
-            if table.shape[1] == len(numeric) and np.all(np.abs(table) < _LIMIT):
-                return table, np.array([p[1].strip().decode() for p in parts]), 0
-        except (ValueError, IndexError):
-            pass
-    rows, labels, malformed = _parse_slowly(lines, len(keys), label_at)
-    if not rows:
-        raise FileFormatError(
-            f"'{path.name}' has no usable row: each must hold {len(keys)} numbers ({', '.join(keys)})."
-        )
-    return np.array(rows), np.array(labels) if label_at is not None else None, malformed
 
 
 def _looks_like_delay(column: NDArray[np.int64], host_ms: NDArray[np.int64] | None) -> bool:
@@ -210,18 +152,27 @@ def _looks_like_delay(column: NDArray[np.int64], host_ms: NDArray[np.int64] | No
     return abs(float(column[1:][together].sum()) - on_host) <= max(200.0, 0.5 * on_host)
 
 
-def _read(path: Path, layout: Layout, *, whole_lines: bool = False) -> ReadResult:
+def read_bytes(path: Path) -> bytes:
+    """What a file holds.
+
+    Raises:
+        FileFormatError: when the system refuses.
+    """
     try:
-        data = path.read_bytes()
+        return path.read_bytes()
     except OSError as cause:
         raise FileFormatError(f"'{path}' cannot be read: {cause.strerror or cause}.") from None
-    data = data.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+
+
+def _read(path: Path, layout: Layout, data: bytes | None, *, whole_lines: bool = False) -> ReadResult:
+    if data is None:
+        data = read_bytes(path)
+    data = data.removeprefix(b"\xef\xbb\xbf")
+    if b"\r" in data:
+        data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     if b"\x00" in data[:4096]:
         raise FileFormatError(f"'{path.name}' is not a text file: a recording is CSV in UTF-8.")
-    first_at = 0
-    while first_at < len(data) and data[first_at : first_at + 1].isspace():
-        first_at += 1
-    data = data[first_at:]
+    data = data.lstrip()
     cut = whole_lines and b"\n" in data and not data.endswith(b"\n")
     if cut:
         data = data[: data.rfind(b"\n") + 1]
@@ -229,17 +180,25 @@ def _read(path: Path, layout: Layout, *, whole_lines: bool = False) -> ReadResul
         raise FileFormatError(f"'{path.name}' is empty: a recording has one row a sample.")
     end = data.find(b"\n")
     first = data if end < 0 else data[:end]
-    keys, header = _column_keys(first, layout, path)
+    if len(first) > LONGEST_LINE:
+        raise FileFormatError(f"'{path.name}' begins with a line of {len(first)} characters: that is no recording.")
+    keys, header = column_keys(first, layout, path)
     if header and (end < 0 or not data[end:].strip()):
         raise FileFormatError(f"'{path.name}' holds a header and no row.")
-    table, labels, malformed = _table(data, keys, 1 if header else 0, path)
+    table, labels, malformed = parse_table(data, keys, 1 if header else 0, path)
     numeric = [k for k in keys if k != "label"]
     warnings: list[str] = ["the last line is cut off: left out"] if cut else []
     if malformed:
         warnings.append(f"{malformed} malformed line{'s' if malformed > 1 else ''} left out")
 
+    def as_whole(numbers: NDArray[Any]) -> NDArray[np.int64]:
+        # What no integer holds is outside every valid range all the same.
+        if numbers.dtype != np.int64:
+            numbers = np.clip(np.round(numbers), -LIMIT, LIMIT)
+        return np.ascontiguousarray(numbers, dtype=np.int64)
+
     def column(name: str) -> NDArray[np.int64] | None:
-        return np.round(table[:, numeric.index(name)]).astype(np.int64) if name in numeric else None
+        return as_whole(table[:, numeric.index(name)]) if name in numeric else None
 
     steps = np.array([c.step for c in layout.channels])
     missing = [n for n in layout.names if n not in numeric]
@@ -261,12 +220,14 @@ def _read(path: Path, layout: Layout, *, whole_lines: bool = False) -> ReadResul
             warnings.append("no device clock: the host's time is used")
         else:
             raise FileFormatError(f"'{path.name}' has no clock column: {DEVICE_MS}, {DELAY_MS} or {HOST_MS}.")
-    frames = Frames(np.round(values / steps).astype(np.int64), clock, host, labels)
+    frames = Frames(as_whole(values if np.all(steps == 1.0) else values / steps), clock, host, labels)
     return ReadResult(frames, warnings, malformed + cut, header, integrated)
 
 
-def read_recording(path: str | os.PathLike[str], layout: Layout) -> ReadResult:
+def read_recording(path: str | os.PathLike[str], layout: Layout, data: bytes | None = None) -> ReadResult:
     """Read one recording: ``,`` or ``;``, with or without header, any line ends.
+
+    ``data`` is what the file holds, where it was read before.
 
     Malformed lines are left out and counted. The clock column of the 14-integer firmware holds delays; that is
     detected and integrated.
@@ -274,15 +235,15 @@ def read_recording(path: str | os.PathLike[str], layout: Layout) -> ReadResult:
     Raises:
         FileFormatError: for a file that is empty, not text, or of another width than the layout's.
     """
-    return _read(Path(path), layout)
+    return _read(Path(path), layout, data)
 
 
-def read_stream(path: str | os.PathLike[str], layout: Layout) -> ReadResult:
+def read_stream(path: str | os.PathLike[str], layout: Layout, data: bytes | None = None) -> ReadResult:
     """Read a session's stream: as `read_recording`, but a last line without its end was cut off and is left out.
 
     A cut line can still have the right number of fields, with a digit of the last one missing.
     """
-    return _read(Path(path), layout, whole_lines=True)
+    return _read(Path(path), layout, data, whole_lines=True)
 
 
 def _columns(frames: Frames, layout: Layout) -> Iterator[list[str]]:

@@ -239,7 +239,7 @@ class Layout:
             )
         except KeyError as missing:
             raise LayoutError(f"The {where} lacks the key {missing}: add it.") from None
-        except (TypeError, ValueError) as cause:
+        except (TypeError, ValueError, OverflowError) as cause:
             raise LayoutError(f"The {where} holds a value that does not fit: {cause}.") from None
 
 

@@ -45,7 +45,7 @@ def read_toml(path: Path, what: str, error: type[BadInput]) -> dict[str, Any]:
         raise error(f"There is no {what} file '{path}': check the path.") from None
     except (OSError, UnicodeDecodeError) as cause:
         raise error(f"The {what} file '{path}' cannot be read ({cause}): give a UTF-8 TOML file.") from None
-    except tomllib.TOMLDecodeError as cause:
+    except (tomllib.TOMLDecodeError, RecursionError) as cause:
         raise error(f"The {what} file '{path}' is not valid TOML: {cause}.") from None
 
 

@@ -63,7 +63,7 @@ def is_fresh(folder: Path) -> bool:
     """Whether the index in ``folder`` is whole and made from what is there now."""
     try:
         said = json.loads((folder / STAMP).read_text(encoding="utf-8"))
-    except (FileNotFoundError, ValueError):
+    except (FileNotFoundError, ValueError, RecursionError):
         return False
     return bool(said == taken(folder) | {"index": _index(folder)})
 
@@ -73,5 +73,5 @@ def missing_files(folder: Path) -> list[str]:
     try:
         listed = json.loads((folder / STAMP).read_text(encoding="utf-8"))["files"]
         return [str(entry[0]) for entry in listed if not (folder / str(entry[0])).is_file()]
-    except (FileNotFoundError, ValueError, KeyError, TypeError, IndexError):
+    except (FileNotFoundError, ValueError, RecursionError, KeyError, TypeError, IndexError):
         return []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import itertools
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -10,10 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from plushsense.core.errors import DatasetError, FileFormatError
-from plushsense.core.gestures import NOBODY, Gesture
-from plushsense.core.recfile import Frames, ReadResult, parse_name, read_recording, read_stream
+from plushsense.core.gestures import NOBODY, Gesture, plain_label
+from plushsense.core.recfile import Frames, ReadResult, parse_name, read_bytes, read_recording, read_stream
 from plushsense.dataset.freshness import (
     RECORDINGS_INDEX,
     STAMP,
@@ -21,7 +23,6 @@ from plushsense.dataset.freshness import (
     is_fresh,
     missing_files,
     raw_files,
-    sha256_of,
     taken,
     write_stamp,
 )
@@ -129,7 +130,9 @@ def build(folder: Path, head: DatasetHead, progress: Progress | None = None) -> 
         reader = read_stream if kind == STREAMS else read_recording
         relative = path.relative_to(folder).as_posix()
         try:
-            read = _Read(path, path.relative_to(folder / kind).parts[0], reader(path, head.layout), sha256_of(path))
+            data = read_bytes(path)
+            result = reader(path, head.layout, data)
+            read = _Read(path, path.relative_to(folder / kind).parts[0], result, hashlib.sha256(data).hexdigest())
         except FileFormatError as cause:
             unreadable[relative] = str(cause)
             continue
@@ -137,7 +140,7 @@ def build(folder: Path, head: DatasetHead, progress: Progress | None = None) -> 
         if progress is not None:
             progress(done + 1, len(files))
     infos = [*_from_files(folder, head, recordings, streams), *_from_labels(folder, head, streams)]
-    infos = _with_marks(infos, read_marks(folder))
+    infos = with_marks(infos, read_marks(folder))
     infos.sort(key=lambda r: r.id)
     return Rebuilt(Dataset(folder, head, infos, [_stream_info(folder, head, s) for s in streams]), unreadable)
 
@@ -178,16 +181,16 @@ def _stream_info(folder: Path, head: DatasetHead, read: _Read) -> StreamInfo:
     )
 
 
-def _locate(recording: ReadResult, stream: ReadResult, at: dict[int, list[int]]) -> tuple[int, int]:
+def _locate(recording: ReadResult, stream: ReadResult, at: _RowLookup) -> tuple[int, int]:
     """Row of the stream at which a recording begins, and how many of its rows follow there; (−1, 0) when absent."""
     frames, whole = recording.frames, stream.frames
     # Delays that were added up begin at 0 in every file: only their differences can be compared.
     relative = recording.integrated or stream.integrated
     rows: Iterable[int]
     if frames.host_ms is not None and whole.host_ms is not None:
-        rows = at.get(int(frames.host_ms[0]), ())
+        rows = at.at(int(frames.host_ms[0]))
     elif whole.host_ms is None and not relative:
-        rows = at.get(int(frames.device_ms[0]), ())
+        rows = at.at(int(frames.device_ms[0]))
     else:
         rows = np.flatnonzero((whole.values == frames.values[0]).all(axis=1)).tolist()
     best = (-1, 0)
@@ -213,13 +216,16 @@ def _usual_rows(reads: Iterable[tuple[str, int]]) -> dict[str, float]:
 
 def _from_files(folder: Path, head: DatasetHead, recordings: list[_Read], streams: list[_Read]) -> list[RecordingInfo]:
     named = []
+    gestures: dict[str, Gesture | None] = {}
     for read in recordings:
         name = parse_name(read.path.name)
         if name is None:
             raise DatasetError(
                 f"'{read.path}' is not named <label>_<epoch ms>_<rows>.csv: move it out of {RECORDINGS}/."
             )
-        found = head.gestures.find(name.label)
+        if name.label not in gestures:
+            gestures[name.label] = head.gestures.find(name.label)
+        found = gestures[name.label]
         named.append((read, name, found.label if found else name.label))
     usual = _usual_rows((label, len(read.result.frames)) for read, _, label in named)
     by_subject: dict[str, list[_Read]] = {}
@@ -227,20 +233,25 @@ def _from_files(folder: Path, head: DatasetHead, recordings: list[_Read], stream
         by_subject.setdefault(stream.subject, []).append(stream)
     # Duplicates are by content: the first in name order is the original.
     originals: dict[str, str] = {}
-    lookups = {id(s): _row_lookup(s.result.frames) for s in streams}
+    lookups = {id(s): _RowLookup.of(s.result.frames) for s in streams}
     infos = []
     for read, name, label in named:
         frames = read.result.frames
         identity = read.path.relative_to(folder / RECORDINGS).with_suffix("").as_posix()
         flags = read.result.warnings + findings(Examined(frames, head.layout, name.rows, usual[label]))
-        known = head.gestures.find(name.label)
+        known = gestures[name.label]
         if known is None or (known.affect == "none" and not head.gestures.inferred):
             flags.append(f"its label '{name.label}' is not in the gesture set '{head.gestures.name}': no affect")
         if read.sha256 in originals:
             flags.append(f"the same content as {originals[read.sha256]}")
         originals.setdefault(read.sha256, identity)
         stream_id, stream_row = "", -1
-        candidates = by_subject.get(read.subject, [])
+        session = _session(read.path.relative_to(folder / RECORDINGS))
+        # The session's own stream first: another day's may begin with the same stamps.
+        candidates = sorted(
+            by_subject.get(read.subject, []),
+            key=lambda s: _session(s.path.relative_to(folder / STREAMS)) != session,
+        )
         for stream in candidates:
             row, rows = _locate(read.result, stream.result, lookups[id(stream)])
             if row >= 0:
@@ -254,7 +265,7 @@ def _from_files(folder: Path, head: DatasetHead, recordings: list[_Read], stream
             RecordingInfo(
                 id=identity,
                 subject=_subject(read.subject, known),
-                session=_session(read.path.relative_to(folder / RECORDINGS)),
+                session=session,
                 gesture=label,
                 file=read.path.relative_to(folder).as_posix(),
                 first_row=0,
@@ -274,16 +285,30 @@ def _from_files(folder: Path, head: DatasetHead, recordings: list[_Read], stream
     return infos
 
 
-def _row_lookup(frames: Frames) -> dict[int, list[int]]:
-    stamps = frames.device_ms if frames.host_ms is None else frames.host_ms
-    at: dict[int, list[int]] = {}
-    for row, stamp in enumerate(stamps.tolist()):
-        at.setdefault(stamp, []).append(row)
-    return at
+@dataclass(frozen=True)
+class _RowLookup:
+    """Rows of a stream by their stamp, the host's where there is one."""
+
+    stamps: NDArray[np.int64]
+    rows: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, frames: Frames) -> _RowLookup:
+        stamps = frames.device_ms if frames.host_ms is None else frames.host_ms
+        order = np.argsort(stamps, kind="stable")
+        return cls(stamps[order], order)
+
+    def at(self, stamp: int) -> list[int]:
+        first, last = np.searchsorted(self.stamps, [stamp, stamp + 1])
+        found: list[int] = self.rows[first:last].tolist()
+        return found
 
 
 def _from_labels(folder: Path, head: DatasetHead, streams: list[_Read]) -> list[RecordingInfo]:
-    """Recordings of streams that carry a label on every row: one for each run of equal labels."""
+    """Recordings of streams that carry a label on every row: one for each run of equal labels.
+
+    Rows without a label belong to none.
+    """
     infos = []
     for read in streams:
         labels = read.result.frames.labels
@@ -293,6 +318,8 @@ def _from_labels(folder: Path, head: DatasetHead, streams: list[_Read]) -> list[
         edges = [0, *(np.flatnonzero(labels[1:] != labels[:-1]) + 1).tolist(), len(labels)]
         for number, (first, last) in enumerate(itertools.pairwise(edges)):
             said = str(labels[first])
+            if not plain_label(said):
+                continue
             found = head.gestures.find(said)
             label = found.label if found else said
             part = frames.slice(first, last)
@@ -321,7 +348,8 @@ def _from_labels(folder: Path, head: DatasetHead, streams: list[_Read]) -> list[
     return infos
 
 
-def _with_marks(infos: list[RecordingInfo], marks: dict[str, Standing]) -> list[RecordingInfo]:
+def with_marks(infos: Iterable[RecordingInfo], marks: dict[str, Standing]) -> list[RecordingInfo]:
+    """The recordings as the marks leave them."""
     out = []
     for info in infos:
         mark = marks.get(info.id)

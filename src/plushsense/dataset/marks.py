@@ -129,7 +129,7 @@ def read_marks(folder: Path) -> dict[str, Standing]:
         where = f"'{path}' line {number}"
         try:
             table: Any = json.loads(line.decode("utf-8"))
-        except ValueError:
+        except (ValueError, RecursionError):
             continue
         if not isinstance(table, dict):
             raise DatasetError(f"{where} is no mark: each line is one JSON object.")

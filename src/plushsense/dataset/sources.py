@@ -1,7 +1,8 @@
 """Finding recordings in a folder that somebody brings: which file is what, and whose.
 
-Two shapes of folder are read: the GestureRecorder's (by person, or by label after the authors' anonymising step), and
-folders of CSVs with a label on every row. The person is the folder nearest to the file.
+Three shapes of folder are read: the sessions of our own recorder (`dataset.sessions`), the GestureRecorder's folders
+(by person, or by label after the authors' anonymising step), and folders of CSVs with a label on every row. Outside a
+session, the person is the folder nearest to the file.
 """
 
 from __future__ import annotations
@@ -9,14 +10,19 @@ from __future__ import annotations
 import csv
 import os
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from plushsense.core.errors import BadInput, DatasetError
 from plushsense.core.gestures import NOBODY, GestureSet, plain_label
 from plushsense.core.recfile import SIMULATION_MARK, STREAM_NAME, parse_name
+from plushsense.core.signal import Layout
 from plushsense.core.tomlfile import read_toml
+from plushsense.dataset.people import PersonInfo
 from plushsense.dataset.store import HEAD, RECORDINGS, STREAMS, UNKNOWN_SUBJECT
+
+COMPANIONS = "companions"
+LEFT_OUT = "left out"
 
 _ASK = (
     "import from the folder that holds one folder a person, or name the people with --subjects map.csv (file,subject)"
@@ -25,12 +31,41 @@ _ASK = (
 
 @dataclass(frozen=True)
 class Found:
-    """One source file and where it goes: ``kind`` is recordings or streams, or "" with the reason it is refused."""
+    """One source file and where it goes.
+
+    ``kind`` is recordings, streams, companions (kept beside another file, never read), left out (named, no fault), or
+    "" with the reason it is refused. ``origin`` is how messages name it; by default its path below the source.
+    ``beside`` is the file that a companion goes with; a companion of none lies with its session's stream. ``aside``:
+    why the recorder does not want the recording used.
+    """
 
     source: Path
     kind: str
     subject: str = ""
     reason: str = ""
+    session: str = ""
+    origin: str = ""
+    beside: Path | None = None
+    aside: str = ""
+
+
+@dataclass
+class Search:
+    """What a source holds: every file of it once, and what its sessions say of themselves."""
+
+    layout: Layout
+    gestures: GestureSet | None
+    shape: str
+    found: list[Found]
+    people: list[PersonInfo] = field(default_factory=list)
+    simulated: bool = False
+    notes: list[str] = field(default_factory=list)
+
+
+def shown(path: Path) -> str:
+    """A path as a message can show it: what is no text, or would act on a terminal, becomes escapes."""
+    text = os.fsencode(path).decode("utf-8", "backslashreplace").replace(os.sep, "/")
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def source_files(source: Path) -> list[Path]:
@@ -60,7 +95,7 @@ def source_files(source: Path) -> list[Path]:
 
 
 def is_simulation(source: Path, files: Iterable[Path]) -> bool:
-    """Whether the virtual toy made these: its mark, or a simulated data set, is in the source or in a folder above."""
+    """Whether the virtual toy made ``files``: its mark, or a simulated data set, is there or above."""
     if any(f.name == SIMULATION_MARK for f in files):
         return True
     for place in (source.resolve(), *source.resolve().parents):
@@ -77,7 +112,29 @@ def is_simulation(source: Path, files: Iterable[Path]) -> bool:
 def _not_a_file(path: Path) -> Found | None:
     if path.is_symlink():
         return Found(path, "", reason="a symbolic link is not followed")
-    return None if path.is_file() else Found(path, "", reason="not a regular file")
+    if not path.is_file():
+        return Found(path, "", reason="not a regular file")
+    if path.name.startswith("._"):
+        return Found(path, "", reason="what macOS leaves beside a file, no recording")
+    try:
+        path.name.encode("utf-8")
+    except UnicodeEncodeError:
+        return Found(path, "", reason="its name is not UTF-8: rename it")
+    if any(c < " " or c == "\x7f" for c in path.name):
+        return Found(path, "", reason="its name holds a control character: rename it")
+    return None
+
+
+def regular(files: Iterable[Path]) -> tuple[list[Path], list[Found]]:
+    """The files that can be looked into, and what is refused before: links, devices, names that are no text."""
+    good, refused = [], []
+    for path in files:
+        odd = _not_a_file(path)
+        if odd is None:
+            good.append(path)
+        else:
+            refused.append(odd)
+    return good, refused
 
 
 def _is_by_label(source: Path, files: Iterable[Path]) -> bool:
@@ -193,14 +250,12 @@ FINDERS: dict[str, Finder] = {
 def find(
     shape: str, source: Path, files: list[Path], subjects: dict[str, str] | None, gestures: GestureSet | None
 ) -> list[Found]:
-    """What each of ``files`` is; every one of them comes back once.
+    """What each of ``files`` is (regular ones); every one of them comes back once.
 
     Raises:
         DatasetError: when the folders leave open who the person is.
     """
-    refused = [f for path in files if (f := _not_a_file(path)) is not None]
-    odd = {f.source for f in refused}
-    found = refused + list(FINDERS[shape](source, [p for p in files if p not in odd], subjects, gestures))
+    found = list(FINDERS[shape](source, files, subjects, gestures))
     if subjects is None:
         _refuse_unclear_people(source, found, nested=shape == "gesture-recorder")
     return found

@@ -19,7 +19,7 @@ import io
 import json
 import os
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Self, TypeVar
@@ -70,7 +70,8 @@ class _Row:
 
     def to_text(self) -> dict[str, str]:
         out = {}
-        for name, value in asdict(self).items():
+        for name in self.__dataclass_fields__:
+            value = getattr(self, name)
             out[name] = (
                 ("yes" if value else "no")
                 if isinstance(value, bool)

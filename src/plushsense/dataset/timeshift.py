@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.recfile import _column_keys
+from plushsense.core.recfile import column_keys
 from plushsense.core.signal import DEVICE_MS, HOST_MS, Layout
 
 FIRST_MS = 631_152_000_000
@@ -156,7 +156,7 @@ def shifted_rows(data: bytes, layout: Layout, columns: Collection[str], shift_ms
     first = next((m for m in _LINE.finditer(data) if m.group().removeprefix(b"\xef\xbb\xbf").strip()), None)
     if first is None:
         return data
-    keys, header = _column_keys(first.group().removeprefix(b"\xef\xbb\xbf"), layout, path)
+    keys, header = column_keys(first.group().removeprefix(b"\xef\xbb\xbf"), layout, path)
     at = [i for i, key in enumerate(keys) if key in columns and key in (HOST_MS, DEVICE_MS)]
     start = first.end() if header else first.start()
     last = b".*" if keys[-1] == "label" else _NUMBER

@@ -68,7 +68,7 @@ class SessionHead:
             table = json.loads(path.read_text(encoding="utf-8"))
         except FileNotFoundError:
             return None
-        except (OSError, ValueError) as cause:
+        except (OSError, ValueError, RecursionError) as cause:
             raise DatasetError(f"'{path}' cannot be read ({cause}): bring it back from a copy.") from None
         if not isinstance(table, dict) or table.pop("format", None) != FORMAT_VERSION:
             raise DatasetError(f"'{path}' is no session head of format {FORMAT_VERSION}: check which version wrote it.")
@@ -115,11 +115,11 @@ def read_events(folder: Path) -> Iterator[Event]:
         return
     except OSError as cause:
         raise DatasetError(f"'{folder / SESSION_LOG}' cannot be read: {cause.strerror or cause}.") from None
-    for line in lines:
+    for line in filter(None, lines):
         try:
             table = json.loads(line.decode("utf-8"))
             yield Event(str(table.pop("what")), int(table.pop("at_ms")), table)
-        except (ValueError, KeyError, TypeError, AttributeError):
+        except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
             continue
 
 

@@ -45,7 +45,7 @@ STOPPED = {
     "demo": "what was finished is kept, and the same command goes on from there",
     "evaluate": "finished folds are kept, and the same command goes on from there",
     "simulate": "nothing was written",
-    "import": "nothing was written",
+    "import": "nothing was written, or with --add nothing by halves: the same command goes on",
     "record": "what was recorded is kept, and the same command goes on from there",
     "pseudonymise": "nothing was written",
     "backup": "no backup was written",

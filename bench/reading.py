@@ -1,0 +1,119 @@
+"""What reading recordings costs: ours against `np.loadtxt` alone, and the whole import, side by side.
+
+1326 recordings of 700 rows × 15 columns, as many as the paper's, are written once. In every round each way reads all of
+them in turn; a ratio is taken within its round, so that a machine whose speed drifts does not matter much. The import
+(copying, checksums, checks, index) is timed in the same rounds.
+
+    python bench/reading.py [--rounds 7] [--files 1326] [--folder RECORDINGS --layout NAME] [--json]
+
+With ``--folder`` a folder of your own is read in place of the written files.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from plushsense.core.recfile import Frames, parse_name, read_recording, recording_filename, write_recording
+from plushsense.core.signal import Layout, load_layout
+from plushsense.dataset.importers import import_recordings
+
+ROWS = 700
+PEOPLE = 26
+
+
+def write(folder: Path, files: int, layout: Layout) -> None:
+    """Recordings with the noise of a toy at rest: what a number costs depends on its digits."""
+    rng = np.random.default_rng(0)
+    for number in range(files):
+        person = folder / f"P{number % PEOPLE:02d}"
+        person.mkdir(exist_ok=True)
+        clock = np.cumsum(rng.integers(9, 12, ROWS)) + number * 20_000
+        values = rng.integers(-900, 4000, (ROWS, layout.n_channels))
+        name = recording_filename(layout_gesture(number), 1_760_000_000_000 + number * 60_000, ROWS)
+        write_recording(person / name, Frames(values, clock, clock + 1_760_000_000_000), layout)
+
+
+def layout_gesture(number: int) -> str:
+    """A gesture of plush-18, in turn."""
+    return ("Tail pull", "Hold strong", "Back stroke 1", "Ear scratch 2")[number % 4]
+
+
+def loadtxt_all(files: list[Path]) -> None:
+    """The floor: NumPy's reader, told where the header ends and what separates."""
+    for path in files:
+        with path.open() as file:
+            separator = ";" if ";" in file.readline() else ","
+        np.loadtxt(path, delimiter=separator, skiprows=1)
+
+
+def timed(work: Callable[[], object]) -> float:
+    began = time.perf_counter()
+    work()
+    return time.perf_counter() - began
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--files", type=int, default=1326)
+    parser.add_argument("--folder", type=Path)
+    parser.add_argument("--layout", default="plush-15")
+    parser.add_argument("--json", action="store_true")
+    args = parser.parse_args()
+    layout = load_layout(args.layout)
+    scratch = Path(tempfile.mkdtemp(prefix="reading-"))
+    try:
+        source = args.folder
+        if source is None:
+            source = scratch / "recordings"
+            source.mkdir()
+            write(source, args.files, layout)
+        files = sorted(p for p in source.rglob("*.csv") if parse_name(p.name) is not None)
+
+        def whole_import() -> None:
+            import_recordings(source, scratch / "DS", layout=layout)
+            shutil.rmtree(scratch / "DS")
+
+        ways: dict[str, Callable[[], object]] = {
+            "np.loadtxt alone": lambda: loadtxt_all(files),
+            "read_recording": lambda: [read_recording(path, layout) for path in files],
+            "whole import": whole_import,
+        }
+        times: dict[str, list[float]] = {name: [] for name in ways}
+        for _ in range(args.rounds + 1):
+            for name, work in ways.items():
+                times[name].append(timed(work))
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+    # The first round warms the disk's cache.
+    floor = times["np.loadtxt alone"][1:]
+    rows = [
+        {
+            "way": name,
+            "files": len(files),
+            "rounds": args.rounds,
+            "seconds": [round(s, 3) for s in (min(mine[1:]), statistics.median(mine[1:]), max(mine[1:]))],
+            "speed_of_loadtxt": round(statistics.median(f / m for f, m in zip(floor, mine[1:], strict=True)), 2),
+        }
+        for name, mine in times.items()
+    ]
+    if args.json:
+        print(json.dumps(rows))
+        return
+    print(f"{len(files)} files, {args.rounds} rounds; least / median / most seconds, speed against np.loadtxt alone")
+    for row in rows:
+        least, median, most = row["seconds"]  # type: ignore[misc]
+        print(f"{row['way']:<18} {least:7.3f} {median:7.3f} {most:7.3f}   {row['speed_of_loadtxt']}")
+
+
+if __name__ == "__main__":
+    main()
