@@ -18,9 +18,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from plushsense.apps.checking import check_dataset
 from plushsense.core.recfile import STREAM_NAME, parse_name, read_recording, read_stream
 from plushsense.core.signal import load_layout
 from plushsense.dataset.importers import import_recordings
+from plushsense.dataset.people import PersonInfo, read_people
 from plushsense.devices.toy import serve_pty
 from plushsense.devices.virtual.cues import LogCues
 from plushsense.devices.virtual.session import GESTURES
@@ -158,11 +160,12 @@ def test_51_recordings_that_import_again(tmp_path: Path) -> None:
     made = [n.label for p in recordings(folder) if (n := parse_name(p.name)) is not None]
     assert {label: made.count(label) for label in GESTURES} == dict.fromkeys(GESTURES, 3)
     _hand_follows_prompt(folder, toy)
-    summary = import_recordings(out, tmp_path / "ds", layout="plush-15")
-    assert summary.recordings == 51
-    assert summary.streams == 1
-    flags = {flag for r in summary.dataset.recordings for flag in r.flags}
-    assert flags == set()
+    summary = import_recordings(out, tmp_path / "ds")
+    assert (summary.recordings, summary.streams, summary.rejected, summary.left_out) == (51, 1, [], [])
+    assert (summary.warnings, summary.dataset.head.simulated) == ([], True)
+    assert {(r.subject, r.session, r.excluded) for r in summary.dataset.recordings} == {("S01", "1", False)}
+    assert read_people(tmp_path / "ds") == {"S01": PersonInfo("S01", "child")}
+    assert [f for f in check_dataset(summary.dataset).findings if f.severity != "info"] == []
     located = {r.file.rsplit("/", 1)[-1]: r.stream_row for r in summary.dataset.recordings}
     assert located == {p.name: json.loads(p.with_suffix(".json").read_text())["stream_row"] for p in recordings(folder)}
 
