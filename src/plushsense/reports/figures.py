@@ -22,7 +22,7 @@ _CELL_IN = 0.36
 
 def _figure(width: float, height: float) -> Figure:
     """A figure outside pyplot: nothing global holds it, so no window opens and no memory stays."""
-    made: Figure = need("matplotlib.figure", "train").Figure(figsize=(width, height), layout="constrained")
+    made: Figure = need("matplotlib.figure", "reports").Figure(figsize=(width, height), layout="constrained")
     return made
 
 
@@ -46,7 +46,7 @@ def confusion(labels: Sequence[str], counts: Any, *, title: str = "") -> Figure:
     figure = _figure(side + longest + 0.9, side + longest + 0.9)
     axes = figure.add_subplot()
     shares = row_shares(table)
-    patch = need("matplotlib.patches", "train").Rectangle
+    patch = need("matplotlib.patches", "reports").Rectangle
     size = 8.0 if table.max() < 1000 else 6.5
     for i in range(k):
         for j in range(k):
@@ -134,6 +134,6 @@ def _mean(lines: Sequence[tuple[Any, Any]]) -> tuple[Any, Any]:
 def svg(figure: Figure) -> bytes:
     """A figure as SVG, letters as outlines: it asks for no font, and the same data give the same bytes."""
     out = io.BytesIO()
-    with need("matplotlib", "train").rc_context({"svg.fonttype": "path", "svg.hashsalt": "plushsense"}):
+    with need("matplotlib", "reports").rc_context({"svg.fonttype": "path", "svg.hashsalt": "plushsense"}):
         figure.savefig(out, format="svg", metadata={"Date": None, "Creator": None})
     return out.getvalue()

@@ -19,25 +19,25 @@ from plushsense.core.errors import PlushSenseError, nearest
 
 VERBS: dict[str, tuple[str, str]] = {
     "demo": ("demo", "the whole path on a virtual toy, in a few minutes"),
-    "simulate": ("simulate", "recordings of virtual people, as the authors' recorder would leave them"),
+    "devices": ("devices", "what toys are there, and the URL that opens each"),
     "record": ("record", "record a session with a toy: prompts, countdown, nothing lost"),
     "import": ("importing", "make a data set from recordings"),
+    "check": ("check", "what may be wrong in a data set, what to do about it, and decisions as marks"),
+    "trim": ("trim", "where each gesture begins: suggested, then accepted, adjusted or undone"),
+    "stats": ("stats", "how long gestures last, before and after trimming"),
+    "info": ("info", "what a data set or a model bundle holds"),
+    "publish": ("publish", "a package that strangers can find, open and cite, proved by validators"),
     "pseudonymise": ("pseudonymise", "a copy of a data set with random codes and moved dates"),
     "backup": ("backup", "one file that restores a data set, with a check"),
     "restore": ("restore", "bring a data set back from a backup"),
     "forget": ("forget", "take a person out of a data set, for good"),
-    "check": ("check", "what may be wrong in a data set, what to do about it, and decisions as marks"),
-    "info": ("info", "what a data set or a model bundle holds"),
-    "trim": ("trim", "where each gesture begins: suggested, then accepted, adjusted or undone"),
-    "stats": ("stats", "how long gestures last, before and after trimming"),
-    "publish": ("publish", "a package that strangers can find, open and cite, proved by validators"),
     "arch": ("arch", "count a network: parameters, receptive field, multiply-accumulates, state"),
     "train": ("train", "train one network and save it as a bundle"),
     "evaluate": ("evaluate", "how good it is, on people it never met"),
     "report": ("report", "one HTML page from evaluations and bundles"),
-    "devices": ("devices", "what toys are there, and the URL that opens each"),
     "live": ("live", "read a toy and say what it feels, 20 times a second"),
     "toy": ("toy", "a virtual toy that speaks the wire format over a pty or TCP"),
+    "simulate": ("simulate", "recordings of virtual people, as the authors' recorder would leave them"),
 }
 
 # What a stopped verb has left; the others leave nothing that would need a word.
