@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import select
+import signal
 import subprocess
 import sys
 import time
@@ -128,6 +129,48 @@ def test_a_person_at_a_terminal(tmp_path: Path, pty_possible: None) -> None:
     os.close(master)
     os.close(slave)
     assert [e.more["text"] for e in read_events(tmp_path / "S01" / "1") if e.what == "note"] == ["möchte nicht"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo terminals")
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "hung up"])
+def test_asked_to_end_while_recording(tmp_path: Path, pty_possible: None, name: str) -> None:
+    """``kill``, or a window that is closed: all is written and the terminal is put back, as after Ctrl-C."""
+    import fcntl
+    import pty
+    import termios
+
+    master, slave = pty.openpty()  # of no size, as some are
+    process = subprocess.Popen(
+        [*COMMAND, str(tmp_path), "--device", "virtual://", "--speed", "5", "--subject", "S01", "--protocol", "quick"],
+        stdin=slave, stderr=slave, stdout=subprocess.DEVNULL, start_new_session=True,
+        preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
+    )  # fmt: skip
+    os.close(slave)
+    shown, limit = b"", time.monotonic() + 20
+    while b"RECORDING" not in shown:
+        assert time.monotonic() < limit
+        assert process.poll() is None
+        if select.select([master], [], [], 0.1)[0]:
+            shown += os.read(master, 65536)
+        if b"READY." in shown and b"GET READY" not in shown:
+            os.write(master, b" ")
+            time.sleep(0.3)
+    if name != "hung up":
+        process.send_signal(getattr(signal, name))
+        shown = b""
+        while b"what was recorded is kept" not in shown:
+            assert time.monotonic() < limit + 10
+            if select.select([master], [], [], 0.1)[0]:
+                shown += os.read(master, 65536)
+        assert b"\x1b[?1049l" in shown
+        assert process.wait(10) == 130
+    os.close(master)
+    process.wait(10)
+    events = list(read_events(tmp_path / "S01" / "1"))
+    assert [e.what for e in events][-2:] == ["abandon", "close"]
+    stream = (tmp_path / "S01" / "1" / "fulldatastream.csv").read_bytes()
+    assert stream.count(b"\n") == events[-1].more["rows"]
+    assert not (tmp_path / "S01" / "1" / "session.lock").exists()
 
 
 @pytest.mark.parametrize(

@@ -53,3 +53,23 @@ def test_silence_is_said() -> None:
     meter.push(60_000)
     meter.heard(Counters(frames=101), 60.0)
     assert meter.quality(60.0).signal == "none", "after a pause it begins anew"
+
+
+def test_a_clock_that_stands_still_is_no_good_signal() -> None:
+    meter, counters = Meter(load_layout("plush-15")), Counters()
+    for _ in range(100_000):
+        meter.push(5000)
+        counters.frames += 1
+    meter.heard(counters, 1.0)
+    assert meter.quality(1.0).signal == "poor"
+    assert len(meter._clock) < 1000, "what is kept does not grow"
+
+
+def test_values_out_of_range_are_no_good_signal() -> None:
+    meter, counters = Meter(load_layout("plush-15")), Counters()
+    for n in range(300):
+        meter.push(10 * n)
+        counters.frames += 1
+        counters.garbage += 1
+        meter.heard(counters, n / 100)
+    assert meter.quality(3.0).signal == "poor"

@@ -107,7 +107,12 @@ class Recorder(Machine):
         """Start the countdown; stop the recording, not within the protocol's shortest_s; cancel a countdown."""
         with self._telling():
             if self._state == "idle":
-                if self._intake.silent:
+                if self._intake.quality().signal == "unreadable":
+                    self._say(
+                        f"The toy sends lines, but none is a frame of {self.session.layout.name} "
+                        f"({len(self.session.layout.wire)} numbers): is --layout right, and the cable sound?"
+                    )
+                elif self._intake.silent:
                     self._say("Nothing comes from the toy: is it switched on and near?")
                 else:
                     self._begin()
@@ -216,11 +221,12 @@ class Recorder(Machine):
                 self._cancel("")
             elif self._state == "recording" and not self._failed:
                 self._abandon("quit", "")
-            if not self._closing:
-                self._log("close", rows=self._intake.rows)
-            self._closing = True
+            last, self._closing = not self._closing, True
         if self._reader.is_alive():
             self._reader.join()
+        if last:
+            with self._telling():
+                self._log("close", rows=self._intake.rows)
         if self._keeper is not None:
             self._keeper.close()
         self.session.close()

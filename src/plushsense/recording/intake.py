@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from typing import Any, NamedTuple
 
@@ -12,6 +13,9 @@ from plushsense.recording.take import gap_entry
 
 AWAY_S = 1.0
 """A toy that is silent for so long is away; its user is told."""
+
+JUMP_MS = 1000
+"""A toy's clock that goes on by so much more than time has passed was misread on the way, or set: it does not count."""
 
 
 class Came(NamedTuple):
@@ -27,7 +31,8 @@ class Intake:
 
     Attributes:
         rows: of the session's stream.
-        toy_ms: how long the toy has been heard, by its own clock: gaps count, a clock that begins anew goes on.
+        toy_ms: how long the toy has been heard, by its own clock: gaps count, a clock that begins anew goes on, and
+            a stamp that cannot be true does not end a countdown or a recording.
         last: the newest frame.
         lost: frames that the toy's clock says are missing; gaps: the holes, ``after_row`` in rows of the stream.
     """
@@ -45,6 +50,8 @@ class Intake:
         self._base_ms = now_ms() if self._real else max(now_ms(), host_ms + 1000)
         self._heard_s = float("-inf")
         self._reconnects = device.counters.reconnects
+        self._noise_s = float("-inf")
+        self._malformed = device.counters.malformed
         self._loss = LossMeter()
         self._meter = Meter(layout, AWAY_S)
 
@@ -65,7 +72,11 @@ class Intake:
 
     def quality(self) -> Quality:
         """How the signal is right now."""
-        return self._meter.quality(time.monotonic(), self.away)
+        now_s = time.monotonic()
+        quality = self._meter.quality(now_s, self.away)
+        if quality.signal == "none" and not self.away and now_s - self._noise_s <= AWAY_S:
+            return Quality(signal="unreadable")
+        return quality
 
     def now_ms(self) -> int:
         """The time that goes with the rows' stamps."""
@@ -76,29 +87,47 @@ class Intake:
         last = self.last
         step_ms = came.device_ms - last.device_ms if last else 0
         on_host = came.host_ms - last.host_ms if last and self._real else 0
-        self.toy_ms += step_ms if step_ms >= 0 else max(on_host, round(1000.0 / self._layout.rate_hz))
+        possible_ms = self._possible_ms(on_host)
+        odd = not 0 <= step_ms <= possible_ms + JUMP_MS
+        self.toy_ms += max(min(step_ms, possible_ms), on_host, 1000.0 / self._layout.rate_hz) if odd else step_ms
         host = came.host_ms if self._real else self._base_ms + round(self.toy_ms)
         frame = Frame(host, came.device_ms, came.values)
-        missing = self._loss.push(came.device_ms)
+        counted = self._loss.push(came.device_ms)
+        missing = 0 if odd else counted
         self.lost += missing
         returned = self._device.counters.reconnects > self._reconnects
         self._reconnects = self._device.counters.reconnects
         gap = None
-        if last is not None and (step_ms < 0 or step_ms > self._layout.gap_ms or returned):
-            gap = gap_entry(self.rows, last, frame, max(step_ms, on_host, 0), self._reason(step_ms, returned))
+        if last is not None and (odd or step_ms > self._layout.gap_ms or returned):
+            missing_ms = max(on_host, 0 if odd else step_ms)
+            gap = gap_entry(self.rows, last, frame, missing_ms, self._reason(step_ms, odd, returned))
             self.gaps.append(gap)
         self._meter.push(came.device_ms)
         self.last = frame
         self.rows += 1
         return Came(frame, missing, gap)
 
+    def listened(self) -> None:
+        """The toy was read, whether frames came or not: lines that are no frames are a signal, too."""
+        if self._device.counters.malformed != self._malformed:
+            self._malformed = self._device.counters.malformed
+            self._noise_s = time.monotonic()
+
     def heard(self) -> None:
         """All frames of one reading are in."""
         self._heard_s = time.monotonic()
         self._meter.heard(self._device.counters, self._heard_s)
 
-    def _reason(self, step_ms: int, returned: bool) -> str:
+    def _possible_ms(self, on_host: int) -> float:
+        """At real time the toy's clock can only have gone on since the last reading, by either of the computer's."""
+        if not self._real or math.isinf(self._heard_s):
+            return math.inf
+        return max(on_host, self.silent_ms)
+
+    def _reason(self, step_ms: int, odd: bool, returned: bool) -> str:
         if returned:
             known = [gap.reason for gap in getattr(self._device, "gaps", ())]
             return known[-1] if known and known[-1] else "the toy was away and came back"
-        return "the toy's clock began anew" if step_ms < 0 else "nothing came"
+        if odd:
+            return "the toy's clock began anew" if step_ms < 0 else "the toy's clock jumped"
+        return "nothing came"

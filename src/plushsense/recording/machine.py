@@ -230,6 +230,7 @@ class Machine:
                 with self._telling():
                     for frame in frames:
                         self._one(frame)
+                    self._intake.listened()
                     if frames:
                         self._hand_on()
                         self._intake.heard()

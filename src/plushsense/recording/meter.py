@@ -15,12 +15,14 @@ LOSS_SPAN_MS = 10_000
 SILENT_S = 1.0
 FAIR, POOR = 0.005, 0.05
 RATE_OFF = 0.2
+_READINGS = 4096
 
 SIGNAL = {
     "good": "hardly anything is lost",
-    "fair": "over 0.5 % of the lines of the last 10 s were lost or spoilt",
-    "poor": "over 5 % were, or the rate is over 20 % off",
+    "fair": "over 0.5 % of the lines of the last 10 s were lost, spoilt or out of range",
+    "poor": "over 5 % were, or the rate is over 20 % off, or the toy's clock stands still",
     "none": "nothing came for a second, or the toy is away",
+    "unreadable": "lines come, but none of them is a frame of the layout",
 }
 
 
@@ -39,8 +41,9 @@ class Meter:
     def __init__(self, layout: Layout, silent_s: float = SILENT_S) -> None:
         self._rate_hz = layout.rate_hz
         self._silent_s = silent_s
-        self._clock: deque[int] = deque()
-        self._losses: deque[tuple[int, int, int]] = deque()
+        # By count, too: a clock that stands still never leaves the span.
+        self._clock: deque[int] = deque(maxlen=max(64, round(2 * layout.rate_hz * SPAN_MS / 1000)))
+        self._losses: deque[tuple[int, int, int]] = deque(maxlen=_READINGS)
         self._heard_s = float("-inf")
 
     def push(self, device_ms: int) -> None:
@@ -58,7 +61,7 @@ class Meter:
         self._heard_s = at_s
         if self._clock:
             now = self._clock[-1]
-            self._losses.append((now, counters.frames, counters.lost + counters.malformed))
+            self._losses.append((now, counters.frames, counters.lost + counters.malformed + counters.garbage))
             while now - self._losses[0][0] > LOSS_SPAN_MS:
                 self._losses.popleft()
 
@@ -71,6 +74,7 @@ class Meter:
         rate = 1000.0 * len(steps) / passed if passed > 0 else 0.0
         frames, bad = (b - a for a, b in zip(self._losses[0][1:], self._losses[-1][1:], strict=True))
         share = bad / max(1, frames + bad)
-        off = passed > SPAN_MS / 2 and abs(rate - self._rate_hz) > RATE_OFF * self._rate_hz
+        stands = passed <= 0 and len(steps) > self._rate_hz
+        off = stands or (passed > SPAN_MS / 2 and abs(rate - self._rate_hz) > RATE_OFF * self._rate_hz)
         word = "poor" if share > POOR or off else "fair" if share > FAIR else "good"
         return Quality(round(rate, 1), round(float(steps.std()), 2), word)

@@ -39,7 +39,8 @@ def keep_take(
         said = f"Nobody stopped it: it ended by itself after {longest_s:g} s; r makes it again."
     elif take.gaps:
         longest = max(gap["missing_ms"] for gap in take.gaps) / 1000.0
-        said = f"This recording has a hole of {longest:.1f} s; it is kept, r makes it again."
+        what = f"has a hole of {longest:.1f} s" if longest >= 0.05 else "has a jump in the toy's clock"
+        said = f"This recording {what}; it is kept, r makes it again."
     return path.name, said
 
 

@@ -1,4 +1,4 @@
-"""Single keys without Enter: from a terminal on any system, or as characters from a script's output."""
+"""Single keys without Enter: from a terminal on any system, or as characters from a script's output; and the end."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import codecs
 import contextlib
 import os
 import queue
+import signal
 import sys
 import threading
 import time
@@ -16,6 +17,11 @@ from typing import Protocol
 
 END = "\x04"
 """What `Keys.get` gives when nothing will come any more."""
+
+
+HELD_S = {" ": 0.7, "r": 0.1, "s": 0.1, "b": 0.1}
+"""A key that comes again so soon is held down. Keyboards begin to repeat after about half a second, then every 0.03 s;
+the space bar, which is leant on, has no use twice within that time, and the others may be pressed in a row."""
 
 
 class Keys(Protocol):
@@ -68,12 +74,16 @@ class _Posix:
 
         fd = sys.stdin.fileno()
         if not self._waiting and select.select([fd], [], [], timeout_s)[0]:
-            data = os.read(fd, 1024)
+            try:
+                data = os.read(fd, 1024)
+            except OSError:  # the terminal was closed
+                data = b""
             if not data:
                 return END
-            # Arrow and function keys come as a sequence that begins with Escape: they are no letters.
+            # Arrow and function keys come as a sequence that begins with Escape: they are no letters. Ctrl-D is a key
+            # like q: it may be a slip.
             if not (data.startswith(b"\x1b") and len(data) > 1):
-                self._waiting.extend(self._decoder.decode(data))
+                self._waiting.extend(self._decoder.decode(data).replace(END, "q"))
         return self._waiting.popleft() if self._waiting else None
 
 
@@ -118,4 +128,42 @@ def keys() -> Iterator[Keys]:
             tty.setcbreak(fd)
             yield _Posix()
         finally:
-            termios.tcsetattr(fd, termios.TCSADRAIN, before)
+            with contextlib.suppress(termios.error):  # it may be gone
+                termios.tcsetattr(fd, termios.TCSADRAIN, before)
+
+
+class Held:
+    """Tells a key that is held down, and so comes again and again, from one that is pressed anew."""
+
+    def __init__(self) -> None:
+        self._key: str | None = None
+        self._at_s = float("-inf")
+
+    def again(self, key: str, at_s: float) -> bool:
+        """Whether ``key``, come at ``at_s`` of a monotonic clock, is only the last one, still held."""
+        held = key == self._key and at_s - self._at_s < HELD_S.get(key.lower(), 0.0)
+        self._key, self._at_s = key, at_s
+        return held
+
+
+@contextmanager
+def orderly_end() -> Iterator[None]:
+    """Have ``kill``, and a terminal that is closed, end the work as Ctrl-C does: in order, and only once."""
+    asked = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGBREAK") if hasattr(signal, name)]
+    # Who started it with nohup wants it to go on.
+    asked = [number for number in asked if signal.getsignal(number) is signal.SIG_DFL]
+    if threading.current_thread() is not threading.main_thread():
+        asked = []
+
+    def end(number: int, frame: object) -> None:
+        for other in asked:
+            signal.signal(other, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    for number in asked:
+        signal.signal(number, end)
+    try:
+        yield
+    finally:
+        for number in asked:
+            signal.signal(number, signal.SIG_DFL)

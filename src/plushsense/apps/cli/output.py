@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import io
 import json
 import sys
@@ -45,9 +46,10 @@ def utf8() -> None:
 
 
 def say(text: str) -> None:
-    """A message for the person, on standard error."""
-    sys.stderr.write(text + "\n")
-    sys.stderr.flush()
+    """A message for the person, on standard error; a terminal that was closed is no failure."""
+    with contextlib.suppress(OSError):
+        sys.stderr.write(text + "\n")
+        sys.stderr.flush()
 
 
 def emit(args: argparse.Namespace, result: dict[str, Any], text: str | Iterable[str]) -> None:

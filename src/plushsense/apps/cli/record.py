@@ -84,7 +84,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from plushsense import __version__
-    from plushsense.apps.cli.keys import keys
+    from plushsense.apps.cli.keys import keys, orderly_end
     from plushsense.apps.cli.screen import Screen
     from plushsense.core.signal import Layout
     from plushsense.recording.engine import Auto, Recorder
@@ -110,7 +110,7 @@ def run(args: argparse.Namespace) -> int:
         title = f"{subject}, session {folder.name}: {session.protocol.title}"
         screen = Screen(recorder, title, notices)
         try:
-            with recorder, keys() as typed:
+            with orderly_end(), recorder, keys() as typed:
                 _drive(recorder, typed, screen, auto is not None)
         finally:
             screen.close()
@@ -226,10 +226,11 @@ def _notices(args: argparse.Namespace, head: SessionHead, fresh: bool) -> list[s
 
 def _drive(recorder: Recorder, typed: Keys, screen: Screen, auto: bool) -> None:
     """Keys to commands, and the screen, until it is over."""
-    from plushsense.apps.cli.keys import END
+    from plushsense.apps.cli.keys import END, Held
 
     note: str | None = None
     leaving = False
+    held = Held()
     commands: dict[str, Callable[[], None]] = {
         " ": recorder.space,
         "r": recorder.redo,
@@ -247,9 +248,11 @@ def _drive(recorder: Recorder, typed: Keys, screen: Screen, auto: bool) -> None:
             if not auto:
                 return
             recorder.wait("finished", timeout_s=_DRAW_S)
-        elif not key:
             continue
-        elif note is not None:
+        repeated = key is not None and held.again(key, time.monotonic())
+        if not key or (repeated and note is None and not typed.script):
+            continue
+        if note is not None:
             if key in "\r\n":
                 recorder.note(note)
                 note = None
@@ -283,7 +286,7 @@ def _settled(recorder: Recorder, key: str) -> None:
         if s.elapsed_s >= recorder.protocol.shortest_s:
             return
         time.sleep(_WAIT_S)
-    while key == " " and (s := recorder.status()).state == "idle" and s.signal == "none":
+    while key == " " and (s := recorder.status()).state == "idle" and s.signal in ("none", "unreadable"):
         time.sleep(_WAIT_S)
 
 

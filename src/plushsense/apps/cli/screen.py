@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import sys
@@ -31,6 +32,8 @@ def _state(s: Status) -> tuple[str, str]:
     if s.state == "idle":
         if s.signal == "none":
             return "WAITING FOR THE TOY: switch it on, bring it near", _RED
+        if s.signal == "unreadable":
+            return "THE TOY CANNOT BE READ: is --layout right, and the cable sound?", _RED
         return "READY.  Press SPACE, then wait for the countdown", _BLUE
     if s.state == "countdown":
         return f"GET READY … {math.ceil(s.countdown_s)}", _BLUE
@@ -47,46 +50,71 @@ def _state(s: Status) -> tuple[str, str]:
     return ("ALL RECORDED.  Press q to close" if s.state == "finished" else "STOPPED"), _GREEN
 
 
-def _toy(s: Status) -> str:
+def _toy(s: Status) -> list[tuple[str, str]]:
+    """Two lines on the signal, each with its colour."""
     words = {
-        "good": "good",
-        "fair": "fair: some readings are lost; bring the toy nearer",
-        "poor": f"{_RED}POOR: many readings are lost; bring the toy nearer, check its battery{_OFF}",
-        "none": f"{_RED}NONE: the toy is silent{_OFF}",
+        "good": ("good", ""),
+        "fair": ("fair: some readings are lost or spoilt; bring the toy nearer", ""),
+        "poor": ("POOR: many readings are lost or spoilt; bring the toy nearer, check its battery", _RED),
+        "none": ("NONE: the toy is silent", _RED),
+        "unreadable": ("UNREADABLE: lines come, but none is a frame", _RED),
     }
     heard = f"   {s.rate_hz:.0f} readings a second" if s.rate_hz else ""
-    return (
-        f"Signal {words[s.signal]}{heard}\n"
-        f"{_DIM}jitter {s.jitter_ms:.1f} ms   lost {s.lost}   unreadable {s.malformed}   out of range {s.garbage}   "
-        f"gaps {s.gaps}   reconnected {s.reconnects}{_OFF}"
-    )
+    text, colour = words[s.signal]
+    return [
+        (f"Signal {text}{heard}", colour),
+        (
+            f"jitter {s.jitter_ms:.1f} ms   lost {s.lost}   unreadable {s.malformed}   out of range {s.garbage}   "
+            f"gaps {s.gaps}   reconnected {s.reconnects}",
+            _DIM,
+        ),
+    ]
 
 
-def lines(s: Status, title: str, notices: Sequence[str], typing: str | None, width: int) -> list[str]:
-    """The screen as lines, no wider than ``width``."""
+def lines(
+    s: Status, title: str, notices: Sequence[str], typing: str | None, width: int, height: int = 1000
+) -> list[str]:
+    """The screen as at most ``height`` lines, no wider than ``width``.
+
+    Where there is no room, what a session can be led without goes first: blank lines, rules, counters; what is to be
+    made, its state and the keys stay longest.
+    """
+    out: list[tuple[int, str]] = []
+
+    def put(rank: int, text: str, colour: str = "", indent: str = "") -> None:
+        for line in textwrap.wrap(text, max(1, width - len(indent))) or [""]:
+            out.append((rank, f"{indent}{colour}{line}{_OFF if colour else ''}"))
+
     rule = "─" * width
-    done = f"{s.done} of {s.steps} recorded" + (f", {s.skipped} skipped" if s.skipped else "")
-    state, colour = _state(s)
-    out = [f"{_BOLD}{title}{_OFF}"]
-    out += [f"{_RED}{text}{_OFF}" for notice in notices for text in textwrap.wrap(notice, width)]
-    out += [f"{done}", _bar(s, width), ""]
+    put(4, title, _BOLD)
+    for notice in notices:
+        put(3, notice, _RED)
+    put(2, f"{s.done} of {s.steps} recorded" + (f", {s.skipped} skipped" if s.skipped else ""))
+    put(6, _bar(s, width))
+    put(8, "")
     if s.state not in ("finished", "stopped"):
         again = "   (recorded; this makes it again)" if s.already else ""
-        out.append(f"  {_BOLD}{s.step.gesture}{_OFF}   {s.step.repetition} of {s.repetitions}{again}")
-        out.append("")
-        out += [f"  {_BOLD}{text}{_OFF}" for text in textwrap.wrap(s.step.prompt, width - 2)]
-        out.append("")
-    out += [f"  {colour}{state}{_OFF}", ""]
-    out += [f"  {text}" for text in textwrap.wrap(s.message, width - 2)] or [""]
-    out.append(rule)
+        name = f"{_BOLD}{s.step.gesture[: max(1, width - 2)]}{_OFF}"
+        out.append((0, f"  {name}   {s.step.repetition} of {s.repetitions}{again}"))
+        put(8, "")
+        put(1, s.step.prompt, _BOLD, "  ")
+        put(8, "")
+    put(0, *_state(s), "  ")
+    put(8, "")
+    put(1, s.message, "", "  " if s.message else "")
+    put(7, rule)
     if s.following is not None and s.state != "finished":
-        out.append(f"Next  {s.following.gesture}, {s.following.repetition} of {s.repetitions}")
-    out += _toy(s).split("\n")
+        put(5, f"Next  {s.following.gesture}, {s.following.repetition} of {s.repetitions}")
+    for rank, (text, colour) in zip((3, 6), _toy(s), strict=True):
+        put(rank, text, colour)
     if s.file:
-        out.append(f"{_DIM}Last  {s.file}{_OFF}")
-    out.append(rule)
-    out.append(f"Note: {typing}▏   (Enter keeps it, Esc forgets it)" if typing is not None else KEYS[s.state])
-    return out
+        put(7, f"Last  {s.file}", _DIM)
+    put(7, rule)
+    put(1, f"Note: {typing}▏   (Enter keeps it, Esc forgets it)" if typing is not None else KEYS[s.state])
+    while len(out) > max(1, height):
+        worst = max(rank for rank, _ in out)
+        del out[max(n for n, (rank, _) in enumerate(out) if rank == worst)]
+    return [text for _, text in out]
 
 
 def _bar(s: Status, width: int) -> str:
@@ -114,9 +142,10 @@ class Screen:
     def draw(self, status: Status, typing: str | None = None) -> None:
         """Show this moment."""
         if self._terminal:
-            # Standard output may be a file: it is the screen's size that counts.
+            # Standard output may be a file: it is the screen's size that counts. Some terminals do not know theirs.
             size = os.get_terminal_size(sys.stderr.fileno())
-            shown = lines(status, self._title, self._notices, typing, min(_WIDEST, size.columns - 1))[: size.lines - 1]
+            width, height = (size.columns or 80) - 1, (size.lines or 24) - 1
+            shown = lines(status, self._title, self._notices, typing, max(1, min(_WIDEST, width)), height)
             sys.stderr.write("\x1b[H" + "".join(f"{line}\x1b[K\n" for line in shown) + "\x1b[J")
             sys.stderr.flush()
 
@@ -141,7 +170,8 @@ class Screen:
         sys.stderr.flush()
 
     def close(self) -> None:
-        """Give the terminal back as it was."""
+        """Give the terminal back as it was; nothing to do for one that is gone."""
         if self._terminal:
-            sys.stderr.write("\x1b[?7h\x1b[?25h\x1b[?1049l")
-            sys.stderr.flush()
+            with contextlib.suppress(OSError):
+                sys.stderr.write("\x1b[?7h\x1b[?25h\x1b[?1049l")
+                sys.stderr.flush()
