@@ -207,7 +207,9 @@ class Machine:
     def _stop(self, ended: Ended) -> None:
         take = self._take
         assert take is not None
-        if self._intake.away or (self._speed == 1.0 and self._intake.silent):
+        # A recording that a frame has ended is not silent: that frame's hole, if any, is known.
+        waiting = self._intake.away or (self._speed == 1.0 and self._intake.silent)
+        if waiting and ended in ("space", "toy"):
             silent_ms = self._intake.silent_ms
             take.gaps.append(gap_entry(len(take.frames), take.frames[-1], None, silent_ms, "nothing came any more"))
         self._take = None

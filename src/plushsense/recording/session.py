@@ -24,6 +24,8 @@ from plushsense.recording.writer import NEW, PART, LogFile
 LOCK = "session.lock"
 TORN = ".torn"
 _KEPT_BYTES = 4096
+_RESERVED = re.compile(r"(?i)con|prn|aux|nul|(com|lpt)\d")
+"""What no folder can be called on Windows."""
 
 Key = tuple[str, int]
 """A recording to be made: its gesture and its repetition."""
@@ -53,7 +55,7 @@ def check_subject(code: str) -> str:
     """
     plain = re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,15}", code, re.ASCII)
     bare = len(code) > 2 and not re.search(r"\d", code) and code != NOBODY
-    if plain is None or bare or re.fullmatch(r"(?i)(com|lpt)\d", code):
+    if plain is None or bare or _RESERVED.fullmatch(code):
         raise DatasetError(
             f"'{code}' is no code for a person: give a short one with a number in it, such as S01, never a name "
             "(at most 16 letters and digits; who S01 is stays on paper, away from the recordings)."
@@ -63,7 +65,7 @@ def check_subject(code: str) -> str:
 
 def check_session(name: str) -> str:
     """A session's name as a folder name; DatasetError for one that cannot be."""
-    if re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,31}", name, re.ASCII) is None:
+    if re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,31}", name, re.ASCII) is None or _RESERVED.fullmatch(name):
         raise DatasetError(
             f"'{name}' is no name for a session: give at most 32 letters and digits, such as 1 or autumn."
         )

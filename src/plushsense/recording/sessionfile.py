@@ -66,7 +66,7 @@ class SessionHead:
         path = folder / SESSION_HEAD
         try:
             table = json.loads(path.read_text(encoding="utf-8"))
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError):
             return None
         except (OSError, ValueError, RecursionError) as cause:
             raise DatasetError(f"'{path}' cannot be read ({cause}): bring it back from a copy.") from None
