@@ -20,7 +20,7 @@ import pytest
 from plushsense.core.errors import DatasetError, DeviceError
 from plushsense.core.recfile import STREAM_NAME, read_recording, read_stream
 from plushsense.core.signal import load_layout
-from plushsense.devices.base import Device, Frame
+from plushsense.devices.base import Device, Frame, now_ms
 from plushsense.devices.opening import open_device
 from plushsense.devices.reconnect import ReconnectingDevice
 from plushsense.recording.engine import Auto, Recorder
@@ -278,6 +278,41 @@ def test_unplugged_for_five_seconds_during_a_gesture(tmp_path: Path) -> None:
     assert [int(frames.device_ms[hole]), int(frames.device_ms[hole + 1])] == gap["device_ms"]
     assert len(frames) == beside["rows"]
     assert frames.device_ms[-1] - frames.device_ms[0] == pytest.approx(10_000, abs=12)
+
+
+class Pausing(Device):
+    """A toy in real time that is silent for a while, once: its clock goes on meanwhile."""
+
+    def __init__(self, from_s: float, pause_s: float) -> None:
+        super().__init__("x", LAYOUT)
+        self._begin, self._from, self._until = time.monotonic(), from_s, from_s + pause_s
+        self._at = 0.0
+
+    def read(self) -> list[Frame] | None:
+        time.sleep(0.01)
+        now = time.monotonic() - self._begin
+        if self._from <= now < self._until:
+            return []
+        before, self._at = self._at, now
+        if before < self._from <= now:
+            return [Frame(now_ms(), round(1000 * now), (0,) * LAYOUT.n_channels)]
+        return [
+            Frame(now_ms(), ms, (0,) * LAYOUT.n_channels)
+            for ms in range(-(-round(1000 * before) // 10) * 10, round(1000 * now), 10)
+        ]
+
+
+def test_a_hole_that_ends_a_recording_is_stated_once(tmp_path: Path) -> None:
+    """The first frame after a silence may be the one at which the recording ends."""
+    with (
+        Pausing(1.0, 1.5) as toy,
+        Recorder.open(tmp_path, toy, head(countdown_s=0.1, gestures=("Hold strong",)), auto=Auto(1.2, 0.3)) as r,
+    ):
+        assert r.wait("finished", timeout_s=20)
+    beside = json.loads(next(tmp_path.glob("*_*.json")).read_text())
+    (gap,) = beside["gaps"]
+    assert gap["reason"] == "nothing came"
+    assert 1400 <= gap["missing_ms"] < 3000
 
 
 class Breaking(Device):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import random
 import subprocess
 import sys
 from dataclasses import replace
@@ -140,8 +141,42 @@ def test_what_is_half_goes_and_what_is_damaged_is_set_aside(folder: Path) -> Non
     assert standing.takes == {}
     assert len(standing.mended) == 2
     assert sorted(p.name for p in folder.iterdir()) == [
-        cut.name + ".torn", STREAM_NAME, "session.json", "session.jsonl",
+        cut.name + ".torn", cut.with_suffix(".json").name, gone.with_suffix(".json").name, STREAM_NAME,
+        "session.json", "session.jsonl",
     ]  # fmt: skip
+
+
+def test_a_recording_that_was_away_and_is_back_does_not_replace_the_newer(folder: Path) -> None:
+    first = made(folder, ("Back stroke 1", 1), 50)
+    rows = first.read_bytes()
+    first.unlink()
+    assert opened(folder).standing.takes == {}
+    assert first.with_suffix(".json").exists()
+    second = made(folder, ("Back stroke 1", 1), 60)
+    first.write_bytes(rows)
+    for _ in range(2):
+        standing = opened(folder).standing
+        assert standing.takes == {("Back stroke 1", 1): second.name}
+        assert standing.aside == {("Back stroke 1", 1): [first.name]}
+    assert set_aside(folder) == {first.name: "made again"}
+
+
+def test_a_log_that_lost_lines_is_survived(folder: Path) -> None:
+    """Whatever is left of a log, in whatever order: a session opens, and no recording on disk is forgotten."""
+    a, b = made(folder, ("Back stroke 1", 1), 50), made(folder, ("Back stroke 1", 1), 60)
+    words = [
+        Event(what, 70, {"file": file, "gesture": "Back stroke 1", "repetition": 1}).to_line()
+        for what in ("take", "redo", "keep", "start", "skip", "abandon", "go")
+        for file in (a.name, b.name, "x", "")
+    ] + ["{}\n", "[]\n", "\x00\x00", '{"what": "keep", "at_ms": "x"}\n']
+    rng = random.Random(5)
+    for _ in range(60):
+        (folder / SESSION_LOG).write_text("".join(rng.choices(words, k=rng.randrange(12))))
+        standing = opened(folder).standing
+        known = set(standing.takes.values()) | {f for files in standing.aside.values() for f in files}
+        assert {a.name, b.name} <= known
+        assert set(standing.takes.values()) <= {a.name, b.name}
+        assert a.exists() and b.exists()
 
 
 def test_a_second_program_is_refused(folder: Path) -> None:
@@ -199,6 +234,10 @@ def test_which_session_comes_next(tmp_path: Path) -> None:
     for name, started in (("1", 5), ("autumn", 4)):
         OpenSession(person / name, replace(HEAD, session=name, started_ms=started)).close()
     assert session_names(person) == ["autumn", "1"]
+    other = tmp_path / "S02"
+    for name, started in (("9", 50), ("10", 40)):
+        OpenSession(other / name, replace(HEAD, subject="S02", session=name, started_ms=started)).close()
+    assert session_names(other) == ["9", "10"], "the computer's clock was set back between them"
     assert (next_session(person), new_session(person)) == ("1", "2")
     opened(person / "1", Event("finished", 9))
     assert next_session(person) == "2"
@@ -221,7 +260,7 @@ def test_no_code(code: str) -> None:
 
 def test_a_sessions_name_is_a_folders_name() -> None:
     assert check_session("autumn-2") == "autumn-2"
-    for name in ("", "..", "a/b", "a b", "x" * 33):
+    for name in ("", "..", "a/b", "a b", "x" * 33, "NUL", "com1"):
         with pytest.raises(DatasetError, match="no name for a session"):
             check_session(name)
 

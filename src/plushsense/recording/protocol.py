@@ -102,6 +102,8 @@ class Protocol:
         for key in ("name", "title", "gesture_set", "order", "words"):
             if not isinstance(table.get(key, ""), str):
                 raise ConfigError(f"The {where}: {key} is {table[key]!r}; it must be a text.")
+        if not table["name"].strip():
+            raise ConfigError(f"The {where} has an empty name: give it one.")
         order = table.get("order", "gesture")
         if order not in ORDERS:
             raise ConfigError(
@@ -161,7 +163,7 @@ def _resolved(
         return tuple(labels), {label: given[label] for label in labels}, tuple(nobody), words
     gesture_set = _gesture_set(table["gesture_set"], beside)
     found = [gesture_set.get(label) for label in labels] or [g for g in gesture_set.gestures if not g.nobody]
-    if len({g.label for g in found}) < len(found) or not found:
+    if len({g.label for g in found}) < len(found) or not found or ("gestures" in table and not labels):
         raise ConfigError(f"The {where} must name every gesture once, and at least one: see its gestures.")
     wordings = {DEFAULT, *(w for text in given.values() if isinstance(text, Mapping) for w in text)}
     if words not in wordings:

@@ -73,12 +73,17 @@ def check_session(name: str) -> str:
 
 
 def session_names(person: Path) -> list[str]:
-    """The sessions in a person's folder, in the order in which they were begun."""
+    """The sessions in a person's folder, in the order in which they were begun.
+
+    Numbers say it where all are numbers: a computer without a battery for its clock may think that it is yesterday.
+    """
     found = []
     for folder in sorted(person.iterdir()) if person.is_dir() else ():
         head = SessionHead.read(folder) if (folder / SESSION_HEAD).is_file() else None
         if head is not None:
             found.append((head.started_ms, folder.name))
+    if all(name.isdigit() for _, name in found):
+        return sorted((name for _, name in found), key=int)
     return [name for _, name in sorted(found)]
 
 
@@ -231,15 +236,17 @@ def _end_torn_line(path: Path) -> None:
 def _mend(folder: Path, layout: Layout, log: LogFile) -> Standing:
     """Where the session stands, by its log and its files; what a crash left is put right, each time with an event."""
     standing = Standing(resumed=(folder / STREAM_NAME).exists() or any(True for _ in read_events(folder)))
-    started = _replay(folder, standing)
+    started, made = _replay(folder, standing)
     _mend_stream(folder / STREAM_NAME, layout, standing, log)
     for path in sorted(folder.iterdir()):
         if path.name.endswith((PART, NEW)):
             log.write([_event("mended", file=path.name, bytes=path.stat().st_size, how="unfinished file removed")])
             path.unlink()
-    _mend_takes(folder, standing, log)
+    _mend_takes(folder, standing, log, made)
     for path in sorted(folder.glob(f"*{SIDECAR}")):
-        if path.name != SESSION_HEAD and not path.with_suffix(".csv").exists():
+        csv = path.with_suffix(".csv")
+        # One whose recording was finished once is kept: the recording may be somewhere else, or come back.
+        if path.name != SESSION_HEAD and csv.name not in made and not csv.exists():
             log.write([_event("mended", file=path.name, how="sidecar without a recording removed")])
             path.unlink()
     if started is not None and started not in standing.takes:
@@ -257,8 +264,12 @@ def _key(more: dict[str, Any]) -> Key | None:
     return (gesture, repetition) if isinstance(gesture, str) and isinstance(repetition, int) else None
 
 
-def _replay(folder: Path, standing: Standing) -> Key | None:
-    """Bring ``standing`` to what the log says; returns the recording that was begun and never ended."""
+def _replay(folder: Path, standing: Standing) -> tuple[Key | None, dict[str, Key]]:
+    """Bring ``standing`` to what the log says.
+
+    Returns:
+        The recording that was begun and never ended, and every file that ever was finished with what it is of.
+    """
     of: dict[str, Key] = {}
     open_key: Key | None = None
     for event in read_events(folder):
@@ -276,11 +287,12 @@ def _replay(folder: Path, standing: Standing) -> Key | None:
             if standing.takes.get(of[file]) == file:
                 del standing.takes[of[file]]
         elif event.what == "keep" and file in of:
-            standing.aside[of[file]].remove(file)
+            if file in (aside := standing.aside.get(of[file], [])):
+                aside.remove(file)
             standing.takes[of[file]] = file
         elif event.what == "skip" and key is not None:
             standing.skipped.add(key)
-    return open_key
+    return open_key, of
 
 
 def _mend_stream(path: Path, layout: Layout, standing: Standing, log: LogFile) -> None:
@@ -317,7 +329,7 @@ def _host_ms(line: bytes, layout: Layout) -> int:
     return 0
 
 
-def _mend_takes(folder: Path, standing: Standing, log: LogFile) -> None:
+def _mend_takes(folder: Path, standing: Standing, log: LogFile, made: dict[str, Key]) -> None:
     """Look at every recording: one that the log does not know is taken in, one that is not whole is set aside."""
     known = {file: key for key, file in standing.takes.items()}
     known |= {file: key for key, files in standing.aside.items() for file in files}
@@ -335,6 +347,12 @@ def _mend_takes(folder: Path, standing: Standing, log: LogFile) -> None:
                 del standing.takes[key]
             continue
         if key is not None:
+            continue
+        if path.name in made:
+            # It was gone, was made again, and is back: the newer one counts.
+            key = made[path.name]
+            log.write([_event("redo", file=path.name, gesture=key[0], repetition=key[1], why="made again")])
+            standing.aside.setdefault(key, []).insert(0, path.name)
             continue
         try:
             sidecar = json.loads(path.with_suffix(SIDECAR).read_text(encoding="utf-8"))
