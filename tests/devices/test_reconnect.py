@@ -49,6 +49,31 @@ def collect(device: Device, until: Callable[[list[Frame]], bool], patience_s: fl
     return frames
 
 
+class Gone(Device):
+    """A toy that is away after its first frame."""
+
+    def read(self) -> list[Frame] | None:
+        if self.counters.frames:
+            raise DeviceError("'x' went away.")
+        self.counters.frames = 1
+        return [Frame(0, 0, (0,) * PLUSH.n_channels)]
+
+
+def test_one_that_went_away_is_closed_before_it_is_opened_again() -> None:
+    """Its port is locked for others as long as it is open, for ourselves, too."""
+    made: list[Device] = []
+
+    def open_inner() -> Device:
+        assert all(device.closed for device in made)
+        made.append(Gone("x", PLUSH))
+        return made[-1]
+
+    with ReconnectingDevice("x", PLUSH, open_inner) as device:
+        assert len(collect(device, lambda frames: len(frames) == 3)) == 3
+    assert (device.counters.reconnects, len(made)) == (2, 3)
+    assert all(device.closed for device in made)
+
+
 @contextmanager
 def tcp_toy(port: int = 0) -> Iterator[str]:
     ready, stop, url = threading.Event(), threading.Event(), [""]
