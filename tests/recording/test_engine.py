@@ -389,6 +389,15 @@ def test_commands_from_many_threads_lose_nothing(tmp_path: Path) -> None:
     assert (len(session.standing.takes), len(session.standing.skipped)) == (at_end.done, at_end.skipped)
 
 
+def test_a_remark_after_the_end_is_not_said_to_be_kept(tmp_path: Path) -> None:
+    with recorder(tmp_path) as r:
+        r.note("in time")
+        assert r.status().message == "Noted."
+    r.note("too late")
+    assert "not kept" in r.status().message
+    assert [e.more["text"] for e in read_events(tmp_path) if e.what == "note"] == ["in time"]
+
+
 FULL = """
 import resource, signal, sys
 from pathlib import Path

@@ -205,7 +205,9 @@ class Recorder(Machine):
         """Keep a remark with the time, the recording that is asked for and the last one made."""
         text = " ".join(text.split())
         with self._telling():
-            if text:
+            if text and (self._closing or self._state == "stopped"):
+                self._say("The session has ended: this remark is not kept.")
+            elif text:
                 self._log_step("note", text=text, file=self._course.last_file)
                 self._say("Noted.")
 

@@ -108,7 +108,7 @@ class _Windows:
             return ""
         if key == "\x03":
             raise KeyboardInterrupt
-        return key
+        return "q" if key == END else key
 
 
 @contextmanager
