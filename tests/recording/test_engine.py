@@ -8,7 +8,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -23,12 +23,14 @@ from plushsense.core.signal import load_layout
 from plushsense.devices.base import Device, Frame, now_ms
 from plushsense.devices.opening import open_device
 from plushsense.devices.reconnect import ReconnectingDevice
+from plushsense.recording import machine
 from plushsense.recording.engine import Auto, Recorder
 from plushsense.recording.protocol import load_protocol
 from plushsense.recording.session import OpenSession
 from plushsense.recording.sessionfile import SessionHead, read_events, set_aside
 from plushsense.recording.status import Status
 from plushsense.recording.toy import prompt_virtual
+from plushsense.recording.writer import StreamFile
 
 LAYOUT = load_layout("plush-15")
 PROTOCOL = load_protocol("quick")
@@ -479,6 +481,33 @@ def test_a_full_disk(small_disk: Path) -> None:
     assert "Traceback" not in done.stderr
     subprocess.run(["mount", "-o", "remount,size=64m", str(small_disk)], check=True)
     resumed(small_disk, before)
+
+
+def test_a_stream_that_fails_while_a_recording_is_saved_stops_the_session(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The recording is kept, and the screen must not say that the next may begin."""
+    full = threading.Event()
+    keep, write = machine.keep_take, StreamFile.write
+
+    def slowly(*given: Any, **more: Any) -> tuple[str, str]:
+        kept = keep(*given, **more)
+        full.set()
+        until(lambda: bool(r.status().failed))
+        return kept
+
+    def refused(self: StreamFile, frames: Sequence[Frame]) -> None:
+        if full.is_set():
+            raise OSError(28, "No space left on device")
+        write(self, frames)
+
+    monkeypatch.setattr(machine, "keep_take", slowly)
+    monkeypatch.setattr(StreamFile, "write", refused)
+    with recorder(tmp_path, auto=Auto(1.0, 0.5)) as r:
+        until(lambda: r.status().done == 1)
+        assert r.status().state == "stopped"
+        assert "cannot be written any more" in r.status().message
+    assert len(list(tmp_path.glob("* *_*.csv"))) == 1
 
 
 def test_a_stream_that_cannot_be_opened_is_one_sentence(tmp_path: Path) -> None:

@@ -154,6 +154,9 @@ class Machine:
         self._changed.notify_all()
 
     def _enter(self, state: State, message: str) -> None:
+        if self._failed:
+            # Also for a recording that was still being saved when the stream could not be written any more.
+            state, message = "stopped", self._failed
         self._state = state
         self._since_ms = self._intake.toy_ms
         self._message = message
