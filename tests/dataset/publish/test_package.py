@@ -25,6 +25,7 @@ def test_every_validator_agrees(package: Published) -> None:
         "checksums",
         "data",
         "times",
+        "metadata",
         "croissant",
         "frictionless",
         "ro-crate",
