@@ -97,11 +97,16 @@ class Description:
         return f"SIMULATION: {title}" if self.simulated and not title.startswith("SIMULATION") else title
 
     @property
+    def gestures_made(self) -> int:
+        """How many gestures there are recordings of; the set can hold more."""
+        return len({r.gesture for r in self.dataset.recordings})
+
+    @property
     def text(self) -> str:
         """The description in a paragraph."""
         d = self.dataset
         counted = (
-            f"{len(d.recordings)} recordings of {len(d.gestures)} gestures by {len(d.subjects)} people on "
+            f"{len(d.recordings)} recordings of {self.gestures_made} gestures by {len(d.subjects)} people on "
             f"'{d.layout.title}': {d.layout.n_channels} channels at about {d.layout.rate_hz:g} Hz"
             f"{f', and {len(d.streams)} whole session streams' if d.streams else ''}."
         )
