@@ -119,7 +119,11 @@ def _labels(found: Reidentified) -> str:
     alone = found.of_one_person
     if not alone:
         return ""
-    return f"Only one person made the gesture {', '.join(alone)}: that label alone names the person."
+    many = len(alone) > 1
+    return (
+        f"Only one person made the gesture{'s' if many else ''} {', '.join(alone)}: "
+        f"{'each of these labels' if many else 'that label'} alone names a person."
+    )
 
 
 def _counted(n: int, of: int) -> str:
