@@ -1,7 +1,8 @@
-"""Unpacking a zip that somebody sent: nothing is written outside the folder, and nothing without end.
+"""Zips. One that somebody sent is unpacked: nothing is written outside the folder, and nothing without end.
 
 Every member is unpacked or refused with a reason: links, devices, paths that leave the folder, names that a file system
 would take for another's or for a device, encrypted or damaged members, and those that swell beyond all measure.
+Ours hold nothing of the disk that they were made on.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.dataset.copying import DEVICE_NAME
 
 _CHUNK = 1 << 20
+# The earliest time that a zip can say.
+_WHEN = (1980, 1, 1, 0, 0, 0)
 _DEEPEST = 30
 _LONGEST_NAME = 200
 _LONGEST_PATH = 800
@@ -57,6 +60,15 @@ class Limits:
         for key in ("total_bytes", "files", "ratio"):
             if not 0 < getattr(self, key) < 2**60:
                 raise ConfigError(f"The archive limit {key} is {getattr(self, key)}; it must be above 0.")
+
+
+def entry_of(name: str) -> zipfile.ZipInfo:
+    """An entry of a zip of ours, without the disk's times and modes: the same files give the same bytes."""
+    entry = zipfile.ZipInfo(name, _WHEN)
+    entry.compress_type = zipfile.ZIP_DEFLATED
+    entry.create_system = 3
+    entry.external_attr = (stat.S_IFREG | 0o644) << 16
+    return entry
 
 
 def _target(name: str) -> PurePosixPath | str:

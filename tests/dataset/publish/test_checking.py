@@ -13,8 +13,9 @@ from urllib.parse import unquote
 import pytest
 
 from plushsense.core.errors import DatasetError
+from plushsense.dataset.freshness import sha256_of
 from plushsense.dataset.publish import as_crate
-from plushsense.dataset.publish.archive import sha256, write_checksums, write_zip
+from plushsense.dataset.publish.archive import write_checksums, write_zip
 from plushsense.dataset.publish.checking import VALIDATORS, Package, check_folder, validate_package
 from plushsense.dataset.publish.package import Published
 
@@ -155,7 +156,7 @@ def reseal(root: Path, before: dict[str, str]) -> None:
     for _ in range(3):
         for path in sorted(p for p in root.rglob("*") if p.is_file()):
             file = path.relative_to(root).as_posix()
-            old, new = before.get(file, ""), sha256(path)
+            old, new = before.get(file, ""), sha256_of(path)
             if old and old != new:
                 for other in ("recordings.csv", "streams.csv", "croissant.json", "datapackage.json", as_crate.FILE):
                     (root / other).write_text((root / other).read_text("utf-8").replace(old, new), "utf-8")
@@ -170,7 +171,7 @@ def reseal(root: Path, before: dict[str, str]) -> None:
             as_crate.FILE,
             lambda t: [size(e, unquote(e["@id"]), "contentSize") for e in t["@graph"] if "contentSize" in e],
         )
-    before[as_crate.FILE] = sha256(root / as_crate.FILE)
+    before[as_crate.FILE] = sha256_of(root / as_crate.FILE)
     write_checksums(root)
 
 
@@ -220,7 +221,7 @@ CONTRADICTIONS: dict[str, tuple[str, Damage]] = {
 def test_a_contradiction_is_caught_whatever_the_checksums_say(package: Published, tmp_path: Path, what: str) -> None:
     root = tmp_path / "package"
     shutil.copytree(package.folder, root)
-    before = {p.relative_to(root).as_posix(): sha256(p) for p in root.rglob("*") if p.is_file()}
+    before = {p.relative_to(root).as_posix(): sha256_of(p) for p in root.rglob("*") if p.is_file()}
     by, damage = CONTRADICTIONS[what]
     damage(root)
     reseal(root, before)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
 import zipfile
@@ -12,11 +11,10 @@ from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 
 from plushsense.core.errors import DatasetError
-from plushsense.dataset.archives import DAMAGED, Limits, refusal, unpack_member
+from plushsense.dataset.archives import DAMAGED, Limits, entry_of, refusal, unpack_member
+from plushsense.dataset.freshness import sha256_of
 from plushsense.dataset.publish.description import CHECKSUMS
 
-# The earliest time that a zip can say.
-_EPOCH = (1980, 1, 1, 0, 0, 0)
 _LINE = re.compile(r"(?P<sha>[0-9a-f]{64}) [ *](?P<path>.+)")
 _LIMITS = Limits(total_bytes=64 * 2**30)
 _BROKEN: tuple[type[Exception], ...] = (*DAMAGED, OSError)
@@ -31,7 +29,7 @@ def files_of(root: Path) -> list[Path]:
 def write_checksums(root: Path) -> int:
     """Write ``checksums.sha256`` as ``sha256sum`` reads it; returns the number of lines."""
     lines = [
-        f"{sha256(path)}  {path.relative_to(root).as_posix()}\n" for path in files_of(root) if path.name != CHECKSUMS
+        f"{sha256_of(path)}  {path.relative_to(root).as_posix()}\n" for path in files_of(root) if path.name != CHECKSUMS
     ]
     (root / CHECKSUMS).write_text("".join(lines), encoding="utf-8", newline="\n")
     return len(lines)
@@ -57,12 +55,6 @@ def read_checksums(root: Path) -> dict[str, str]:
     return sums
 
 
-def sha256(path: Path) -> str:
-    """SHA-256 of a file, in hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
 def write_zip(root: Path, target: Path, folder: str) -> None:
     """Pack a package under one folder name; whole or not at all, and never in place of another file.
 
@@ -75,10 +67,7 @@ def write_zip(root: Path, target: Path, folder: str) -> None:
     try:
         with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
             for path in files_of(root):
-                entry = zipfile.ZipInfo(f"{folder}/{path.relative_to(root).as_posix()}", _EPOCH)
-                entry.compress_type = zipfile.ZIP_DEFLATED
-                entry.create_system = 3
-                entry.external_attr = 0o100644 << 16
+                entry = entry_of(f"{folder}/{path.relative_to(root).as_posix()}")
                 archive.writestr(entry, path.read_bytes())
         os.replace(part, target)
     finally:

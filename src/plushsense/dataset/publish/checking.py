@@ -26,11 +26,12 @@ from urllib.parse import unquote
 from plushsense.core.errors import MissingExtraError, PlushSenseError
 from plushsense.core.extras import need
 from plushsense.core.recfile import parse_name, read_stream
+from plushsense.dataset.freshness import sha256_of
 from plushsense.dataset.index import Rebuilt, build
 from plushsense.dataset.people import PEOPLE
 from plushsense.dataset.publish import as_crate, as_croissant, as_datacite, as_datapackage
 from plushsense.dataset.publish.agreement import compare_metadata, compare_tables, find_private
-from plushsense.dataset.publish.archive import files_of, opened, read_checksums, sha256
+from plushsense.dataset.publish.archive import files_of, opened, read_checksums
 from plushsense.dataset.publish.croissant_records import compare_records
 from plushsense.dataset.publish.description import CHECKSUMS, DATA
 from plushsense.dataset.publish.shifting import LATEST_MS, WALL_CLOCK_MS
@@ -100,7 +101,7 @@ class Package:
     @cached_property
     def sums(self) -> dict[str, str]:
         """SHA-256 of every file that is there."""
-        return {p.relative_to(self.root).as_posix(): sha256(p) for p in files_of(self.root)}
+        return {p.relative_to(self.root).as_posix(): sha256_of(p) for p in files_of(self.root)}
 
     @cached_property
     def built(self) -> Rebuilt:

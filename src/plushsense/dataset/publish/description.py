@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from plushsense.core.signal import DEVICE_MS, HOST_MS, Channel, Layout
 from plushsense.dataset.about import About, Creator
+from plushsense.dataset.freshness import sha256_of
 from plushsense.dataset.publish.licences import Licence
 from plushsense.dataset.store import Dataset
 
@@ -151,9 +151,8 @@ _MEDIA = {
 
 def file_entry(root: Path, path: Path, text: str) -> FileEntry:
     """What is to be said of a file of the package in ``root``."""
-    data = path.read_bytes()
     relative = path.relative_to(root).as_posix()
-    return FileEntry(relative, len(data), hashlib.sha256(data).hexdigest(), _MEDIA.get(path.suffix, "text/plain"), text)
+    return FileEntry(relative, path.stat().st_size, sha256_of(path), _MEDIA.get(path.suffix, "text/plain"), text)
 
 
 def sample_columns(layout: Layout, labelled: bool) -> tuple[Column, ...]:
