@@ -115,7 +115,7 @@ def test_across_sessions_the_way_of_holding_does_not_help(tmp_path: Path) -> Non
     assert within.top1["mean"] > 0.95
     assert across.top1["mean"] < 0.6
     assert "In a session that the program never saw it is right in" in short(found)
-    assert "tried on the 4 people who came more than once" in short(found)
+    assert "tried on those who came more than once: 4 of 4 people" in short(found)
     other = found.under({"P1": "PX"})
     assert set(other.trials[0].by_person) == set(other.trials[0].precision) == {"PX", "P2", "P3", "P4"}
     assert "PX" in report(other, "x")

@@ -87,7 +87,7 @@ def _sessions(found: Reidentified) -> str:
         )
     return (
         f"In a session that the program never saw it is right in {_hundred(trial.top1['mean'])} of 100 cases"
-        f"{_range(trial)}, tried on {_counted(len(trial.by_person), trial.people)} who came more than once."
+        f"{_range(trial)}, tried on those who came more than once: {len(trial.by_person)} of {trial.people} people."
     )
 
 
@@ -124,10 +124,6 @@ def _labels(found: Reidentified) -> str:
         f"Only one person made the gesture{'s' if many else ''} {', '.join(alone)}: "
         f"{'each of these labels' if many else 'that label'} alone names a person."
     )
-
-
-def _counted(n: int, of: int) -> str:
-    return f"the {n} people" if n == of else f"{n} of the {of} people"
 
 
 def _table(found: Reidentified) -> str:
