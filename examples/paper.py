@@ -218,8 +218,8 @@ def as_html(rows: list[Row], notes: list[str]) -> str:
     )
     said = "".join(f"<p>{html.escape(n)}</p>" for n in notes)
     style = (
-        "body{font:15px/1.5 sans-serif;max-width:60em;margin:2em auto;padding:0 1em}"
-        "td,th{padding:.2em .8em;text-align:left}"
+        "body{font:15px/1.5 sans-serif;max-width:75em;margin:2em auto;padding:0 1em}"
+        "td,th{padding:.2em .8em;text-align:left}td:nth-child(n+3){white-space:nowrap}"
     )
     title = "The paper beside ours"
     return (

@@ -34,7 +34,9 @@ def test_from_refusal_to_a_valid_package(cli: Cli, dataset: Dataset, tmp_path: P
     assert (found["recordings"], found["subjects"], found["problems"]) == (30, 5, [])
     assert (dataset.path / "dataset.toml").read_bytes() == head, "nothing is written back unless asked"
     assert "The right" not in (out / "reidentification.md").read_text()
+    assert any("the title is the data set's name" in w for w in found["warnings"])
     said = (out / "README.md").read_text()
+    assert "`reidentification.md`" in said
     assert "a simple program names the right one of 5 people" in said
     assert json.loads((out / "reidentification.json").read_text())["people"] == 5
     checked = cli("publish", "--check", found["zip"], "--json")
@@ -45,6 +47,18 @@ def test_from_refusal_to_a_valid_package(cli: Cli, dataset: Dataset, tmp_path: P
     assert "checksums: gestures.csv: was changed" in damaged.err
     assert "not valid" in damaged.out
     assert cli("publish", dataset.path, out, *SAID).status == 2
+
+
+def test_the_report_says_the_codes_of_the_package(cli: Cli, dataset: Dataset, tmp_path: Path) -> None:
+    for number, code in enumerate(dataset.subjects, 1):
+        for kind in ("recordings", "streams"):
+            (dataset.path / kind / code).rename(dataset.path / kind / str(number))
+    (dataset.path / "index.json").unlink()
+    assert cli("publish", dataset.path, tmp_path / "out", *SAID, "--no-streams").status == 0
+    table = (tmp_path / "out" / "subjects.csv").read_text().splitlines()[1:]
+    published = {line.partition(",")[0] for line in table} - {"none"}
+    figures = json.loads((tmp_path / "out" / "reidentification.json").read_text())
+    assert set(figures["trials"][0]["by_person"]) == published == {"P1", "P2", "P3", "P4", "P5"}
 
 
 def test_saving_and_leaving_the_report_out(cli: Cli, dataset: Dataset, tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """One file that brings a data set back; a damaged one brings back nothing."""
 
+import hashlib
 import json
 import random
 import stat
@@ -204,3 +205,26 @@ def test_a_file_that_changes_while_it_is_saved_stops_the_backup(
 def test_links_to_folders_are_named(folder: Path, tmp_path: Path) -> None:
     (folder / "elsewhere").symlink_to(tmp_path, target_is_directory=True)
     assert backup(folder, tmp_path / "a.zip").left_out == ("elsewhere",)
+
+
+def test_a_file_put_in_place_of_another_is_noticed(folder: Path, tmp_path: Path) -> None:
+    """The zip's own checksum is right then; the manifest's is not, or (made anew too) the data set's."""
+    backup(folder, tmp_path / "a.zip")
+    changed = next(name for name in kept(folder) if name.endswith("_50.csv"))
+    for careful in (False, True):
+        target = tmp_path / f"{careful}.zip"
+        with zipfile.ZipFile(tmp_path / "a.zip") as old, zipfile.ZipFile(target, "w") as new:
+            manifest = json.loads(old.read(MANIFEST))
+            data = old.read(changed).replace(b"1", b"2", 1)
+            if careful:
+                entry = next(e for e in manifest["files"] if e["path"] == changed)
+                entry["sha256"] = hashlib.sha256(data).hexdigest()
+            for info in old.infolist():
+                if info.filename != MANIFEST:
+                    new.writestr(info, data if info.filename == changed else old.read(info))
+            new.writestr(MANIFEST, json.dumps(manifest))
+        with pytest.raises(DatasetError, match="another data set than" if careful else "is not what was saved"):
+            restore(target, tmp_path / "R")
+        assert not (tmp_path / "R").exists()
+    with pytest.raises(DatasetError, match="is not what was saved"):
+        check_backup(tmp_path / "False.zip")

@@ -55,6 +55,47 @@ def files(folder: Path) -> dict[str, bytes]:
     return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
+@pytest.mark.parametrize("at", ["forgetting.json.7.part", "marks.jsonl.7.part", "recordings.csv.7.part"])
+def test_what_a_killed_program_never_renamed_goes_too(folder: Path, at: str) -> None:
+    (folder / at).write_text('{"recording": "P1/Wave"}')
+    forget(folder, "P1")
+    assert not list(folder.glob("*.part"))
+
+
+def test_stopped_between_the_last_line_and_the_end_it_is_buried_once(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    forget(folder, "P11")
+    whole = Path.unlink
+
+    def killed(path: Path, missing_ok: bool = False) -> None:
+        if path.name == UNDER_WAY:
+            raise KeyboardInterrupt
+        whole(path, missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", killed)
+    with pytest.raises(KeyboardInterrupt):
+        forget(folder, "P1")
+    monkeypatch.undo()
+    forget(folder, "P1")
+    assert [stone.files for stone in forgotten(folder)] == [3, 3]
+    assert not (folder / UNDER_WAY).exists()
+
+
+def test_who_comes_into_a_set_that_people_were_taken_out_of_is_named(folder: Path, tmp_path: Path) -> None:
+    def told() -> list[str]:
+        done = import_recordings(tmp_path / "src", folder, add_to=True)
+        return [w for w in done.to_dict()["warnings"] if "forgotten" in w]
+
+    (folder / "cache").mkdir(exist_ok=True)
+    assert told() == []
+    forget(folder, "P1")
+    (said,) = told()
+    assert "P1 just came in" in said
+    assert "plushsense forget" in said
+    assert told() == [], "only who is new"
+
+
 def test_a_look_changes_nothing(folder: Path) -> None:
     before = files(folder)
     plan = leaving(folder, "P1")

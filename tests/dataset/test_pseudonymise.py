@@ -16,7 +16,7 @@ from plushsense.core.recfile import Frames, format_rows, write_recording
 from plushsense.core.signal import load_layout
 from plushsense.dataset.importers import import_recordings
 from plushsense.dataset.index import open_dataset
-from plushsense.dataset.marks import Mark, append_marks, read_marks
+from plushsense.dataset.marks import MARKS, Mark, append_marks, read_marks
 from plushsense.dataset.people import read_people
 from plushsense.dataset.pseudonymise import Pseudonymised, pseudonymise
 from plushsense.dataset.store import Dataset, RecordingInfo
@@ -212,6 +212,28 @@ def test_session_files_people_and_marks_go_along(folder: Path, tmp_path: Path) -
     quiet = pseudonymise(folder, tmp_path / "OUT2", key=done.key, drop_notes=True)
     assert {json.loads(m)["why"] for m in (tmp_path / "OUT2" / "marks.jsonl").read_text().splitlines()} == {""}
     assert not any("free words" in f["message"] for f in quiet.findings)
+
+
+def test_a_session_named_in_words_is_said_and_like_findings_are_one(folder: Path, tmp_path: Path) -> None:
+    """What the recorder did is nobody's, and its name is no name that texts are searched for."""
+    for kind in ("recordings", "streams"):
+        for place in ("monday-anna", "2"):
+            (folder / kind / "P02" / place).mkdir()
+    for at, path in enumerate(sorted((folder / "recordings" / "P02").glob("*.csv"))):
+        path.rename(path.parent / ("monday-anna", "2")[at % 2] / path.name)
+    (folder / "index.json").unlink()
+    ids = [r.id for r in open_dataset(folder).recordings if "anna" in r.id]
+    append_marks(folder, [Mark(i, "exclude", "recorder", "Ana Maria moved") for i in ids])
+    done = made(folder, tmp_path)
+    messages = [f["message"] for f in done.findings]
+    assert any("names of sessions" in m and "'monday-anna';" in m for m in messages)
+    assert len(messages) == len({(f["file"], f["line"], f["message"]) for f in done.findings})
+    assert any(m.startswith(f"{len(ids) + 1} times: a name or code") for m in messages)
+    assert "recorder" in (tmp_path / "OUT" / "dataset.toml").read_text()
+    assert '"who": "recorder"' in (tmp_path / "OUT" / MARKS).read_text()
+    words = pseudonymise(folder, tmp_path / "OUT2", key=done.key, words=["anna"])
+    assert not any("monday-anna" in f["message"] for f in words.findings)
+    assert not list((tmp_path / "OUT2").rglob("*anna*"))
 
 
 def test_the_key_is_added_to_and_a_person_keeps_the_code(folder: Path, tmp_path: Path) -> None:

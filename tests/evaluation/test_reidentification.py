@@ -65,7 +65,9 @@ def test_people_of_their_own_style_are_found_and_the_words_say_so(tmp_path: Path
     assert (everything.people, everything.recordings, everything.chance) == (4, 96, 0.25)
     assert found.find("recordings", "movement").top1["mean"] > 0.9  # type: ignore[union-attr]
     said = short(found)
+    assert "one more recording of a session and of gestures that it knows" in said
     assert "the right one of 4 people" in said
+    assert "Of a gesture that it never saw, it is" in said
     assert "guessing would be right in 25" in said
     assert "must be treated as personal data" in said
     assert "nobody has more than one session" in said
@@ -113,6 +115,11 @@ def test_across_sessions_the_way_of_holding_does_not_help(tmp_path: Path) -> Non
     assert within.top1["mean"] > 0.95
     assert across.top1["mean"] < 0.6
     assert "In a session that the program never saw it is right in" in short(found)
+    assert "tried on those who came more than once: 4 of 4 people" in short(found)
+    other = found.under({"P1": "PX"})
+    assert set(other.trials[0].by_person) == set(other.trials[0].precision) == {"PX", "P2", "P3", "P4"}
+    assert "PX" in report(other, "x")
+    assert "P1 " not in report(other, "x")
 
 
 def test_the_same_seed_gives_the_same_figures(tmp_path: Path) -> None:
@@ -156,4 +163,4 @@ def test_a_gesture_of_one_person_is_told(tmp_path: Path) -> None:
         target.write_bytes(some.read_bytes().replace(b", 1", b", 2", 1 + number))
     found = reidentify(open_dataset(dataset.path), trees=10)
     assert found.of_one_person == ("Salute",)
-    assert "that label alone names the person" in short(found)
+    assert "that label alone names a person" in short(found)

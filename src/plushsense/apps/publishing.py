@@ -9,7 +9,7 @@ from pathlib import Path
 from plushsense.apps.preparation import opened
 from plushsense.core.errors import DatasetError
 from plushsense.dataset.publish.checking import Tell, validate_package
-from plushsense.dataset.publish.contents import Options
+from plushsense.dataset.publish.contents import Options, public_codes
 from plushsense.dataset.publish.package import (
     Published,
     Reidentification,
@@ -78,7 +78,7 @@ def publish_dataset(
     found = None
     if reidentification:
         steps = (lambda done, total: tell("recognising people", done, total)) if tell else None
-        tried = reidentify(dataset, seed=seed, progress=steps)
+        tried = reidentify(dataset, seed=seed, progress=steps).under(public_codes(dataset))
         command = f"plushsense publish DATASET OUT --seed {seed}"
         found = Reidentification(report(tried, command), short(tried), tried.to_dict())
     done = publish(

@@ -22,6 +22,7 @@ from filelock import FileLock, Timeout
 from plushsense.core.errors import DatasetError
 from plushsense.core.gestures import GestureSet
 from plushsense.dataset.copying import Copier, key_of
+from plushsense.dataset.forget import forgotten
 from plushsense.dataset.freshness import sha256_of
 from plushsense.dataset.index import Progress, open_dataset, rebuild
 from plushsense.dataset.making import RECORDER, Account, ImportSummary, extended, merged_people, read_all, summary_of
@@ -149,7 +150,21 @@ def add(
                 raise DatasetError(f"'{target}' appeared while adding: nothing is overwritten, so run it once more.")
             os.replace(work / file, target)
         rebuilt = rebuild(dest, head).dataset if new or marks else open_dataset(dest)
-    return summary_of(rebuilt, account, search.notes + notes, new)
+    come = sorted(set(rebuilt.subjects) - set(dataset.subjects))
+    return summary_of(rebuilt, account, search.notes + notes + _came_back(dest, come), new)
+
+
+def _came_back(dest: Path, come: list[str]) -> list[str]:
+    """A warning where people come into a data set that others were taken out of: nobody knows any more who that was."""
+    gone = forgotten(dest)
+    if not come or not gone:
+        return []
+    days = ", ".join(dict.fromkeys(g.day for g in gone))
+    return [
+        f"people were forgotten here ({len(gone)}; {days}), and {', '.join(come[:5])} just came in"
+        f"{f' with {len(come) - 5} more' if len(come) > 5 else ''}: whoever should not be here, take out again with  "
+        f"plushsense forget {dest} CODE"
+    ]
 
 
 def _with_described(mine: GestureSet, more: GestureSet | None) -> GestureSet:

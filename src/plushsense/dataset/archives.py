@@ -1,7 +1,8 @@
-"""Unpacking a zip that somebody sent: nothing is written outside the folder, and nothing without end.
+"""Zips. One that somebody sent is unpacked: nothing is written outside the folder, and nothing without end.
 
 Every member is unpacked or refused with a reason: links, devices, paths that leave the folder, names that a file system
 would take for another's or for a device, encrypted or damaged members, and those that swell beyond all measure.
+Ours hold nothing of the disk that they were made on.
 """
 
 from __future__ import annotations
@@ -19,14 +20,15 @@ from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.dataset.copying import DEVICE_NAME
 
 _CHUNK = 1 << 20
+# The earliest time that a zip can say.
+_WHEN = (1980, 1, 1, 0, 0, 0)
 _DEEPEST = 30
 _LONGEST_NAME = 200
 _LONGEST_PATH = 800
 # Below this a file may be as regular as it likes: a recording of zeros packs well.
 _SMALL_BYTES = 4_000_000
 _FORBIDDEN = re.compile(r'[\x00-\x1f\x7f:*?"<>|]')
-# What the reader of zips raises on bytes that are no zip, or a damaged one.
-_DAMAGED: tuple[type[Exception], ...] = (
+DAMAGED: tuple[type[Exception], ...] = (
     zipfile.BadZipFile,
     zipfile.LargeZipFile,
     zlib.error,
@@ -37,10 +39,11 @@ _DAMAGED: tuple[type[Exception], ...] = (
     struct.error,
     ValueError,
 )
+"""What the reader of zips raises on bytes that are no zip, or a damaged one."""
 try:
     import lzma
 
-    _DAMAGED = (*_DAMAGED, lzma.LZMAError)
+    DAMAGED = (*DAMAGED, lzma.LZMAError)
 except ImportError:  # A Python that was built without it refuses such members by itself.
     pass
 
@@ -57,6 +60,15 @@ class Limits:
         for key in ("total_bytes", "files", "ratio"):
             if not 0 < getattr(self, key) < 2**60:
                 raise ConfigError(f"The archive limit {key} is {getattr(self, key)}; it must be above 0.")
+
+
+def entry_of(name: str) -> zipfile.ZipInfo:
+    """An entry of a zip of ours, without the disk's times and modes: the same files give the same bytes."""
+    entry = zipfile.ZipInfo(name, _WHEN)
+    entry.compress_type = zipfile.ZIP_DEFLATED
+    entry.create_system = 3
+    entry.external_attr = (stat.S_IFREG | 0o644) << 16
+    return entry
 
 
 def _target(name: str) -> PurePosixPath | str:
@@ -81,7 +93,7 @@ def _target(name: str) -> PurePosixPath | str:
     return PurePosixPath(*parts)
 
 
-def _refusal(info: zipfile.ZipInfo, limits: Limits) -> str:
+def refusal(info: zipfile.ZipInfo, limits: Limits) -> str:
     """Why a member is refused by what the directory says of it; "" when it may be unpacked."""
     kind = stat.S_IFMT(info.external_attr >> 16)
     if kind == stat.S_IFLNK:
@@ -98,8 +110,11 @@ def _refusal(info: zipfile.ZipInfo, limits: Limits) -> str:
     return ""
 
 
-def _unpack_one(archive: zipfile.ZipFile, info: zipfile.ZipInfo, target: Path, limit: int) -> int:
-    """Write one member; returns its size. More than it said, or than there is room for, is damage."""
+def unpack_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, target: Path, limit: int) -> int:
+    """Write one member to the new file ``target``; returns its size.
+
+    More than it said, or than there is room for (``limit`` bytes), is damage; nothing of it is left then.
+    """
     target.parent.mkdir(parents=True, exist_ok=True)
     written = 0
     try:
@@ -126,7 +141,7 @@ def unpack(path: Path, folder: Path, limits: Limits | None = None) -> list[tuple
     refused: list[tuple[str, str]] = []
     try:
         archive = zipfile.ZipFile(path)
-    except _DAMAGED as cause:
+    except DAMAGED as cause:
         raise DatasetError(f"'{path}' is no zip, or a damaged one ({_said(cause)}): get it once more.") from None
     with archive:
         members = [m for m in archive.infolist() if not m.filename.endswith("/")]
@@ -142,7 +157,7 @@ def unpack(path: Path, folder: Path, limits: Limits | None = None) -> list[tuple
         for info in members:
             name = info.filename.encode("utf-8", "backslashreplace").decode()
             target = _target(info.orig_filename if "\x00" in info.orig_filename else info.filename)
-            reason = target if isinstance(target, str) else _refusal(info, limits)
+            reason = target if isinstance(target, str) else refusal(info, limits)
             if isinstance(target, str) or reason:
                 refused.append((name, reason))
                 continue
@@ -152,10 +167,10 @@ def unpack(path: Path, folder: Path, limits: Limits | None = None) -> list[tuple
                 continue
             seen.add(key)
             try:
-                room -= _unpack_one(archive, info, folder / target, room)
+                room -= unpack_member(archive, info, folder / target, room)
             except (FileExistsError, NotADirectoryError, IsADirectoryError):
                 refused.append((name, "another member stands where its folder would be"))
-            except _DAMAGED as cause:
+            except DAMAGED as cause:
                 refused.append((name, f"it is damaged: {_said(cause)}"))
     return refused
 

@@ -22,6 +22,7 @@ from typing import IO, Any
 
 from plushsense.core.errors import DatasetError
 from plushsense.core.folders import whole_folder
+from plushsense.dataset.archives import entry_of
 from plushsense.dataset.contents import contents
 from plushsense.dataset.index import open_dataset, rebuild
 from plushsense.dataset.store import HEAD, Dataset
@@ -30,7 +31,6 @@ MANIFEST = "plushsense-backup.json"
 FORMAT = "plushsense-backup"
 VERSION = 1
 _CHUNK = 1 << 20
-_WHEN = (1980, 1, 1, 0, 0, 0)
 _LEFT_OUT = ("cache", "index", "working")
 # A manifest has about 150 bytes a file.
 _MANIFEST_LIMIT = 1 << 28
@@ -159,17 +159,8 @@ def _manifest(source: Dataset, files: list[dict[str, Any]]) -> str:
     return json.dumps(table, ensure_ascii=False, indent=0) + "\n"
 
 
-def _info(name: str) -> zipfile.ZipInfo:
-    # Without the disk's times and modes, so that the same data set gives the same bytes.
-    info = zipfile.ZipInfo(name, _WHEN)
-    info.compress_type = zipfile.ZIP_DEFLATED
-    info.create_system = 3
-    info.external_attr = (stat.S_IFREG | 0o644) << 16
-    return info
-
-
 def _put(archive: zipfile.ZipFile, name: str, text: str) -> None:
-    archive.writestr(_info(name), text.encode("utf-8"))
+    archive.writestr(entry_of(name), text.encode("utf-8"))
 
 
 def _store(archive: zipfile.ZipFile, folder: Path, path: PurePosixPath) -> dict[str, Any]:
@@ -177,7 +168,7 @@ def _store(archive: zipfile.ZipFile, folder: Path, path: PurePosixPath) -> dict[
     size = 0
     with (folder / path).open("rb") as file:
         before = os.fstat(file.fileno())
-        with archive.open(_info(path.as_posix()), "w", force_zip64=before.st_size >= 1 << 31) as member:
+        with archive.open(entry_of(path.as_posix()), "w", force_zip64=before.st_size >= 1 << 31) as member:
             while chunk := file.read(_CHUNK):
                 digest.update(chunk)
                 size += len(chunk)

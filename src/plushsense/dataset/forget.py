@@ -169,8 +169,12 @@ def forget(dataset: str | Path, subject: str) -> Leaving:
                 "subject": subject,
                 "files": plan.raw,
                 "day": datetime.now(timezone.utc).date().isoformat(),
+                "before": len(_tombstones(folder)),
             }
             write_atomically(folder / UNDER_WAY, json.dumps(intent) + "\n")
+            # What a killed program never renamed: tables, marks or this note, with the person in it.
+            for part in folder.glob("*.part"):
+                part.unlink()
             # From here on no index claims files that are about to go.
             for name in reversed(INDEX):
                 (folder / name).unlink(missing_ok=True)
@@ -291,7 +295,8 @@ def _remove_empty(folder: Path, files: Iterable[str]) -> None:
 def _under_way(folder: Path) -> dict[str, Any] | None:
     try:
         table = json.loads((folder / UNDER_WAY).read_text(encoding="utf-8"))
-        return {"subject": str(table["subject"]), "files": int(table["files"]), "day": str(table["day"])}
+        told = {"subject": str(table["subject"]), "files": int(table["files"]), "day": str(table["day"])}
+        return told | {"before": int(table["before"])}
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, TypeError) as cause:
@@ -303,7 +308,12 @@ def _under_way(folder: Path) -> dict[str, Any] | None:
 def _bury(folder: Path, intent: dict[str, Any]) -> None:
     """Add the line that stays, and take away the note that this was under way: last of all."""
     line = json.dumps({"day": intent["day"], "files": intent["files"]}) + "\n"
-    path = folder / FORGOTTEN
-    before = path.read_text(encoding="utf-8") if path.is_file() else ""
-    write_atomically(path, before + line)
+    # A run that was stopped just here has its line already.
+    before = _tombstones(folder)[: intent["before"]]
+    write_atomically(folder / FORGOTTEN, "".join([*before, line]))
     (folder / UNDER_WAY).unlink()
+
+
+def _tombstones(folder: Path) -> list[str]:
+    path = folder / FORGOTTEN
+    return path.read_text(encoding="utf-8").splitlines(keepends=True) if path.is_file() else []

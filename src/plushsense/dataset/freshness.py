@@ -33,7 +33,10 @@ def raw_files(folder: Path) -> list[tuple[str, Path]]:
 
 def sha256_of(path: Path) -> str:
     """SHA-256 of a file, in hexadecimal; "" where there is none."""
-    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
+    if not path.is_file():
+        return ""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def taken(folder: Path) -> dict[str, Any]:

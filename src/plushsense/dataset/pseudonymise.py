@@ -22,7 +22,7 @@ from plushsense.core.gestures import NOBODY
 from plushsense.core.recfile import ReadResult, parse_name, read_recording, read_stream
 from plushsense.core.signal import DEVICE_MS, HOST_MS, Layout
 from plushsense.dataset.contents import Content, contents, folders_of_people, same_code
-from plushsense.dataset.index import Progress, build, open_dataset, write
+from plushsense.dataset.index import AGAIN, Progress, build, open_dataset, write
 from plushsense.dataset.keyfile import KEPT, Pseudonym, extended, read_key, write_key
 from plushsense.dataset.marks import MARKS
 from plushsense.dataset.people import PEOPLE, read_people, write_people
@@ -190,8 +190,15 @@ class _Work:
             write_key(self.key, self.codes)
         if self.found.prose:
             self.found.add("", f"{self.found.prose} notes in free words were kept: names are replaced, but read them")
+        words = sorted({s for new in self.moved.values() for s in PurePosixPath(new).parts[2:-1] if _in_words(s)})
+        if words:
+            self.found.add(
+                "",
+                f"names of sessions that are words stay as they are: {_listed(words)}; where one tells who somebody "
+                "is, put that word into --words",
+            )
         result = Dataset(dest, made.head, made.recordings, made.streams)
-        return Pseudonymised(result, files, self.found.found, self.key)
+        return Pseudonymised(result, files, self.found.told(), self.key)
 
     def _raw_files(self, work: Path) -> NDArray[np.int64]:
         """Rewrite the raw files, each checked against its original; returns every time that was in one."""
@@ -303,6 +310,11 @@ class _Work:
 
         stream = self._renamed(old.stream)
         return facts(old) == facts(new) and new.stream == stream
+
+
+def _in_words(session: str) -> bool:
+    """Whether a session's name is more than a number or a date; the importer's own names are not counted."""
+    return not session.startswith(AGAIN) and re.search(r"[^\W\d_]{2}", session.removeprefix("session")) is not None
 
 
 def _listed(names: Iterable[str]) -> str:

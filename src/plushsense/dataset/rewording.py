@@ -32,7 +32,7 @@ _PLACES = frozenset({"device", "port", "address", "url", "mac", "hostname", "com
 PROSE = frozenset({"why", "text", "note", "notes", "comment", "comments", "said", "description"})
 _SECONDS = ("_s", "timestamp", "epoch")
 # A program that marks says so in place of a login; that is nobody's name.
-_PROGRAM = "plushsense"
+_PROGRAMS = re.compile(r"plushsense.*|recorder", re.IGNORECASE | re.DOTALL)
 _FILE = re.compile(r"^(?P<label>.+)_(?P<epoch>\d{1,18})_(?P<rows>\d{1,12}(?:\.\w+)?(?:#.*)?)$", re.DOTALL)
 
 
@@ -46,6 +46,14 @@ class Findings:
     def add(self, file: str, message: str, line: int = 0) -> None:
         """One more."""
         self.found.append({"file": file, "line": line, "message": message})
+
+    def told(self) -> list[dict[str, Any]]:
+        """All, those that are alike as one."""
+        times = Counter((f["file"], f["line"], f["message"]) for f in self.found)
+        return [
+            {"file": file, "line": line, "message": message if n == 1 else f"{n} times: {message}"}
+            for (file, line, message), n in times.items()
+        ]
 
 
 @dataclass(frozen=True)
@@ -78,7 +86,7 @@ class Rewording:
 
     def role(self, login: str) -> str:
         """``person-1`` in place of a login; a program that marked stays."""
-        if not login or login.casefold().startswith(_PROGRAM):
+        if not login or _PROGRAMS.fullmatch(login):
             return login
         return self.roles.setdefault(login.casefold(), f"person-{len(self.roles) + 1}")
 
@@ -130,7 +138,7 @@ def logins_in(value: Any, key: str = "") -> Iterator[str]:
     elif isinstance(value, list):
         for v in value:
             yield from logins_in(v, key)
-    elif isinstance(value, str) and key in LOGINS and value and not value.casefold().startswith(_PROGRAM):
+    elif isinstance(value, str) and key in LOGINS and value and not _PROGRAMS.fullmatch(value):
         yield value
 
 

@@ -10,8 +10,8 @@ Each person counts alike: top-1 and top-5 are averaged over people, so that chan
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -109,6 +109,15 @@ class Reidentified:
     def find(self, design: str, sees: str) -> Trial | None:
         """One trial; None where it was not possible."""
         return next((t for t in self.trials if (t.design, t.sees) == (design, sees)), None)
+
+    def under(self, codes: Mapping[str, str]) -> Reidentified:
+        """The same under other codes, such as those of a package; who is not in ``codes`` keeps theirs."""
+
+        def renamed(shares: dict[str, float]) -> dict[str, float]:
+            return {codes.get(p, p): share for p, share in shares.items()}
+
+        trials = [replace(t, by_person=renamed(t.by_person), precision=renamed(t.precision)) for t in self.trials]
+        return replace(self, trials=tuple(trials))
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, ready for JSON."""

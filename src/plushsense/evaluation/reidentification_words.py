@@ -8,6 +8,9 @@ LIMITS = """\
 - The program is simple, and one made for the purpose may do better: this is a lower bound of the risk.
 - Whoever wants to recognise somebody needs at least one other recording of that person on the same kind of toy; the
   recordings hold no name, voice or picture.
+- Repetitions of a gesture, made one right after the other, are much alike. Asked about gestures that it knows, the
+  program has mostly learned from the neighbours of the very recording; of a gesture that it never saw, it has not.
+- It read the recordings, trimmed: neither the streams nor for how long the toy had been on. Both may tell more.
 - Recordings of one session share how the toy was set up, worn and switched on. What is recognised within a session is
   partly that, not the person; across sessions it is the person, or what stayed the same about the device.
 - A low figure is no proof of anonymity. Ask your data protection officer."""
@@ -21,11 +24,18 @@ def short(found: Reidentified) -> str:
         return "Nothing could be tried."
     said = [SIMULATED] if found.simulated else []
     said.append(
-        f"Given one new recording, a simple program names the right one of {head.people} people in "
-        f"{_hundred(head.top1['mean'])} of 100 cases{_range(head)}; guessing would be right in "
-        f"{_hundred(head.chance)}. {_verdict(head, found.simulated)}"
+        f"Given one more recording of a session and of gestures that it knows, a simple program names the right one of "
+        f"{head.people} people in {_hundred(head.top1['mean'])} of 100 cases{_range(head)}; guessing would be right in "
+        f"{_hundred(head.chance)}."
     )
-    said += [_sessions(found), _clock(found), _movement(found), _labels(found)]
+    said += [
+        _gestures(found),
+        _verdict(head, found.simulated),
+        _sessions(found),
+        _clock(found),
+        _movement(found),
+        _labels(found),
+    ]
     return " ".join(s for s in said if s)
 
 
@@ -58,9 +68,14 @@ def _verdict(trial: Trial, simulated: bool) -> str:
         return "That is no better than guessing, which is no proof of anonymity: treat the recordings with care."
     many = trial.top1["mean"] >= 3 * trial.chance or trial.top1["mean"] >= 0.5
     return (
-        "**So these recordings must be treated as personal data**: whoever holds another recording of somebody can "
-        f"{'often' if many else 'sometimes'} find that person here, though no name is in the package."
+        "**So these recordings must be treated as personal data**: whoever holds another recording of somebody, made "
+        f"that day, can {'often' if many else 'sometimes'} find that person here, though no name is in the package."
     )
+
+
+def _gestures(found: Reidentified) -> str:
+    trial = found.find("gestures", "everything")
+    return f"Of a gesture that it never saw, it is {_hundred(trial.top1['mean'])} of 100." if trial else ""
 
 
 def _sessions(found: Reidentified) -> str:
@@ -72,7 +87,7 @@ def _sessions(found: Reidentified) -> str:
         )
     return (
         f"In a session that the program never saw it is right in {_hundred(trial.top1['mean'])} of 100 cases"
-        f"{_range(trial)}."
+        f"{_range(trial)}, tried on those who came more than once: {len(trial.by_person)} of {trial.people} people."
     )
 
 
@@ -104,7 +119,11 @@ def _labels(found: Reidentified) -> str:
     alone = found.of_one_person
     if not alone:
         return ""
-    return f"Only one person made the gesture {', '.join(alone)}: that label alone names the person."
+    many = len(alone) > 1
+    return (
+        f"Only one person made the gesture{'s' if many else ''} {', '.join(alone)}: "
+        f"{'each of these labels' if many else 'that label'} alone names a person."
+    )
 
 
 def _table(found: Reidentified) -> str:
@@ -125,7 +144,7 @@ def _table(found: Reidentified) -> str:
 def _designs(found: Reidentified) -> str:
     lines = [
         f"- recordings: {FOLDS} folds over each person's recordings",
-        f"- gestures: {FOLDS} groups of gestures, each left out once",
+        f"- gestures: at most {FOLDS} groups of gestures, each left out once",
         "- sessions: of people of several sessions, each session left out once",
     ]
     lines += [f"- not possible here: {DESIGNS[name]} ({why})" for name, why in found.skipped.items()]

@@ -64,3 +64,15 @@ def test_a_link_and_a_damaged_zip_are_refused(tmp_path: Path) -> None:
     (tmp_path / "broken.zip").write_bytes(bytes(data))
     with pytest.raises(DatasetError, match="damaged zip"), opened(tmp_path / "broken.zip"):
         pass
+
+
+def test_an_entry_that_hides_another_or_swells_is_refused(tmp_path: Path) -> None:
+    write_zip(package(tmp_path / "P"), tmp_path / "p.zip", "n")
+    with zipfile.ZipFile(tmp_path / "p.zip", "a") as archive, pytest.warns(UserWarning, match="Duplicate"):
+        archive.writestr("n/z.txt", "another")
+    with pytest.raises(DatasetError, match=r"'n/z.txt' twice"), opened(tmp_path / "p.zip"):
+        pass
+    with zipfile.ZipFile(tmp_path / "bomb.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("n/z.txt", bytes(20_000_000))
+    with pytest.raises(DatasetError, match="would swell"), opened(tmp_path / "bomb.zip"):
+        pass

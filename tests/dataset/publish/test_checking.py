@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import pytest
 
 from plushsense.core.errors import DatasetError
-from plushsense.dataset.publish.archive import write_checksums
-from plushsense.dataset.publish.checking import check_folder, validate_package
+from plushsense.dataset.freshness import sha256_of
+from plushsense.dataset.publish import as_crate
+from plushsense.dataset.publish.archive import write_checksums, write_zip
+from plushsense.dataset.publish.checking import VALIDATORS, Package, check_folder, validate_package
 from plushsense.dataset.publish.package import Published
 
 Damage = Callable[[Path], None]
@@ -147,6 +151,101 @@ def a_true_time_in_a_name(root: Path) -> None:
     path.rename(path.with_name("Pat_1700000012345_60.csv"))
 
 
+def reseal(root: Path, before: dict[str, str]) -> None:
+    """Every checksum and size made anew, in the metadata too: as one does who knows the format."""
+    for _ in range(3):
+        for path in sorted(p for p in root.rglob("*") if p.is_file()):
+            file = path.relative_to(root).as_posix()
+            old, new = before.get(file, ""), sha256_of(path)
+            if old and old != new:
+                for other in ("recordings.csv", "streams.csv", "croissant.json", "datapackage.json", as_crate.FILE):
+                    (root / other).write_text((root / other).read_text("utf-8").replace(old, new), "utf-8")
+                before[file] = new
+
+        def size(entry: dict[str, Any], file: str, key: str) -> None:
+            entry[key] = type(entry[key])((root / file).stat().st_size)
+
+        edit(root, "datapackage.json", lambda t: [size(r, r["path"], "bytes") for r in t["resources"]])
+        edit(
+            root,
+            as_crate.FILE,
+            lambda t: [size(e, unquote(e["@id"]), "contentSize") for e in t["@graph"] if "contentSize" in e],
+        )
+    before[as_crate.FILE] = sha256_of(root / as_crate.FILE)
+    write_checksums(root)
+
+
+def cell(root: Path, file: str, column: str, value: str) -> None:
+    with (root / file).open(encoding="utf-8", newline="") as table:
+        rows = list(csv.DictReader(table))
+    assert rows[0][column] != value
+    rows[0][column] = value
+    with (root / file).open("w", encoding="utf-8", newline="") as table:
+        out = csv.DictWriter(table, list(rows[0]), lineterminator="\n")
+        out.writeheader()
+        out.writerows(rows)
+
+
+CONTRADICTIONS: dict[str, tuple[str, Damage]] = {
+    "a person's age group": ("data", lambda r: cell(r, "subjects.csv", "age_group", "senior")),
+    "a person's age group in the data": ("data", lambda r: cell(r, "data/subjects.csv", "age_group", "senior")),
+    "a column of names": ("data", lambda r: change(r / "data/subjects.csv", "consent\n", "consent,name\n")),
+    "a consent form": ("data", lambda r: cell(r, "data/subjects.csv", "consent", "C-77")),
+    "who trimmed": ("data", lambda r: change(r / "data/marks.jsonl", '"who": ""', '"who": "Anna"')),
+    "a stream's rows": ("data", lambda r: cell(r, "streams.csv", "rows", "7")),
+    "a stream's person": ("data", lambda r: cell(r, "streams.csv", "subject", "P2")),
+    "a place in the stream": ("data", lambda r: cell(r, "recordings.csv", "stream_row", "7")),
+    "an affect": ("data", lambda r: cell(r, "recordings.csv", "affect", "negative")),
+    "a gesture's affect": ("data", lambda r: cell(r, "gestures.csv", "affect", "negative")),
+    "a channel's scale": ("data", lambda r: cell(r, "channels.csv", "scale", "2.0")),
+    "the layout's scale": ("data", lambda r: change(r / "data/dataset.toml", "scale = 1.0", "scale = 2.0")),
+    "the licence of the data": (
+        "metadata",
+        lambda r: change(r / "data/dataset.toml", '"CC-BY-4.0"', '"CC0-1.0"'),
+    ),
+    "the licence for machines": ("metadata", lambda r: edit(r, "croissant.json", lambda t: t.update(license="x"))),
+    "a version": ("metadata", lambda r: edit(r, "croissant.json", lambda t: t.update(version="2.0.0"))),
+    "a title": ("metadata", lambda r: edit(r, "datapackage.json", lambda t: t.update(title="Another"))),
+    "the crate's day": (
+        "metadata",
+        lambda r: edit(r, as_crate.FILE, lambda t: t["@graph"][1].update(datePublished="2001-01-01")),
+    ),
+    "nobody is virtual": (
+        "metadata",
+        lambda r: change(r / "data/dataset.toml", "simulated = false", "simulated = true"),
+    ),
+}
+
+
+@pytest.mark.parametrize("what", CONTRADICTIONS)
+def test_a_contradiction_is_caught_whatever_the_checksums_say(package: Published, tmp_path: Path, what: str) -> None:
+    root = tmp_path / "package"
+    shutil.copytree(package.folder, root)
+    before = {p.relative_to(root).as_posix(): sha256_of(p) for p in root.rglob("*") if p.is_file()}
+    by, damage = CONTRADICTIONS[what]
+    damage(root)
+    reseal(root, before)
+    found = Package(root)
+    VALIDATORS["checksums"](found)
+    assert not found.found, "the test reseals everything"
+    VALIDATORS[by](found)
+    assert found.found
+
+
+def test_what_plushsense_leaves_in_an_opened_folder_is_no_part_of_a_zip(package: Published, tmp_path: Path) -> None:
+    root = tmp_path / "package"
+    shutil.copytree(package.folder, root)
+    (root / "data" / "cache").mkdir()
+    (root / "data" / "cache" / "who.txt").write_text("P1 is Anna")
+    assert check_folder(root).valid
+    write_zip(root, tmp_path / "p.zip", "package")
+    found = validate_package(tmp_path / "p.zip")
+    assert {(p.validator, p.file) for p in found.problems} == {
+        ("checksums", "data/cache/who.txt"),
+        ("ro-crate", "data/cache/who.txt"),
+    }
+
+
 @pytest.mark.parametrize(
     ("damage", "by"),
     [
@@ -179,9 +278,9 @@ def test_planted_damage_is_caught(package: Published, tmp_path: Path, damage: Da
     root = tmp_path / "package"
     shutil.copytree(package.folder, root)
     damage(root)
-    found = check_folder(root)
-    assert not found.valid
-    assert "checksums" in {p.validator for p in found.problems}, "not even a careless damage may pass"
+    careless = Package(root)
+    VALIDATORS["checksums"](careless)
+    assert careless.found, "not even a careless damage may pass"
     # Whoever makes the checksums anew is still caught, by what they cannot know.
     write_checksums(root)
     found = check_folder(root)

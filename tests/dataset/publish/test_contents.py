@@ -12,7 +12,7 @@ from plushsense.core.signal import load_layout
 from plushsense.dataset.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks
-from plushsense.dataset.publish.contents import Options
+from plushsense.dataset.publish.contents import Options, public_codes
 from plushsense.dataset.publish.package import Published
 from plushsense.dataset.store import Dataset
 
@@ -98,6 +98,7 @@ def test_codes_that_look_like_numbers_and_equal_names(tmp_path: Path) -> None:
     done = made_of(dataset, tmp_path / "out")
     back = sound(done)
     assert back.subjects == ["P01", "P1e5", "PP01", "Pnan"]
+    assert public_codes(dataset) == {"01": "PP01", "P01": "P01", "1e5": "P1e5", "nan": "Pnan"}
     assert any("3 subject codes" in note for note in done.description.notes)
 
 

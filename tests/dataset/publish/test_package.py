@@ -25,6 +25,7 @@ def test_every_validator_agrees(package: Published) -> None:
         "checksums",
         "data",
         "times",
+        "metadata",
         "croissant",
         "frictionless",
         "ro-crate",
@@ -132,6 +133,10 @@ def test_the_tables_say_what_there_is(package: Published) -> None:
     assert len(trimmed) == 1
     with (package.folder / "subjects.csv").open(encoding="utf-8", newline="") as file:
         people = {r["subject"]: r for r in csv.DictReader(file)}
+    read = (package.folder / "README.md").read_text("utf-8")
+    assert "| gestures | 3, of 4 in the set |" in read
+    assert "21 recordings of 3 gestures by 2 people" in read
+    assert "of 3 gestures by 2 people" in (package.folder / "croissant.json").read_text("utf-8")
     assert set(people["P1"]) == {"subject", "age_group", "gender", "recordings", "sessions"}
     assert any("2 people are of an age group and gender that fewer than 3" in w for w in package.warnings)
     assert (people["P1"]["age_group"], people["P1"]["sessions"], people["none"]["age_group"]) == ("child", "2", "")

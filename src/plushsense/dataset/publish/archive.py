@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
-import shutil
 import zipfile
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 
 from plushsense.core.errors import DatasetError
+from plushsense.dataset.archives import DAMAGED, Limits, entry_of, refusal, unpack_member
+from plushsense.dataset.freshness import sha256_of
 from plushsense.dataset.publish.description import CHECKSUMS
 
-# The earliest time that a zip can say.
-_EPOCH = (1980, 1, 1, 0, 0, 0)
 _LINE = re.compile(r"(?P<sha>[0-9a-f]{64}) [ *](?P<path>.+)")
-_LARGEST_BYTES = 64 * 2**30
+_LIMITS = Limits(total_bytes=64 * 2**30)
+_BROKEN: tuple[type[Exception], ...] = (*DAMAGED, OSError)
 
 
 def files_of(root: Path) -> list[Path]:
@@ -31,7 +29,7 @@ def files_of(root: Path) -> list[Path]:
 def write_checksums(root: Path) -> int:
     """Write ``checksums.sha256`` as ``sha256sum`` reads it; returns the number of lines."""
     lines = [
-        f"{sha256(path)}  {path.relative_to(root).as_posix()}\n" for path in files_of(root) if path.name != CHECKSUMS
+        f"{sha256_of(path)}  {path.relative_to(root).as_posix()}\n" for path in files_of(root) if path.name != CHECKSUMS
     ]
     (root / CHECKSUMS).write_text("".join(lines), encoding="utf-8", newline="\n")
     return len(lines)
@@ -57,12 +55,6 @@ def read_checksums(root: Path) -> dict[str, str]:
     return sums
 
 
-def sha256(path: Path) -> str:
-    """SHA-256 of a file, in hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
 def write_zip(root: Path, target: Path, folder: str) -> None:
     """Pack a package under one folder name; whole or not at all, and never in place of another file.
 
@@ -75,10 +67,7 @@ def write_zip(root: Path, target: Path, folder: str) -> None:
     try:
         with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
             for path in files_of(root):
-                entry = zipfile.ZipInfo(f"{folder}/{path.relative_to(root).as_posix()}", _EPOCH)
-                entry.compress_type = zipfile.ZIP_DEFLATED
-                entry.create_system = 3
-                entry.external_attr = 0o100644 << 16
+                entry = entry_of(f"{folder}/{path.relative_to(root).as_posix()}")
                 archive.writestr(entry, path.read_bytes())
         os.replace(part, target)
     finally:
@@ -101,32 +90,25 @@ def opened(package: Path) -> Iterator[Path]:
         target = Path(scratch).resolve()
         try:
             with zipfile.ZipFile(package) as archive:
-                if sum(info.file_size for info in archive.infolist()) > _LARGEST_BYTES:
-                    raise DatasetError(f"'{package}' would unpack to more than {_LARGEST_BYTES // 2**30} GiB.")
-                for info in archive.infolist():
+                members = [info for info in archive.infolist() if not info.is_dir()]
+                if sum(info.file_size for info in members) > _LIMITS.total_bytes:
+                    raise DatasetError(f"'{package}' would unpack to more than {_LIMITS.total_bytes // 2**30} GiB.")
+                for info in members:
                     _unpack(archive, info, target, package)
-        except (
-            zipfile.BadZipFile,
-            zlib.error,
-            OSError,
-            RuntimeError,
-            NotImplementedError,
-            EOFError,
-            ValueError,
-        ) as cause:
+        except _BROKEN as cause:
             raise DatasetError(f"'{package}' is a damaged zip ({cause}): fetch it again.") from None
         inside = list(target.iterdir())
         yield inside[0] if len(inside) == 1 and inside[0].is_dir() else target
 
 
 def _unpack(archive: zipfile.ZipFile, info: zipfile.ZipInfo, target: Path, package: Path) -> None:
+    """Unpack one entry; a package comes out whole or not at all, so that a refused one refuses the package."""
     name = PurePosixPath(info.filename.replace("\\", "/"))
-    link = (info.external_attr >> 16) & 0o170000 == 0o120000
-    if name.is_absolute() or ".." in name.parts or ":" in info.filename or link:
-        raise DatasetError(f"'{package}' holds the entry '{info.filename}', which no package has: not unpacked.")
-    if info.is_dir():
-        return
-    path = target.joinpath(*name.parts)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with archive.open(info) as source, path.open("wb") as out:
-        shutil.copyfileobj(source, out)
+    outside = name.is_absolute() or ".." in name.parts or ":" in info.filename
+    if reason := "it would be written outside" if outside else refusal(info, _LIMITS):
+        raise DatasetError(
+            f"'{package}' holds the entry '{info.filename}', which no package has: not unpacked ({reason})."
+        )
+    if (path := target.joinpath(*name.parts)).exists():
+        raise DatasetError(f"'{package}' holds the entry '{info.filename}' twice: not unpacked.")
+    unpack_member(archive, info, path, _LIMITS.total_bytes)

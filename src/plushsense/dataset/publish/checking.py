@@ -1,8 +1,9 @@
 """Whether a package holds what it promises: every validator over every file, without the network.
 
 checksums    every file is there, unchanged, and no other
-data         the recordings read, and the tables say what they hold
+data         the recordings read, the tables say what they hold, and what does not leave is not there
 times        no time of the true day is left
+metadata     title, version, licence and day are the same in every metadata file
 croissant    mlcroissant accepts the metadata and loads back, bit for bit, what the files hold
 frictionless frictionless accepts the descriptor and every cell has the type that its schema says
 ro-crate     rocrate opens the crate, and it lists every file as it is
@@ -11,7 +12,6 @@ datacite     the metadata fit DataCite's own schema
 
 from __future__ import annotations
 
-import csv
 import json
 import re
 import time
@@ -26,12 +26,14 @@ from urllib.parse import unquote
 from plushsense.core.errors import MissingExtraError, PlushSenseError
 from plushsense.core.extras import need
 from plushsense.core.recfile import parse_name, read_stream
+from plushsense.dataset.freshness import sha256_of
 from plushsense.dataset.index import Rebuilt, build
 from plushsense.dataset.people import PEOPLE
 from plushsense.dataset.publish import as_crate, as_croissant, as_datacite, as_datapackage
-from plushsense.dataset.publish.archive import files_of, opened, read_checksums, sha256
+from plushsense.dataset.publish.agreement import compare_metadata, compare_tables, find_private
+from plushsense.dataset.publish.archive import files_of, opened, read_checksums
 from plushsense.dataset.publish.croissant_records import compare_records
-from plushsense.dataset.publish.description import CHECKSUMS, DATA, RECORDINGS_TABLE
+from plushsense.dataset.publish.description import CHECKSUMS, DATA
 from plushsense.dataset.publish.shifting import LATEST_MS, WALL_CLOCK_MS
 from plushsense.dataset.store import DatasetHead
 
@@ -79,6 +81,7 @@ class Package:
 
     root: Path
     thorough: bool = False
+    packed: bool = False
     found: list[tuple[str, str]] = field(default_factory=list)
     looked_at: str = ""
 
@@ -98,12 +101,16 @@ class Package:
     @cached_property
     def sums(self) -> dict[str, str]:
         """SHA-256 of every file that is there."""
-        return {p.relative_to(self.root).as_posix(): sha256(p) for p in files_of(self.root)}
+        return {p.relative_to(self.root).as_posix(): sha256_of(p) for p in files_of(self.root)}
 
     @cached_property
     def built(self) -> Rebuilt:
         """The data folder, read anew from its raw files."""
         return build(self.root / DATA, DatasetHead.read(self.root / DATA))
+
+    def is_own(self, path: str) -> bool:
+        """Whether PlushSense may have put a file into the data folder since; not into a zip."""
+        return not self.packed and _OWN.fullmatch(path) is not None
 
     def is_local(self, path: object) -> bool:
         """Whether a path of a metadata file stays in the package and off the network."""
@@ -124,13 +131,13 @@ def validate_package(package: str | Path, *, thorough: bool = False, tell: Tell 
         MissingExtraError: without the validators.
     """
     with opened(Path(package)) as root:
-        return check_folder(root, thorough=thorough, tell=tell)
+        return check_folder(root, thorough=thorough, packed=Path(package).is_file(), tell=tell)
 
 
-def check_folder(root: Path, *, thorough: bool = False, tell: Tell | None = None) -> Checked:
-    """As `validate_package`, for a folder."""
+def check_folder(root: Path, *, thorough: bool = False, packed: bool = False, tell: Tell | None = None) -> Checked:
+    """As `validate_package`, for a folder; ``packed``: it came out of a zip, which nobody has opened as a data set."""
     checked = Checked()
-    package = Package(root, thorough)
+    package = Package(root, thorough, packed)
     for number, (name, validator) in enumerate(VALIDATORS.items()):
         if tell is not None:
             tell(f"validating: {name}", number, len(VALIDATORS))
@@ -175,8 +182,10 @@ def _checksums(p: Package) -> None:
             p.say(path, "is missing")
         elif p.sums[path] != expected:
             p.say(path, f"was changed: its SHA-256 is {p.sums[path][:12]}…, not {expected[:12]}…")
+        if (p.root / path).is_symlink():
+            p.say(path, "is a link, which may lead out of the package")
     for path in sorted(p.sums.keys() - listed.keys()):
-        if path != CHECKSUMS and not _OWN.fullmatch(path):
+        if path != CHECKSUMS and not p.is_own(path):
             p.say(path, "is not listed in the checksums")
     p.looked_at = f"{len(listed)} files"
 
@@ -185,31 +194,14 @@ def _data(p: Package) -> None:
     for file, reason in p.built.unreadable.items():
         p.say(f"{DATA}/{file}", reason)
     dataset = p.built.dataset
-    with (p.root / RECORDINGS_TABLE).open(encoding="utf-8", newline="") as table:
-        rows = {row["id"]: row for row in csv.DictReader(table)}
-    for r in dataset.recordings:
-        row = rows.pop(r.id, None)
-        if row is None:
-            p.say(f"{DATA}/{r.file}", f"'{r.id}' is not in {RECORDINGS_TABLE}")
-            continue
-        said = {
-            "subject": r.subject,
-            "session": r.session,
-            "gesture": r.gesture,
-            "file": f"{DATA}/{r.file}",
-            "first_row": str(r.first_row),
-            "rows": str(r.rows),
-            "start": str(r.start),
-            "stop": str(r.stop),
-            "excluded": "true" if r.excluded else "false",
-            "sha256": r.sha256,
-        }
-        for key, value in said.items():
-            if row.get(key) != value:
-                p.say(RECORDINGS_TABLE, f"'{r.id}' has {key} {row.get(key)!r}; the data say {value!r}")
-    for identity in rows:
-        p.say(RECORDINGS_TABLE, f"'{identity}' is in the table but not in the data")
+    compare_tables(p.root, dataset, p.say)
+    find_private(dataset, p.say)
     p.looked_at = f"{len(dataset.recordings)} recordings, {len(dataset.streams)} streams"
+
+
+def _metadata(p: Package) -> None:
+    compared = compare_metadata(p.root, p.built.dataset, p.load, p.say)
+    p.looked_at = f"{compared} statements"
 
 
 def _times(p: Package) -> None:
@@ -286,7 +278,7 @@ def _frictionless(p: Package) -> None:
             p.say(resource.path, error.message)
     covered = {r.path for r in package.resources}
     for path in p.sums:
-        if path.endswith(".csv") and path not in covered and not _OWN.fullmatch(path) and path != f"{DATA}/{PEOPLE}":
+        if path.endswith(".csv") and path not in covered and not p.is_own(path) and path != f"{DATA}/{PEOPLE}":
             p.say(path, "is no resource of datapackage.json")
     p.looked_at = f"{len(package.resources)} resources, {rows} rows"
 
@@ -317,7 +309,7 @@ def _crate(p: Package) -> None:
         elif str(entity.get("contentSize")) != str((p.root / path).stat().st_size):
             p.say(path, "has another size than the crate says")
     for path in sorted(p.sums.keys() - listed - {as_crate.FILE, CHECKSUMS}):
-        if not _OWN.fullmatch(path):
+        if not p.is_own(path):
             p.say(path, "is not listed in the crate")
     p.looked_at = f"{len(listed)} files"
 
@@ -342,6 +334,7 @@ VALIDATORS: dict[str, Validator] = {
     "checksums": _checksums,
     "data": _data,
     "times": _times,
+    "metadata": _metadata,
     "croissant": _croissant,
     "frictionless": _frictionless,
     "ro-crate": _crate,

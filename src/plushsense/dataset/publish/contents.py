@@ -104,7 +104,8 @@ class _Writing:
         self.streams = dataset.streams if options.streams else []
         self.layout = public_layout(dataset.layout, self._all_have_host())
         self.head = replace(head, layout=self.layout, source="")
-        self.codes = _codes([_folder_of(r.file) for r in self.kept] + [_folder_of(s.file) for s in self.streams])
+        held = {_folder_of(r.file) for r in self.kept} | {_folder_of(s.file) for s in self.streams}
+        self.codes = {folder: public for folder, public in public_codes(dataset).items() if folder in held}
         self.shifts = self._shifts()
         self.sessions = self._sessions()
         self.taken: set[str] = set()
@@ -341,13 +342,14 @@ def _folder_of(file: str) -> str:
     return Path(file).parts[1]
 
 
-def _codes(folders: list[str]) -> dict[str, str]:
-    """Public codes by folder: as they are, but none that a reader takes for a number or for nothing."""
+def public_codes(dataset: Dataset) -> dict[str, str]:
+    """Public codes by a person's folder: as they are, but none that a reader takes for a number or for nothing."""
+    folders = {_folder_of(r.file) for r in dataset.recordings} | {_folder_of(s.file) for s in dataset.streams}
     # "none" is nobody, by our own convention.
     fine = {f for f in folders if f == "none" or not _NOT_A_CODE.fullmatch(f)}
     codes: dict[str, str] = {}
     taken = {f.casefold() for f in fine}
-    for folder in sorted(set(folders)):
+    for folder in sorted(folders):
         public = folder
         while folder not in fine and (public == folder or public.casefold() in taken):
             public = f"P{public}"

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from plushsense.core.signal import DEVICE_MS, HOST_MS, Channel, Layout
 from plushsense.dataset.about import About, Creator
+from plushsense.dataset.freshness import sha256_of
 from plushsense.dataset.publish.licences import Licence
 from plushsense.dataset.store import Dataset
 
@@ -97,11 +97,16 @@ class Description:
         return f"SIMULATION: {title}" if self.simulated and not title.startswith("SIMULATION") else title
 
     @property
+    def gestures_made(self) -> int:
+        """How many gestures there are recordings of; the set can hold more."""
+        return len({r.gesture for r in self.dataset.recordings})
+
+    @property
     def text(self) -> str:
         """The description in a paragraph."""
         d = self.dataset
         counted = (
-            f"{len(d.recordings)} recordings of {len(d.gestures)} gestures by {len(d.subjects)} people on "
+            f"{len(d.recordings)} recordings of {self.gestures_made} gestures by {len(d.subjects)} people on "
             f"'{d.layout.title}': {d.layout.n_channels} channels at about {d.layout.rate_hz:g} Hz"
             f"{f', and {len(d.streams)} whole session streams' if d.streams else ''}."
         )
@@ -146,9 +151,8 @@ _MEDIA = {
 
 def file_entry(root: Path, path: Path, text: str) -> FileEntry:
     """What is to be said of a file of the package in ``root``."""
-    data = path.read_bytes()
     relative = path.relative_to(root).as_posix()
-    return FileEntry(relative, len(data), hashlib.sha256(data).hexdigest(), _MEDIA.get(path.suffix, "text/plain"), text)
+    return FileEntry(relative, path.stat().st_size, sha256_of(path), _MEDIA.get(path.suffix, "text/plain"), text)
 
 
 def sample_columns(layout: Layout, labelled: bool) -> tuple[Column, ...]:

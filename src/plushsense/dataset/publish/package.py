@@ -276,6 +276,11 @@ def _warnings(source: Dataset, d: Description, people: dict[str, PersonInfo]) ->
         said.append(
             f"{d.licence.spdx} asks that its text lies beside every copy: put it into the data set as LICENSE.txt"
         )
+    if not d.about.title:
+        said.append(
+            f"the title is the data set's name, '{source.head.name}', often that of the folder that was imported: it "
+            "is published, so look at it, or set title in [about] in dataset.toml"
+        )
     if not d.about.creators:
         said.append("nobody is named as creator, so the contact is: add creators to [about] in dataset.toml")
     if any(r.subject == UNKNOWN_SUBJECT for r in d.dataset.recordings):

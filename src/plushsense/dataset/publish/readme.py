@@ -41,7 +41,7 @@ def readme(d: Description, reidentification: str | None) -> str:
         d.about.collected or "Recorded with PlushSense or a recorder of its format, one gesture a recording.",
         f"Consent: {d.consent}",
         "## What is in it",
-        _files(d),
+        _files(d, reidentification is not None),
         "## Columns",
         _columns(d),
         "## Gestures",
@@ -53,7 +53,7 @@ def readme(d: Description, reidentification: str | None) -> str:
         "## What the checks found",
         _findings(d),
         "## Can the people be recognised?",
-        reidentification if reidentification is not None else NOT_LOOKED_AT,
+        f"{reidentification} All of it: `{REIDENTIFICATION}`." if reidentification is not None else NOT_LOOKED_AT,
         "## How to load it",
         _loading(d),
         "## Limits",
@@ -76,14 +76,18 @@ def _facts(d: Description) -> str:
         ("made by", "; ".join(c.name for c in d.creators)),
         ("people", str(len(data.subjects))),
         ("recordings", str(len(data.recordings))),
-        ("gestures", str(len(data.gestures))),
-        ("session streams", f"{len(data.streams)}, {seconds / 3600:.1f} h" if data.streams else "none"),
+        ("gestures", f"{d.gestures_made}, of {len(data.gestures)} in the set"),
+        ("session streams", f"{len(data.streams)}, {_duration(seconds)}" if data.streams else "none"),
         ("sensors", f"{data.layout.title}: {data.layout.n_channels} channels, nominally {data.layout.rate_hz:g} Hz"),
     ]
     return _table(("", ""), rows)
 
 
-def _files(d: Description) -> str:
+def _duration(seconds: float) -> str:
+    return f"{seconds / 3600:.1f} h" if seconds >= 3600 else f"{seconds / 60:.1f} min"
+
+
+def _files(d: Description, reidentification: bool) -> str:
     rows = [(f"`{t.file or t.glob}`", t.text + (f", {len(t.files)} files" if t.files else "")) for t in d.tables]
     rows += [
         (f"`{DATA}/`", "a PlushSense data set: the recordings with layout, gesture set and marks"),
@@ -91,6 +95,7 @@ def _files(d: Description) -> str:
         ("`datapackage.json`, `schemas/`", "metadata of the tables (Frictionless)"),
         ("`ro-crate-metadata.json`", "metadata of the files (RO-Crate 1.1)"),
         ("`datacite.json`, `datacite.xml`", "metadata for a DOI (DataCite 4.5)"),
+        *([(f"`{REIDENTIFICATION}`, `.json`", "whether people can be recognised")] if reidentification else []),
         ("`checksums.sha256`", "of all files; check with  `sha256sum -c checksums.sha256`"),
     ]
     return _table(("file", "what"), rows)

@@ -80,21 +80,28 @@ _CHANNELS = (
 )
 
 
-def write_tables(root: Path, contents: Contents) -> tuple[Table, ...]:
-    """Write the tables beside the data, and describe them and the data's files."""
+def tables_of(contents: Contents) -> list[tuple[Table, str]]:
+    """The tables beside the data, and the text of each."""
     d = contents.dataset
     people = _people_columns(contents)
     made = [
-        _write(
-            root, Table("recordings", "one line a recording", _RECORDINGS, RECORDINGS_TABLE, key="id"), _recordings(d)
-        ),
-        _write(root, Table("subjects", "one line a person", people, SUBJECTS_TABLE, key="subject"), _people(contents)),
-        _write(root, Table("gestures", "one line a gesture", _GESTURES, GESTURES_TABLE, key="gesture"), _gestures(d)),
-        _write(root, Table("channels", "one line a channel", _CHANNELS, CHANNELS_TABLE, key="channel"), _channels(d)),
+        (Table("recordings", "one line a recording", _RECORDINGS, RECORDINGS_TABLE, key="id"), _recordings(d)),
+        (Table("subjects", "one line a person", people, SUBJECTS_TABLE, key="subject"), _people(contents)),
+        (Table("gestures", "one line a gesture", _GESTURES, GESTURES_TABLE, key="gesture"), _gestures(d)),
+        (Table("channels", "one line a channel", _CHANNELS, CHANNELS_TABLE, key="channel"), _channels(d)),
     ]
     if d.streams:
-        streams = Table("streams", "one line a session's stream", _STREAMS, STREAMS_TABLE, key="file")
-        made.append(_write(root, streams, _streams(d)))
+        made.append((Table("streams", "one line a session's stream", _STREAMS, STREAMS_TABLE, key="file"), _streams(d)))
+    return [(table, _text(table, rows)) for table, rows in made]
+
+
+def write_tables(root: Path, contents: Contents) -> tuple[Table, ...]:
+    """Write the tables beside the data, and describe them and the data's files."""
+    d = contents.dataset
+    made = []
+    for table, text in tables_of(contents):
+        (root / table.file).write_text(text, encoding="utf-8", newline="\n")
+        made.append(table)
     labelled = is_labelled(d.layout)
     columns = sample_columns(d.layout, labelled)
     if not labelled:
@@ -115,14 +122,13 @@ def write_tables(root: Path, contents: Contents) -> tuple[Table, ...]:
     return tuple(made)
 
 
-def _write(root: Path, table: Table, rows: Iterable[Row]) -> Table:
+def _text(table: Table, rows: Iterable[Row]) -> str:
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow([c.name for c in table.columns])
     for row in rows:
         writer.writerow([_cell(value) for value in row])
-    (root / table.file).write_text(out.getvalue(), encoding="utf-8", newline="\n")
-    return table
+    return out.getvalue()
 
 
 def _cell(value: object) -> str:
