@@ -208,7 +208,9 @@ def make(
             head = replace(head, gestures=GestureSet.infer(n.label for n in names if n is not None))
         built = read_all(account, head, progress)
         if not built.dataset.recordings:
-            reasons = [*built.unreadable.values(), *(r["reason"] for r in account.rejected), *search.notes[-1:], "none"]
+            reasons = [*built.unreadable.values(), *(r["reason"] for r in account.rejected), *search.notes[-1:]]
+            if not reasons:
+                raise DatasetError(f"'{source}' holds no finished recording yet, only a stream: record some first.")
             raise DatasetError(
                 f"'{source}' holds no recording that layout '{head.layout.name}' can read. The first: {reasons[0]}"
             )
