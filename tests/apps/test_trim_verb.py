@@ -53,6 +53,7 @@ def test_suggest_accept_adjust_undo(cli: Cli, waves: Path) -> None:
     one = first["recording"]
     ran = cli("trim", waves, "--set", one, "0.7:", "--who", "K")
     assert "adjusted 1" in ran.err
+    assert [line.split()[0] for line in ran.out.splitlines() if line.startswith("P")] == [one]
     done = cli("trim", waves, "--accept-above", "0.5", "--json").json
     assert (len(done["accepted"]), done["kept_by_hand"]) == (11, [one])
     assert done["states"] == {"accepted": 11, "adjusted": 1}
@@ -84,11 +85,11 @@ def test_only_and_accept_by_pattern(cli: Cli, waves: Path) -> None:
     ("words", "said"),
     [
         (("--accept-above", "1.5"), "confidence from 0 to 1"),
-        (("--accept", "P9/*"), "called 'P9/*'"),
+        (("--accept", "P9/*"), "no recording 'P9/*'"),
         (("--set", "P1/*", "0.1:1"), "names 4"),
         (("--set", "P1/Fast*3989", "soon"), "FROM:TO"),
-        (("--set", "P1/nothing", "0:1"), "called 'P1/nothing'"),
-        (("--only", "P9/*"), "called 'P9/*'"),
+        (("--set", "P1/nothing", "0:1"), "no recording 'P1/nothing'"),
+        (("--only", "P9/*"), "no recording 'P9/*'"),
     ],
 )
 def test_refusals_are_sentences_and_mark_nothing(cli: Cli, waves: Path, words: tuple[str, ...], said: str) -> None:

@@ -125,7 +125,7 @@ def rows_of(seed: int, rows: int = 60) -> Frames:
 def lay(folder: Path, streams: dict[str, Frames], recordings: dict[str, Frames]) -> Dataset:
     """A data set of one person's sessions, in a layout without the computer's clock."""
     layout = replace(ACCEL, csv=CsvFormat(("device_ms", "x", "y", "z"), ("t", "x", "y", "z"), ","))
-    head = DatasetHead(name="two days", layout=layout, gestures=GestureSet("inferred", (), inferred=True))
+    head = DatasetHead(name="two days", layout=layout, gestures=GestureSet.infer(["Shake"]))
     for session, frames in streams.items():
         path = folder / "streams" / "ana" / session / "fulldatastream.csv"
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -12,7 +12,7 @@ from plushsense.core.recfile import Frames, format_rows, recording_filename, wri
 from plushsense.core.signal import load_layout
 from plushsense.dataset.importers import import_recordings
 from plushsense.dataset.quality.checking import Checked, check
-from plushsense.reports import quality, quality_figures
+from plushsense.reports import figures, quality, quality_figures
 
 ACCEL = load_layout("accel-3")
 
@@ -65,6 +65,11 @@ def test_each_finding_is_there_and_what_needs_a_decision_first(result: Checked, 
     assert {"never-stopped", "gaps", "stuck"} <= {f.check for f in result.findings}
     for name in {f.check for f in result.findings}:
         assert f'<h2 id="{name}">' in page
+    shares = re.search(
+        r'#gaps">gaps</a></td><td class="n">(\d*)</td><td class="n">(\d*)</td><td class="n">(\d*)</td>', page
+    )
+    assert shares is not None
+    assert sum(int(n or 0) for n in shares.groups()) == len(result.of("gaps"))
     decide = page[page.index("<h2>To decide</h2>") : page.index("<h2>Gesture by gesture</h2>")]
     for f in result.undecided:
         assert f.recording.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;") in decide
@@ -122,6 +127,4 @@ def test_the_place_is_marked_in_rows_of_the_file(result: Checked) -> None:
 
 def test_the_same_data_give_the_same_bytes(result: Checked) -> None:
     gesture = result.dataset.gestures.labels[0]
-    assert quality_figures.png(quality.gesture_figure(result, gesture)) == quality_figures.png(
-        quality.gesture_figure(result, gesture)
-    )
+    assert figures.png(quality.gesture_figure(result, gesture)) == figures.png(quality.gesture_figure(result, gesture))

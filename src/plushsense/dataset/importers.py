@@ -283,6 +283,8 @@ def import_recordings(
     if people is not None and not Path(people).exists():
         raise DatasetError(f"There is no people's file '{people}': check the path.")
     told = {} if people is None else read_people(Path(people))
+    if source.is_dir() and dest.resolve() != source.resolve() and dest.resolve().is_relative_to(source.resolve()):
+        raise ConfigError(f"'{dest}' lies in '{source}', which is only read: give a place outside it for the data set.")
     head = None
     if add_to:
         head = DatasetHead.read(dest)

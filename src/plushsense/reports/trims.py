@@ -12,6 +12,7 @@ import numpy as np
 from plushsense.core.extras import need
 from plushsense.dataset.store import Dataset
 from plushsense.dataset.trim import Trim
+from plushsense.reports.figures import png
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -91,5 +92,5 @@ def save_trims(dataset: Dataset, trims: Sequence[Trim], out: Path, offset: bool 
     written = []
     for number, page in enumerate(pages, 1):
         written.append(out if single else out / f"trim-{number:03d}.png")
-        trim_page(dataset, page, offset).savefig(written[-1], dpi=110)
+        written[-1].write_bytes(png(trim_page(dataset, page, offset), dpi=110))
     return written

@@ -12,6 +12,8 @@ from plushsense.apps.cli.output import bar, emit, say, table
 if TYPE_CHECKING:
     from plushsense.dataset.trim import Accepted, Trim
 
+LINES = 20
+
 
 def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("dataset", metavar="DATASET", help="data set folder")
@@ -41,7 +43,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         default=False,
         help="accept the suggested end too (default: the start alone, as in the paper)",
     )
-    parser.add_argument("--who", default="not said", metavar="CODE", help="who decides, kept in the mark")
+    parser.add_argument("--who", metavar="NAME", help="who decides, kept in the mark (default: the login name)")
     parser.add_argument("--why", default="", metavar="TEXT", help="why, kept in the mark (default: nothing)")
     parser.add_argument(
         "--plot", metavar="FILE.png|DIR", help="draw recordings, the least sure first: one page, or all into a folder"
@@ -53,6 +55,7 @@ def run(args: argparse.Namespace) -> int:
     from plushsense.core.extras import need
     from plushsense.dataset import trim
     from plushsense.dataset.index import open_dataset
+    from plushsense.dataset.quality.deciding import signed
 
     if args.accept_above is not None and not 0.0 <= args.accept_above <= 1.0:
         raise ConfigError(f"--accept-above is {args.accept_above:g}: a confidence from 0 to 1 is accepted.")
@@ -78,17 +81,18 @@ def run(args: argparse.Namespace) -> int:
     for info, start_s, stop_s in to_set:
         trim.kept_rows((found | extra)[info.id], start_s, stop_s)
 
-    taken_back = trim.undo(dataset, list(undone.values()), args.who, args.why)
+    who = signed(args.who) if _decides(args) else ""
+    taken_back = trim.undo(dataset, list(undone.values()), who, args.why)
     adjusted = [
         info.id
         for info, start_s, stop_s in to_set
-        if trim.set_trim(dataset, (found | extra)[info.id], start_s, stop_s, args.who, args.why)
+        if trim.set_trim(dataset, (found | extra)[info.id], start_s, stop_s, who, args.why)
     ]
     accepted = trim.Accepted()
     if by_name or args.accept_above is not None:
         chosen = list(by_name) if by_name else list(found)
         again = trim.renewed(dataset, [(found | extra)[identity] for identity in chosen])
-        accepted = trim.accept(dataset, again, args.who, args.why, above=args.accept_above or 0.0, offset=args.offset)
+        accepted = trim.accept(dataset, again, who, args.why, above=args.accept_above or 0.0, offset=args.offset)
     listed = trim.renewed(dataset, list(found.values()))
     drawn: list[Path] = []
     if args.plot:
@@ -98,6 +102,11 @@ def run(args: argparse.Namespace) -> int:
         drawn = save_trims(dataset, least_sure_first, Path(args.plot), args.offset)
     _tell(args, listed, accepted, adjusted, taken_back, drawn)
     return 0
+
+
+def _decides(args: argparse.Namespace) -> bool:
+    """Whether marks were asked for, rather than to look."""
+    return bool(args.accept or args.set or args.undo) or args.accept_above is not None
 
 
 def _seconds(text: str) -> tuple[float | None, float | None]:
@@ -132,6 +141,9 @@ def _tell(
         "undone": list(undone),
         "plots": [str(path) for path in drawn],
     }
+    # After a decision, what it changed; the rest was shown when it was made.
+    decided = _decides(args)
+    changed = {*accepted.marked, *adjusted, *undone}
     rows = [
         (
             r["recording"],
@@ -143,6 +155,7 @@ def _tell(
             r["note"],
         )
         for r in result["recordings"]
+        if not decided or r["recording"] in changed
     ]
     if not args.json and (args.accept or args.accept_above is not None):
         less_sure = " or not sure enough" if args.accept_above else ""
@@ -157,4 +170,5 @@ def _tell(
         say(f"undone {len(undone)}")
     counts = ", ".join(f"{n} {state}" for state, n in sorted(states.items()))
     head = ("recording", "rows", "start s", "stop s", "confidence", "state", "note")
-    emit(args, result, [table(head, rows), "", f"{len(listed)} recordings: {counts}", *map(str, drawn)])
+    shown = [] if decided and not 0 < len(rows) <= LINES else [table(head, rows), ""]
+    emit(args, result, [*shown, f"{len(listed)} recordings{': ' if counts else ''}{counts}", *map(str, drawn)])
