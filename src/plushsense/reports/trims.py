@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from plushsense.core.extras import need
+from plushsense.core.signal import Layout
 from plushsense.dataset.store import Dataset
 from plushsense.dataset.trim import Trim
 from plushsense.reports.figures import png
@@ -43,12 +45,11 @@ def trim_page(dataset: Dataset, trims: Sequence[Trim], offset: bool = True) -> F
     for axes, trim in zip(grid.flat, trims, strict=False):
         info, s = trim.recording, trim.suggestion
         frames = dataset.read(replace(info, start=0, stop=info.rows))
-        values = frames.values.astype(np.float64)
-        values -= np.median(values, axis=0)
+        values = _off_median(frames.values, dataset.layout)
         at = trim.seconds[: len(frames)]
         for lane, kind in enumerate(kinds):
             mine = [i for i, c in enumerate(channels) if c.kind == kind]
-            swing = max(1.0, float(np.abs(values[:, mine]).max()))
+            swing = max(1.0, float(np.nanmax(np.abs(values[:, mine]))))
             for i in mine:
                 axes.plot(
                     at, values[:, i] / swing - 2.1 * lane, linewidth=0.8, color=colours(i), label=channels[i].name
@@ -79,6 +80,13 @@ def trim_page(dataset: Dataset, trims: Sequence[Trim], offset: bool = True) -> F
         handles, [*labels, "suggested", "marked"], loc="outside upper center", ncols=min(10, len(handles)), fontsize=8
     )
     return figure
+
+
+def _off_median(raw: NDArray[np.int64], layout: Layout) -> NDArray[np.float64]:
+    """Values (T, C) less their channel's median; garbage, which would squeeze all else, is a hole in the line."""
+    valid = (raw >= layout.valid_min_int) & (raw <= layout.valid_max_int)
+    values = np.where(valid | ~valid.any(axis=0), raw, np.nan)
+    return np.asarray(values - np.nanmedian(values, axis=0))
 
 
 def save_trims(dataset: Dataset, trims: Sequence[Trim], out: Path, offset: bool = True) -> list[Path]:
