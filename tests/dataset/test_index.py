@@ -174,3 +174,14 @@ def test_streams_with_labels_have_the_session_of_their_recordings(tmp_path: Path
     dataset = import_recordings(tmp_path / "plain", tmp_path / "DS", add_to=True).dataset
     assert [s.session for s in dataset.streams] == ["a", "b", "bo_01"]
     assert {r.stream: r.session for r in dataset.recordings} == {s.id: s.session for s in dataset.streams}
+
+
+def test_the_label_may_be_any_column(tmp_path: Path) -> None:
+    columns = ("label", "device_ms", "x", "y", "z")
+    layout = replace(ACCEL, csv=CsvFormat(columns, columns, ","))
+    (tmp_path / "src" / "bo").mkdir(parents=True)
+    rows = "".join(f"{'A' if i < 5 else 'B'},{i}0,{i},2,3\n" for i in range(12))
+    (tmp_path / "src" / "bo" / "day.csv").write_text(",".join(columns) + "\n" + rows)
+    import_recordings(tmp_path / "src", tmp_path / "DS", layout=layout)
+    dataset = open_dataset(tmp_path / "DS")
+    assert [(r.gesture, dataset.read(r).values[0, 0]) for r in dataset.recordings] == [("A", 0), ("B", 5)]

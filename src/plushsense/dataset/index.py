@@ -27,7 +27,7 @@ from plushsense.dataset.freshness import (
     write_stamp,
 )
 from plushsense.dataset.marks import Standing, read_marks
-from plushsense.dataset.quality import Examined, findings, measured_rate_hz
+from plushsense.dataset.quality import Examined, findings, measured_rate_hz, usual_rows
 from plushsense.dataset.store import (
     RECORDINGS,
     STREAMS,
@@ -237,13 +237,6 @@ def _best_stream(
     return best
 
 
-def _usual_rows(reads: Iterable[tuple[str, int]]) -> dict[str, float]:
-    rows: dict[str, list[int]] = {}
-    for gesture, n in reads:
-        rows.setdefault(gesture, []).append(n)
-    return {gesture: float(np.median(ns)) for gesture, ns in rows.items()}
-
-
 def _from_files(folder: Path, head: DatasetHead, recordings: list[_Read], streams: list[_Read]) -> list[RecordingInfo]:
     named = []
     gestures: dict[str, Gesture | None] = {}
@@ -257,7 +250,7 @@ def _from_files(folder: Path, head: DatasetHead, recordings: list[_Read], stream
             gestures[name.label] = head.gestures.find(name.label)
         found = gestures[name.label]
         named.append((read, name, found.label if found else name.label))
-    usual = _usual_rows((label, len(read.result.frames)) for read, _, label in named)
+    usual = usual_rows((label, len(read.result.frames)) for read, _, label in named)
     by_subject: dict[str, list[_Read]] = {}
     for stream in streams:
         by_subject.setdefault(stream.subject, []).append(stream)

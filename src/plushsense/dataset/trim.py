@@ -107,7 +107,7 @@ def trims(
     Raises:
         DatasetError: for a data set whose recordings are cut from labels, which need no trimming.
     """
-    if dataset.layout.csv.columns[-1] == "label":
+    if dataset.layout.is_labelled:
         raise DatasetError(
             f"The recordings of '{dataset.head.name}' are cut where the label on the rows changes (layout "
             f"'{dataset.layout.name}'), so there is no reaction time to trim: trim data sets of single recordings."

@@ -87,7 +87,8 @@ def overlay(gesture: str, lines: Sequence[Line], mean_s: float, tolerance: float
         style = "-" if i < len(COLOURS) else "--"
         top.plot(one.seconds, one.size, style, color=COLOURS[i % len(COLOURS)], linewidth=1.4, label=one.name)
     heights = [s for one in lines for s in (np.percentile(one.size, 99.5),) if one.size.size]
-    top.set_ylim(0, 1.25 * float(np.percentile(heights, 98)) if heights else 1.0)
+    # A recording of one row has neither height nor length.
+    top.set_ylim(0, (1.25 * float(np.percentile(heights, 98)) if heights else 0.0) or 1.0)
     top.set_ylabel("deviation from rest\n(1 = usual)", fontsize=9)
     top.set_title(f"{gesture}: {len(lines)} recordings", fontsize=10, parse_math=False)
     if named:
@@ -111,7 +112,7 @@ def overlay(gesture: str, lines: Sequence[Line], mean_s: float, tolerance: float
         )
     strip.set_yticks([])
     strip.set_ylim(-0.15, 1.15)
-    strip.set_xlim(0, end * 1.01)
+    strip.set_xlim(0, end * 1.01 or 1.0)
     strip.set_xlabel(
         f"seconds; below: how long each lasts, the mean {mean_s:.2f} s, and ±{100 * tolerance:.0f} % of it shaded",
         fontsize=9,

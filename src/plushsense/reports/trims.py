@@ -65,7 +65,7 @@ def trim_page(dataset: Dataset, trims: Sequence[Trim], offset: bool = True) -> F
                     axes.axvspan(trim.seconds[cut[0]], trim.seconds[cut[1]], color=_MARK, alpha=0.12, linewidth=0)
         said = f"{trim.state}, confidence {s.onset_confidence:.2f}" + (f"; {s.why}" if s.why else "")
         axes.set_title(f"{info.id}\n{said}", fontsize=7.5, parse_math=False)
-        axes.set_xlim(0.0, float(trim.seconds[-1]))
+        axes.set_xlim(0.0, float(trim.seconds[-1]) or 1.0)
         axes.set_ylim(-1.08 - 2.1 * (len(kinds) - 1), 1.08)
         axes.set_yticks([-2.1 * lane for lane in range(len(kinds))], kinds, rotation=90, va="center")
         axes.tick_params(labelsize=7)
