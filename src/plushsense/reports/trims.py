@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from plushsense.core.errors import ConfigError
 from plushsense.core.extras import need
 from plushsense.core.signal import Layout
 from plushsense.dataset.store import Dataset
@@ -87,6 +88,23 @@ def _off_median(raw: NDArray[np.int64], layout: Layout) -> NDArray[np.float64]:
     valid = (raw >= layout.valid_min_int) & (raw <= layout.valid_max_int)
     values = np.where(valid | ~valid.any(axis=0), raw, np.nan)
     return np.asarray(values - np.nanmedian(values, axis=0))
+
+
+def check_place(out: Path) -> None:
+    """Refuse a place that `save_trims` could not write to, before anything is marked.
+
+    Raises:
+        ConfigError: for a file that is no .png, or a folder that cannot be made.
+        MissingExtraError: when matplotlib is not installed.
+    """
+    need("matplotlib", "reports")
+    single = out.suffix.lower() == ".png"
+    if out.is_dir() if single else out.is_file():
+        raise ConfigError(f"'{out}' is a {'folder' if single else 'file'}: name a new .png for one page, or a folder.")
+    try:
+        (out.parent if single else out).mkdir(parents=True, exist_ok=True)
+    except OSError as cause:
+        raise ConfigError(f"'{out}' cannot be drawn to ({cause.strerror or cause}): name another place.") from None
 
 
 def save_trims(dataset: Dataset, trims: Sequence[Trim], out: Path, offset: bool = True) -> list[Path]:
