@@ -47,6 +47,14 @@ def test_sessions_then_more_of_them(cli: Cli, tmp_path: Path) -> None:
     assert cli("info", tmp_path / "DS", "--json").json["located_in_stream"] == 2
 
 
+def test_the_source_is_only_read(cli: Cli, tmp_path: Path) -> None:
+    session(tmp_path / "out" / "P1" / "s1", "P1", 1)
+    ran = cli("import", tmp_path / "out", tmp_path / "out" / "DS")
+    assert ran.status == 2
+    assert "which is only read" in ran.err
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["P1"]
+
+
 def test_a_table_with_columns_of_its_own(cli: Cli, tmp_path: Path) -> None:
     rows = "".join(f"ana,Shake,{i * 10},{i},2,3\n" for i in range(50))
     (tmp_path / "t.csv").write_text("who,gesture,time_ms,x,y,z\n" + rows)

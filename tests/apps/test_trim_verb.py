@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from plushsense.apps.trimming import decide_trims
 from plushsense.core.recfile import Frames, recording_filename, write_recording
 from plushsense.core.signal import load_layout
 from plushsense.dataset.importers import import_recordings
@@ -53,6 +55,7 @@ def test_suggest_accept_adjust_undo(cli: Cli, waves: Path) -> None:
     one = first["recording"]
     ran = cli("trim", waves, "--set", one, "0.7:", "--who", "K")
     assert "adjusted 1" in ran.err
+    assert [line.split()[0] for line in ran.out.splitlines() if line.startswith("P")] == [one]
     done = cli("trim", waves, "--accept-above", "0.5", "--json").json
     assert (len(done["accepted"]), done["kept_by_hand"]) == (11, [one])
     assert done["states"] == {"accepted": 11, "adjusted": 1}
@@ -84,11 +87,11 @@ def test_only_and_accept_by_pattern(cli: Cli, waves: Path) -> None:
     ("words", "said"),
     [
         (("--accept-above", "1.5"), "confidence from 0 to 1"),
-        (("--accept", "P9/*"), "called 'P9/*'"),
+        (("--accept", "P9/*"), "no recording 'P9/*'"),
         (("--set", "P1/*", "0.1:1"), "names 4"),
         (("--set", "P1/Fast*3989", "soon"), "FROM:TO"),
-        (("--set", "P1/nothing", "0:1"), "called 'P1/nothing'"),
-        (("--only", "P9/*"), "called 'P9/*'"),
+        (("--set", "P1/nothing", "0:1"), "no recording 'P1/nothing'"),
+        (("--only", "P9/*"), "no recording 'P9/*'"),
     ],
 )
 def test_refusals_are_sentences_and_mark_nothing(cli: Cli, waves: Path, words: tuple[str, ...], said: str) -> None:
@@ -103,6 +106,20 @@ def test_one_bad_request_stops_all(cli: Cli, waves: Path) -> None:
     one = open_dataset(waves).recordings[0].id
     assert cli("trim", waves, "--accept", "*", "--set", one, "9:10").status == 2
     assert not (waves / MARKS).exists()
+
+
+def test_a_place_that_cannot_be_drawn_to_is_refused_before_the_first_mark(cli: Cli, waves: Path) -> None:
+    ran = cli("trim", waves, "--accept", "*", "--plot", waves / "dataset.toml")
+    assert (ran.status, ran.err.count("\n")) == (2, 1)
+    assert "is a file" in ran.err
+    assert not (waves / MARKS).exists()
+
+
+def test_from_python(waves: Path) -> None:
+    done = decide_trims(waves, only="P1/*", above=0.5, who="K")
+    assert (len(done.changed), done.states) == (4, {"accepted": 4})
+    assert decide_trims(waves, undo=["P1/*"], who="K").states == {"suggested": 12}
+    assert {json.loads(line)["who"] for line in (waves / MARKS).read_text().splitlines()} == {"K"}
 
 
 def test_plot(cli: Cli, waves: Path, tmp_path: Path) -> None:

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from plushsense.core.errors import DatasetError
+from plushsense.core.gestures import GestureSet
 from plushsense.core.recfile import Frames, format_rows, write_recording
-from plushsense.core.signal import load_layout
+from plushsense.core.signal import CsvFormat, load_layout
 from plushsense.dataset import index
 from plushsense.dataset.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks
+from plushsense.dataset.store import Dataset, DatasetHead
 from plushsense.recording.simulate import simulate
 
 ACCEL = load_layout("accel-3")
@@ -109,3 +112,76 @@ def test_delays_are_compared_not_only_values(tmp_path: Path) -> None:
     (recording,) = import_recordings(tmp_path / "src", tmp_path / "DS", layout=layout).dataset.recordings
     assert recording.stream_row == 123
     assert not any("stream" in f for f in recording.flags)
+
+
+def rows_of(seed: int, rows: int = 60) -> Frames:
+    """Rows of the toy's clock alone, which begins at 0 whenever it is switched on."""
+    clock = np.arange(rows, dtype=np.int64) * 10
+    values = np.random.default_rng(seed).integers(0, 900, (rows, 3))
+    values[0] = 7
+    return Frames(values, clock, None)
+
+
+def lay(folder: Path, streams: dict[str, Frames], recordings: dict[str, Frames]) -> Dataset:
+    """A data set of one person's sessions, in a layout without the computer's clock."""
+    layout = replace(ACCEL, csv=CsvFormat(("device_ms", "x", "y", "z"), ("t", "x", "y", "z"), ","))
+    head = DatasetHead(name="two days", layout=layout, gestures=GestureSet.infer(["Shake"]))
+    for session, frames in streams.items():
+        path = folder / "streams" / "ana" / session / "fulldatastream.csv"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(format_rows(frames, layout), encoding="utf-8")
+    for session, frames in recordings.items():
+        path = folder / "recordings" / "ana" / session / f"Shake_1760000000000_{len(frames)}.csv"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_recording(path, frames, layout)
+    (folder / "dataset.toml").write_text(head.to_toml(), encoding="utf-8")
+    return open_dataset(folder)
+
+
+def test_a_recording_is_looked_for_in_its_own_session_first(tmp_path: Path) -> None:
+    one, two = rows_of(1), rows_of(2)
+    dataset = lay(tmp_path, {"s1": one, "s2": two}, {"s1": one.slice(0, 20), "s2": two.slice(0, 20)})
+    assert [(r.session, r.stream) for r in dataset.recordings] == [
+        ("s1", "ana/s1/fulldatastream"),
+        ("s2", "ana/s2/fulldatastream"),
+    ]
+
+
+def test_another_days_stream_that_only_begins_alike_is_not_the_recordings(tmp_path: Path) -> None:
+    dataset = lay(tmp_path, {"s1": rows_of(1)}, {"s2": rows_of(2).slice(0, 20)})
+    (recording,) = dataset.recordings
+    assert (recording.stream, recording.stream_row) == ("", -1)
+    assert recording.flags[-1] == "not found in the session's stream"
+
+
+def test_a_stream_that_holds_more_of_the_recording_is_taken(tmp_path: Path) -> None:
+    cut, whole = rows_of(2).slice(0, 5), rows_of(2)
+    dataset = lay(tmp_path, {"again-2": cut, ".": whole}, {".": whole.slice(0, 20)})
+    (recording,) = dataset.recordings
+    assert (recording.session, recording.stream, recording.flags) == ("1", "ana/fulldatastream", ())
+
+
+def test_streams_with_labels_have_the_session_of_their_recordings(tmp_path: Path) -> None:
+    rows = "".join(f"ana,{day},W,{1000 + 10 * i},1,2,{i},4,5,6\n" for day in ("a", "b") for i in range(9))
+    head = "subject,session,label,time_ms,x_acc,y_acc,z_acc,x_gyro,y_gyro,z_gyro\n"
+    (tmp_path / "table.csv").write_text(head + rows)
+    (tmp_path / "plain" / "bo").mkdir(parents=True)
+    (tmp_path / "plain" / "bo" / "bo_01.csv").write_text(
+        "x_acc,y_acc,z_acc,x_gyro,y_gyro,z_gyro,timestamp,label\n"
+        + "".join(f"1,2,{i},4,5,6,{i}0,W\n" for i in range(9))
+    )
+    import_recordings(tmp_path / "table.csv", tmp_path / "DS", layout="phone-6")
+    dataset = import_recordings(tmp_path / "plain", tmp_path / "DS", add_to=True).dataset
+    assert [s.session for s in dataset.streams] == ["a", "b", "bo_01"]
+    assert {r.stream: r.session for r in dataset.recordings} == {s.id: s.session for s in dataset.streams}
+
+
+def test_the_label_may_be_any_column(tmp_path: Path) -> None:
+    columns = ("label", "device_ms", "x", "y", "z")
+    layout = replace(ACCEL, csv=CsvFormat(columns, columns, ","))
+    (tmp_path / "src" / "bo").mkdir(parents=True)
+    rows = "".join(f"{'A' if i < 5 else 'B'},{i}0,{i},2,3\n" for i in range(12))
+    (tmp_path / "src" / "bo" / "day.csv").write_text(",".join(columns) + "\n" + rows)
+    import_recordings(tmp_path / "src", tmp_path / "DS", layout=layout)
+    dataset = open_dataset(tmp_path / "DS")
+    assert [(r.gesture, dataset.read(r).values[0, 0]) for r in dataset.recordings] == [("A", 0), ("B", 5)]

@@ -39,7 +39,7 @@ def test_only_a_newline_ends_a_mark(tmp_path: Path) -> None:
     ("line", "said"),
     [
         ("[1]", "is no mark"),
-        ('{"recording": "a", "action": "trim"}', "lacks something.*who"),
+        ('{"recording": "a", "action": "trim"}', "lacks who: a mark says at least"),
         ('{"recording": "a", "action": "trim", "who": "x", "start": -1}', "start is -1"),
         ('{"recording": "a", "action": "trim", "who": "x", "start": "3"}', "start is '3'"),
         ('{"recording": "a", "action": "trim", "who": "x", "stop": 2.5}', "stop is 2.5"),

@@ -69,15 +69,16 @@ def test_codes_that_would_share_a_folder_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_data_set_is_no_source(tmp_path: Path) -> None:
-    put(tmp_path / "src" / "ana", "Shake", 1)
-    put(tmp_path / "src" / "ben", "Shake", 2)
-    import_recordings(tmp_path / "src", tmp_path / "DS", layout="accel-3")
+    both = tmp_path / "both"
+    put(both / "src" / "ana", "Shake", 1)
+    put(both / "src" / "ben", "Shake", 2)
+    import_recordings(both / "src", both / "DS", layout="accel-3")
     with pytest.raises(DatasetError, match="is a data set already: open it as it is"):
-        import_recordings(tmp_path / "DS", tmp_path / "DS2", layout="accel-3")
+        import_recordings(both / "DS", tmp_path / "DS2", layout="accel-3")
     with pytest.raises(DatasetError, match="DS' in .* is a data set already"):
-        import_recordings(tmp_path, tmp_path / "DS2", layout="accel-3")
+        import_recordings(both, tmp_path / "DS2", layout="accel-3")
     assert not (tmp_path / "DS2").exists()
-    done = import_recordings(tmp_path / "DS" / "recordings", tmp_path / "DS2", layout="accel-3")
+    done = import_recordings(both / "DS" / "recordings", tmp_path / "DS2", layout="accel-3")
     assert done.dataset.subjects == ["ana", "ben"]
 
 

@@ -129,7 +129,7 @@ def test_rows_that_cannot_be_used_are_counted(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        (b"", "no column"),
+        (b"", "begins with no line of column names"),
         (b"a,b\n1,2\n", "no column"),
         (b"label,time,x,y,z\n", "no column 'subject'"),
         (b"subject,label,time,x,y,z\n", "no usable row"),

@@ -142,7 +142,7 @@ def test_names_and_patterns(dataset: Dataset) -> None:
     assert len(choose(dataset, "P2/Wave*")) == 2
     (one,) = choose(dataset, dataset.recordings[0].id)
     assert one == dataset.recordings[0]
-    with pytest.raises(DatasetError, match="called 'P3/.'"):
+    with pytest.raises(DatasetError, match="no recording 'P3/.'"):
         choose(dataset, "P3/*")
 
 

@@ -63,3 +63,11 @@ def test_the_same_figure_gives_the_same_bytes_and_no_window(study):
     assert first == second
     pyplot = sys.modules.get("matplotlib.pyplot")
     assert pyplot is None or not pyplot.get_fignums()
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_letter_that_the_font_lacks_is_no_warning() -> None:
+    figure = figures.training_curves([])
+    figure.axes[0].set_title("Streicheln \U0001f9f8")
+    assert figures.png(figure).startswith(b"\x89PNG")
+    assert figures.svg(figure)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +13,9 @@ from plushsense.core.recfile import Frames, format_rows, recording_filename, wri
 from plushsense.core.signal import load_layout
 from plushsense.dataset.importers import import_recordings
 from plushsense.dataset.quality.checking import Checked, check
-from plushsense.reports import quality, quality_figures
+from plushsense.dataset.trim import trims
+from plushsense.reports import figures, quality, quality_figures
+from plushsense.reports.trims import trim_page
 
 ACCEL = load_layout("accel-3")
 
@@ -65,6 +68,11 @@ def test_each_finding_is_there_and_what_needs_a_decision_first(result: Checked, 
     assert {"never-stopped", "gaps", "stuck"} <= {f.check for f in result.findings}
     for name in {f.check for f in result.findings}:
         assert f'<h2 id="{name}">' in page
+    shares = re.search(
+        r'#gaps">gaps</a></td><td class="n">(\d*)</td><td class="n">(\d*)</td><td class="n">(\d*)</td>', page
+    )
+    assert shares is not None
+    assert sum(int(n or 0) for n in shares.groups()) == len(result.of("gaps"))
     decide = page[page.index("<h2>To decide</h2>") : page.index("<h2>Gesture by gesture</h2>")]
     for f in result.undecided:
         assert f.recording.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;") in decide
@@ -122,6 +130,14 @@ def test_the_place_is_marked_in_rows_of_the_file(result: Checked) -> None:
 
 def test_the_same_data_give_the_same_bytes(result: Checked) -> None:
     gesture = result.dataset.gestures.labels[0]
-    assert quality_figures.png(quality.gesture_figure(result, gesture)) == quality_figures.png(
-        quality.gesture_figure(result, gesture)
-    )
+    assert figures.png(quality.gesture_figure(result, gesture)) == figures.png(quality.gesture_figure(result, gesture))
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_recording_of_one_row_is_drawn_without_a_word(tmp_path: Path) -> None:
+    (tmp_path / "src" / "bo").mkdir(parents=True)
+    one = Frames(np.array([[1, 2, 3]]), np.array([5]), np.array([10**12]))
+    write_recording(tmp_path / "src" / "bo" / "Tap_1000000000000_1.csv", one, ACCEL)
+    dataset = import_recordings(tmp_path / "src", tmp_path / "DS", layout="accel-3").dataset
+    assert "<h3>Tap</h3>" in quality.render(check(dataset))
+    assert figures.png(trim_page(dataset, trims(dataset))).startswith(b"\x89PNG")

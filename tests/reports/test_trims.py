@@ -3,6 +3,7 @@ from pathlib import Path
 import numpy as np
 
 from plushsense.dataset.importers import import_recordings
+from plushsense.dataset.index import open_dataset
 from plushsense.dataset.store import Dataset
 from plushsense.dataset.trim import accept, renewed, trims
 from plushsense.recording.simulate import simulate
@@ -27,6 +28,20 @@ def test_dotted_where_suggested_and_solid_where_marked(tmp_path: Path) -> None:
         assert all(np.ptp(np.asarray(line.get_xdata())) == 0 for line in upright)
         assert upright[0].get_xdata()[0] == trim.seconds[trim.suggestion.start]
         assert len(axes.lines) - len(upright) == 13, "every channel"
+
+
+def test_garbage_is_a_hole_and_squeezes_nothing(tmp_path: Path) -> None:
+    dataset = _dataset(tmp_path)
+    path = dataset.path / dataset.recordings[0].file
+    lines = path.read_text().splitlines()
+    cells = lines[20].split("; ")
+    path.write_text("\n".join([*lines[:20], "; ".join(["-30000", *cells[1:]]), *lines[21:], ""]))
+    dataset = open_dataset(dataset.path)
+    axes = trim_page(dataset, trims(dataset)[:1]).axes[0]
+    drawn = np.asarray(axes.lines[0].get_ydata())
+    assert np.flatnonzero(np.isnan(drawn)).tolist() == [19]
+    lane = [np.asarray(line.get_ydata()) for line in axes.lines if line.get_label() in dataset.layout.names[:5]]
+    assert max(np.nanmax(np.abs(y)) for y in lane) == 1.0
 
 
 def test_pages(tmp_path: Path) -> None:

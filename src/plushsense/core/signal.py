@@ -163,6 +163,11 @@ class Layout:
         return tuple(c.name for c in self.channels)
 
     @property
+    def is_labelled(self) -> bool:
+        """Whether every row of a file carries its gesture, so that recordings are stretches of streams."""
+        return "label" in self.csv.columns
+
+    @property
     def n_channels(self) -> int:
         """Measured channels, C."""
         return len(self.channels)

@@ -129,6 +129,12 @@ def add(
         account = Account(search, copier)
         head = replace(dataset.head, gestures=_with_described(dataset.head.gestures, gestures))
         built = read_all(account, head, progress)
+        if account.rejected and not account.kept and not copier.already:
+            file, reason = account.rejected[0].values()
+            raise DatasetError(
+                f"Nothing of the source fits '{dest}', whose layout is '{head.layout.name}': all "
+                f"{len(account.rejected)} files are rejected. The first: '{file}': {reason.rstrip('.')}."
+            )
         head = replace(head, gestures=extended(head.gestures, built.dataset))
         subjects = {r.subject for r in (*dataset.recordings, *built.dataset.recordings)}
         there = read_people(dest)

@@ -113,7 +113,7 @@ def lay_out(
     folder.mkdir(parents=True)
     where = f"{original.shown}: {subject}{f', session {session}' if session else ''}"
     main: Path | None = None
-    if "label" in layout.csv.columns:
+    if layout.is_labelled:
         apart = layout.csv.separator.strip() or " "
         written = [" ".join(cut.label.replace(apart, "_").split()) for cut in cuts]
         labels = np.full(len(frames), "", dtype=f"<U{max(map(len, written), default=1)}")

@@ -14,7 +14,7 @@ from plushsense.dataset.store import HEAD, RECORDINGS, STREAMS, write_atomically
 RECORDINGS_INDEX = "recordings.csv"
 STREAMS_INDEX = "streams.csv"
 STAMP = "index.json"
-STAMP_VERSION = 1
+STAMP_VERSION = 2
 
 
 def raw_files(folder: Path) -> list[tuple[str, Path]]:

@@ -86,7 +86,7 @@ def from_folder(source: Path, ask: Ask, *, around: Path | None = None) -> Search
     convertible = [f for f in rest if f.suffix.lower() == ".xdf"]
     plain = [f for f in rest if f.suffix.lower() != ".xdf"]
     mapping = None if ask.mapping is None else dict(ask.mapping)
-    shape = "labelled-rows" if "label" in layout.csv.columns else "gesture-recorder"
+    shape = "labelled-rows" if layout.is_labelled else "gesture-recorder"
     found = refused + list(find_sessions(sessions, in_session)) + find(shape, source, plain, mapping, gestures)
     found = [replace(f, origin=shown(f.source.relative_to(source))) for f in found]
     people, notes = people_of(sessions)
@@ -227,7 +227,7 @@ def search_source(source: Path, ask: Ask) -> Search:
     except FileFormatError as cause:
         raise FileFormatError(f"'{source}': {cause}.") from None
     if not any(f.kind in ("recordings", "streams") for f in search.found):
-        first = next((f" The first: '{f.origin}': {f.reason}." for f in search.found if f.reason), "")
+        first = next((f" The first: '{f.origin}': {f.reason.rstrip('.')}." for f in search.found if f.reason), "")
         raise DatasetError(
             f"'{source}' holds no recording: expected <label>_<epoch ms>_<rows>.csv in a folder a person"
             f"{' (or CSVs with a label column)' if search.shape == 'labelled-rows' else ''}; "
@@ -283,6 +283,8 @@ def import_recordings(
     if people is not None and not Path(people).exists():
         raise DatasetError(f"There is no people's file '{people}': check the path.")
     told = {} if people is None else read_people(Path(people))
+    if source.is_dir() and dest.resolve() != source.resolve() and dest.resolve().is_relative_to(source.resolve()):
+        raise ConfigError(f"'{dest}' lies in '{source}', which is only read: give a place outside it for the data set.")
     head = None
     if add_to:
         head = DatasetHead.read(dest)

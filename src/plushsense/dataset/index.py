@@ -27,7 +27,7 @@ from plushsense.dataset.freshness import (
     write_stamp,
 )
 from plushsense.dataset.marks import Standing, read_marks
-from plushsense.dataset.quality import Examined, findings, measured_rate_hz
+from plushsense.dataset.quality import Examined, findings, measured_rate_hz, usual_rows
 from plushsense.dataset.store import (
     RECORDINGS,
     STREAMS,
@@ -148,10 +148,19 @@ def build(folder: Path, head: DatasetHead, progress: Progress | None = None) -> 
 AGAIN = "again-"
 
 
-def _session(relative: Path) -> str:
-    """The session of a raw file by its path below ``recordings/`` or ``streams/``: the folder in the person's, or 1."""
+def _session(relative: Path, labelled: bool = False) -> str:
+    """The session of a raw file by its path below ``recordings/`` or ``streams/``: the folder in the person's.
+
+    Without one it is 1; but streams with labels lie side by side, and each is a session by its own name.
+    """
     inner = relative.parts[1:-1]
-    return inner[0] if inner and not inner[0].startswith(AGAIN) else "1"
+    if inner and not inner[0].startswith(AGAIN):
+        return inner[0]
+    return relative.stem if labelled else "1"
+
+
+def _stream_session(folder: Path, read: _Read) -> str:
+    return _session(read.path.relative_to(folder / STREAMS), read.result.frames.labels is not None)
 
 
 def _subject(folder_name: str, gesture: Gesture | None) -> str:
@@ -171,7 +180,7 @@ def _stream_info(folder: Path, head: DatasetHead, read: _Read) -> StreamInfo:
     return StreamInfo(
         id=_stream_id(folder, read),
         subject=read.subject,
-        session=_session(read.path.relative_to(folder / STREAMS)),
+        session=_stream_session(folder, read),
         file=read.path.relative_to(folder).as_posix(),
         rows=len(frames),
         seconds=float(steps[~broken].sum()) / 1000.0,
@@ -207,11 +216,25 @@ def _locate(recording: ReadResult, stream: ReadResult, at: _RowLookup) -> tuple[
     return best
 
 
-def _usual_rows(reads: Iterable[tuple[str, int]]) -> dict[str, float]:
-    rows: dict[str, list[int]] = {}
-    for gesture, n in reads:
-        rows.setdefault(gesture, []).append(n)
-    return {gesture: float(np.median(ns)) for gesture, ns in rows.items()}
+def _best_stream(
+    folder: Path, recording: _Read, session: str, streams: Iterable[_Read], lookups: dict[int, _RowLookup]
+) -> tuple[_Read | None, int, int]:
+    """The person's stream that holds most of a recording, its row there, and how many rows follow; (None, −1, 0).
+
+    The session's own first. Another session's only if it holds all of it: a day that begins with the same stamps is
+    not where the recording was made.
+    """
+    best: tuple[_Read | None, int, int] = (None, -1, 0)
+    for own in (True, False):
+        for stream in streams:
+            if (_stream_session(folder, stream) == session) is not own:
+                continue
+            row, rows = _locate(recording.result, stream.result, lookups[id(stream)])
+            if rows > best[2] and (own or rows == len(recording.result.frames)):
+                best = (stream, row, rows)
+            if best[2] == len(recording.result.frames):
+                return best
+    return best
 
 
 def _from_files(folder: Path, head: DatasetHead, recordings: list[_Read], streams: list[_Read]) -> list[RecordingInfo]:
@@ -227,7 +250,7 @@ def _from_files(folder: Path, head: DatasetHead, recordings: list[_Read], stream
             gestures[name.label] = head.gestures.find(name.label)
         found = gestures[name.label]
         named.append((read, name, found.label if found else name.label))
-    usual = _usual_rows((label, len(read.result.frames)) for read, _, label in named)
+    usual = usual_rows((label, len(read.result.frames)) for read, _, label in named)
     by_subject: dict[str, list[_Read]] = {}
     for stream in streams:
         by_subject.setdefault(stream.subject, []).append(stream)
@@ -245,21 +268,12 @@ def _from_files(folder: Path, head: DatasetHead, recordings: list[_Read], stream
         if read.sha256 in originals:
             flags.append(f"the same content as {originals[read.sha256]}")
         originals.setdefault(read.sha256, identity)
-        stream_id, stream_row = "", -1
         session = _session(read.path.relative_to(folder / RECORDINGS))
-        # The session's own stream first: another day's may begin with the same stamps.
-        candidates = sorted(
-            by_subject.get(read.subject, []),
-            key=lambda s: _session(s.path.relative_to(folder / STREAMS)) != session,
-        )
-        for stream in candidates:
-            row, rows = _locate(read.result, stream.result, lookups[id(stream)])
-            if row >= 0:
-                stream_id, stream_row = _stream_id(folder, stream), row
-                if rows < len(frames):
-                    flags.append(f"only its first {rows} rows are in the session's stream")
-                break
-        if candidates and stream_row < 0:
+        mine = by_subject.get(read.subject, [])
+        found_in, stream_row, rows = _best_stream(folder, read, session, mine, lookups)
+        if found_in is not None and rows < len(frames):
+            flags.append(f"only its first {rows} rows are in the session's stream")
+        elif mine and found_in is None:
             flags.append("not found in the session's stream")
         infos.append(
             RecordingInfo(
@@ -272,7 +286,7 @@ def _from_files(folder: Path, head: DatasetHead, recordings: list[_Read], stream
                 rows=len(frames),
                 start=0,
                 stop=len(frames),
-                stream=stream_id,
+                stream="" if found_in is None else _stream_id(folder, found_in),
                 stream_row=stream_row,
                 start_ms=int(frames.device_ms[0]),
                 epoch_ms=int(frames.host_ms[0]) if frames.host_ms is not None else name.epoch_ms,
@@ -328,7 +342,7 @@ def _from_labels(folder: Path, head: DatasetHead, streams: list[_Read]) -> list[
                 RecordingInfo(
                     id=f"{_stream_id(folder, read)}#{number:03d} {label}",
                     subject=_subject(read.subject, found),
-                    session=_stream_id(folder, read).rsplit("/", 1)[-1],
+                    session=_stream_session(folder, read),
                     gesture=label,
                     file=read.path.relative_to(folder).as_posix(),
                     first_row=first,

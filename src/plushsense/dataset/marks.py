@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timezone
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from plushsense.core.tomlfile import refuse_unknown
 
 MARKS = "marks.jsonl"
 BY_HAND, SUGGESTED = "hand", "suggested"
+NEEDED = ("recording", "action", "who")
 ACTIONS = ("trim", "untrim", "exclude", "include", "accept", "unaccept")
 
 
@@ -84,6 +86,23 @@ def _checked(mark: Mark, where: str) -> Mark:
     return mark
 
 
+def matching(pattern: str, known: Iterable[str], what: str) -> list[str]:
+    """The ids that a pattern names: the id itself, or a glob such as ``P19/*``.
+
+    Raises:
+        DatasetError: when it names none, with the nearest one.
+    """
+    ids = sorted(set(known))
+    if pattern in ids:
+        return [pattern]
+    found = [i for i in ids if fnmatchcase(i, pattern)]
+    if not found:
+        hint = nearest(pattern, ids)
+        example = f" For example '{ids[0]}', or a pattern such as 'P01/*'." if ids and not hint else ""
+        raise DatasetError(f"There is no {what} '{pattern}'.{hint}{example}")
+    return found
+
+
 def append_marks(folder: Path, marks: Iterable[Mark]) -> None:
     """Add marks at the end, under a file lock, so that two programs can mark at once.
 
@@ -134,10 +153,9 @@ def read_marks(folder: Path) -> dict[str, Standing]:
         if not isinstance(table, dict):
             raise DatasetError(f"{where} is no mark: each line is one JSON object.")
         refuse_unknown(table, Mark.__dataclass_fields__, where, DatasetError)
-        try:
-            mark = _checked(Mark(**table), where)
-        except TypeError as cause:
-            raise DatasetError(f"{where} lacks something: {cause}.") from None
+        if lacking := [key for key in NEEDED if key not in table]:
+            raise DatasetError(f"{where} lacks {', '.join(lacking)}: a mark says at least {', '.join(NEEDED)}.")
+        mark = _checked(Mark(**table), where)
         now = standing.get(mark.recording, Standing())
         match mark.action:
             case "trim":

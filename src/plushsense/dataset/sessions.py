@@ -70,11 +70,7 @@ def common_layout(sessions: Sessions, given: Layout | None, of: str) -> Layout |
                 f"Session '{place.name}' was recorded with the layout {what}, but {of} is '{agreed.name}': "
                 "a data set has one layout, so import them apart."
             )
-    if (
-        agreed is not None
-        and "label" in agreed.csv.columns
-        and any(isinstance(h, SessionHead) for h in sessions.values())
-    ):
+    if agreed is not None and agreed.is_labelled and any(isinstance(h, SessionHead) for h in sessions.values()):
         raise DatasetError(
             f"Layout '{agreed.name}' has a label on every row, which recordings of a session do not carry: "
             "take 'label' out of its csv.columns."

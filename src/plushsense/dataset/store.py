@@ -246,7 +246,7 @@ class Dataset:
 
     def read(self, recording: RecordingInfo) -> Frames:
         """The rows of one recording that remain after trimming."""
-        if self.layout.csv.columns[-1] == "label":
+        if self.layout.is_labelled:
             return self.read_stream(recording.stream).slice(
                 recording.first_row + recording.start, recording.first_row + recording.stop
             )

@@ -85,10 +85,11 @@ def choose(there: list[str], layout: Layout, given: Mapping[str, str], shown: st
         if found is not None:
             chosen[role] = there[plain.index(found)]
         elif role in given or role in ("label", "time") or role in layout.names:
+            if not any(plain):
+                raise FileFormatError(f"'{shown}' begins with no line of column names: a table needs a header")
             listed = ", ".join(t[:30] for t in there[:20]) + (", …" if len(there) > 20 else "")
             raise FileFormatError(
-                f"'{shown}' has no column '{names[0]}'; it has {listed or 'none'}: name the right one with "
-                f"--column {role}=NAME"
+                f"'{shown}' has no column '{names[0]}'; it has {listed}: name the right one with --column {role}=NAME"
             )
     return chosen
 

@@ -10,15 +10,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import DatasetError, nearest
+from plushsense.core.errors import DatasetError
 from plushsense.core.recfile import Frames
-from plushsense.dataset.marks import BY_HAND, SUGGESTED, Mark, Standing, append_marks, read_marks
+from plushsense.dataset.marks import BY_HAND, SUGGESTED, Mark, Standing, append_marks, matching, read_marks
 from plushsense.dataset.onset import CONTEXT_S, Suggestion, suggest
 from plushsense.dataset.store import Dataset, RecordingInfo
 
@@ -108,7 +107,7 @@ def trims(
     Raises:
         DatasetError: for a data set whose recordings are cut from labels, which need no trimming.
     """
-    if dataset.layout.csv.columns[-1] == "label":
+    if dataset.layout.is_labelled:
         raise DatasetError(
             f"The recordings of '{dataset.head.name}' are cut where the label on the rows changes (layout "
             f"'{dataset.layout.name}'), so there is no reaction time to trim: trim data sets of single recordings."
@@ -151,15 +150,7 @@ def choose(dataset: Dataset, pattern: str) -> list[RecordingInfo]:
         DatasetError: when it names none.
     """
     ids = {r.id: r for r in dataset.recordings}
-    if pattern in ids:
-        return [ids[pattern]]
-    matched = [r for r in dataset.recordings if fnmatchcase(r.id, pattern)]
-    if not matched:
-        raise DatasetError(
-            f"No recording of '{dataset.head.name}' is called '{pattern}': give an id as recordings.csv has it, or a "
-            f"pattern such as 'P01/*'.{nearest(pattern, ids)}"
-        )
-    return matched
+    return [ids[identity] for identity in matching(pattern, ids, "recording")]
 
 
 def accept(

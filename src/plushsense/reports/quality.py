@@ -22,6 +22,7 @@ from plushsense.dataset.quality.outline import outline
 from plushsense.dataset.store import Dataset, RecordingInfo
 from plushsense.reports import quality_figures as figures
 from plushsense.reports import words
+from plushsense.reports.figures import png
 from plushsense.reports.html import check_place, fill, put_page
 
 if TYPE_CHECKING:
@@ -89,7 +90,7 @@ class _Pictures:
     made: int = 0
 
     def add(self, figure: Figure) -> str | None:
-        data = figures.png(figure)
+        data = png(figure)
         if self.weight + len(data) > self.limit:
             self.left_out += 1
             return None
@@ -141,7 +142,7 @@ def render(result: Checked, progress: Progress | None = None) -> str:
         title=f"Check of {dataset.head.name}",
         made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         simulated=dataset.head.simulated,
-        simulated_title=words.SIMULATED_TITLE,
+        simulated_title=words.SIMULATED_RECORDINGS_TITLE,
         simulated_words=words.SIMULATED_WORDS,
         summary=[
             ("Recordings looked at", words.count(result.recordings)),
@@ -157,6 +158,7 @@ def render(result: Checked, progress: Progress | None = None) -> str:
         overlays=overlays,
         named=NAMED,
         tolerance=f"{100 * result.limits.duration:.0f}",
+        severities=[_SEVERITY[s] for s in SEVERITIES],
         left_out=pictures.left_out,
         plots=PLOTS,
         pictures=pictures.made,
@@ -183,6 +185,7 @@ def _section(name: str, found: list[Finding], places: _Places, pictures: _Pictur
     return {
         "name": name,
         "count": len(found),
+        "counts": [sum(f.severity == s and not f.accepted for f in found) for s in SEVERITIES],
         "action": CHECKS[name].action,
         "rows": [_row(f) for f in found],
         "pictures": drawn,

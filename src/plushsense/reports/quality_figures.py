@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +24,7 @@ GREY, BAND, MARK = "#9aa0a6", "#e8f0fa", "#d55e00"
 _POINTS = 1500
 _LINE_POINTS = 160
 _CHANNELS = 13
+_FEW = 40
 
 
 @dataclass(frozen=True)
@@ -78,14 +78,17 @@ def overlay(gesture: str, lines: Sequence[Line], mean_s: float, tolerance: float
     named = [one for one in lines if one.name]
     # One that never stopped would squeeze all others to the left.
     end = max([1.8 * mean_s, *(one.lasts for one in lines if one.lasts < 4 * mean_s)], default=1.0)
+    # Few lines are to be seen each, of many the mass.
+    few = len(lines) <= _FEW
     for one in lines:
         if not one.name:
-            top.plot(one.seconds, one.size, color=GREY, linewidth=0.6, alpha=0.35)
+            top.plot(one.seconds, one.size, color=GREY, linewidth=1.0 if few else 0.6, alpha=0.9 if few else 0.35)
     for i, one in enumerate(named):
         style = "-" if i < len(COLOURS) else "--"
         top.plot(one.seconds, one.size, style, color=COLOURS[i % len(COLOURS)], linewidth=1.4, label=one.name)
     heights = [s for one in lines for s in (np.percentile(one.size, 99.5),) if one.size.size]
-    top.set_ylim(0, 1.25 * float(np.percentile(heights, 98)) if heights else 1.0)
+    # A recording of one row has neither height nor length.
+    top.set_ylim(0, (1.25 * float(np.percentile(heights, 98)) if heights else 0.0) or 1.0)
     top.set_ylabel("deviation from rest\n(1 = usual)", fontsize=9)
     top.set_title(f"{gesture}: {len(lines)} recordings", fontsize=10, parse_math=False)
     if named:
@@ -109,7 +112,7 @@ def overlay(gesture: str, lines: Sequence[Line], mean_s: float, tolerance: float
         )
     strip.set_yticks([])
     strip.set_ylim(-0.15, 1.15)
-    strip.set_xlim(0, end * 1.01)
+    strip.set_xlim(0, end * 1.01 or 1.0)
     strip.set_xlabel(
         f"seconds; below: how long each lasts, the mean {mean_s:.2f} s, and ±{100 * tolerance:.0f} % of it shaded",
         fontsize=9,
@@ -213,11 +216,3 @@ def _finished(figure: Figure, axes: Any, title: str) -> Figure:
     if title:
         axes.set_title(textwrap.fill(title, 105), fontsize=8, loc="left", parse_math=False)
     return figure
-
-
-def png(figure: Figure, dpi: int = 90) -> bytes:
-    """A figure as PNG; the same data give the same bytes."""
-    out = io.BytesIO()
-    metadata: Mapping[str, Any] = {"Software": None}
-    figure.savefig(out, format="png", dpi=dpi, metadata=metadata)
-    return out.getvalue()

@@ -8,10 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
+from plushsense.core.errors import ConfigError
 from plushsense.core.extras import need
+from plushsense.core.signal import Layout
 from plushsense.dataset.store import Dataset
 from plushsense.dataset.trim import Trim
+from plushsense.reports.figures import png
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -42,12 +46,11 @@ def trim_page(dataset: Dataset, trims: Sequence[Trim], offset: bool = True) -> F
     for axes, trim in zip(grid.flat, trims, strict=False):
         info, s = trim.recording, trim.suggestion
         frames = dataset.read(replace(info, start=0, stop=info.rows))
-        values = frames.values.astype(np.float64)
-        values -= np.median(values, axis=0)
+        values = _off_median(frames.values, dataset.layout)
         at = trim.seconds[: len(frames)]
         for lane, kind in enumerate(kinds):
             mine = [i for i, c in enumerate(channels) if c.kind == kind]
-            swing = max(1.0, float(np.abs(values[:, mine]).max()))
+            swing = max(1.0, float(np.nanmax(np.abs(values[:, mine]))))
             for i in mine:
                 axes.plot(
                     at, values[:, i] / swing - 2.1 * lane, linewidth=0.8, color=colours(i), label=channels[i].name
@@ -63,7 +66,7 @@ def trim_page(dataset: Dataset, trims: Sequence[Trim], offset: bool = True) -> F
                     axes.axvspan(trim.seconds[cut[0]], trim.seconds[cut[1]], color=_MARK, alpha=0.12, linewidth=0)
         said = f"{trim.state}, confidence {s.onset_confidence:.2f}" + (f"; {s.why}" if s.why else "")
         axes.set_title(f"{info.id}\n{said}", fontsize=7.5, parse_math=False)
-        axes.set_xlim(0.0, float(trim.seconds[-1]))
+        axes.set_xlim(0.0, float(trim.seconds[-1]) or 1.0)
         axes.set_ylim(-1.08 - 2.1 * (len(kinds) - 1), 1.08)
         axes.set_yticks([-2.1 * lane for lane in range(len(kinds))], kinds, rotation=90, va="center")
         axes.tick_params(labelsize=7)
@@ -80,6 +83,30 @@ def trim_page(dataset: Dataset, trims: Sequence[Trim], offset: bool = True) -> F
     return figure
 
 
+def _off_median(raw: NDArray[np.int64], layout: Layout) -> NDArray[np.float64]:
+    """Values (T, C) less their channel's median; garbage, which would squeeze all else, is a hole in the line."""
+    valid = (raw >= layout.valid_min_int) & (raw <= layout.valid_max_int)
+    values = np.where(valid | ~valid.any(axis=0), raw, np.nan)
+    return np.asarray(values - np.nanmedian(values, axis=0))
+
+
+def check_place(out: Path) -> None:
+    """Refuse a place that `save_trims` could not write to, before anything is marked.
+
+    Raises:
+        ConfigError: for a file that is no .png, or a folder that cannot be made.
+        MissingExtraError: when matplotlib is not installed.
+    """
+    need("matplotlib", "reports")
+    single = out.suffix.lower() == ".png"
+    if out.is_dir() if single else out.is_file():
+        raise ConfigError(f"'{out}' is a {'folder' if single else 'file'}: name a new .png for one page, or a folder.")
+    try:
+        (out.parent if single else out).mkdir(parents=True, exist_ok=True)
+    except OSError as cause:
+        raise ConfigError(f"'{out}' cannot be drawn to ({cause.strerror or cause}): name another place.") from None
+
+
 def save_trims(dataset: Dataset, trims: Sequence[Trim], out: Path, offset: bool = True) -> list[Path]:
     """Draw recordings into ``out``: a file that ends in .png holds the first page, a folder all pages.
 
@@ -91,5 +118,5 @@ def save_trims(dataset: Dataset, trims: Sequence[Trim], out: Path, offset: bool 
     written = []
     for number, page in enumerate(pages, 1):
         written.append(out if single else out / f"trim-{number:03d}.png")
-        trim_page(dataset, page, offset).savefig(written[-1], dpi=110)
+        written[-1].write_bytes(png(trim_page(dataset, page, offset), dpi=110))
     return written

@@ -57,6 +57,7 @@ LEAKY_WORDS = (
     "about a person it never met, and cannot be compared with a split by person."
 )
 SIMULATED_TITLE = "These scores are of a simulation."
+SIMULATED_RECORDINGS_TITLE = "These recordings are of a simulation."
 SIMULATED_WORDS = "They were made on a virtual toy with virtual people and say nothing about a real toy."
 PARTLY_SIMULATED_TITLE = "A part of this page is of a simulation."
 PARTLY_SIMULATED_WORDS = (

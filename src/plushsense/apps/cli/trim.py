@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import argparse
-from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from plushsense.apps.cli.output import bar, emit, say, table
 
 if TYPE_CHECKING:
-    from plushsense.dataset.trim import Accepted, Trim
+    from plushsense.apps.trimming import Trimmed
+
+LINES = 20
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -41,7 +42,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         default=False,
         help="accept the suggested end too (default: the start alone, as in the paper)",
     )
-    parser.add_argument("--who", default="not said", metavar="CODE", help="who decides, kept in the mark")
+    parser.add_argument("--who", metavar="NAME", help="who decides, kept in the mark (default: the login name)")
     parser.add_argument("--why", default="", metavar="TEXT", help="why, kept in the mark (default: nothing)")
     parser.add_argument(
         "--plot", metavar="FILE.png|DIR", help="draw recordings, the least sure first: one page, or all into a folder"
@@ -49,55 +50,37 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from plushsense.core.errors import ConfigError
-    from plushsense.core.extras import need
-    from plushsense.dataset import trim
-    from plushsense.dataset.index import open_dataset
+    from plushsense.apps.trimming import decide_trims
 
-    if args.accept_above is not None and not 0.0 <= args.accept_above <= 1.0:
-        raise ConfigError(f"--accept-above is {args.accept_above:g}: a confidence from 0 to 1 is accepted.")
     if args.plot:
-        need("matplotlib", "reports")
-    times = [(identity, *_seconds(text)) for identity, text in args.set]
-    dataset = open_dataset(args.dataset)
-    shown = trim.choose(dataset, args.only)
-    if args.only == "*":
-        shown = dataset.used
-    found = {t.recording.id: t for t in trim.trims(dataset, shown, bar("reading"))}
-    # Everything is found and understood before the first mark is made.
-    undone = {r.id: r for pattern in args.undo for r in trim.choose(dataset, pattern)}
-    by_name = {r.id: r for pattern in args.accept for r in trim.choose(dataset, pattern)}
-    to_set = []
-    for identity, start_s, stop_s in times:
-        (info, *others) = trim.choose(dataset, identity)
-        if others:
-            raise ConfigError(f"--set changes one recording, and '{identity}' names {1 + len(others)}: give an id.")
-        to_set.append((info, start_s, stop_s))
-    missing = [r for r in [*by_name.values(), *(i for i, _, _ in to_set)] if r.id not in found]
-    extra = {t.recording.id: t for t in trim.trims(dataset, missing)}
-    for info, start_s, stop_s in to_set:
-        trim.kept_rows((found | extra)[info.id], start_s, stop_s)
+        from plushsense.reports.trims import check_place
 
-    taken_back = trim.undo(dataset, list(undone.values()), args.who, args.why)
-    adjusted = [
-        info.id
-        for info, start_s, stop_s in to_set
-        if trim.set_trim(dataset, (found | extra)[info.id], start_s, stop_s, args.who, args.why)
-    ]
-    accepted = trim.Accepted()
-    if by_name or args.accept_above is not None:
-        chosen = list(by_name) if by_name else list(found)
-        again = trim.renewed(dataset, [(found | extra)[identity] for identity in chosen])
-        accepted = trim.accept(dataset, again, args.who, args.why, above=args.accept_above or 0.0, offset=args.offset)
-    listed = trim.renewed(dataset, list(found.values()))
+        check_place(Path(args.plot))
+    result = decide_trims(
+        args.dataset,
+        only=args.only,
+        accept=args.accept,
+        above=args.accept_above,
+        keep=[(identity, *_seconds(text)) for identity, text in args.set],
+        undo=args.undo,
+        offset=args.offset,
+        who=args.who,
+        why=args.why,
+        progress=bar("reading"),
+    )
     drawn: list[Path] = []
     if args.plot:
         from plushsense.reports.trims import save_trims
 
-        least_sure_first = sorted(listed, key=lambda t: t.suggestion.onset_confidence)
-        drawn = save_trims(dataset, least_sure_first, Path(args.plot), args.offset)
-    _tell(args, listed, accepted, adjusted, taken_back, drawn)
+        least_sure_first = sorted(result.trims, key=lambda t: t.suggestion.onset_confidence)
+        drawn = save_trims(result.dataset, least_sure_first, Path(args.plot), args.offset)
+    _tell(args, result, drawn)
     return 0
+
+
+def _decides(args: argparse.Namespace) -> bool:
+    """Whether marks were asked for, rather than to look."""
+    return bool(args.accept or args.set or args.undo) or args.accept_above is not None
 
 
 def _seconds(text: str) -> tuple[float | None, float | None]:
@@ -112,26 +95,21 @@ def _seconds(text: str) -> tuple[float | None, float | None]:
         raise ConfigError(f"--set was given '{text}': seconds as FROM:TO are accepted, such as 0.35:2.1.") from None
 
 
-def _tell(
-    args: argparse.Namespace,
-    listed: list[Trim],
-    accepted: Accepted,
-    adjusted: list[str],
-    undone: tuple[str, ...],
-    drawn: list[Path],
-) -> None:
-    states = Counter(t.state for t in listed)
+def _tell(args: argparse.Namespace, done: Trimmed, drawn: list[Path]) -> None:
+    accepted, states = done.accepted, done.states
     result: dict[str, Any] = {
-        "recordings": [t.to_dict(args.offset) for t in listed],
-        "states": dict(states),
+        "recordings": [t.to_dict(args.offset) for t in done.trims],
+        "states": states,
         "accepted": list(accepted.marked),
         "already": len(accepted.already),
         "not_visible": len(accepted.not_visible),
         "kept_by_hand": list(accepted.kept_by_hand),
-        "adjusted": adjusted,
-        "undone": list(undone),
+        "adjusted": list(done.adjusted),
+        "undone": list(done.undone),
         "plots": [str(path) for path in drawn],
     }
+    # After a decision, what it changed; the rest was shown when it was made.
+    decided = _decides(args)
     rows = [
         (
             r["recording"],
@@ -143,6 +121,7 @@ def _tell(
             r["note"],
         )
         for r in result["recordings"]
+        if not decided or r["recording"] in done.changed
     ]
     if not args.json and (args.accept or args.accept_above is not None):
         less_sure = " or not sure enough" if args.accept_above else ""
@@ -152,9 +131,10 @@ def _tell(
             f"kept as set by hand {len(accepted.kept_by_hand)}"
         )
     if not args.json and args.set:
-        say(f"adjusted {len(adjusted)}, already so {len(args.set) - len(adjusted)}")
+        say(f"adjusted {len(done.adjusted)}, already so {len(args.set) - len(done.adjusted)}")
     if not args.json and args.undo:
-        say(f"undone {len(undone)}")
+        say(f"undone {len(done.undone)}")
     counts = ", ".join(f"{n} {state}" for state, n in sorted(states.items()))
     head = ("recording", "rows", "start s", "stop s", "confidence", "state", "note")
-    emit(args, result, [table(head, rows), "", f"{len(listed)} recordings: {counts}", *map(str, drawn)])
+    shown = [] if decided and not 0 < len(rows) <= LINES else [table(head, rows), ""]
+    emit(args, result, [*shown, f"{len(done.trims)} recordings{': ' if counts else ''}{counts}", *map(str, drawn)])

@@ -147,12 +147,12 @@ class _Writing:
 
     def _write_stream(self, stream: StreamInfo) -> str:
         code = _folder_of(stream.file)
-        number = self.sessions[code][self._session_of(stream)]
+        number = self.sessions[code][stream.session]
         folder = f"{STREAMS}/{self.codes[code]}"
         if self.labelled:
             target = self._free(f"{folder}/session-{number}.csv")
         else:
-            target = self._free(f"{folder}/{self._inner(code, self._session_of(stream))}{STREAM_NAME}")
+            target = self._free(f"{folder}/{self._inner(code, stream.session)}{STREAM_NAME}")
         raw = read_stream(self.source.path / stream.file, self.source.layout).frames
         self._put(target, self.shifts[code].frames(raw, self._host), raw.values)
         return target
@@ -203,10 +203,6 @@ class _Writing:
         self.taken.add(wanted.casefold())
         return wanted
 
-    def _session_of(self, stream: StreamInfo) -> str:
-        """A stream's session as its recordings name it: of streams with labels, the stream itself."""
-        return stream.id.rpartition("/")[2] if self.labelled else stream.session
-
     def _inner(self, code: str, session: str) -> str:
         return f"{self.sessions[code][session]}/" if len(self.sessions[code]) > 1 else ""
 
@@ -256,7 +252,7 @@ class _Writing:
             for r in self.kept:
                 if _folder_of(r.file) == code:
                     began[r.session] = min(r.epoch_ms, began.get(r.session, r.epoch_ms))
-            rest = sorted({self._session_of(s) for s in self.streams if _folder_of(s.file) == code} - set(began))
+            rest = sorted({s.session for s in self.streams if _folder_of(s.file) == code} - set(began))
             ordered = [name for _, name in sorted((at, name) for name, at in began.items())] + rest
             numbered[code] = {name: number for number, name in enumerate(ordered, 1)}
         return numbered

@@ -8,12 +8,10 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
 from plushsense.core.errors import ConfigError, nearest
 from plushsense.core.recfile import Frames, ReadResult, parse_name, read_recording, read_stream
 from plushsense.dataset.marks import read_marks
-from plushsense.dataset.quality.examined import Examined
+from plushsense.dataset.quality.examined import Examined, usual_rows
 from plushsense.dataset.quality.finding import SEVERITIES, Finding, Limits, Said
 from plushsense.dataset.quality.outline import Outline, Whole, outline
 from plushsense.dataset.quality.table import CHECKS
@@ -108,7 +106,7 @@ def check(
     checks = known_checks(only)
     limits = limits or Limits()
     used = dataset.used
-    usual = _usual_rows(used)
+    usual = usual_rows((r.gesture, r.stop - r.start) for r in used)
     found: list[Finding] = []
     recordings: list[Outline] = []
     streams: list[Outline] = []
@@ -167,13 +165,6 @@ def check(
         limits,
         time.perf_counter() - began,
     )
-
-
-def _usual_rows(used: Sequence[RecordingInfo]) -> dict[str, float]:
-    rows: dict[str, list[int]] = {}
-    for r in used:
-        rows.setdefault(r.gesture, []).append(r.stop - r.start)
-    return {gesture: float(np.median(n)) for gesture, n in rows.items()}
 
 
 def _read(

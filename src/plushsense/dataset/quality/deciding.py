@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import getpass
-from collections.abc import Iterable, Sequence
-from fnmatch import fnmatchcase
+from collections.abc import Sequence
 
-from plushsense.core.errors import ConfigError, DatasetError, nearest
-from plushsense.dataset.marks import Mark, read_marks
+from plushsense.core.errors import ConfigError, DatasetError
+from plushsense.dataset.marks import Mark, matching, read_marks
 from plushsense.dataset.quality.checking import Checked, known_checks
 from plushsense.dataset.store import Dataset
 
@@ -24,23 +23,6 @@ def signed(who: str | None) -> str:
         return getpass.getuser()
     except (OSError, KeyError, ImportError):
         raise ConfigError("Nobody is logged in by name here: say who decides with --who NAME.") from None
-
-
-def matching(pattern: str, known: Iterable[str], what: str) -> list[str]:
-    """The ids that a pattern names: the id itself, or a glob such as ``P19/*``.
-
-    Raises:
-        DatasetError: when it names none, with the nearest one.
-    """
-    ids = sorted(set(known))
-    if pattern in ids:
-        return [pattern]
-    found = [i for i in ids if fnmatchcase(i, pattern)]
-    if not found:
-        hint = nearest(pattern, ids)
-        example = f" For example '{ids[0]}', or a pattern such as 'P01/*'." if ids and not hint else ""
-        raise DatasetError(f"There is no {what} '{pattern}'.{hint}{example}")
-    return found
 
 
 def exclusions(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -105,6 +106,14 @@ class Examined:
     def row(self, at: int) -> int:
         """The number of a row in its file, from 1."""
         return int(at) + self.first_row + 1
+
+
+def usual_rows(recordings: Iterable[tuple[str, int]]) -> dict[str, float]:
+    """The median number of rows of each gesture, from pairs of gesture and rows."""
+    rows: dict[str, list[int]] = {}
+    for gesture, n in recordings:
+        rows.setdefault(gesture, []).append(n)
+    return {gesture: float(np.median(ns)) for gesture, ns in rows.items()}
 
 
 def measured_rate_hz(frames: Frames) -> float:
