@@ -172,7 +172,7 @@ BAD = [
     (["trian"], "Did you mean 'train'?"),
     (["import", "{recordings}", "{tmp}/x", "--layout", "plush-15"], "has 5 columns, but a file of layout 'plush-15'"),
     (["import", "{recordings}", "{tmp}/x", "--layout", "accel3"], "Did you mean 'accel-3'?"),
-    (["import", "{tmp}", "{tmp}/x", "--layout", "accel-3"], "holds no recording"),
+    (["import", "{tmp}", "{tmp}-x", "--layout", "accel-3"], "holds no recording"),
     (["evaluate", "{tmp}"], "is not a data set"),
     (["evaluate", "{ds}", "--split", "by-subjct:5"], "Did you mean 'by-subject:5'?"),
     (["evaluate", "{ds}", "--split", "by-subject:50"], "there are 5"),
