@@ -61,15 +61,10 @@ class Contents:
     notes: tuple[str, ...]
 
 
-def is_labelled(layout: Layout) -> bool:
-    """Whether every row of a stream carries its gesture, so that recordings are parts of streams."""
-    return layout.csv.columns[-1] == "label"
-
-
 def public_layout(layout: Layout, host: bool) -> Layout:
     """The layout with plain columns: keys as header, ``,`` between, clocks first."""
     clocks = (HOST_MS, DEVICE_MS) if host else (DEVICE_MS,)
-    columns = (*clocks, *layout.names, *(("label",) if is_labelled(layout) else ()))
+    columns = (*clocks, *layout.names, *(("label",) if layout.is_labelled else ()))
     return replace(layout, csv=CsvFormat(columns, columns, ","))
 
 
@@ -92,7 +87,7 @@ class _Writing:
         self.folder = folder
         self.options = options
         self.progress = progress or (lambda done, total: None)
-        self.labelled = is_labelled(dataset.layout)
+        self.labelled = dataset.layout.is_labelled
         self.notes: list[str] = []
         if self.labelled and not options.streams:
             raise DatasetError(

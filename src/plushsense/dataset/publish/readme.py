@@ -6,7 +6,6 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 
-from plushsense.dataset.publish.contents import is_labelled
 from plushsense.dataset.publish.description import DATA, SIMULATION, Description
 from plushsense.dataset.store import RECORDINGS, STREAMS
 
@@ -162,7 +161,7 @@ def _kind(flag: str) -> str:
 
 def _loading(d: Description) -> str:
     first = next(t for t in d.tables if t.files).files[0]
-    many = is_labelled(d.dataset.layout)
+    many = d.dataset.layout.is_labelled
     places = f"{DATA}/{STREAMS}" if many else f"{DATA}/{RECORDINGS}"
     record_set = "stream-samples" if many else "samples"
     return f"""With PlushSense:

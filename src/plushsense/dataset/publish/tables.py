@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from plushsense.core.gestures import NOBODY
-from plushsense.dataset.publish.contents import Contents, is_labelled
+from plushsense.dataset.publish.contents import Contents
 from plushsense.dataset.publish.description import (
     CHANNELS_TABLE,
     DATA,
@@ -102,7 +102,7 @@ def write_tables(root: Path, contents: Contents) -> tuple[Table, ...]:
     for table, text in tables_of(contents):
         (root / table.file).write_text(text, encoding="utf-8", newline="\n")
         made.append(table)
-    labelled = is_labelled(d.layout)
+    labelled = d.layout.is_labelled
     columns = sample_columns(d.layout, labelled)
     if not labelled:
         files = tuple(sorted({f"{DATA}/{r.file}" for r in d.recordings}))
