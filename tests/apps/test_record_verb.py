@@ -75,6 +75,28 @@ def test_an_input_that_never_ends_does_not_hold_it_up(tmp_path: Path) -> None:
     assert "Fatal" not in process.stderr.read()
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux lets a pipe be made small")
+def test_a_log_that_nobody_reads_holds_up_no_recording(tmp_path: Path) -> None:
+    import fcntl
+
+    out, err = os.pipe()
+    fcntl.fcntl(err, 1031, 4096)  # F_SETPIPE_SZ, which Python 3.11 does not name on every system
+    process = subprocess.Popen(
+        [*COMMAND, str(tmp_path), "--device", URL, "--subject", "S01", "--auto", "1", "--json"],
+        stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=err, text=True,
+    )  # fmt: skip
+    os.close(err)
+    until = time.monotonic() + 60
+    folder = tmp_path / "S01" / "1"
+    while not any(e.what == "finished" for e in read_events(folder)):
+        assert time.monotonic() < until, f"only {len(list(folder.glob('*_*.csv')))} recordings"
+        time.sleep(0.05)
+    with os.fdopen(out, "rb") as log:
+        said = log.read()
+    assert len(said) > 4096, "there was too little to fill the pipe"
+    assert json.loads(process.communicate(timeout=30)[0])["recordings"] == 51
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo terminals")
 def test_a_person_at_a_terminal(tmp_path: Path, pty_possible: None) -> None:
     import pty

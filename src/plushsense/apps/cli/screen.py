@@ -8,6 +8,7 @@ import os
 import sys
 import textwrap
 from collections.abc import Sequence
+from queue import SimpleQueue
 
 from plushsense.recording.engine import Recorder
 from plushsense.recording.status import Status
@@ -131,6 +132,8 @@ class Screen:
         self._notices = notices
         self._terminal = sys.stderr.isatty()
         self._said = self._message = ""
+        # Told by the recorder's threads, written by the caller's: a log that nobody reads must hold up no frame.
+        self._told: SimpleQueue[str] = SimpleQueue()
         if self._terminal:
             if sys.platform == "win32":
                 os.system("")  # wakes the console's escape sequences
@@ -141,6 +144,7 @@ class Screen:
 
     def draw(self, status: Status, typing: str | None = None) -> None:
         """Show this moment."""
+        self._write_told()
         if self._terminal:
             # Standard output may be a file: it is the screen's size that counts. Some terminals do not know theirs.
             size = os.get_terminal_size(sys.stderr.fileno())
@@ -162,15 +166,22 @@ class Screen:
             else "",
         }.get(what, "")
         if s.message and s.message != self._message:
-            sys.stderr.write(s.message + "\n")
+            self._told.put(s.message + "\n")
         if said and said != self._said:
-            sys.stderr.write(said + "\n")
+            self._told.put(said + "\n")
             self._said = said
         self._message = s.message
-        sys.stderr.flush()
+
+    def _write_told(self) -> None:
+        if not self._told.empty():
+            while not self._told.empty():
+                sys.stderr.write(self._told.get())
+            sys.stderr.flush()
 
     def close(self) -> None:
-        """Give the terminal back as it was; nothing to do for one that is gone."""
+        """Write what is left, and give the terminal back as it was; nothing to do for one that is gone."""
+        with contextlib.suppress(OSError):
+            self._write_told()
         if self._terminal:
             with contextlib.suppress(OSError):
                 sys.stderr.write("\x1b[?7h\x1b[?25h\x1b[?1049l")
