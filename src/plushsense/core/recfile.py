@@ -70,6 +70,7 @@ class ReadResult:
     """Frames read, with what was odd about the file; ``malformed`` lines were left out.
 
     ``integrated``: the file held delays, so ``device_ms`` is their sum and begins at 0 in every file.
+    ``cut``: the last line had no end and was left out; it counts as malformed.
     """
 
     frames: Frames
@@ -77,6 +78,7 @@ class ReadResult:
     malformed: int = 0
     had_header: bool = False
     integrated: bool = False
+    cut: bool = False
 
 
 def parse_name(filename: str) -> RecordingName | None:
@@ -221,7 +223,7 @@ def _read(path: Path, layout: Layout, data: bytes | None, *, whole_lines: bool =
         else:
             raise FileFormatError(f"'{path.name}' has no clock column: {DEVICE_MS}, {DELAY_MS} or {HOST_MS}.")
     frames = Frames(as_whole(values if np.all(steps == 1.0) else values / steps), clock, host, labels)
-    return ReadResult(frames, warnings, malformed + cut, header, integrated)
+    return ReadResult(frames, warnings, malformed + cut, header, integrated, cut)
 
 
 def read_recording(path: str | os.PathLike[str], layout: Layout, data: bytes | None = None) -> ReadResult:

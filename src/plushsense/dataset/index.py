@@ -28,6 +28,7 @@ from plushsense.dataset.freshness import (
 )
 from plushsense.dataset.marks import Standing, read_marks
 from plushsense.dataset.quality import Examined, findings, measured_rate_hz, usual_rows
+from plushsense.dataset.quality.finding import PARTLY_THERE
 from plushsense.dataset.store import (
     RECORDINGS,
     STREAMS,
@@ -272,7 +273,7 @@ def _from_files(folder: Path, head: DatasetHead, recordings: list[_Read], stream
         mine = by_subject.get(read.subject, [])
         found_in, stream_row, rows = _best_stream(folder, read, session, mine, lookups)
         if found_in is not None and rows < len(frames):
-            flags.append(f"only its first {rows} rows are in the session's stream")
+            flags.append(f"{PARTLY_THERE} {rows} rows are in the session's stream")
         elif mine and found_in is None:
             flags.append("not found in the session's stream")
         infos.append(

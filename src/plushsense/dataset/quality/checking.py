@@ -121,10 +121,8 @@ def check(
 
     for info, result, frames in _read(dataset, used, progress):
         if isinstance(info, StreamInfo):
-            cut = any("cut off" in w for w in result.warnings)
-            whole = Examined(
-                frames, dataset.layout, None, None, limits, malformed=result.malformed - cut, cut=cut, stream=True
-            )
+            bad = result.malformed - result.cut
+            whole = Examined(frames, dataset.layout, None, None, limits, malformed=bad, cut=result.cut, stream=True)
             look(whole, info)
             continue
         own_file = not info.file.startswith("streams/")

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from plushsense.core.gestures import NOBODY
-from plushsense.dataset.quality.finding import Said
+from plushsense.dataset.quality.finding import PARTLY_THERE, Said
 from plushsense.dataset.quality.outline import Outline, Whole, gesture_of
 from plushsense.dataset.store import UNKNOWN_SUBJECT, RecordingInfo
 
@@ -133,7 +133,7 @@ def not_in_stream(w: Whole) -> Iterator[Said]:
         if o.info.stream_row < 0 and (folder, o.info.session) in streamed:
             yield Said("not found in the session's stream", about=o.info.id)
         for flag in o.info.flags:
-            if flag.startswith("only its first"):
+            if flag.startswith(PARTLY_THERE):
                 yield Said(flag, about=o.info.id)
 
 

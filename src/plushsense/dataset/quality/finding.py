@@ -9,6 +9,9 @@ from typing import Any, Literal, Self
 from plushsense.core.errors import ConfigError, nearest
 
 Severity = Literal["info", "warning", "error"]
+PARTLY_THERE = "only its first"
+"""How the index's flag begins of a recording whose end the stream lacks; a check knows it by this."""
+
 # Most urgent first. An error asks for a decision: until it is accepted, or the recording excluded, the check says no.
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "info")
 
