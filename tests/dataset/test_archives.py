@@ -169,3 +169,18 @@ def test_what_is_no_archive_of_recordings(tmp_path: Path, session_writer: Writer
         archive.write(tmp_path / "DS" / "dataset.toml", "DS/dataset.toml")
     with pytest.raises(DatasetError, match="holds a data set: unpack it"):
         import_recordings(tmp_path / "ds.zip", tmp_path / "DS2")
+
+
+def test_bytes_that_no_unpacker_knows_are_one_damaged_member(tmp_path: Path) -> None:
+    """bzip2 raises an OSError of its own, which is no fault of the disk."""
+    with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_BZIP2) as archive:
+        archive.writestr("bad.csv", b"1,2\n" * 100)
+        archive.writestr("good.csv", b"3,4\n")
+        at = archive.infolist()[0].header_offset + 30 + len("bad.csv")
+    data = bytearray((tmp_path / "a.zip").read_bytes())
+    data[at : at + 4] = b"none"
+    (tmp_path / "a.zip").write_bytes(data)
+    (tmp_path / "out").mkdir()
+    refused = unpack(tmp_path / "a.zip", tmp_path / "out")
+    assert [name for name, _ in refused] == ["bad.csv"]
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["good.csv"]

@@ -228,3 +228,21 @@ def test_a_file_put_in_place_of_another_is_noticed(folder: Path, tmp_path: Path)
         assert not (tmp_path / "R").exists()
     with pytest.raises(DatasetError, match="is not what was saved"):
         check_backup(tmp_path / "False.zip")
+
+
+@pytest.mark.parametrize("method", [12, 14, 99])
+def test_a_member_that_says_another_packing_is_damage(folder: Path, tmp_path: Path, method: int) -> None:
+    """Each unpacker fails in its own way on bytes that are not its own."""
+    backup(folder, tmp_path / "a.zip")
+    with zipfile.ZipFile(tmp_path / "a.zip") as archive:
+        member = next(i for i in archive.infolist() if i.filename.endswith(".csv"))
+        central = archive.start_dir
+    data = bytearray((tmp_path / "a.zip").read_bytes())
+    entry = data.index(member.filename.encode(), central) - 46
+    for at in (member.header_offset + 8, entry + 10):
+        assert data[at : at + 2] == member.compress_type.to_bytes(2, "little")
+        data[at : at + 2] = method.to_bytes(2, "little")
+    (tmp_path / "bad.zip").write_bytes(data)
+    with pytest.raises(DatasetError, match="damaged"):
+        restore(tmp_path / "bad.zip", tmp_path / "R")
+    assert not (tmp_path / "R").exists()

@@ -124,8 +124,11 @@ def unpack_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, target: Path,
                 if written > min(info.file_size, limit):
                     raise zipfile.BadZipFile("it holds more than its size says")
                 out.write(chunk)
-    except BaseException:
+    except BaseException as cause:
         target.unlink(missing_ok=True)
+        # The unpacker of bzip2 says so of damaged bytes; what the disk refuses has a number.
+        if isinstance(cause, OSError) and cause.errno is None:
+            raise zipfile.BadZipFile(str(cause)) from None
         raise
     return written
 

@@ -13,7 +13,6 @@ import re
 import stat
 import uuid
 import zipfile
-import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -22,7 +21,7 @@ from typing import IO, Any
 
 from plushsense.core.errors import DatasetError
 from plushsense.core.folders import whole_folder
-from plushsense.dataset.archives import entry_of
+from plushsense.dataset.archives import DAMAGED, entry_of
 from plushsense.dataset.contents import contents
 from plushsense.dataset.index import open_dataset, rebuild
 from plushsense.dataset.store import HEAD, Dataset
@@ -198,7 +197,8 @@ def _damaged(path: Path, why: object) -> DatasetError:
 
 
 # Whatever a damaged zip can make its reader raise.
-_BROKEN = (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError, KeyError, IndexError, OverflowError)
+# A member that the manifest names may be missing, too.
+_BROKEN: tuple[type[Exception], ...] = (*DAMAGED, KeyError, IndexError)
 
 
 @contextmanager
@@ -242,6 +242,8 @@ def _refused(info: zipfile.ZipInfo) -> str:
     kind = stat.S_IFMT(info.external_attr >> 16)
     if kind not in (0, stat.S_IFREG):
         return "a link or no plain file"
+    if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        return "packed as PlushSense packs nothing: damaged, or changed by another program"
     return ""
 
 
@@ -263,7 +265,9 @@ def _manifest_of(path: Path, archive: zipfile.ZipFile) -> dict[str, Any]:
         )
         if not whole:
             raise ValueError("its manifest lacks something")
-    except (*_BROKEN, TypeError, NotImplementedError, OSError, RecursionError) as cause:
+    except (TypeError, OSError, RecursionError) as cause:
+        raise _damaged(path, cause) from None
+    except _BROKEN as cause:
         raise _damaged(path, cause) from None
     return dict(table)
 
@@ -281,7 +285,7 @@ def _read(path: Path, archive: zipfile.ZipFile, entry: dict[str, Any], out: IO[b
                 digest.update(chunk)
                 if out is not None:
                     out.write(chunk)
-    except (*_BROKEN, NotImplementedError) as cause:
+    except _BROKEN as cause:
         raise _damaged(path, f"'{entry['path']}': {cause}") from None
     if size != entry["bytes"] or digest.hexdigest() != entry["sha256"]:
         raise _damaged(path, f"'{entry['path']}' is not what was saved")
