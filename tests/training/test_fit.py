@@ -137,3 +137,13 @@ def test_the_number_of_threads_is_put_back(made: Make) -> None:
         assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(before)
+
+
+def test_a_long_training_passes_through_the_end_of_a_short_one(made: Make) -> None:
+    spec = replace(SPEC, epochs=4, halve_every=None, patience=None)
+    long = fit(made(40), None, arch(), spec, keep=(2, 4))
+    short = fit(made(40), None, arch(), replace(spec, epochs=2))
+    assert sorted(long.kept) == [2, 4]
+    for name, values in short.weights.items():
+        assert np.array_equal(values, long.kept[2][name])
+        assert np.array_equal(long.weights[name], long.kept[4][name])

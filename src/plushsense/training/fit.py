@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -36,7 +36,8 @@ class Fitted:
 
     ``weights`` as ``models/reference`` takes them; ``history`` one row an epoch: epoch (from 1), train_loss,
     train_accuracy (means over the epoch's batches, as they were trained on), validation_loss, validation_accuracy
-    (None without validation), learning_rate; ``best_epoch`` the one whose weights these are.
+    (None without validation), learning_rate; ``best_epoch`` the one whose weights these are; ``kept`` the weights
+    after the epochs that were asked for.
     """
 
     weights: dict[str, NDArray[np.float32]]
@@ -44,6 +45,7 @@ class Fitted:
     history: list[dict[str, Any]]
     best_epoch: int
     seconds: float
+    kept: dict[int, dict[str, NDArray[np.float32]]] = field(default_factory=dict)
 
 
 def fit(
@@ -52,8 +54,12 @@ def fit(
     arch: Arch,
     spec: TrainSpec | None = None,
     progress: Progress | None = None,
+    keep: Collection[int] = (),
 ) -> Fitted:
     """Train ``arch`` on ``train``; ``validation`` decides when to stop. The same seed gives the same weights.
+
+    ``keep``: epochs after which the weights are kept as well. At a constant rate a long training passes through the
+    end of every shorter one.
 
     Raises:
         TrainingError: when the windows do not fit the network, or the loss is no longer a number.
@@ -74,6 +80,7 @@ def fit(
         turn = Turn(train.vectors, scaler, spec.turn_deg, device)
         adam = torch.optim.Adam(net.parameters(), lr=spec.learning_rate, fused=True)
         history: list[dict[str, Any]] = []
+        kept: dict[int, dict[str, NDArray[np.float32]]] = {}
         best_epoch, best_score, best = 0, float("-inf"), net.export_weights()
         for epoch in range(1, spec.epochs + 1):
             row: dict[str, Any] = {"epoch": epoch}
@@ -86,6 +93,8 @@ def fit(
             row["learning_rate"] = spec.learning_rate_at(epoch)
             _still_numbers(row, spec)
             history.append(row)
+            if epoch in keep:
+                kept[epoch] = net.export_weights()
             if progress is not None:
                 progress(epoch, spec.epochs, row)
             if watched is not None and spec.patience is not None:
@@ -96,7 +105,7 @@ def fit(
                     break
         if best_epoch == 0:
             best_epoch, best = len(history), net.export_weights()
-    return Fitted(best, scaler, history, best_epoch, time.perf_counter() - began)
+    return Fitted(best, scaler, history, best_epoch, time.perf_counter() - began, kept)
 
 
 def predict(
