@@ -228,13 +228,15 @@ def evaluate(
     fit_on = score
     if train_context not in (None, config.windows.context):
         fit_on = windows_for(dataset, network, replace(config.windows, context=str(train_context)), gestures)
+    from plushsense.training.fit import placed
+
     result = crossvalidate(
         fit_on,
         score,
         config.evaluation.split,
         TrainAndPredict(network, config.training),
         journal=Journal(dataset.path / "cache" / "folds"),
-        key={"arch": network.to_dict(), "training": config.training.key(), "vectors": fit_on.vectors},
+        key={"arch": network.to_dict(), "training": placed(config.training).key(), "vectors": fit_on.vectors},
         workers=config.evaluation.processes,
         seed=config.evaluation.seed,
         progress=progress,

@@ -121,10 +121,11 @@ class RunConfig:
             "train_context": self.evaluation.train_context or self.windows.context,
         }
         del evaluation["workers"]
+        training = {k: v for k, v in self.training.key().items() if k not in ("device", "threads")}
         return {
             "windows": asdict(self.windows),
             "model": asdict(self.model) | {"padding": self.padding},
-            "training": self.training.key(),
+            "training": training,
             "evaluation": evaluation,
         }
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass, field
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from plushsense.core.errors import TrainingError
 from plushsense.models.arch import Arch
 from plushsense.models.net import Net
 from plushsense.training.augment import Turn
+from plushsense.training.engine import Engine, Windows, engine, is_fast, slices
 from plushsense.training.spec import TrainSpec
 from plushsense.windows.cut import WindowSet
 from plushsense.windows.features import Scaler
@@ -25,9 +26,6 @@ from torch.nn import functional as F
 
 # Called with (epoch, epochs at most, the epoch's row of the history).
 Progress = Callable[[int, int, dict[str, Any]], None]
-
-# Windows at a time where no gradient is kept.
-_READ = 512
 
 
 @dataclass(frozen=True)
@@ -73,38 +71,39 @@ def fit(
     scaler = Scaler.fit(train.x)
     x, y = _tensors(train, scaler, arch, device)
     watched = None if validation is None or not len(validation) else _tensors(validation, scaler, arch, device)
-    with torch.random.fork_rng(devices=[]), _repeatable(device), _threads(spec.threads):
+    with torch.random.fork_rng(devices=[]), _repeatable(device), _threads(spec.threads, arch, device):
         torch.manual_seed(spec.seed)
-        net = Net(arch).to(device)
+        net = engine(arch, Net(arch), device, min(spec.batch, len(train)), spec.threads)
         order = torch.Generator().manual_seed(spec.seed)
         turn = Turn(train.vectors, scaler, spec.turn_deg, device)
-        adam = torch.optim.Adam(net.parameters(), lr=spec.learning_rate, fused=True)
-        history: list[dict[str, Any]] = []
-        kept: dict[int, dict[str, NDArray[np.float32]]] = {}
-        best_epoch, best_score, best = 0, float("-inf"), net.export_weights()
-        for epoch in range(1, spec.epochs + 1):
-            row: dict[str, Any] = {"epoch": epoch}
-            for group in adam.param_groups:
-                group["lr"] = spec.learning_rate_at(epoch)
-            row["train_loss"], row["train_accuracy"] = _train(net, adam, x, y, spec, order, turn)
-            row["validation_loss"], row["validation_accuracy"] = (
-                (None, None) if watched is None else _measure(net, *watched)
-            )
-            row["learning_rate"] = spec.learning_rate_at(epoch)
-            _still_numbers(row, spec)
-            history.append(row)
-            if epoch in keep:
-                kept[epoch] = net.export_weights()
-            if progress is not None:
-                progress(epoch, spec.epochs, row)
-            if watched is not None and spec.patience is not None:
-                score = row["validation_accuracy"] if spec.stop_on == "accuracy" else -row["validation_loss"]
-                if score > best_score:
-                    best_epoch, best_score, best = epoch, score, net.export_weights()
-                elif epoch - best_epoch >= spec.patience:
-                    break
-        if best_epoch == 0:
-            best_epoch, best = len(history), net.export_weights()
+        adam = torch.optim.Adam(net.parameters, lr=spec.learning_rate, fused=True)
+        with closing(net):
+            history: list[dict[str, Any]] = []
+            kept: dict[int, dict[str, NDArray[np.float32]]] = {}
+            best_epoch, best_score, best = 0, float("-inf"), net.export_weights()
+            for epoch in range(1, spec.epochs + 1):
+                row: dict[str, Any] = {"epoch": epoch}
+                for group in adam.param_groups:
+                    group["lr"] = spec.learning_rate_at(epoch)
+                row["train_loss"], row["train_accuracy"] = _train(net, adam, x, y, spec, order, turn)
+                row["validation_loss"], row["validation_accuracy"] = (
+                    (None, None) if watched is None else _measure(net, *watched)
+                )
+                row["learning_rate"] = spec.learning_rate_at(epoch)
+                _still_numbers(row, spec)
+                history.append(row)
+                if epoch in keep:
+                    kept[epoch] = net.export_weights()
+                if progress is not None:
+                    progress(epoch, spec.epochs, row)
+                if watched is not None and spec.patience is not None:
+                    score = row["validation_accuracy"] if spec.stop_on == "accuracy" else -row["validation_loss"]
+                    if score > best_score:
+                        best_epoch, best_score, best = epoch, score, net.export_weights()
+                    elif epoch - best_epoch >= spec.patience:
+                        break
+            if best_epoch == 0:
+                best_epoch, best = len(history), net.export_weights()
     return Fitted(best, scaler, history, best_epoch, time.perf_counter() - began, kept)
 
 
@@ -116,61 +115,44 @@ def predict(
     place = _device(device)
     net = Net(arch)
     net.import_weights(weights)
-    net.to(place).eval()
     x, _ = _tensors(windows, scaler, arch, place)
-    with torch.no_grad(), _threads(1):
-        parts = [F.softmax(net(x[at]), dim=1) for at in _slices(len(x), _READ)]
-    if not parts:
-        return np.zeros((0, arch.classes), dtype=np.float32)
-    found: NDArray[np.float32] = torch.cat(parts).cpu().numpy()
+    with _threads(1, arch, place):
+        reader = engine(arch, net, place, 1, 1)
+        found: NDArray[np.float32] = F.softmax(reader.logits(x), dim=1).cpu().numpy()
     return found
 
 
 def _train(
-    net: Net, adam: torch.optim.Adam, x: Tensor, y: Tensor, spec: TrainSpec, order: torch.Generator, turn: Turn
+    net: Engine, adam: torch.optim.Adam, x: Windows, y: Tensor, spec: TrainSpec, order: torch.Generator, turn: Turn
 ) -> tuple[float, float]:
     """One epoch; the mean loss and accuracy of what was trained on."""
-    net.train()
     # Summed where the data are: reading a number out of a GPU would wait for it in every batch.
-    sums, seen = torch.zeros(2, device=x.device), 0
-    shuffled = torch.randperm(len(x), generator=order).to(x.device)
-    for at in _slices(len(x), spec.batch):
+    sums, seen = torch.zeros(2, device=y.device), 0
+    shuffled = torch.randperm(len(x), generator=order).to(y.device)
+    for at in slices(len(x), spec.batch):
         batch = shuffled[at]
         # A few left over would give noisy batch statistics; they come in another epoch.
         if seen and len(batch) < min(8, spec.batch):
             continue
         truth = y[batch]
-        logits = net(turn(x[batch], order))
-        loss = F.cross_entropy(logits, truth)
-        adam.zero_grad(set_to_none=True)
-        torch.autograd.backward(loss)
+        loss, logits = net.step(x, batch, truth, turn, order)
         adam.step()
-        sums[0] += loss.detach() * len(batch)
-        sums[1] += (logits.detach().argmax(dim=1) == truth).sum()
+        sums[0] += loss * len(batch)
+        sums[1] += (logits.argmax(dim=1) == truth).sum()
         seen += len(batch)
     return float(sums[0]) / seen, float(sums[1]) / seen
 
 
-def _measure(net: Net, x: Tensor, y: Tensor) -> tuple[float, float]:
+def _measure(net: Engine, x: Windows, y: Tensor) -> tuple[float, float]:
     """Mean loss and accuracy without training."""
-    net.eval()
-    loss, right = 0.0, 0
-    with torch.no_grad():
-        for at in _slices(len(x), _READ):
-            logits = net(x[at])
-            loss += float(F.cross_entropy(logits, y[at], reduction="sum"))
-            right += int((logits.argmax(dim=1) == y[at]).sum())
-    return loss / len(x), right / len(x)
+    logits = net.logits(x)
+    return float(F.cross_entropy(logits, y)), float((logits.argmax(dim=1) == y).float().mean())
 
 
-def _slices(n: int, size: int) -> Iterator[slice]:
-    return (slice(start, start + size) for start in range(0, n, size))
-
-
-def _tensors(windows: WindowSet, scaler: Scaler, arch: Arch, device: torch.device) -> tuple[Tensor, Tensor]:
+def _tensors(windows: WindowSet, scaler: Scaler, arch: Arch, device: torch.device) -> tuple[Windows, Tensor]:
     """Scaled windows (N, C, span or window) and classes (N,), whole and where they are needed."""
     x = scaler.apply(windows.x[:, :, windows.x.shape[2] - arch.span :])
-    return torch.from_numpy(x).to(device), torch.from_numpy(windows.y.astype(np.int64)).to(device)
+    return Windows(x, arch, device), torch.from_numpy(windows.y.astype(np.int64)).to(device)
 
 
 def _check(windows: WindowSet, arch: Arch, what: str, some: bool = True) -> None:
@@ -198,6 +180,15 @@ def _still_numbers(row: dict[str, Any], spec: TrainSpec) -> None:
             )
 
 
+def placed(spec: TrainSpec) -> TrainSpec:
+    """The settings with the device that they mean here: what a job's id has to hold.
+
+    Raises:
+        TrainingError: when the device is not there.
+    """
+    return replace(spec, device=_device(spec.device).type)
+
+
 def _device(name: str) -> torch.device:
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -207,9 +198,10 @@ def _device(name: str) -> torch.device:
 
 
 @contextmanager
-def _threads(wanted: int) -> Iterator[None]:
+def _threads(wanted: int, arch: Arch, device: torch.device) -> Iterator[None]:
     before = torch.get_num_threads()
-    torch.set_num_threads(wanted)
+    # The fast engine has threads of its own, each with one of PyTorch's.
+    torch.set_num_threads(1 if is_fast(arch, device) else wanted)
     try:
         yield
     finally:

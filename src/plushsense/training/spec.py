@@ -11,7 +11,7 @@ DEVICES = ("auto", "cpu", "cuda")
 STOP_ON = ("loss", "accuracy")
 
 # Part of every journalled training: raise it when the same settings would train differently.
-TRAINING_VERSION = 1
+TRAINING_VERSION = 2
 
 
 def _one_of(what: str, value: str, known: tuple[str, ...]) -> None:
@@ -72,9 +72,8 @@ class TrainSpec:
         return asdict(self)
 
     def key(self) -> dict[str, Any]:
-        """What the outcome depends on: the settings without where they are computed, and the code's version."""
-        elsewhere = ("device", "threads")
-        return {"version": TRAINING_VERSION} | {k: v for k, v in asdict(self).items() if k not in elsewhere}
+        """What the outcome depends on, to the last bit: all settings, and the code's version."""
+        return {"version": TRAINING_VERSION} | asdict(self)
 
 
 # "search": paper, section 3.6.1; "loso": paper, section 4.4; "paper" is the same schedule, for the paper's own form

@@ -1,0 +1,354 @@
+"""A network whose training step is written out: forward, backward, and a normalisation that costs no pass of its own.
+
+Batch normalisation is an affine map a·r + b of each channel. Where nothing but mirrored or real samples goes into the
+next convolution, the map is folded into that layer's weights, and the network stores only r = ReLU(z): of its gradient,
+the parts through a and b follow from the gradient of the folded weights. Large batches go in chunks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional as F
+
+from plushsense.models.arch import NORM_EPSILON, Arch, reflected
+from plushsense.models.net import Net
+from plushsense.training.fast.conv import Space, Way, way
+from plushsense.training.fast.crew import LANES, Crew
+from plushsense.training.fast.plan import CHUNK, plan_net
+
+MOMENTUM = 0.1
+
+# Fills (rows, windows, channels) with the input of the windows from, to of the batch.
+Fill = Callable[[Tensor, int, int], None]
+
+
+def can(arch: Arch) -> bool:
+    """Whether a network can be trained this way: batch normalisation, and no zeros among what a layer reads."""
+    return arch.norm == "batch" and arch.padding in ("mirror", "stream")
+
+
+@dataclass
+class _Layer:
+    """One block: its way, its parameters (``w`` (taps, C, F)), running statistics, and the rows mirrored before it."""
+
+    way: Way
+    w: Tensor
+    bias: Tensor
+    gain: Tensor
+    shift: Tensor
+    mean: Tensor
+    var: Tensor
+    mirror: Tensor | None
+    keeps: bool
+
+
+@dataclass
+class _Pass:
+    """What the forward pass of a layer leaves for the backward pass."""
+
+    w: Tensor
+    mean: Tensor
+    var: Tensor
+    a: Tensor
+    b: Tensor
+
+
+class FastNet:
+    """The trainable network. ``parameters`` have their gradients after `step`; gradients are not tracked otherwise.
+
+    Args:
+        net: where the weights come from: a `Net` of the same architecture.
+        batch: windows in a batch, at most.
+        threads: threads that share the chunks of a batch; the outcome is the same for any number.
+    """
+
+    def __init__(self, net: Net, batch: int, threads: int = 1) -> None:
+        arch = net.arch
+        self.arch, self.plan = arch, plan_net(arch, batch)
+        self._layers = [self._layer(net, i) for i in range(len(arch.layers))]
+        self._dense, self._dense_bias = net.dense.weight.detach().clone(), net.dense.bias.detach().clone()
+        self._crew, self._shared = Crew(threads), Space()
+        self._scratch = [Space() for _ in range(self._crew.threads)]
+        self._ones = torch.ones(1, arch.span)
+        self._edges: list[tuple[int, int]] = []
+        self.parameters = [t for one in self._layers for t in (one.w, one.bias, one.gain, one.shift)]
+        self.parameters += [self._dense, self._dense_bias]
+
+    def _layer(self, net: Net, i: int) -> _Layer:
+        named, planned = net.export_weights(), self.plan.layers[i]
+
+        def tensor(name: str) -> Tensor:
+            return torch.from_numpy(named[name])
+
+        rows = reflected(planned.before, planned.front)[: planned.front]
+        return _Layer(
+            way(planned),
+            tensor(f"conv{i}.weight").permute(2, 1, 0).contiguous(),
+            tensor(f"conv{i}.bias"),
+            tensor(f"norm{i}.gain"),
+            tensor(f"norm{i}.shift"),
+            tensor(f"norm{i}.mean"),
+            tensor(f"norm{i}.var"),
+            mirror=torch.from_numpy(rows.astype(np.int64)) if planned.front else None,
+            keeps=self.plan.keeps[i],
+        )
+
+    @torch.no_grad()
+    def step(self, fill: Fill, y: Tensor) -> tuple[Tensor, Tensor]:
+        """The mean loss of a batch and its logits (N, K); the gradients are then in ``grad`` of the parameters."""
+        self._cut(len(y))
+        passes, pooled = self._forward(fill)
+        last = passes[-1]
+        features = pooled * last.a + last.b
+        logits = torch.addmm(self._dense_bias, features, self._dense.t())
+        logs = F.log_softmax(logits, dim=1)
+        loss = F.nll_loss(logs, y)
+        slope = logs.exp()
+        slope[torch.arange(len(y)), y] -= 1.0
+        slope /= len(y)
+        self._dense.grad, self._dense_bias.grad = slope.t() @ features, slope.sum(0)
+        self._backward(passes, pooled, slope @ self._dense)
+        return loss, logits
+
+    @torch.no_grad()
+    def logits(self, fill: Fill, windows: int) -> Tensor:
+        """Logits (N, K) with the running statistics, as a finished network gives them."""
+        if not windows:
+            return torch.zeros(0, self.arch.classes)
+        self._cut(windows)
+        folded = []
+        for layer in self._layers:
+            a = layer.gain * (layer.var + NORM_EPSILON).rsqrt()
+            folded.append((a, layer.shift - layer.mean * a))
+        ready = [self._folded(i, *(folded[i - 1] if i else (None, None))) for i in range(len(self._layers))]
+
+        def read(i: int, lane: int, thread: int) -> Tensor:
+            space, size = self._scratch[thread], self._size(i)
+            x = self._input(fill, i, space.take(("read", 0), self.plan.buffers[0], size, self.arch.channels))
+            for at, layer in enumerate(self._layers):
+                out = space.take(("read", 1 + at % 2), self.plan.buffers[at + 1], size, layer.way.plan.filters)
+                spectrum = space.take("spectrum", *layer.way.spectrum_shape(size))
+                layer.way.forward(x, *ready[at], self._place(at, out), space, spectrum)
+                self._finish(at, out)
+                x = out
+            return self._rows(len(self._layers) - 1, x).mean(0)
+
+        pooled = torch.cat(self._crew.each(read, len(self._edges)))
+        a, b = folded[-1]
+        return torch.addmm(self._dense_bias, pooled * a + b, self._dense.t())
+
+    def export_weights(self) -> dict[str, NDArray[np.float32]]:
+        """A copy of the weights, as ``models/reference`` and the bundle take them."""
+        named: dict[str, Tensor] = {"dense.weight": self._dense, "dense.bias": self._dense_bias}
+        for i, layer in enumerate(self._layers):
+            named |= {f"conv{i}.weight": layer.w.permute(2, 1, 0), f"conv{i}.bias": layer.bias}
+            named |= {f"norm{i}.{name}": getattr(layer, name) for name in ("gain", "shift", "mean", "var")}
+        return {
+            name: np.array(named[name].detach().numpy(), dtype=np.float32, order="C")
+            for name in self.arch.weight_shapes
+        }
+
+    def close(self) -> None:
+        """End the threads."""
+        self._crew.close()
+
+    def _cut(self, windows: int) -> None:
+        """Windows into chunks, [from, to)."""
+        self._edges = [(at, min(at + CHUNK, windows)) for at in range(0, windows, CHUNK)]
+
+    def _size(self, i: int) -> int:
+        return self._edges[i][1] - self._edges[i][0]
+
+    def _folded(self, at: int, a: Tensor | None, b: Tensor | None) -> tuple[Tensor, Tensor]:
+        """A layer's weights with the normalisation before it folded in, as its way uses them, and the bias."""
+        layer = self._layers[at]
+        w = layer.w if a is None else layer.w * a[None, :, None]
+        bias = layer.bias if b is None else layer.bias + b @ layer.w.sum(0)
+        return layer.way.weights(w, self._shared, ("weights", at)), bias
+
+    def _input(self, fill: Fill, i: int, x: Tensor) -> Tensor:
+        front, before = self._layers[0].way.plan.front, self.arch.span
+        fill(x[front : front + before], *self._edges[i])
+        x[front + before :].zero_()
+        self._mirror(0, x)
+        return x
+
+    def _mirror(self, at: int, x: Tensor) -> None:
+        """The rows before the input of layer ``at``."""
+        mirror, front = self._layers[at].mirror, self._layers[at].way.plan.front
+        if mirror is not None:
+            torch.index_select(x[front:], 0, mirror, out=x[:front])
+
+    def _front(self, at: int) -> int:
+        """Rows before the output of layer ``at`` in its buffer: those that the next layer mirrors."""
+        return self._layers[at + 1].way.plan.front if at + 1 < len(self._layers) else 0
+
+    def _place(self, at: int, out: Tensor) -> Tensor:
+        """Where layer ``at`` writes in its output's buffer."""
+        front = self._front(at)
+        return out[front : front + self._layers[at].way.plan.writes]
+
+    def _rows(self, at: int, out: Tensor) -> Tensor:
+        """The true output rows of layer ``at`` in its buffer."""
+        front = self._front(at)
+        return out[front : front + self._layers[at].way.plan.after]
+
+    def _finish(self, at: int, out: Tensor) -> Tensor:
+        """ReLU, zeros behind, mirrored rows before; the true rows."""
+        rows = self._rows(at, out)
+        rows.relu_()
+        out[self._front(at) + len(rows) :].zero_()
+        if at + 1 < len(self._layers):
+            self._mirror(at + 1, out)
+        return rows
+
+    def _held(self, at: int, i: int) -> Tensor:
+        """The input buffer of layer ``at`` for a chunk (one beyond the last layer: its output)."""
+        width = self.arch.channels if at == 0 else self._layers[at - 1].way.plan.filters
+        return self._shared.take(("x", at, i), self.plan.buffers[at], self._size(i), width)
+
+    def _spectrum(self, at: int, i: int, thread: int) -> Tensor:
+        layer = self._layers[at]
+        shape = layer.way.spectrum_shape(self._size(i))
+        return (
+            self._shared.take(("spectrum", at, i), *shape)
+            if layer.keeps
+            else self._scratch[thread].take("spectrum", *shape)
+        )
+
+    def _forward(self, fill: Fill) -> tuple[list[_Pass], Tensor]:
+        """The passes of all layers, and the mean over time of the last one's output (N, F)."""
+        chunks, windows = len(self._edges), self._edges[-1][1]
+        self._crew.each(lambda i, lane, thread: self._input(fill, i, self._held(0, i)), chunks)
+        passes: list[_Pass] = []
+        pooled: list[Tensor] = []
+        for at, layer in enumerate(self._layers):
+            ready, bias = self._folded(at, *((passes[-1].a, passes[-1].b) if passes else (None, None)))
+
+            def work(
+                i: int,
+                lane: int,
+                thread: int,
+                at: int = at,
+                layer: _Layer = layer,
+                w: Tensor = ready,
+                bias: Tensor = bias,
+            ) -> tuple[Tensor, Tensor]:
+                out = self._held(at + 1, i)
+                layer.way.forward(
+                    self._held(at, i),
+                    w,
+                    bias,
+                    self._place(at, out),
+                    self._scratch[thread],
+                    self._spectrum(at, i, thread),
+                )
+                rows = self._finish(at, out)
+                return self._sums(rows, self._scratch[thread])
+
+            sums = self._crew.each(work, chunks)
+            count = windows * layer.way.plan.after
+            mean = _added([s.sum(0) for s, _ in sums]) / count
+            var = (_added([q for _, q in sums]) / count - mean * mean).clamp_min_(0.0)
+            layer.mean.lerp_(mean, MOMENTUM)
+            layer.var.lerp_(var * (count / max(1, count - 1)), MOMENTUM)
+            a = layer.gain * (var + NORM_EPSILON).rsqrt()
+            passes.append(_Pass(ready, mean, var, a, layer.shift - mean * a))
+            pooled = [s / layer.way.plan.after for s, _ in sums]
+        return passes, torch.cat(pooled)
+
+    def _sums(self, rows: Tensor, space: Space) -> tuple[Tensor, Tensor]:
+        """Sums over time (N, F), and sums of squares over time and windows (F,)."""
+        after, windows, width = rows.shape
+        flat, ones = rows.view(after, windows * width), self._ones[:, :after]
+        squares = torch.mul(flat, flat, out=space.take("squares", after, windows * width))
+        return (ones @ flat).view(windows, width), (ones @ squares).view(windows, width).sum(0)
+
+    def _backward(self, passes: list[_Pass], pooled: Tensor, slope: Tensor) -> None:
+        """Gradients of all layers from ``slope`` (N, F), that of the last features."""
+        chunks, windows = len(self._edges), self._edges[-1][1]
+        da, db = (slope * pooled).sum(0), slope.sum(0)
+        flat = slope * passes[-1].a / self._layers[-1].way.plan.after
+        for at in range(len(self._layers) - 1, -1, -1):
+            layer, here = self._layers[at], passes[at]
+            count = windows * layer.way.plan.after
+            inverse = (here.var + NORM_EPSILON).rsqrt()
+            straight = da - here.mean * db
+            layer.gain.grad, layer.shift.grad = straight * inverse, db.clone()
+            # dL/dr = (what comes down) + alpha + beta · r: the way through the batch's own mean and variance.
+            beta = straight * layer.gain * inverse.pow(3) / -count
+            alpha = -here.a * db / count - beta * here.mean
+            totals: dict[int, Tensor] = {}
+            last = at + 1 == len(self._layers)
+
+            def work(
+                i: int,
+                lane: int,
+                thread: int,
+                at: int = at,
+                layer: _Layer = layer,
+                w: Tensor = here.w,
+                alpha: Tensor = alpha,
+                beta: Tensor = beta,
+                totals: dict[int, Tensor] = totals,
+                last: bool = last,
+            ) -> Tensor:
+                planned, space, size = layer.way.plan, self._scratch[thread], self._size(i)
+                rows = self._rows(at, self._held(at + 1, i))
+                dz = space.take("dz", planned.writes, size, planned.filters)
+                inner = dz[: planned.after]
+                if last:
+                    start, end = self._edges[i]
+                    torch.addcmul((flat[start:end] + alpha).expand(rows.shape), rows, beta, out=inner)
+                else:
+                    torch.addcmul(self._gradient(at + 1, i), rows, beta, out=inner)
+                    inner += alpha
+                torch.ops.aten.threshold_backward.grad_input(inner, rows, 0, grad_input=inner)
+                dz[planned.after :].zero_()
+                x, spectrum = self._held(at, i), self._spectrum(at, i, thread)
+                if not layer.keeps:
+                    layer.way.spectrum(x, space, spectrum)
+                fresh = lane not in totals
+                if fresh:
+                    totals[lane] = self._shared.take(("total", lane), *w.shape)
+                dx = self._slope(at, i) if at else None
+                bias = layer.way.backward(dz, x, w, totals[lane], fresh, dx, space, spectrum)
+                if dx is not None and layer.mirror is not None:
+                    dx[planned.front :].index_add_(0, layer.mirror, dx[: planned.front])
+                return bias
+
+            bias = _added(self._crew.each(work, chunks))
+            total = totals[0]
+            for lane in range(1, min(LANES, chunks)):
+                total += totals[lane]
+            dw = layer.way.gradient(total).reshape(layer.w.shape)
+            layer.bias.grad = bias
+            if at:
+                before = passes[at - 1]
+                da, db = (dw * layer.w).sum((0, 2)), layer.w.sum(0) @ bias
+                layer.w.grad = dw * before.a[None, :, None] + before.b[None, :, None] * bias
+            else:
+                layer.w.grad = dw.clone()
+
+    def _slope(self, at: int, i: int) -> Tensor:
+        """The gradient of the input rows of layer ``at`` (needs, N, C): one memory a chunk, for all layers."""
+        planned = self._layers[at].way.plan
+        return self._shared.take(("slope", i), planned.needs, self._size(i), planned.reads)
+
+    def _gradient(self, at: int, i: int) -> Tensor:
+        """The part of `_slope` that belongs to the rows the layer before wrote."""
+        planned = self._layers[at].way.plan
+        return self._slope(at, i)[planned.front : planned.front + planned.before]
+
+
+def _added(parts: list[Tensor]) -> Tensor:
+    total = parts[0].clone()
+    for part in parts[1:]:
+        total += part
+    return total
