@@ -1,0 +1,245 @@
+"""What the paper's grid costs with our training and with a plain PyTorch loop, side by side; and that both learn alike.
+
+    python bench/sweep.py steps [--threads 1] [--filters 0,1,2,3] [--batches 64,256,3936] [--repeats 5]
+    python bench/sweep.py losses DATASET        first 50 steps of all 52 networks, from the same weights and batches
+    python bench/sweep.py trials DATASET        20 paired trainings: are the final accuracies different?
+
+The plain loop is what a careful person would write: nn.Conv1d, nn.ReLU, nn.BatchNorm1d, F.pad with reflection, the
+data in memory as one tensor, fused Adam, no number read out within an epoch, one training at a time. Both are timed in
+turn, step by step, with the same threads and batch. The grid: 52 networks × batch 64, 256, full × 100, 250 and 1000
+epochs; trained apart that is 1350 epochs, nested 1000.
+"""
+
+import argparse
+import math
+import platform
+import statistics
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+import plushsense as ps
+from plushsense.models.arch import PAPER_ARCHITECTURES, PAPER_FILTERS, Arch
+from plushsense.models.net import Net
+from plushsense.training.fast.net import FastNet
+
+WINDOWS, CHANNELS, CLASSES, SAMPLES = 3936, 11, 18, 250
+APART, NESTED = 100 + 250 + 1000, 1000
+RATE = 0.001
+
+
+class Mirror(nn.Module):
+    """Left padding by reflection; again where the samples do not suffice."""
+
+    def __init__(self, reach: int) -> None:
+        super().__init__()
+        self.reach = reach
+
+    def forward(self, x: Tensor) -> Tensor:
+        left = self.reach
+        while left:
+            some = min(left, x.shape[2] - 1)
+            x = F.pad(x, (some, 0), mode="reflect")
+            left -= some
+        return x
+
+
+class Plain(nn.Module):
+    """The paper's network, layer by layer."""
+
+    def __init__(self, arch: Arch) -> None:
+        super().__init__()
+        parts: list[nn.Module] = []
+        for layer, reads in zip(arch.layers, arch.inputs, strict=True):
+            parts += [Mirror(layer.reach)] if layer.reach else []
+            parts.append(nn.Conv1d(reads, layer.filters, layer.kernel, dilation=layer.dilation))
+            parts += [nn.ReLU(), nn.BatchNorm1d(layer.filters)]
+        self.blocks, self.dense = nn.Sequential(*parts), nn.Linear(arch.filters[-1], arch.classes)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.dense(self.blocks(x).mean(2))
+
+    def take(self, net: Net) -> None:
+        """The weights of one of ours."""
+        weights = {name: torch.from_numpy(values) for name, values in net.export_weights().items()}
+        with torch.no_grad():
+            for i, conv in enumerate(m for m in self.blocks if isinstance(m, nn.Conv1d)):
+                conv.weight.copy_(weights[f"conv{i}.weight"])
+                conv.bias.copy_(weights[f"conv{i}.bias"])
+            self.dense.weight.copy_(weights["dense.weight"])
+            self.dense.bias.copy_(weights["dense.bias"])
+
+
+class Loops:
+    """One training step each way, from the same weights, on the same batch."""
+
+    def __init__(self, arch: Arch, x: Tensor, y: Tensor, batch: int, threads: int, seed: int = 0) -> None:
+        torch.manual_seed(seed)
+        net = Net(arch)
+        self.arch, self.x, self.y, self.threads = arch, x, y, threads
+        self.time_first = x.permute(2, 0, 1).contiguous()
+        self.model, self.fast = Plain(arch), FastNet(net, batch, threads)
+        self.model.take(net)
+        self.adam = torch.optim.Adam(self.model.parameters(), lr=RATE, fused=True)
+        self.fast_adam = torch.optim.Adam(self.fast.parameters, lr=RATE, fused=True)
+
+    def plain(self, batch: Tensor) -> Tensor:
+        torch.set_num_threads(self.threads)
+        loss = F.cross_entropy(self.model(self.x[batch]), self.y[batch])
+        self.adam.zero_grad(set_to_none=True)
+        loss.backward()
+        self.adam.step()
+        return loss.detach()
+
+    def ours(self, batch: Tensor) -> Tensor:
+        torch.set_num_threads(1)
+
+        def fill(out: Tensor, start: int, end: int) -> None:
+            torch.index_select(self.time_first, 1, batch[start:end], out=out)
+
+        loss, _ = self.fast.step(fill, self.y[batch])
+        self.fast_adam.step()
+        return loss
+
+
+def networks(filters: list[int]) -> list[Arch]:
+    return [
+        Arch.parse(symbol, PAPER_FILTERS[i], channels=CHANNELS, classes=CLASSES, padding="mirror")
+        for i in filters
+        for symbol in PAPER_ARCHITECTURES
+    ]
+
+
+def named(arch: Arch) -> str:
+    return f"{arch.symbol} {'/'.join(map(str, arch.filters))}"
+
+
+def steps(args: argparse.Namespace) -> None:
+    filters, batches = [int(i) for i in args.filters.split(",")], [int(b) for b in args.batches.split(",")]
+    random = torch.Generator().manual_seed(1)
+    x = torch.randn(WINDOWS, CHANNELS, SAMPLES, generator=random)
+    y = torch.randint(0, CLASSES, (WINDOWS,), generator=random)
+    plain_s = ours_s = 0.0
+    print(f"{platform.machine()}, {args.threads} thread(s), torch {torch.__version__}; medians of interleaved steps")
+    print(f"{'network':38s} {'batch':>5s} {'plain ms':>9s} {'ours ms':>9s} {'ratio':>6s} {'MB':>6s}")
+    for arch in networks(filters):
+        for batch in batches:
+            loops = Loops(arch, x, y, batch, args.threads)
+            took: tuple[list[float], list[float]] = ([], [])
+            # A full batch of a large network takes half a minute: fewer of those.
+            repeats = args.repeats if batch <= 512 else max(1, args.repeats // 3)
+            for turn in range(repeats + (1 if batch <= 512 else 0)):
+                at = torch.randperm(WINDOWS, generator=random)[:batch]
+                for which, step in enumerate((loops.plain, loops.ours)):
+                    began = time.perf_counter()
+                    step(at)
+                    if turn or batch > 512:
+                        took[which].append(time.perf_counter() - began)
+            loops.fast.close()
+            plain, ours = (statistics.median(t) for t in took)
+            each = math.ceil(WINDOWS / batch)
+            plain_s += plain * each
+            ours_s += ours * each
+            print(
+                f"{named(arch):38s} {batch:5d} {1e3 * plain:9.1f} {1e3 * ours:9.1f} {plain / ours:6.2f} "
+                f"{loops.fast.plan.bytes / 1e6:6.0f}",
+                flush=True,
+            )
+    print(f"an epoch of everything: plain {plain_s:.1f} s, ours {ours_s:.1f} s")
+    print(f"step for step:                       {plain_s / ours_s:.2f} times less")
+    print(f"nested epochs (1350 → 1000):         {APART / NESTED:.2f} times less")
+    print(f"the whole grid:                      {plain_s * APART / (ours_s * NESTED):.2f} times less")
+    print(f"in hours: plain {plain_s * APART / 3600:.1f}, ours {ours_s * NESTED / 3600:.1f}")
+
+
+def data(path: str) -> tuple[Tensor, Tensor, Any]:
+    """The looped windows of a data set, scaled; classes; and the windows."""
+    from plushsense.windows.features import Scaler
+
+    windows = ps.cut_windows(ps.open_dataset(Path(path)), ps.WindowSpec(context="loop"))
+    scaled = Scaler.fit(windows.x).apply(windows.x)
+    return torch.from_numpy(scaled), torch.from_numpy(windows.y.astype(np.int64)), windows
+
+
+def losses(args: argparse.Namespace) -> None:
+    x, y, windows = data(args.dataset)
+    worst = []
+    for given in networks([int(i) for i in args.filters.split(",")]):
+        arch = Arch.parse(
+            given.symbol, given.filters, channels=x.shape[1], classes=len(windows.labels), padding="mirror"
+        )
+        random = torch.Generator().manual_seed(2)
+        loops, apart = Loops(arch, x, y, 64, args.threads), []
+        for _ in range(50):
+            at = torch.randperm(len(x), generator=random)[:64]
+            plain, ours = float(loops.plain(at)), float(loops.ours(at))
+            apart.append(abs(plain - ours) / plain)
+        loops.fast.close()
+        worst.append(max(apart))
+        print(f"{named(arch):38s} largest relative difference in 50 steps {worst[-1]:.1e}", flush=True)
+    print(f"of {len(worst)} networks {sum(w <= 1e-3 for w in worst)} within 1e-3; largest {max(worst):.1e}")
+
+
+def trials(args: argparse.Namespace) -> None:
+    x, y, windows = data(args.dataset)
+    from plushsense.scoring.splits import make_folds, parse_split
+
+    pairs = []
+    for n, given in enumerate(networks([0, 1])[:20]):
+        arch = Arch.parse(
+            given.symbol, given.filters, channels=x.shape[1], classes=len(windows.labels), padding="mirror"
+        )
+        fold = make_folds(parse_split("windows:holdout"), windows.subject, windows.y, n)[0]
+        train, test = torch.from_numpy(fold.train), torch.from_numpy(fold.test)
+        loops, random = Loops(arch, x, y, 64, args.threads, seed=n), torch.Generator().manual_seed(n)
+        for _ in range(args.epochs):
+            order = train[torch.randperm(len(train), generator=random)]
+            for start in range(0, len(order) - 8, 64):
+                loops.plain(order[start : start + 64])
+                loops.ours(order[start : start + 64])
+        loops.model.eval()
+        with torch.no_grad():
+            plain = float((loops.model(x[test]).argmax(1) == y[test]).float().mean())
+        held = loops.time_first[:, test]
+        found = loops.fast.logits(lambda out, a, b, held=held: out.copy_(held[:, a:b]), len(test))
+        pairs.append((plain, float((found.argmax(1) == y[test]).float().mean())))
+        loops.fast.close()
+        print(f"{named(arch):38s} plain {pairs[-1][0]:.4f} ours {pairs[-1][1]:.4f}", flush=True)
+    apart = np.array([ours - plain for plain, ours in pairs])
+    # Which of the two is called ours is exchangeable under the null hypothesis: flip signs at random.
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(100_000, len(apart)))
+    p = float((np.abs((signs * apart).mean(1)) >= abs(apart.mean()) - 1e-12).mean())
+    half = 1.96 * apart.std(ddof=1) / math.sqrt(len(apart))
+    print(
+        f"{len(apart)} pairs, {args.epochs} epochs, random windows (leaky), test accuracy: ours − plain "
+        f"{apart.mean():+.4f} (95 % interval {apart.mean() - half:+.4f} to {apart.mean() + half:+.4f}), "
+        f"sign-flip test p = {p:.2f}"
+    )
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("what", choices=("steps", "losses", "trials"))
+    parser.add_argument("dataset", nargs="?", help="for losses and trials")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument(
+        "--filters", default="0,1,2,3", help="which of the paper's four filter sets, from small to large"
+    )
+    parser.add_argument("--batches", default="64,256,3936")
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--epochs", type=int, default=30)
+    args = parser.parse_args()
+    if args.what != "steps" and not args.dataset:
+        parser.error(f"{args.what} needs a data set")
+    {"steps": steps, "losses": losses, "trials": trials}[args.what](args)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
