@@ -24,10 +24,12 @@ ANONYMOUS = "arrays"
 ANONYMOUS_RATE_HZ = 100.0
 
 _INT32 = np.iinfo(np.int32).max
-# Steps in one spread (standard deviation) of a channel, and steps up to its largest value: 2³⁰ leaves room for twice
+# Steps in one spread (standard deviation) of a channel, and steps up to its largest value, which leave room for twice
 # that value later.
 _STEPS_IN_SPREAD = 2.0**16
-_STEPS_IN_PEAK = 2.0**30
+_STEPS_IN_PEAK = 2.0**29
+# What a sum's rounding leaves of a channel's spread that has none.
+_CONSTANT = 1e-12
 
 
 def rows_of(X: Any) -> tuple[Any, tuple[int, int] | None]:
@@ -46,7 +48,7 @@ def shape_of(features: int, found: tuple[int, int] | None, asked: int | None) ->
         raise ArrayError(f"channels is {asked!r}: accepted are None and whole numbers from 1 up.")
     if found is not None and asked is not None and found[0] != asked:
         raise ArrayError(
-            f"X holds windows of {found[0]} channels where channels or layout say {asked}: give (N, C, T)."
+            f"X holds windows of {found[0]} channels, but channels or layout say {asked}: change one of them."
         )
     channels = found[0] if found is not None else int(asked or 1)
     if features % channels:
@@ -79,7 +81,8 @@ def anonymous_layout(x: NDArray[Any]) -> Layout:
     """A layout for windows (N, C, T) of which only the numbers are known.
 
     Integers of up to 32 bits keep their value (step 1). Floats are read in steps of a power of two, at most 1/65536
-    of the channel's spread but no finer than 2⁻³⁰ of its largest value. The rate is unknown; 100 Hz stands in for it.
+    of the channel's spread but no finer than 2⁻²⁹ of its largest value; a constant channel, from which nothing is
+    learnt, in steps as large as itself. The rate is unknown; 100 Hz stands in for it.
     """
     whole = x.dtype.kind in "biu"
     names = [f"channel {i}" for i in range(x.shape[1])]
@@ -105,9 +108,9 @@ def _step(values: NDArray[np.float64], whole: bool) -> float:
     if peak == 0.0 or (whole and peak <= _INT32):
         return 1.0
     # Divided first: squares of large values would not be finite.
-    spread = float((values / peak).std()) * peak
-    finest = max(spread / _STEPS_IN_SPREAD, peak / _STEPS_IN_PEAK, 1e-300)
-    return float(2.0 ** np.floor(np.log2(finest)))
+    spread = float((values / peak).std())
+    finest = max(spread / _STEPS_IN_SPREAD, 1.0 / _STEPS_IN_PEAK) if spread > _CONSTANT else 1.0
+    return float(2.0 ** np.floor(np.log2(max(finest * peak, 1e-300))))
 
 
 def to_integers(x: NDArray[Any], layout: Layout) -> NDArray[np.int32]:
