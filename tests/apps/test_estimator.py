@@ -310,3 +310,14 @@ def test_what_does_not_fit_is_refused_in_a_sentence() -> None:
         model.predict(holes)
     with pytest.raises(TypeError, match="sample_weight"):
         model.fit(x, y, sample_weight=np.ones(60))
+
+
+def test_forget_finds_a_classifier_that_was_told_whose_windows_they_are(dataset: Dataset, tmp_path: Path) -> None:
+    from plushsense.apps.retraining import trained_on
+
+    windows = ps.cut_windows(dataset)
+    model = ps.PlushClassifier(filters=(2, 2, 2), epochs=1, layout="accel-3")
+    model.fit(windows.x, windows.y, groups=windows.subject).save(tmp_path / "m.plush")
+    found = trained_on(dataset.path, "P2", [tmp_path])
+    assert [f.certain for f in found] == [False]
+    assert "arrays given to PlushClassifier" in found[0].message

@@ -81,7 +81,7 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
 
     Args:
         arch, filters, padding, norm: the network (see `Arch`). The padding None is the preset's: ``stream`` for
-            most, which needs T of at least the receptive field; ``mirror`` works with any T.
+            most, which needs T of at least the receptive field; ``mirror`` works with any T from 2.
         preset, epochs, batch, learning_rate: the training; None keeps the preset's number.
         channels: how many channels a row (N, C·T) holds.
         layout: a `Layout`, or its name or path, where ``X`` holds the integers of `cut_windows`: then vectors are
@@ -144,6 +144,7 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
 
         ``groups`` (N,) names the person of each window. Under a preset that stops early (``loso``, ``paper``) 15 % of
         the people decide when; without groups 15 % of the windows do, which is leaky. Other presets train on all of X.
+        The bundle keeps their names, as that of `train` does, so that `forget` finds it.
         """
         from sklearn.utils.multiclass import check_classification_targets
         from sklearn.utils.validation import validate_data
@@ -209,6 +210,7 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
             windowing={"window_s": samples / layout.rate_hz, "context": "unknown"},
             decision=DecideSpec().to_dict(),
             provenance={
+                "dataset": "arrays given to PlushClassifier",
                 "estimator": {"settings": self._settings(), **labels_table(classes)},
                 "windows": len(x),
                 "subjects": sorted(set(people[~watching].tolist())) if named else [],
