@@ -35,7 +35,8 @@ SRC = Path(__file__).resolve().parents[2] / "src"
 TINY: dict[str, Any] = {"arch": "3", "filters": (4,), "padding": "causal", "epochs": 20, "learning_rate": 0.03}
 
 
-@parametrize_with_checks([ps.PlushClassifier(**TINY), ps.PlushClassifier(preset="loso", batch=32, **TINY)])
+# None of the checks is expected to fail.
+@parametrize_with_checks([ps.PlushClassifier(**TINY)])
 def test_scikit_learns_own_checks(estimator: Any, check: Callable[[Any], None]) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
