@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import plushsense as ps
-from plushsense.core.errors import ConfigError, DatasetError, TrainingError
+from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.dataset.store import Dataset
 
 
@@ -64,26 +64,6 @@ def test_notebook_faces(dataset: Dataset, bundle: Path) -> None:
     assert "<table>" in dataset._repr_html_()
     assert "30 recordings" in repr(ps.cut_windows(dataset))
     assert "14d1_19d2_19d4" in repr(ps.load(bundle))
-
-
-def test_the_estimator_learns_arrays() -> None:
-    rng = np.random.default_rng(0)
-    y = rng.integers(0, 2, 120)
-    t = np.arange(250) / 100
-    x = np.stack([np.sin(2 * np.pi * (1 + 3 * k) * t + rng.uniform(0, 6)) for k in y])[:, None, :]
-    x = np.concatenate([x, rng.normal(0, 0.1, x.shape)], axis=1)
-    people = np.arange(120) % 6
-    model = ps.PlushClassifier(filters=(4, 4, 4), epochs=12).fit(
-        x[:90], np.array(["slow", "fast"])[y[:90]], people[:90]
-    )
-    assert model.classes_.tolist() == ["fast", "slow"]
-    assert model.score(x[90:], np.array(["slow", "fast"])[y[90:]]) > 0.9
-    assert np.allclose(model.predict_proba(x[90:]).sum(axis=1), 1, atol=1e-5)
-    assert model.set_params(epochs=1).get_params()["epochs"] == 1
-    with pytest.raises(TrainingError, match=r"expected \(N, 2, T\)"):
-        model.predict(x[:, :1])
-    with pytest.raises(TrainingError, match="not trained"):
-        ps.PlushClassifier().predict(x)
 
 
 def long_recordings(folder: Path, people: int, recordings: int) -> Dataset:

@@ -8,6 +8,7 @@
     │   ├── FileFormatError     a recording file
     │   ├── DatasetError        a data set folder
     │   ├── BundleError         a model bundle
+    │   ├── ArrayError          arrays given from Python; also a ValueError
     │   └── ConfigError         a setting, a flag, a configuration file
     ├── DeviceError             a toy that cannot be opened or went away
     ├── TrainingError           a training run that cannot start or go on
@@ -53,6 +54,10 @@ class DatasetError(BadInput):
 
 class BundleError(BadInput):
     """A model bundle that cannot be read or does not fit."""
+
+
+class ArrayError(BadInput, ValueError):
+    """Arrays that cannot be used; a ValueError too, as users of scikit-learn expect."""
 
 
 class ConfigError(BadInput):

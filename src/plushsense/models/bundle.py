@@ -87,7 +87,7 @@ class Bundle:
             BundleError: when the place cannot be written.
         """
         path = Path(path)
-        data = self._to_bytes()
+        data = self.to_bytes()
         part = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.part")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -119,6 +119,15 @@ class Bundle:
             ) from None
         except OSError as cause:
             raise BundleError(f"The bundle '{path}' cannot be read ({cause}).") from None
+        return cls.from_bytes(data, path)
+
+    @classmethod
+    def from_bytes(cls, data: bytes, path: str | Path = "in memory") -> Bundle:
+        """The bundle that ``to_bytes`` wrote; ``path`` names it in errors.
+
+        Raises:
+            BundleError: as for ``load``.
+        """
         head = _header(data, path)
         version = head.get("version")
         if version != VERSION:
@@ -169,7 +178,8 @@ class Bundle:
             "span": self.arch.span,
         }
 
-    def _to_bytes(self) -> bytes:
+    def to_bytes(self) -> bytes:
+        """What ``save`` writes."""
         content: dict[str, Any] = _plain(
             {
                 "arch": self.arch.to_dict(),
@@ -192,7 +202,7 @@ class Bundle:
         return bytes(save_tensors(weights, metadata={"plushsense": _canonical(head)}))
 
 
-def _header(data: bytes, path: Path) -> dict[str, Any]:
+def _header(data: bytes, path: str | Path) -> dict[str, Any]:
     """The JSON of a bundle, once the length of the file is known to be right."""
     stranger = f"'{path}' is not a PlushSense bundle: give a *.plush file made by plushsense train"
     length = int.from_bytes(data[:8], "little")
@@ -218,7 +228,7 @@ def _header(data: bytes, path: Path) -> dict[str, Any]:
     return dict(head)
 
 
-def _damaged(path: Path) -> str:
+def _damaged(path: str | Path) -> str:
     return f"The bundle '{path}' is damaged: {_AGAIN}"
 
 
