@@ -54,7 +54,10 @@ def tick(shared: Any, task: Any, report: Any) -> dict[str, Any]:
 
 
 def walk(shared: Any, task: Any, report: Any) -> dict[str, Any]:
-    """Ten epochs that depend on each other, with a mark for each start; says the epoch and the node it is on."""
+    """Ten epochs that depend on each other, with a mark for each start; says the epoch and the node it is on.
+
+    On the node that is to be lost it never comes to an end.
+    """
     node = ""
     if "ray" in sys.modules:
         import ray
@@ -70,6 +73,8 @@ def walk(shared: Any, task: Any, report: Any) -> dict[str, Any]:
         shared["data"][:] += 0.0
         sums.append(float(shared["data"] @ rng.normal(size=len(shared["data"]))) + (sums[-1] if sums else 0.0))
         report((epoch, node))
+        if epoch == 5 and node and node == shared["doomed"]:
+            time.sleep(120)
     return {"sums": np.array(sums), "task": task}
 
 
@@ -77,3 +82,17 @@ def diverge(shared: Any, task: Any, report: Any) -> dict[str, Any]:
     if task == 2:
         raise TrainingError("no more")
     return {"value": task, "threads": os.environ.get("OPENBLAS_NUM_THREADS")}
+
+
+def killed_once(shared: Any, task: Any, report: Any) -> dict[str, Any]:
+    """Job 1 is killed from outside at its first try; job 3 kills its process at every try."""
+    mark = Path(shared, f"started-{task}")
+    first = not mark.exists()
+    with mark.open("a") as file:
+        file.write("x")
+    if task == 1 and first:
+        report(os.getpid())
+        time.sleep(60)
+    if task == 3:
+        os._exit(9)
+    return {"value": task}

@@ -68,10 +68,16 @@ def _connected(ray: Any, address: str) -> Iterator[None]:
         ray.init(address, **quiet)
     except (Exception, SystemExit) as cause:
         raise _no_connection(address, cause) from cause
+    # Ray prints pages on standard output when a node is lost, whatever it was told of logs.
+    inner = need("ray._private.worker", extra="cluster")
+    loud = getattr(inner, "print_to_stdstream", None)
+    inner.print_to_stdstream = lambda *_, **__: None
     try:
         yield
     finally:
         ray.shutdown()
+        if loud is not None:
+            inner.print_to_stdstream = loud
 
 
 def _knock(address: str) -> None:

@@ -254,7 +254,9 @@ class Table:
     def __exit__(self, *_: object) -> None:
         self._stop.set()
         self._drawer.join(5)
-        self._draw(last=True)
+        # A terminal that somebody holds (Ctrl-S) must not hold the run.
+        if not self._drawer.is_alive():
+            self._draw(last=True)
 
     def on_start(self, job: Job) -> None:
         """The job begins."""
