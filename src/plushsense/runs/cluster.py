@@ -15,9 +15,9 @@ import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-from plushsense import __version__
 from plushsense.core.errors import ConfigError, PlushSenseError
 from plushsense.core.extras import need
 from plushsense.runs.jobs import Engine, Event, Job, Take, portable, thread_settings
@@ -69,7 +69,7 @@ def _connected(ray: Any, address: str) -> Iterator[None]:
     except (Exception, SystemExit) as cause:
         raise _no_connection(address, cause) from cause
     # Ray prints pages on standard output when a node is lost, whatever it was told of logs.
-    inner = need("ray._private.worker", extra="cluster")
+    inner: Any = need("ray._private.worker", extra="cluster")
     loud = getattr(inner, "print_to_stdstream", None)
     inner.print_to_stdstream = lambda *_, **__: None
     try:
@@ -149,7 +149,7 @@ def _conduct(ray: Any, take: Take, work_and_shared: tuple[Any, Any], threads: in
                 if job is None:
                     more = False
                 else:
-                    out[task.remote(run, __version__, [packed], board, job.id, job.task)] = job
+                    out[task.remote(run, _version(), [packed], board, job.id, job.task)] = job
             ready, _ = ray.wait(list(out), num_returns=len(out), timeout=0) if out else ([], [])
             if not ready and out:
                 ready, _ = ray.wait(list(out), num_returns=1, timeout=_LOOK_S)
@@ -256,15 +256,16 @@ class _Board:
 _unpacked: tuple[str, Any, Any] | None = None
 
 
-def _task(run: str, version: str, packed: list[Any], board: Any, job: str, task: Any) -> tuple[str, bytes]:
+def _task(run: str, wanted: str, packed: list[Any], board: Any, job: str, task: Any) -> tuple[str, bytes]:
     """One job on a node: ("done", its result), ("failed", its exception) or ("lost", why no job can work here)."""
     global _unpacked
     ray = need("ray", extra="cluster")
-    if version != __version__:
-        where = f"A node of the cluster has PlushSense {__version__} where the run was started with {version}"
-        return "lost", pickle.dumps(
-            PlushSenseError(f"{where}: install the same on every node; finished jobs are kept.")
+    if wanted != _version():
+        other = PlushSenseError(
+            f"A node of the cluster has PlushSense {_version()} where the run was started with {wanted}: install the "
+            "same on every node; finished jobs are kept."
         )
+        return "lost", pickle.dumps(other)
     board.begun.remote(job)
     try:
         if _unpacked is None or _unpacked[0] != run:
@@ -276,6 +277,13 @@ def _task(run: str, version: str, packed: list[Any], board: Any, job: str, task:
         return "done", pickle.dumps(result)
     except Exception as error:  # noqa: BLE001 - whatever it is, it is raised again where the jobs came from
         return "failed", pickle.dumps(portable(error))
+
+
+def _version() -> str:
+    try:
+        return version("plushsense")
+    except PackageNotFoundError:
+        return "that is not installed"
 
 
 def _sparing(send: Callable[[bytes], Any]) -> Callable[[Any], None]:
