@@ -67,3 +67,13 @@ def publish_tools() -> None:
     for module in ("mlcroissant", "frictionless", "rocrate", "datacite", "sklearn"):
         if importlib.util.find_spec(module) is None:
             missing("publish", f"{module} is not installed")
+
+
+@pytest.fixture(scope="session")
+def cluster_possible() -> None:
+    """Ray (extra cluster), and the system on which it can run several nodes on one machine."""
+    if importlib.util.find_spec("ray") is None:
+        missing("cluster", "ray is not installed")
+    if not Path("/dev/shm").is_dir():
+        missing("cluster", "several nodes of a Ray cluster on one machine are tested on Linux only")
+    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+import sys
 import time
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from plushsense.core.errors import TrainingError
 
@@ -47,4 +50,49 @@ def tick(shared: Any, task: Any, report: Any) -> dict[str, Any]:
     for n in range(5):
         time.sleep(0.06)
         report(n)
+    return {"value": task}
+
+
+def walk(shared: Any, task: Any, report: Any) -> dict[str, Any]:
+    """Ten epochs that depend on each other, with a mark for each start; says the epoch and the node it is on.
+
+    On the node that is to be lost it never comes to an end.
+    """
+    node = ""
+    if "ray" in sys.modules:
+        import ray
+
+        if ray.is_initialized():
+            node = ray.get_runtime_context().get_node_id()
+    with Path(shared["folder"], f"started-{task}").open("a") as file:
+        file.write("x")
+    rng = np.random.default_rng(task)
+    sums = []
+    for epoch in range(10):
+        time.sleep(0.05)
+        shared["data"][:] += 0.0
+        sums.append(float(shared["data"] @ rng.normal(size=len(shared["data"]))) + (sums[-1] if sums else 0.0))
+        report((epoch, node))
+        if epoch == 5 and node and node == shared["doomed"]:
+            time.sleep(120)
+    return {"sums": np.array(sums), "task": task}
+
+
+def diverge(shared: Any, task: Any, report: Any) -> dict[str, Any]:
+    if task == 2:
+        raise TrainingError("no more")
+    return {"value": task, "threads": os.environ.get("OPENBLAS_NUM_THREADS")}
+
+
+def killed_once(shared: Any, task: Any, report: Any) -> dict[str, Any]:
+    """Job 1 is killed from outside at its first try; job 3 kills its process at every try."""
+    mark = Path(shared, f"started-{task}")
+    first = not mark.exists()
+    with mark.open("a") as file:
+        file.write("x")
+    if task == 1 and first:
+        report(os.getpid())
+        time.sleep(60)
+    if task == 3:
+        os._exit(9)
     return {"value": task}

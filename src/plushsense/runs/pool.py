@@ -1,50 +1,24 @@
-"""Many jobs in several processes, whatever they are. Each result is kept the moment its job is done.
+"""Many jobs, whatever they are: in this process, in several, or on a cluster. Each result is kept once it is done.
 
-With one worker the jobs run in this process, one after the other. With more, processes are started fresh (the same
-on every system) and each computes on one thread. A worker keeps its result in the journal itself, before it tells
-anybody, so that a run killed at any moment goes on from there. A worker whose starter is gone ends at its next word.
+A job is looked for in the journal before anything begins and again before it is handed out, and one that another run
+on the same journal is at comes last: two runs at a time share the work.
 """
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 import pickle
-import signal
-import threading
-import traceback
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing
 from functools import partial
-from multiprocessing import connection
-from multiprocessing.connection import Connection
-from multiprocessing.process import BaseProcess
-from typing import Any, Protocol
+from typing import Any
 
-from plushsense.core.errors import ConfigError, PlushSenseError
-from plushsense.runs.journal import Journal, Result
+from plushsense.core.errors import ConfigError
+from plushsense.runs.jobs import Engine, Event, Job, Report, Take, Work
+from plushsense.runs.journal import Claim, Journal, Result
+from plushsense.runs.processes import in_processes
 
-Report = Callable[[Any], None]
-
-# Read by the numeric libraries when they are loaded: one process, one thread.
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
-
-
-@dataclass(frozen=True)
-class Job:
-    """One job: its id in the journal, and what the work is given."""
-
-    id: str
-    task: Any
-
-
-class Work(Protocol):
-    """What is done for each job; a picklable callable (a function of a module, a dataclass with ``__call__``)."""
-
-    def __call__(self, shared: Any, task: Any, report: Report, /) -> Result:
-        """The result of one job. ``report`` may be given anything on the way; it reaches ``on_report``."""
-        ...
+__all__ = ["Job", "Report", "Work", "run_jobs"]
 
 
 def run_jobs(
@@ -53,27 +27,41 @@ def run_jobs(
     *,
     shared: Any = None,
     workers: int = 1,
+    threads: int = 1,
     journal: Journal | None = None,
-    on_done: Callable[[Job, Result, bool], None] | None = None,
+    cluster: str | None = None,
+    gpus: float = 0.0,
+    on_start: Callable[[Job], None] | None = None,
     on_report: Callable[[Job, Any], None] | None = None,
+    on_done: Callable[[Job, Result, bool], None] | None = None,
+    on_failed: Callable[[Job, Exception], None] | None = None,
 ) -> dict[str, Result]:
-    """Do every job that the journal does not hold yet.
+    """Do every job that the journal does not hold yet. Every callback is called here, in the caller's thread.
 
     Args:
-        shared: given to every job, and sent to each process once.
-        workers: processes at a time; 1 works in this one.
-        on_done: called here with (job, result, whether it came from the journal), in the order of completion.
-        on_report: called here with (job, what its work reported).
+        shared: given to every job, and sent to each process once. A job must leave it as it is.
+        workers: processes at a time; 1 works in this one. A cluster does as many as its processors hold.
+        threads: that each process computes on; has no effect on this one (``workers=1``).
+        cluster: do the jobs as Ray tasks there: "auto", "host:6379", "ray://host:10001", or "local" to start Ray here.
+        gpus: of a cluster, the share of a graphics processor that each job takes.
+        on_start: called with the job when it is begun; twice for one whose process or node was lost.
+        on_report: called with (job, what its work reported); on a cluster some reports may be left out.
+        on_done: called with (job, result, whether it came from the journal), in the order of completion.
+        on_failed: called with (job, the exception that it raised); the other jobs go on, and this one is in neither
+            the journal nor the answer. Without it the first failure ends the run.
 
     Returns:
         the result of each job by its id.
 
     Raises:
-        PlushSenseError: what the work raised, as itself; or a worker that died. Finished jobs are kept.
+        PlushSenseError: what the work raised, as itself; or a process that died twice at the same job; a result that
+            cannot be kept; a cluster that does not answer. Finished jobs are kept.
         KeyboardInterrupt: on Ctrl-C, after the workers have been ended. Finished jobs are kept.
     """
     if workers < 1:
         raise ConfigError(f"{workers} workers cannot do anything: give 1 or more.")
+    if threads < 1:
+        raise ConfigError(f"{threads} threads cannot do anything: give 1 or more.")
     results: dict[str, Result] = {}
 
     def done(job: Job, result: Result, resumed: bool) -> None:
@@ -81,154 +69,117 @@ def run_jobs(
         if on_done is not None:
             on_done(job, result, resumed)
 
-    def reported(job: Job, message: Any) -> None:
-        if on_report is not None:
-            on_report(job, message)
+    with ExitStack() as stack:
+        left = _Left(jobs, journal, done, stack)
+        engine: Engine
+        if not left.jobs:
+            return results
+        if cluster is not None:
+            from plushsense.runs.cluster import on_cluster
 
-    left = []
-    for job in jobs:
-        kept = None if journal is None else journal.find(job.id)
-        if kept is None:
-            left.append(job)
+            engine = on_cluster(left.take, (work, shared), cluster, threads=threads, gpus=gpus)
+        elif workers == 1:
+            engine = _here(left.take, work, shared, on_report)
         else:
-            done(job, kept, True)
-    if workers == 1 or len(left) < 2:
-        for job in left:
-            result = work(shared, job.task, partial(reported, job))
-            if journal is not None:
-                journal.save(job.id, result)
-            done(job, result, False)
-    else:
-        with _crew(min(workers, len(left)), pickle.dumps((work, shared, journal))) as crew:
-            for job, kind, message in _conduct(crew, left):
-                if kind == "done":
-                    done(job, message, False)
-                else:
-                    reported(job, message)
+            # Also for a single job: what it computes may depend on the threads of its process.
+            setup = pickle.dumps((work, shared, journal))
+            engine = in_processes(left.take, setup, min(workers, len(left.jobs)), threads)
+        saved = cluster is None and workers > 1
+        # Closed at once, not when it is collected: an engine ends its processes.
+        with closing(engine):  # type: ignore[type-var]
+            for job, kind, what in engine:
+                if kind == "started" and on_start is not None:
+                    on_start(job)
+                elif kind == "report" and on_report is not None:
+                    on_report(job, what)
+                elif kind == "done":
+                    if journal is not None and not saved:
+                        journal.save(job.id, what)
+                    left.release(job)
+                    done(job, what, False)
+                elif kind == "failed":
+                    left.release(job)
+                    if on_failed is None:
+                        raise what
+                    on_failed(job, what)
     return results
 
 
-@dataclass
-class _Worker:
-    """One process, the pipe to it, and the job it is at."""
+def _here(take: Take, work: Work, shared: Any, on_report: Callable[[Job, Any], None] | None) -> Engine:
+    """The jobs in this process, one after the other."""
 
-    process: BaseProcess
-    pipe: Connection
-    job: Job | None = field(default=None)
+    def told(job: Job, message: Any) -> None:
+        if on_report is not None:
+            on_report(job, message)
 
-
-@contextmanager
-def _crew(workers: int, setup: bytes) -> Iterator[list[_Worker]]:
-    """Started processes, ended again in any case."""
-    spawn = multiprocessing.get_context("spawn")
-    crew: list[_Worker] = []
-    try:
-        for _ in range(workers):
-            here, there = spawn.Pipe()
-            process = spawn.Process(target=_serve, args=(there,), daemon=True)
-            with _inherited():
-                process.start()
-            # Only the worker may hold its end: then each side sees the other one go.
-            there.close()
-            crew.append(_Worker(process, here))
-        for worker in crew:
-            _send(worker, setup)
-        yield crew
-        for worker in crew:
-            worker.pipe.send(None)
-            worker.process.join(5)
-    finally:
-        for worker in crew:
-            if worker.process.is_alive():
-                worker.process.kill()
-            worker.process.join()
-            worker.pipe.close()
+    while (job := take()) is not None:
+        yield Event(job, "started")
+        try:
+            result = work(shared, job.task, partial(told, job))
+        except Exception as error:  # noqa: BLE001 - the caller decides whether it ends the run
+            yield Event(job, "failed", error)
+        else:
+            yield Event(job, "done", result)
 
 
-@contextmanager
-def _inherited() -> Iterator[None]:
-    """What a process that is started now takes over: one thread, and no ear for Ctrl-C while it loads."""
-    before = {name: os.environ.get(name) for name in _THREADS}
-    # Only the main thread may set a signal's handler.
-    ours = threading.current_thread() is threading.main_thread()
-    handler = signal.signal(signal.SIGINT, signal.SIG_IGN) if ours else None
-    os.environ.update(dict.fromkeys(_THREADS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            os.environ.pop(name, None)
-            if value is not None:
-                os.environ[name] = value
-        if ours:
-            signal.signal(signal.SIGINT, signal.SIG_DFL if handler is None else handler)
+class _Left:
+    """The jobs still to be handed out, and the claims on those that are."""
 
+    def __init__(
+        self,
+        jobs: Sequence[Job],
+        journal: Journal | None,
+        done: Callable[[Job, Result, bool], None],
+        stack: ExitStack,
+    ) -> None:
+        self.jobs: deque[Job] = deque()
+        self._journal = journal
+        self._done = done
+        self._claims: dict[str, Claim] = {}
+        stack.callback(self._release_all)
+        for job in jobs:
+            if not self._found(job):
+                self.jobs.append(job)
 
-def _conduct(crew: list[_Worker], jobs: Sequence[Job]) -> Iterator[tuple[Job, str, Any]]:
-    """Hand out the jobs and pass on what comes back: (job, "done" or "report", what)."""
-    waiting = list(reversed(jobs))
-    for worker in crew:
-        worker.job = waiting.pop()
-        _send(worker, (worker.job.id, worker.job.task))
-    while busy := {worker.pipe: worker for worker in crew if worker.job is not None}:
-        for pipe in connection.wait(list(busy)):
-            worker = busy[pipe]  # type: ignore[index]
-            job = worker.job
-            assert job is not None
-            try:
-                kind, message = worker.pipe.recv()
-            except (EOFError, OSError):
-                raise _gone(worker) from None
-            if kind == "failed":
-                raise message
-            if kind == "done":
-                worker.job = waiting.pop() if waiting else None
-                if worker.job is not None:
-                    _send(worker, (worker.job.id, worker.job.task))
-            yield job, kind, message
+    def take(self) -> Job | None:
+        """The next job that nobody has done or is at; when another run is at all that are left, one of these."""
+        elsewhere: deque[Job] = deque()
+        try:
+            while self.jobs:
+                job = self.jobs.popleft()
+                claim = None if self._journal is None else self._journal.claim(job.id)
+                if self._journal is not None and claim is None:
+                    elsewhere.append(job)
+                    continue
+                # Looked for after it was claimed: whoever had the claim before us may have done it.
+                if self._found(job):
+                    if claim is not None:
+                        claim.release()
+                    continue
+                if claim is not None:
+                    self._claims[job.id] = claim
+                return job
+            while elsewhere:
+                job = elsewhere.popleft()
+                # Not waited for: the other run may take long, may stop, and the result is the same.
+                if not self._found(job):
+                    return job
+            return None
+        finally:
+            self.jobs.extendleft(reversed(elsewhere))
 
+    def release(self, job: Job) -> None:
+        claim = self._claims.pop(job.id, None)
+        if claim is not None:
+            claim.release()
 
-def _send(worker: _Worker, message: Any) -> None:
-    try:
-        worker.pipe.send(message)
-    except OSError:
-        raise _gone(worker) from None
+    def _found(self, job: Job) -> bool:
+        kept = None if self._journal is None else self._journal.find(job.id)
+        if kept is None:
+            return False
+        self._done(job, kept, True)
+        return True
 
-
-def _gone(worker: _Worker) -> PlushSenseError:
-    worker.process.join(5)
-    return PlushSenseError(
-        f"A worker process ended unexpectedly (exit code {worker.process.exitcode}), perhaps for lack of memory: "
-        "run again, finished jobs are kept; try fewer workers. In a script of your own, more than one worker needs "
-        "the code under  if __name__ == '__main__':"
-    )
-
-
-def _serve(pipe: Connection) -> None:
-    """A worker's life: one job after the other, until it is sent None or the other side is gone."""
-    # Ctrl-C reaches every process of the terminal: the one that started us decides.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        work, shared, journal = pickle.loads(pipe.recv())
-        while (message := pipe.recv()) is not None:
-            job, task = message
-            result = work(shared, task, lambda said: pipe.send(("report", said)))
-            if journal is not None:
-                journal.save(job, result)
-            pipe.send(("done", result))
-    except (EOFError, BrokenPipeError, ConnectionResetError):
-        return
-    except Exception as error:  # noqa: BLE001 - whatever it is, it is raised again where the jobs came from
-        _confess(pipe, error)
-
-
-def _confess(pipe: Connection, error: Exception) -> None:
-    """Send an exception over, itself where it can be pickled, with this process's traceback as a note."""
-    told = traceback.format_exc()
-    if not isinstance(error, PlushSenseError):
-        error.add_note(f"In a worker process:\n{told}")
-    try:
-        pickle.loads(pickle.dumps(error))
-    except Exception:  # noqa: BLE001 - an exception class may refuse in any way
-        error = RuntimeError(f"A job failed in a worker process:\n{told}")
-    pipe.send(("failed", error))
+    def _release_all(self) -> None:
+        while self._claims:
+            self._claims.popitem()[1].release()
