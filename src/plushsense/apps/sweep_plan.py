@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from statistics import median
 from typing import Any
 
+from plushsense.apps.config import ALL
 from plushsense.apps.preparation import Warn, choose_classes, silent, windows_for
 from plushsense.core.errors import BadInput, ConfigError, TrainingError
 from plushsense.core.extras import need
@@ -21,7 +22,7 @@ from plushsense.runs.pool import Job
 from plushsense.scoring.splits import Split, parse_split
 from plushsense.training.grid import FULL, GridSpec, Trial, problems, trainings
 from plushsense.training.spec import TrainSpec
-from plushsense.windows.cut import WindowSet
+from plushsense.windows.cut import WindowSet, shared_gestures
 
 # Part of every id: raise it when the meaning of a stored training changes.
 _VERSION = 1
@@ -151,6 +152,14 @@ class _Cut:
         """Cut for a window without more past: what every grid needs to know how many there are."""
         split = parse_split(grid.split)
         gestures = choose_classes(dataset, grid.classes, warn)
+        if split.apart and grid.classes == ALL:
+            rare = set(gestures.labels) - set(shared_gestures(dataset)[0].labels)
+            if rare:
+                warn(
+                    f"{len(rare)} of the {len(gestures)} classes are no gesture that 90 % of the people share "
+                    f"({', '.join(sorted(rare))}): who is tested may be the only one who made them; "
+                    "leave them out with --classes shared"
+                )
         window = Arch.parse(
             "1", "1", channels=dataset.layout.n_inputs, padding="mirror", window=dataset.layout.samples(grid.window_s)
         )

@@ -10,18 +10,16 @@ import math
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from plushsense.apps.sweep_job import CURVE, Outcome, outcome
 from plushsense.apps.sweep_plan import Plan, PlannedTrial, Run
 from plushsense.core.errors import ConfigError
 from plushsense.core.extras import need
-from plushsense.core.gestures import NOBODY
 from plushsense.dataset.store import write_atomically
 from plushsense.models.arch import DEFAULT_FILTERS
 from plushsense.scoring import metrics
@@ -37,8 +35,6 @@ SUMMARY, TRIALS, TRIALS_CSV, RUNS, CURVES = (
 BEST = 10
 # Paper, section 3.6.2: the network that it chose.
 PAPERS_CHOICE = ("14d1_39d2_41d4", DEFAULT_FILTERS)
-# The columns of a training's curve, as its result holds them; the epoch is the row.
-CURVE = ("train_loss", "train_accuracy", "validation_loss", "validation_accuracy", "learning_rate")
 
 _TRIAL_COLUMNS: dict[str, type[Any]] = {
     "trial": str,
@@ -97,55 +93,6 @@ _CURVE_COLUMNS: dict[str, type[Any]] = {
 }
 # Their means make a trial's.
 _MEANS = ("accuracy", "macro_f1", "validation_accuracy", "validation_macro_f1", "train_loss")
-
-
-@dataclass(frozen=True)
-class Scored:
-    """A trial's part of one training: its figures, and confusions of all windows that were tested."""
-
-    figures: dict[str, float | None]
-    counts: Counts
-    windows: int
-    seconds: float
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What a sweep keeps of one training: a score for each number of epochs, its curve, and what went wrong."""
-
-    scored: dict[int, Scored]
-    curve: NDArray[np.float64]
-    failed: dict[int, str]
-    seconds: float
-
-
-def outcome(plan: Plan, run: Run, result: Mapping[str, Any]) -> Outcome:
-    """Score one training's probabilities. Where people are kept apart, the toy at rest with nobody is not counted."""
-    windows, fold = plan.sets[run.span], plan.folds[run.span][run.fold_index]
-    truth, classes = windows.y[fold.test], len(windows.labels)
-    counted = windows.subject[fold.test] != NOBODY if plan.split.apart else np.ones(len(truth), dtype=np.bool_)
-    scored, before, seconds = dict[int, Scored](), 0, float(result["seconds"])
-    for i, epochs in enumerate(result["epochs"]):
-        read = np.argmax(result["probabilities"][i], axis=1).astype(np.int64)
-        counts = metrics.confusion(truth[counted], read[counted], classes)
-        accuracy, f1 = result["validation"][i]
-        figures = {
-            "accuracy": metrics.accuracy(counts),
-            "macro_f1": metrics.macro_f1(counts),
-            "validation_accuracy": float(accuracy),
-            "validation_macro_f1": float(f1),
-            "train_loss": float(result["curve"][result["at"][i] - 1, 0]),
-        }
-        # A training that contains others is paid for once: each number of epochs its own stretch.
-        share = seconds * (epochs - before) / result["epochs"][-1]
-        before = epochs
-        scored[epochs] = Scored(
-            {name: value if math.isfinite(value) else None for name, value in figures.items()},
-            metrics.confusion(truth, read, classes),
-            int(counted.sum()),
-            share,
-        )
-    return Outcome(scored, result["curve"], {int(e): why for e, why in result["failed"].items()}, seconds)
 
 
 class Tables:

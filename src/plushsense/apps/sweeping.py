@@ -11,92 +11,25 @@ import os
 import platform
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from plushsense import __version__
 from plushsense.apps.preparation import Warn, opened, silent
+from plushsense.apps.sweep_job import TrainAndScore
 from plushsense.apps.sweep_plan import GridProblems, Plan, Task, plan, processes
-from plushsense.apps.sweep_tables import CURVE, TRIALS, Tables, check_place
-from plushsense.core.errors import ConfigError, TrainingError
+from plushsense.apps.sweep_tables import TRIALS, Tables, check_place
+from plushsense.core.errors import ConfigError
 from plushsense.core.extras import need
 from plushsense.dataset.store import Dataset
 from plushsense.runs.journal import Journal, Result, job_id
-from plushsense.runs.pool import Job, Report, run_jobs
-from plushsense.scoring import metrics
-from plushsense.training.grid import GridSpec, changed, load_grid
-from plushsense.windows.cut import WindowSet
+from plushsense.runs.pool import Job, run_jobs
+from plushsense.training.grid import GridSpec
+from plushsense.training.gridfile import changed, load_grid
 
 JOURNAL = ("cache", "sweeps")
-
-
-@dataclass(frozen=True)
-class TrainAndScore:
-    """One training as a job: probabilities of the tested windows after each number of epochs that is scored.
-
-    A training whose loss is no longer a number is no reason to stop the others: it is trained up to the longest that
-    goes well, and says why not further. ``at`` is the epoch whose weights are scored.
-    """
-
-    def __call__(self, shared: Any, task: Task, report: Report, /) -> Result:
-        from plushsense.training.fit import fit, predict
-
-        sets, folds = shared
-        windows, fold = sets[task.span], folds[task.span][task.fold]
-        train, validation, test = (windows.take(index) for index in (fold.train, fold.validation, fold.test))
-        wanted, failed, fitted = task.epochs, dict[str, str](), None
-        while wanted and fitted is None:
-            spec = replace(task.spec, epochs=wanted[-1])
-            keep = wanted if task.nested else ()
-            try:
-                fitted = fit(train, validation, task.arch, spec, lambda at, of, _: report((at, of)), keep)
-            except TrainingError as cause:
-                failed[str(wanted[-1])] = str(cause)
-                wanted = wanted[:-1]
-        if fitted is None:
-            return _result(
-                (), np.zeros((0, len(test), len(windows.labels))), [], [], np.zeros((0, len(CURVE))), 0, failed
-            )
-        tested, watched = [], []
-        for epochs in wanted:
-            weights = fitted.kept[epochs] if task.nested else fitted.weights
-            tested.append(predict(task.arch, weights, fitted.scaler, test, task.spec.device))
-            watched.append(
-                _watched(predict(task.arch, weights, fitted.scaler, validation, task.spec.device), validation)
-            )
-        curve = np.array([[row[name] for name in CURVE] for row in fitted.history], dtype=np.float64)
-        at = list(wanted) if task.nested else [fitted.best_epoch]
-        return _result(wanted, np.stack(tested), watched, at, curve, fitted.seconds, failed)
-
-
-def _result(
-    epochs: tuple[int, ...],
-    probabilities: np.ndarray[Any, Any],
-    validation: list[tuple[float, float]],
-    at: list[int],
-    curve: np.ndarray[Any, Any],
-    seconds: float,
-    failed: dict[str, str],
-) -> Result:
-    """(E, n, K) float32, (E, 2) accuracy and macro-F1, (epochs trained, 5) columns as in `CURVE`."""
-    return {
-        "epochs": list(epochs),
-        "at": at,
-        "probabilities": probabilities.astype(np.float32),
-        "validation": np.array(validation, dtype=np.float64).reshape(-1, 2),
-        "curve": curve,
-        "seconds": seconds,
-        "failed": failed,
-    }
-
-
-def _watched(probabilities: np.ndarray[Any, Any], windows: WindowSet) -> tuple[float, float]:
-    counts = metrics.confusion(windows.y, np.argmax(probabilities, axis=1).astype(np.int64), len(windows.labels))
-    return metrics.accuracy(counts), metrics.macro_f1(counts)
 
 
 class SweepProgress(NamedTuple):
@@ -201,10 +134,12 @@ def sweep(
 
     try:
         _work_off(planned, dataset, processes(workers, spec.threads), cluster, done, teller.epoch)
-    finally:
-        # Also where it is stopped: what is finished stands in the tables.
-        summary = tables.write()
-    return Sweep(place, summary)
+    except BaseException:
+        # What is finished stands in the tables; stopped before anything new, those of before stay.
+        if len(tables.outcomes) > len(tables.resumed):
+            tables.write()
+        raise
+    return Sweep(place, tables.write())
 
 
 def _work_off(
