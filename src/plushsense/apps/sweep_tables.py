@@ -64,6 +64,9 @@ _TRIAL_COLUMNS: dict[str, type[Any]] = {
     "acr": float,
     "seconds": float,
     "status": str,
+    "split": str,
+    "leaky": bool,
+    "simulated": bool,
 }
 _RUN_COLUMNS: dict[str, type[Any]] = {
     "trial": str,
@@ -102,13 +105,21 @@ class Tables:
         self.plan, self.out, self.head = plan, out, dict(head)
         self.outcomes: dict[str, Outcome] = {}
         self.resumed: set[str] = set()
-        self._first = {run.job: (planned, run) for planned in plan.trials for run in planned.runs}
+        self.best: dict[str, Any] | None = None
+        self._of: dict[str, list[tuple[PlannedTrial, Run]]] = {}
+        for planned in plan.trials:
+            for run in planned.runs:
+                self._of.setdefault(run.job, []).append((planned, run))
         self._every_s, self._due = every_s, 0.0
         self._began = time.monotonic()
 
     def add(self, job: str, result: Mapping[str, Any], resumed: bool) -> None:
         """Take in a training that is done; the files follow when it is time."""
-        self.outcomes[job] = outcome(self.plan, self._first[job][1], result)
+        self.outcomes[job] = outcome(self.plan, self._of[job][0][1], result)
+        for planned, _ in self._of[job]:
+            row = self._row(planned)
+            if _ranked(row) and (self.best is None or _rank(row) < _rank(self.best)):
+                self.best = row
         if resumed:
             self.resumed.add(job)
         elif time.monotonic() >= self._due:
@@ -116,17 +127,21 @@ class Tables:
 
     def trial_rows(self) -> list[dict[str, Any]]:
         """One row a trial, in the order of the grid."""
-        return [_trial_row(planned, self.outcomes) for planned in self.plan.trials]
+        return [self._row(planned) for planned in self.plan.trials]
+
+    def _row(self, planned: PlannedTrial) -> dict[str, Any]:
+        marks = {key: self.head[key] for key in ("split", "leaky", "simulated")}
+        return {**_trial_row(planned, self.outcomes), **marks}
 
     def summary(self) -> dict[str, Any]:
         """What ``sweep.json`` holds."""
         rows = self.trial_rows()
         done = [row for row in rows if row["status"] == "done"]
-        best = sorted(done, key=lambda row: (-row["accuracy"], row["parameters"]))
-        chosen = max(done, key=lambda row: row["validation_macro_f1"] or 0.0, default=None)
+        best = sorted(filter(_ranked, rows), key=_rank)
+        chosen = max(best, key=lambda row: row["validation_macro_f1"] or 0.0, default=None)
         shown = self._shown(best)
         failed = [
-            {"run": job, **_words(*self._first[job]), "epochs": epochs, "why": why}
+            {"run": job, **_words(*self._of[job][0]), "epochs": epochs, "why": why}
             for job, found in self.outcomes.items()
             for epochs, why in found.failed.items()
         ]
@@ -193,7 +208,7 @@ class Tables:
         for job in sorted(self.outcomes):
             curve = self.outcomes[job].curve
             part = polars.DataFrame({name: curve[:, i] for i, name in enumerate(CURVE)}).fill_nan(None)
-            words = {"run": job, **_words(*self._first[job])}
+            words = {"run": job, **_words(*self._of[job][0])}
             parts.append(
                 part.with_columns(
                     epoch=polars.int_range(1, len(curve) + 1, eager=True, dtype=polars.Int64),
@@ -277,7 +292,16 @@ def _trial_row(planned: PlannedTrial, outcomes: Mapping[str, Outcome]) -> dict[s
     row["acr"] = None if accuracy is None else accuracy / math.log10(arch.parameters)
     row["seconds"] = sum(s.seconds for s in scored) if scored else None
     row["status"] = status
-    return {name: row[name] for name in _TRIAL_COLUMNS}
+    return {name: row[name] for name in _TRIAL_COLUMNS if name in row}
+
+
+def _ranked(row: Mapping[str, Any]) -> bool:
+    return row["status"] == "done" and row["accuracy"] is not None
+
+
+def _rank(row: Mapping[str, Any]) -> tuple[float, int]:
+    """The most accurate first; of equals the smallest."""
+    return -row["accuracy"], row["parameters"]
 
 
 def _words(planned: PlannedTrial, run: Run) -> dict[str, Any]:
@@ -296,7 +320,7 @@ def _slashed(filters: Sequence[int]) -> str:
 
 
 def _kind(polars: Any, kind: type[Any]) -> Any:
-    return {str: polars.String, int: polars.Int64, float: polars.Float64}[kind]
+    return {str: polars.String, int: polars.Int64, float: polars.Float64, bool: polars.Boolean}[kind]
 
 
 def _frame(polars: Any, rows: Sequence[Mapping[str, Any]], columns: Mapping[str, type[Any]]) -> Any:

@@ -33,7 +33,10 @@ JOURNAL = ("cache", "sweeps")
 
 
 class SweepProgress(NamedTuple):
-    """Where a sweep stands: ``share`` of its work; ``epoch`` of ``epochs`` in ``what``, 0: that training is done."""
+    """Where a sweep stands: ``share`` of its work; ``epoch`` of ``epochs`` in ``what``, 0: that training is done.
+
+    ``best`` is the row of the best trial that is complete.
+    """
 
     done: int
     trainings: int
@@ -42,6 +45,7 @@ class SweepProgress(NamedTuple):
     what: str
     epoch: int
     epochs: int
+    best: dict[str, Any] | None
 
 
 @dataclass(frozen=True)
@@ -71,23 +75,15 @@ class Sweep:
         return f"Sweep({self._said()}{first}; {self.out})"
 
     def _repr_html_(self) -> str:
-        head = (
-            "arch",
-            "filters",
-            "epochs",
-            "batch_asked",
-            "parameters",
-            "macs_per_step",
-            "accuracy",
-            "macro_f1",
-            "acr",
-        )
-        rows = "".join(
-            "<tr>" + "".join(f"<td>{f'{v:.3f}' if isinstance(v := row[k], float) else v}</td>" for k in head) + "</tr>"
-            for row in self.summary["best"]
-        )
+        mark = " (leaky)" if self.summary["leaky"] else ""
+        head = ("arch", "filters", "epochs", "batch_asked", "parameters", "macs_per_step")
+        scores = ("accuracy", "macro_f1", "acr")
+        title = [*head, *(name + mark for name in scores)]
+        rows = [[*(row[k] for k in head), *(f"{row[k]:.3f}" for k in scores)] for row in self.summary["best"]]
+        cells = "".join("<tr>" + "".join(f"<td>{value}</td>" for value in row) + "</tr>" for row in rows)
         return (
-            f"<table><caption>{self._said()}</caption><tr>{''.join(f'<th>{k}</th>' for k in head)}</tr>{rows}</table>"
+            f"<table><caption>{self._said()}</caption>"
+            f"<tr>{''.join(f'<th>{name}</th>' for name in title)}</tr>{cells}</table>"
         )
 
 
@@ -126,7 +122,7 @@ def sweep(
     place = Path(out) if out is not None else default_place(dataset, grid, spec)
     check_place(place, planned.id, replace=overwrite)
     tables = Tables(planned, place, head(dataset, planned))
-    teller = _Teller(planned, progress)
+    teller = _Teller(planned, tables, progress)
 
     def done(job: Job, result: Result, resumed: bool) -> None:
         tables.add(job.id, result, resumed)
@@ -221,12 +217,12 @@ def machine(threads: int) -> str:
 class _Teller:
     """Turns what jobs say into `SweepProgress`; the share counts multiply-accumulates, of running trainings too."""
 
-    def __init__(self, planned: Plan, progress: Callable[[SweepProgress], None] | None) -> None:
+    def __init__(self, planned: Plan, tables: Tables, progress: Callable[[SweepProgress], None] | None) -> None:
         self._macs = {job.id: planned.macs(job) for job in planned.jobs}
         self._all = sum(self._macs.values()) or 1
         self._finished = self._done = self._resumed = 0
         self._running: dict[str, float] = {}
-        self._progress = progress
+        self._tables, self._progress = tables, progress
 
     def done(self, job: Job, resumed: bool) -> None:
         self._done += 1
@@ -245,7 +241,8 @@ class _Teller:
         task: Task = job.task
         what = f"{task.arch.symbol} {'/'.join(map(str, task.arch.filters))} batch {task.spec.batch}"
         share = (self._finished + sum(self._running.values())) / self._all
-        self._progress(SweepProgress(self._done, len(self._macs), self._resumed, share, what, epoch, epochs))
+        at = (self._done, len(self._macs), self._resumed, share, what, epoch, epochs, self._tables.best)
+        self._progress(SweepProgress(*at))
 
 
 def preview(

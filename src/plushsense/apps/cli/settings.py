@@ -141,10 +141,10 @@ def sweep_shown() -> Callable[[Any], None]:
         fresh = at.share - before
         if fresh > 0 and not over:
             left = (now - began) / fresh * (1 - at.share)
-            text += f", {at.share:.0%} of the work, about "
-            text += f"{left / 3600:.1f} h left" if left > 5400 else f"{left / 60:.0f} min left" if left > 90 else (
-                f"{left:.0f} s left"
-            )  # fmt: skip
+            text += f", {at.share:.0%} of the work, about {_spelt(left)} left"
+        if at.best is not None:
+            marks = " (leaky)" * at.best["leaky"] + " (simulation)" * at.best["simulated"]
+            text += f", best {at.best['arch']} {at.best['filters']} {at.best['accuracy']:.3f}{marks}"
         if rewritten:
             what = f", {at.what} epoch {at.epoch} of {at.epochs}" if at.epoch else ""
             sys.stderr.write("\r\x1b[K" + text + what + ("\n" if over else ""))
@@ -153,3 +153,10 @@ def sweep_shown() -> Callable[[Any], None]:
             say(text)
 
     return show
+
+
+def _spelt(seconds: float) -> str:
+    """A duration as a person would say it."""
+    if seconds > 5400:
+        return f"{seconds / 3600:.1f} h"
+    return f"{seconds / 60:.0f} min" if seconds > 90 else f"{seconds:.0f} s"
