@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from plushsense.apps.estimator import PlushClassifier
     from plushsense.apps.reporting import write_report
     from plushsense.apps.retraining import forget
+    from plushsense.apps.sweeping import sweep
     from plushsense.core.gestures import GestureSet, load_gestures
     from plushsense.core.signal import Layout, load_layout
     from plushsense.dataset.backup import backup, check_backup, restore
@@ -48,6 +49,7 @@ _WHERE = {
     "simulate": "plushsense.apps.api",
     "write_report": "plushsense.apps.reporting",
     "forget": "plushsense.apps.retraining",
+    "sweep": "plushsense.apps.sweeping",
     "backup": "plushsense.dataset.backup",
     "check_backup": "plushsense.dataset.backup",
     "restore": "plushsense.dataset.backup",
@@ -85,6 +87,7 @@ __all__ = [
     "pseudonymise",
     "restore",
     "simulate",
+    "sweep",
     "train",
     "write_report",
 ]

@@ -12,6 +12,7 @@
     │   └── ConfigError         a setting, a flag, a configuration file
     ├── DeviceError             a toy that cannot be opened or went away
     ├── TrainingError           a training run that cannot start or go on
+    │   └── DivergedError       its loss is no longer a number: the same settings will end so again
     └── MissingExtraError       an optional package that is not installed
 
 Every message is one sentence for the person who reads it: what is wrong, where, what is accepted, what to do.
@@ -70,6 +71,10 @@ class DeviceError(PlushSenseError):
 
 class TrainingError(PlushSenseError):
     """A training run that cannot start or cannot go on."""
+
+
+class DivergedError(TrainingError):
+    """A training whose loss is no longer a number; the same settings end so on every machine."""
 
 
 class MissingExtraError(PlushSenseError):

@@ -132,7 +132,7 @@ def evaluate(
     asked = parse_split(split)
     folds = fold_windows(train_windows, score_windows, asked, seed)
     base = {"version": _VERSION, "key": dict(key or {}), "windows": _prints(train_windows, score_windows)}
-    jobs = [Job(job_id({**base, "fold": _fold_print(fold)}), fold) for fold in folds]
+    jobs = [Job(job_id({**base, "fold": fold_print(fold)}), fold) for fold in folds]
     told = _Teller(len(folds), progress)
     results = run_jobs(
         jobs,
@@ -225,18 +225,20 @@ def _context(windows: WindowSet) -> str:
 
 def _prints(train: WindowSet, score: WindowSet) -> list[str]:
     """The content of both sets, hashed: other windows are other jobs."""
-    first = _print(train)
-    return [first, first if score is train else _print(score)]
+    first = windows_print(train)
+    return [first, first if score is train else windows_print(score)]
 
 
-def _print(windows: WindowSet) -> str:
+def windows_print(windows: WindowSet) -> str:
+    """The content of a set, hashed."""
     digest = hashlib.sha256(repr((windows.x.shape, windows.labels, windows.recording_ids)).encode())
     for array in (windows.x, windows.y, windows.recording):
         digest.update(np.ascontiguousarray(array).data)
     return digest.hexdigest()
 
 
-def _fold_print(fold: WindowFold) -> str:
+def fold_print(fold: WindowFold) -> str:
+    """The windows of a fold, hashed."""
     digest = hashlib.sha256()
     for index in (fold.train, fold.validation, fold.test):
         digest.update(len(index).to_bytes(8, "little") + index.astype("<i8").tobytes())

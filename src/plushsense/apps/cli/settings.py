@@ -117,3 +117,46 @@ def folds_shown(what: str) -> Callable[[Any], None]:
             say(text)
 
     return show
+
+
+def sweep_shown() -> Callable[[Any], None]:
+    """Progress of a sweep, from `plushsense.apps.sweeping.SweepProgress`: time left by what was computed so far."""
+    import time
+
+    rewritten = sys.stderr.isatty()
+    began = last = time.monotonic()
+    before = 0.0
+
+    def show(at: Any) -> None:
+        nonlocal last, before
+        now, over = time.monotonic(), at.done == at.trainings
+        if at.done == at.resumed and not at.epoch:
+            # What was there already tells nothing of how fast it goes.
+            before = at.share
+        if not over and now - last < (0.2 if rewritten else 5.0):
+            return
+        last = now
+        text = f"sweep: {at.done} of {at.trainings} trainings"
+        text += f" ({at.resumed} from before)" if at.resumed else ""
+        fresh = at.share - before
+        if fresh > 0 and not over:
+            left = (now - began) / fresh * (1 - at.share)
+            text += f", {at.share:.0%} of the work, about {_spelt(left)} left"
+        if at.best is not None:
+            marks = " (leaky)" * at.best["leaky"] + " (simulation)" * at.best["simulated"]
+            text += f", best {at.best['arch']} {at.best['filters']} {at.best['accuracy']:.3f}{marks}"
+        if rewritten:
+            what = f", {at.what} epoch {at.epoch} of {at.epochs}" if at.epoch else ""
+            sys.stderr.write("\r\x1b[K" + text + what + ("\n" if over else ""))
+            sys.stderr.flush()
+        else:
+            say(text)
+
+    return show
+
+
+def _spelt(seconds: float) -> str:
+    """A duration as a person would say it."""
+    if seconds > 5400:
+        return f"{seconds / 3600:.1f} h"
+    return f"{seconds / 60:.0f} min" if seconds > 90 else f"{seconds:.0f} s"

@@ -1,0 +1,141 @@
+"""``plushsense sweep DATASET --grid paper|FILE``"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from plushsense.apps.cli.evaluate import figure
+from plushsense.apps.cli.output import emit, say, table
+from plushsense.apps.cli.settings import sweep_shown, warn
+
+# Keys of the grid that an option changes, each an attribute of the arguments.
+_CHANGES = (
+    "split", "architectures", "filters", "epochs", "batches", "padding", "norm", "context", "classes", "device",
+    "threads",
+)  # fmt: skip
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("dataset", metavar="DATASET", help="data set folder")
+    parser.add_argument("--grid", default="paper", metavar="GRID", help="paper (default, 468 trials), or a TOML file")
+    parser.add_argument(
+        "--split",
+        metavar="SPLIT",
+        help="leave-one-subject-out, by-subject:K, by-recording:K; leaky, as in the paper: windows:holdout, windows:K "
+        "(default: the grid's; paper windows:holdout)",
+    )
+    parser.add_argument(
+        "--out", metavar="DIR", help="folder for the tables and sweep.json (default: DATASET/evaluations/sweep-GRID)"
+    )
+    parser.add_argument("--force", action="store_true", help="replace a sweep of another grid or data in --out")
+    parser.add_argument(
+        "--workers", type=int, default=0, metavar="N", help="trainings at a time (default 0: one a processor)"
+    )
+    parser.add_argument("--threads", type=int, metavar="N", help="threads of a training, part of its identity (1)")
+    parser.add_argument(
+        "--cluster", metavar="ADDRESS", help="train on a Ray cluster instead (default: on this machine)"
+    )
+    parser.add_argument("--seeds", type=int, metavar="N", help="seeds of every trial, 0 to N - 1 (default: the grid's)")
+    parser.add_argument("--architectures", metavar="SPEC,…", help="only these networks (default: the grid's)")
+    parser.add_argument(
+        "--filters", metavar="SETS", help="only these filters: 4,6,8,8 or several sets, 4/6/8/8,8/12/16/16"
+    )
+    parser.add_argument("--epochs", metavar="N,…", help="only these numbers of epochs (default: the grid's)")
+    parser.add_argument("--batches", metavar="N,…", help="only these batches, windows or full (default: the grid's)")
+    parser.add_argument("--padding", help="stream, causal or mirror (default: the grid's; paper mirror)")
+    parser.add_argument("--norm", help="batch or layer (default: the grid's; paper batch)")
+    parser.add_argument("--context", help="stream or loop (default: the grid's; paper loop)")
+    parser.add_argument("--classes", metavar="LABELS", help="all, shared, or labels (default: the grid's; paper all)")
+    parser.add_argument("--device", help="auto, cpu or cuda (default: the grid's; paper auto)")
+    parser.add_argument(
+        "--dry-run", action="store_true", help="say what would be trained and what is wrong; no training"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    from plushsense.apps.sweeping import sweep
+
+    changes: dict[str, Any] = {key: getattr(args, key) for key in _CHANGES}
+    if args.seeds is not None:
+        # None at all is a problem of the grid, said with the others.
+        changes["seeds"] = tuple(range(args.seeds))
+    if args.dry_run:
+        return _dry_run(args, changes)
+    found = sweep(
+        args.dataset,
+        args.grid,
+        out=None if args.out is None else Path(args.out),
+        overwrite=args.force,
+        workers=args.workers,
+        cluster=args.cluster,
+        progress=sweep_shown(),
+        warn=warn,
+        **changes,
+    )
+    shown = found.to_dict()
+    say(f"written: {found.out}")
+    emit(args, shown, lines(shown))
+    return 0
+
+
+def _dry_run(args: argparse.Namespace, changes: dict[str, Any]) -> int:
+    from plushsense.apps.sweeping import preview
+
+    found = preview(args.dataset, args.grid, warn=warn, **changes)
+    text = [f"- {line}" for line in found["problems"]]
+    if not text:
+        text = [
+            f"{found['trials']} trials in {found['trainings']} trainings of {found['folds']} folds and "
+            f"{found['seeds']} seeds together, {found['held']} of them done before",
+            f"about {found['macs']:.2e} multiply-accumulates; trial by trial {found['macs_one_by_one']:.2e}",
+            f"memory of the windows: {found['windows_mb']:.0f} MB in each process",
+            "",
+            table(("network", "share of the cost"), [(arch, f"{share:.1%}") for arch, share in found["cost"].items()]),
+        ]
+    emit(args, found, text)
+    return 1 if found["problems"] else 0
+
+
+def lines(s: dict[str, Any]) -> list[str]:
+    """The best trials as text."""
+    out = []
+    if s["simulated"]:
+        out.append("SIMULATION: these scores are of the virtual toy and say nothing about a real one.")
+    if s["leaky"]:
+        out.append("LEAKY: windows of one recording stand on both sides of this split; the scores flatter.")
+    out.append(
+        f"grid {s['name']}, split {s['split']}, context {s['context']}: {s['done']} of {s['trials']} trials done "
+        f"({s['resumed']} from before)\n"
+    )
+    mark = " (leaky)" if s["leaky"] else ""
+    head = (
+        "network", "filters", "epochs", "batch", "parameters", "MAC/step", f"accuracy{mark}", f"macro-F1{mark}",
+        f"ACR{mark}",
+    )  # fmt: skip
+    out.append(table(head, [_row(row) for row in s["best"]]))
+    picked = s["best_on_validation"]
+    if picked is not None:
+        out.append("")
+        out.append(
+            f"The best of {s['done']} on the test windows is partly luck. Chosen by validation macro-F1 it is "
+            f"{picked['arch']} {picked['filters']}, {picked['epochs']} epochs, batch {picked['batch_asked']}: accuracy "
+            f"{figure(picked['accuracy'])}, macro-F1 {figure(picked['macro_f1'])}{mark}."
+        )
+    for failed in s["failed"]:
+        out.append(f"failed: {failed['arch']} {failed['filters']}, {failed['epochs']} epochs: {failed['why']}")
+    return out
+
+
+def _row(row: dict[str, Any]) -> tuple[object, ...]:
+    scores = (figure(row[key]) for key in ("accuracy", "macro_f1", "acr"))
+    return (
+        row["arch"],
+        row["filters"],
+        row["epochs"],
+        row["batch_asked"],
+        row["parameters"],
+        row["macs_per_step"],
+        *scores,
+    )

@@ -1,0 +1,273 @@
+"""Grids: networks × epochs × batches to train and compare, checked as a whole before anything runs.
+
+A training contains the shorter ones: rate, order and turns of an epoch follow from its number and the seed, not from
+how many epochs are to come. Only where validation decides when to stop (``patience``) every number of epochs is a
+training of its own.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from typing import Any
+
+from plushsense.core.errors import ArchError, BadInput, nearest
+from plushsense.core.signal import Layout
+from plushsense.models.arch import NORMS, PADDINGS, PAPER_ARCHITECTURES, PAPER_FILTERS, Arch
+from plushsense.models.symbol import parse_symbol
+from plushsense.scoring.splits import parse_split
+from plushsense.training.spec import DEVICES, PRESETS, TrainSpec
+from plushsense.windows.cut import CONTEXTS, WindowSpec
+
+FULL = "full"
+# A decision every 50 ms, as everywhere.
+_STEP_S = 0.05
+# Settings of the preset that a grid may change; None keeps the preset's.
+_OF_TRAINING = ("learning_rate", "halve_every", "patience", "turn_deg")
+
+
+@dataclass(frozen=True)
+class GridSpec:
+    """What is tried. Nothing is checked when it is made: `problems` finds everything at once.
+
+    ``filters`` are sets of four, of which a network takes as many as it has layers. ``seeds`` are those of the
+    trainings; the split has its own, so that all trainings of a grid see the same folds. ``classes`` is "all",
+    "shared" or labels joined by commas. ``threads`` belongs to a training and to its id: another number sums in
+    another order.
+    """
+
+    name: str = "grid"
+    architectures: tuple[str, ...] = PAPER_ARCHITECTURES
+    filters: tuple[tuple[int, ...], ...] = PAPER_FILTERS
+    epochs: tuple[int, ...] = (100, 250, 1000)
+    batches: tuple[int | str, ...] = (64, 256, FULL)
+    seeds: tuple[int, ...] = (0,)
+    split: str = "windows:holdout"
+    split_seed: int = 0
+    preset: str = "search"
+    padding: str = "mirror"
+    norm: str = "batch"
+    context: str = "loop"
+    classes: str = "all"
+    window_s: float = 2.5
+    step_s: float = 0.5
+    learning_rate: float | None = None
+    halve_every: int | None = None
+    patience: int | None = None
+    turn_deg: float | None = None
+    device: str = "auto"
+    threads: int = 1
+
+    @property
+    def training(self) -> TrainSpec:
+        """How every network is trained; epochs, batch and seed are the trial's."""
+        changes = {key: getattr(self, key) for key in _OF_TRAINING if getattr(self, key) is not None}
+        return replace(PRESETS[self.preset], device=self.device, threads=self.threads, **changes)
+
+    @property
+    def windows(self) -> WindowSpec:
+        """How windows are cut."""
+        return WindowSpec(window_s=self.window_s, step_s=self.step_s, context=self.context)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, ready for JSON."""
+        return asdict(self)
+
+
+# Paper, section 3.6: 13 architectures × 4 filter sets × 3 epochs × 3 batches = 468 trials.
+GRIDS: dict[str, GridSpec] = {"paper": GridSpec(name="paper")}
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One network, trained for ``epochs`` in batches of ``batch`` windows ("full": all)."""
+
+    arch: Arch
+    filter_set: tuple[int, ...]
+    epochs: int
+    batch: int | str
+
+
+@dataclass(frozen=True)
+class Training:
+    """What is trained in one go: trials that differ in their epochs only, the shortest first."""
+
+    trials: tuple[Trial, ...]
+
+    @property
+    def epochs(self) -> tuple[int, ...]:
+        """The epochs after which it is scored."""
+        return tuple(trial.epochs for trial in self.trials)
+
+
+def trainings(grid: GridSpec, layout: Layout, classes: int) -> list[Training]:
+    """All trials of a grid without `problems`, as the trainings that contain them."""
+    found = []
+    nested = grid.training.patience is None
+    for symbol in grid.architectures:
+        for filters in grid.filters:
+            arch = _network(grid, symbol, filters, layout, classes)
+            for batch in grid.batches:
+                trials = tuple(Trial(arch, filters, epochs, batch) for epochs in grid.epochs)
+                found += [Training(trials)] if nested else [Training((trial,)) for trial in trials]
+    return found
+
+
+def _network(grid: GridSpec, symbol: str, filters: Sequence[int], layout: Layout, classes: int) -> Arch:
+    return Arch.parse(
+        symbol,
+        filters,
+        channels=layout.n_inputs,
+        classes=classes,
+        padding=grid.padding,
+        norm=grid.norm,
+        window=layout.samples(grid.window_s),
+        step=layout.samples(_STEP_S),
+    )
+
+
+def problems(
+    grid: GridSpec, layout: Layout | None = None, past: int | None = None, windows: int | None = None
+) -> list[str]:
+    """Everything that keeps a grid from being trained, one sentence each; nothing where all is well.
+
+    Args:
+        layout: of the toy, for the length of a window in samples.
+        past: samples up to the end of a recording that its stream holds, for at least half of the recordings.
+        windows: the fewest that any fold trains on.
+    """
+    found = _of_settings(grid)
+    shapes: dict[str, int] = {}
+    for symbol in grid.architectures:
+        try:
+            shapes[symbol] = len(parse_symbol(symbol))
+        except ArchError as cause:
+            found.append(first_line(cause))
+    for filters in grid.filters:
+        if not filters or min(filters) < 1:
+            found.append(f"The filters {_slashed(filters)} cannot be used: accepted are whole numbers from 1.")
+            continue
+        for symbol, layers in shapes.items():
+            if len(filters) < layers:
+                found.append(
+                    f"{symbol} has {layers} layers, but the filters {_slashed(filters)} are only {len(filters)}: "
+                    "give one a layer."
+                )
+    found += _twice(grid)
+    for epochs in grid.epochs:
+        if epochs < 1:
+            found.append(f"Epochs {epochs} cannot be trained: accepted are whole numbers from 1.")
+    if list(grid.epochs) != sorted(grid.epochs):
+        found.append(f"The epochs {_listed(grid.epochs)} do not ascend: give {_listed(sorted(set(grid.epochs)))}.")
+    for batch in grid.batches:
+        if isinstance(batch, int) and batch < 2:
+            found.append(f"A batch of {batch} cannot be used: accepted are whole numbers from 2 and '{FULL}'.")
+        elif isinstance(batch, int) and windows is not None and batch > windows:
+            found.append(
+                f"A batch of {batch} is larger than the {windows} windows that a fold of {grid.split} trains on: "
+                f"give at most {windows}, or '{FULL}'."
+            )
+    found += [f"Seed {seed} cannot be used: accepted are whole numbers from 0." for seed in grid.seeds if seed < 0]
+    if layout is not None:
+        found += [line for symbol in shapes for line in _too_long(grid, symbol, layout, past)]
+    return list(dict.fromkeys(found))
+
+
+def _of_settings(grid: GridSpec) -> list[str]:
+    found = []
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", grid.name):
+        found.append(f"The name '{grid.name}' cannot be a folder's: accepted are letters, digits and . _ - between.")
+    for key in ("architectures", "filters", "epochs", "batches", "seeds"):
+        if not getattr(grid, key):
+            found.append(f"The grid has no {key}: give at least one.")
+    for key, known in (
+        ("preset", tuple(PRESETS)),
+        ("padding", PADDINGS),
+        ("norm", NORMS),
+        ("context", CONTEXTS),
+        ("device", DEVICES),
+    ):
+        value = getattr(grid, key)
+        if value not in known:
+            found.append(f"Unknown {key} '{value}': accepted are {', '.join(known)}.{nearest(value, known)}")
+    for key in (*_OF_TRAINING, "threads"):
+        if getattr(grid, key) is not None:
+            found += _refused(partial(replace, TrainSpec(), **{key: getattr(grid, key)}))
+    found += _refused(lambda: WindowSpec(window_s=grid.window_s, step_s=grid.step_s))
+    found += _refused(lambda: parse_split(grid.split))
+    if grid.split_seed < 0:
+        found.append(f"split_seed is {grid.split_seed}: accepted are whole numbers from 0.")
+    return found
+
+
+def _refused(make: Callable[[], object]) -> list[str]:
+    try:
+        make()
+    except BadInput as cause:
+        return [first_line(cause)]
+    return []
+
+
+def _twice(grid: GridSpec) -> list[str]:
+    """Trials that are in the grid more than once: values that repeat, and names of one network."""
+    found = []
+    for key in ("epochs", "batches", "seeds"):
+        values = getattr(grid, key)
+        again = [value for value in dict.fromkeys(values) if values.count(value) > 1]
+        found += [f"The grid has {value} among its {key} {values.count(value)} times: give it once." for value in again]
+    seen: dict[object, str] = {}
+    for symbol in grid.architectures:
+        for filters in grid.filters:
+            try:
+                shape = parse_symbol(symbol)
+            except ArchError:
+                continue
+            network, said = (shape, filters[: len(shape)]), f"{symbol} with {_slashed(filters)}"
+            if network in seen:
+                other = f"as {seen[network]}" if seen[network] != said else "twice"
+                found.append(f"{said} is the same network {other}: leave one out.")
+            seen.setdefault(network, said)
+    return found
+
+
+def _too_long(grid: GridSpec, symbol: str, layout: Layout, past: int | None) -> list[str]:
+    """Whether a network reads more than a window and its real past hold.
+
+    Without a real past a receptive field may reach beyond the window by less than its widest dilation, as the paper's
+    126d2 does: that much is rounding.
+    """
+    try:
+        arch = _network(grid, symbol, (1,) * 4, layout, 2)
+    except BadInput as cause:
+        # Of padding, norm or window, which are said once already.
+        return [] if _of_settings(grid) else [first_line(cause)]
+    field, window = arch.receptive_field, arch.window
+    if grid.padding == "stream" and grid.context == "stream":
+        if past is None or arch.span <= max(past, window):
+            return []
+        return [
+            f"{symbol} sees {arch.span} samples for a decision (receptive field {field}), but half of the recordings "
+            f"have fewer than {past + 1} samples of real past up to their end: take shorter kernels."
+        ]
+    if field - window < max(layer.dilation for layer in arch.layers):
+        return []
+    real = "without padding 'stream' and context 'stream' there is no more"
+    return [
+        f"{symbol} has a receptive field of {field} samples, longer than the window of {window} ({real}): take "
+        f"shorter kernels, or a window_s of {field / layout.rate_hz:g}."
+    ]
+
+
+def first_line(cause: Exception) -> str:
+    """A refusal without the picture below it."""
+    return str(cause).splitlines()[0]
+
+
+def _slashed(filters: Iterable[int]) -> str:
+    return "/".join(map(str, filters)) or "(none)"
+
+
+def _listed(values: Iterable[object]) -> str:
+    return ", ".join(map(str, values))
