@@ -67,3 +67,11 @@ def publish_tools() -> None:
     for module in ("mlcroissant", "frictionless", "rocrate", "datacite", "sklearn"):
         if importlib.util.find_spec(module) is None:
             missing("publish", f"{module} is not installed")
+
+
+@pytest.fixture(scope="session")
+def mlflow_here() -> None:
+    """MLflow with a database (extra mlflow)."""
+    for module in ("mlflow", "sqlalchemy", "alembic"):
+        if importlib.util.find_spec(module) is None:
+            missing("mlflow", f"{module} is not installed")

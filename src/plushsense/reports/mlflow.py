@@ -71,7 +71,7 @@ def export_trials(sweep: Sweep, where: str | os.PathLike[str]) -> Exported:
             run = there.get(str(trial["trial"]), ("", ""))[0]
             _log(mlflow, client, experiment, run, sweep, trial)
     except (mlflow.exceptions.MlflowException, OSError) as cause:
-        said = str(cause).splitlines()[0].rstrip(".") if str(cause) else type(cause).__name__
+        said = str(cause).splitlines()[0].split(". ")[0].rstrip(".") if str(cause) else type(cause).__name__
         raise ConfigError(
             f"MLflow refuses '{where}' ({said}): give a folder, or a URI such as sqlite:///x.db."
         ) from None

@@ -29,9 +29,12 @@ class Point:
     label: str
 
 
-def place_labels(figure: Figure, axes: Axes, points: Sequence[Point], *, size: float = 7.5) -> None:
+def place_labels(
+    figure: Figure, axes: Axes, points: Sequence[Point], *, avoid: Sequence[Box] = (), size: float = 7.5
+) -> None:
     """Write the labels beside their points, the nearest free place first; a far one gets a thin line.
 
+    ``avoid`` are straight lines in data coordinates (left, bottom, right, top) that no label may cover.
     The figure is laid out first, as places are known only then. A label that finds no free place is left out:
     the table beside the figure has it.
     """
@@ -40,6 +43,9 @@ def place_labels(figure: Figure, axes: Axes, points: Sequence[Point], *, size: f
     at = axes.transData.transform([(p.x, p.y) for p in points]) if points else np.empty((0, 2))
     around = _POINT_PT * pixel
     taken: list[Box] = [(x - around, y - around, x + around, y + around) for x, y in at]
+    for left, bottom, right, top in avoid:
+        (x0, y0), (x1, y1) = axes.transData.transform([(left, bottom), (right, top)])
+        taken.append((x0 - pixel, y0 - pixel, x1 + pixel, y1 + pixel))
     inside = axes.get_window_extent()
     for (x, y), point in zip(at, points, strict=True):
         if not point.label:
@@ -52,7 +58,7 @@ def place_labels(figure: Figure, axes: Axes, points: Sequence[Point], *, size: f
             fontsize=size,
             ha="center",
             va="center",
-            linespacing=1.0,
+            linespacing=1.2,
             zorder=6,
             parse_math=False,
             bbox={"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.75},

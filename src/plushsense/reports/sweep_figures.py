@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -220,9 +221,11 @@ def pareto(sweep: Sweep, cost: str) -> Figure:
     )
     named = sorted(edge, key=lambda r: -r["macro_f1"])[:NAMED]
     others = [Point(r["value"], r["macro_f1"], "") for r in rows if r not in named]
-    place_labels(
-        figure, axes, [Point(r["value"], r["macro_f1"], f"{r['arch']}\n{r['filters']}") for r in named] + others
-    )
+    labels = [Point(r["value"], r["macro_f1"], f"{r['arch']}\n{r['filters']}") for r in named]
+    corners = [*steps, (right, steps[-1][1])]
+    flat = [(x, y, after, y) for (x, y), (after, _) in pairwise(corners)]
+    upright = [(after, y, after, high) for (_, y), (after, high) in pairwise(corners)]
+    place_labels(figure, axes, labels + others, avoid=flat + upright)
     return figure
 
 
@@ -236,7 +239,10 @@ def acr_bars(sweep: Sweep, top: int = 15) -> Figure:
     axes.barh(at, values, 0.62, color=MAX)
     for y, (value, row) in enumerate(zip(values, rows, strict=True)):
         said = f"{value:.1f}   accuracy {100 * row['accuracy']:.1f} %, {count(row['parameters'])} parameters"
-        axes.text(0.15, y, said, va="center", fontsize=7.5, color="white" if value > 9 else "black")
+        # Inside a bar where it has the room.
+        inside = value > 0.5 * max(values)
+        at_x, ink = (0.01 * max(values), "white") if inside else (value + 0.01 * max(values), "black")
+        axes.text(at_x, y, said, va="center", fontsize=7.5, color=ink)
     axes.set_yticks(at, [f"{r['arch']}  {r['filters']}" for r in rows], parse_math=False)
     axes.tick_params(labelsize=8)
     axes.set_ylim(len(rows) - 0.4, -0.6)

@@ -92,8 +92,9 @@ def _table3_words(met: int, near: int, off: Sequence[str], other: bool) -> list[
     if not total:
         return ["None of these networks is in the paper's Table 3."]
     words = [
-        f"Of {total} cells that the paper prints, {met} meet our count to the printed digits (rounded or cut off) and "
-        f"{near} more within 4 %." + (f" Not: {'; '.join(off)}." if off else "")
+        f"Of {total} cells that the paper prints, {met} meet our count to the printed digits (rounded or cut off)"
+        + (f", {near} more within 4\N{NO-BREAK SPACE}%" if near else "")
+        + (f". Not: {'; '.join(off)}." if off else ".")
     ]
     arch, filters = TABLE3_MISPRINT
     if any(said.startswith(f"{arch} at {'/'.join(map(str, filters))}") for said in off):
