@@ -259,7 +259,7 @@ def test_every_figure_says_what_it_is_of(tmp_path):
     drawn = [d.figure for section in sections_of(sweep) for d in section.drawings]
     assert len(drawn) >= 8
     for figure in drawn:
-        said = figure.get_supxlabel()
+        said = figure.get_supxlabel().replace("\n", " ")
         assert "LEAKY" in said and "SIMULATION" in said and "MADE-UP" in said and "one seed, no spread" in said
         assert f"of {sweep.total} trials done" in said
 
@@ -332,3 +332,22 @@ def test_a_folder_that_is_no_sweep_is_one_sentence(tmp_path):
     (folder / "sweep.json").write_text("{")
     with pytest.raises(BadInput, match="is not a sweep"):
         read_sweep(folder)
+
+
+@pytest.mark.parametrize(
+    "dataset", ["short", "a data set with a long name, which somebody gave it who likes long names"]
+)
+def test_nothing_is_cut_off_in_a_small_figure(tmp_path, dataset):
+    sweep = read_sweep(make_sweep(tmp_path / "S", **ONE, simulated=True, dataset=dataset))
+    for section in sections_of(sweep):
+        for drawing in section.drawings:
+            figure = drawing.figure
+            figure.draw_without_rendering()
+            whole = figure.bbox
+            named = [a for axes in figure.axes for a in (axes.title, axes.xaxis.label, axes.yaxis.label)]
+            others = [t for t in figure.texts if t.get_text()]
+            assert others, "what the scores are of"
+            for text in [*others, *(t for t in named if t.get_text())]:
+                box = text.get_window_extent()
+                assert whole.x0 - 1 <= box.x0 and box.x1 <= whole.x1 + 1, (drawing.name, text.get_text())
+                assert whole.y0 - 1 <= box.y0 and box.y1 <= whole.y1 + 1, (drawing.name, text.get_text())

@@ -122,12 +122,13 @@ def _log(mlflow: Any, client: Any, experiment: str, run: str, sweep: Sweep, tria
     }
     if not run:
         name = f"{trial['arch']} {trial['filters']} e{trial['epochs']} b{trial['batch_asked']}{marks}"
-        made = client.create_run(experiment, run_name=name, tags={key: str(value) for key, value in tags.items()})
+        made = client.create_run(experiment, run_name=name, tags={TRIAL: str(trial["trial"])})
         run = made.info.run_id
     now = int(time.time() * 1000)
     client.log_batch(
         run,
         metrics=[entities.Metric(key, float(trial[key]), now, 0) for key in _METRICS if finite(trial.get(key))],
         params=[entities.Param(key, str(value)) for key, value in params.items() if value is not None],
+        tags=[entities.RunTag(key, str(value)) for key, value in tags.items()],
     )
     client.set_terminated(run, status="FINISHED")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -44,6 +45,8 @@ CLASSES = (
 _STYLES = ("-", "--", ":", "-.")
 BARS = 30
 """Architectures that a figure of bars shows, the best; more could not be read."""
+_LETTERS_AN_INCH = 13
+_NARROWEST_IN = 5.2
 NAMED = 14
 """Points of a front that are named."""
 
@@ -72,7 +75,8 @@ def _figure(sweep: Sweep, width: float, height: float, title: str) -> Figure:
 def _say_below(figure: Figure, sweep: Sweep) -> None:
     warned = sweep.leaky or sweep.simulated
     colour, weight = ("#b3261e", "bold") if warned else ("#57606a", "normal")
-    said = figure.supxlabel(about(sweep), fontsize=7.5, color=colour, fontweight=weight)
+    lines = textwrap.fill(about(sweep), round(_LETTERS_AN_INCH * figure.get_figwidth()), break_on_hyphens=False)
+    said = figure.supxlabel(lines, fontsize=7.5, color=colour, fontweight=weight)
     said.set_parse_math(False)
 
 
@@ -137,7 +141,10 @@ def _accuracy_bars(axes: Axes, rows: Sequence[Row], over: str) -> None:
     )
     axes.barh(at - 0.2, high, 0.38, color=MAX, label="highest")
     axes.barh(at + 0.2, mean, 0.38, color=MEAN, edgecolor=MAX, linewidth=0.6, label=f"mean over {over} ± sd")
-    axes.errorbar(mean, at + 0.2, xerr=np.nan_to_num(sd), fmt="none", ecolor="#333333", elinewidth=0.9, capsize=1.8)
+    some = sd > 0
+    if some.any():
+        rows_at = at[some] + 0.2
+        axes.errorbar(mean[some], rows_at, xerr=sd[some], fmt="none", ecolor="#333333", elinewidth=0.9, capsize=1.8)
     for y, value in enumerate(high):
         if np.isfinite(value):
             axes.text(1.2, y - 0.19, f"{value:.1f}", va="center", fontsize=7.5, color="white")
@@ -314,7 +321,8 @@ def confusion(sweep: Sweep, trial: Row) -> Figure | None:
     order = affect_order(sweep.affects)
     labels, affects = [sweep.labels[i] for i in order], [sweep.affects[i] for i in order]
     table = np.asarray(counts)[np.ix_(order, order)]
-    figure = figures.confusion(labels, table, title=f"Confusions of {name_of(trial)}")
+    figure = figures.confusion(labels, table, title=f"Confusions of {name_of(trial).replace(', ', chr(10), 1)}")
+    figure.set_figwidth(max(figure.get_figwidth(), _NARROWEST_IN))
     axes = figure.axes[0]
     rectangle = need("matplotlib.patches", "reports").Rectangle
     for affect in dict.fromkeys(affects):
