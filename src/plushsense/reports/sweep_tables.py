@@ -99,7 +99,8 @@ def _table3_words(met: int, near: int, off: Sequence[str], other: bool) -> list[
     arch, filters = TABLE3_MISPRINT
     if any(said.startswith(f"{arch} at {'/'.join(map(str, filters))}") for said in off):
         words.append(
-            f"The cell of {arch} looks like a misprint: its other three sizes agree, and no way of counting gives it."
+            f"The cell of {arch} looks like a misprint: the paper's other three sizes of it agree with our count "
+            "within 1 %."
         )
     if other:
         words.append(
