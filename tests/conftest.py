@@ -77,3 +77,11 @@ def cluster_possible() -> None:
     if not Path("/dev/shm").is_dir():
         missing("cluster", "several nodes of a Ray cluster on one machine are tested on Linux only")
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+
+
+@pytest.fixture(scope="session")
+def mlflow_here() -> None:
+    """MLflow with a database (extra mlflow)."""
+    for module in ("mlflow", "sqlalchemy", "alembic"):
+        if importlib.util.find_spec(module) is None:
+            missing("mlflow", f"{module} is not installed")

@@ -151,6 +151,53 @@ def write_report(
     )
 
 
+def is_sweep(folder: str | os.PathLike[str]) -> bool:
+    """Whether this is the results folder of a sweep."""
+    from plushsense.reports.sweep_results import HEAD
+
+    return (Path(folder) / HEAD).is_file()
+
+
+def write_sweep_report(
+    folder: str | os.PathLike[str],
+    page: str | os.PathLike[str] | None = None,
+    *,
+    title: str | None = None,
+    mlflow: str | os.PathLike[str] | None = None,
+) -> dict[str, Any]:
+    """The page of a sweep with its tables and figures as files, and on wish its finished trials in MLflow.
+
+    Args:
+        folder: what ``plushsense sweep`` wrote; it may still be filling.
+        page: the .html file (default: ``report.html`` in the folder); its files go into a folder beside it.
+        mlflow: a folder or a tracking URI; trials that are there already are not logged again.
+
+    Returns:
+        ``report``, ``files`` (the folder), ``trials``, ``done``, ``mlflow`` ({uri, new, before} or None), and
+        ``said``, the same in words.
+    """
+    from plushsense.reports.sweep import write_sweep_report as write_html
+
+    made = write_html(Path(folder), None if page is None else Path(page), title=title)
+    said = [f"{len(made.files)} tables and figures in {made.folder}"]
+    exported = None
+    if mlflow is not None:
+        from plushsense.reports.mlflow import export_trials
+        from plushsense.reports.sweep_results import read_sweep
+
+        there = export_trials(read_sweep(Path(folder)), mlflow)
+        exported = {"uri": there.uri, "experiment": there.experiment, "new": there.new, "before": there.before}
+        said.append(f"MLflow: {there.new} trials logged, {there.before} were there already ({there.uri})")
+    return {
+        "report": str(made.page),
+        "files": str(made.folder),
+        "trials": made.trials,
+        "done": made.done,
+        "mlflow": exported,
+        "said": said,
+    }
+
+
 def _evaluation_table(given: Evaluation | Mapping[str, Any] | str | os.PathLike[str]) -> dict[str, Any]:
     if isinstance(given, Evaluation):
         return given.to_dict()

@@ -79,13 +79,14 @@ def confusion(labels: Sequence[str], counts: Any, *, title: str = "") -> Figure:
     return figure
 
 
-def training_curves(histories: Sequence[Sequence[Mapping[str, Any]]], *, title: str = "") -> Figure:
+def training_curves(histories: Sequence[Sequence[Mapping[str, Any]]], *, title: str = "", of: str = "folds") -> Figure:
     """Loss and accuracy by epoch: a thin line a fold, a thick one for the mean of the folds still training.
 
     Args:
         histories: one list of epochs a fold; an epoch holds epoch, train_loss, train_accuracy,
             validation_loss, validation_accuracy (any may be missing or None).
         title: written above; may be empty.
+        of: what a history is one of, for the legend.
     """
     figure = _figure(9.2, 3.4)
     left, right = figure.subplots(1, 2)
@@ -99,7 +100,7 @@ def training_curves(histories: Sequence[Sequence[Mapping[str, Any]]], *, title: 
                 axes.plot(epochs, values, color=colour, linewidth=0.5, alpha=0.3)
             if lines:
                 epochs, mean = _mean(lines)
-                said = f"{name}, mean of {len(lines)} folds" if len(lines) > 1 else name
+                said = f"{name}, mean of {len(lines)} {of}" if len(lines) > 1 else name
                 axes.plot(epochs, mean, style, color=colour, linewidth=2.0, label=said)
         axes.set_xlabel("Epoch")
         axes.set_ylabel(label)

@@ -193,6 +193,16 @@ def spread_words(evaluation: Mapping[str, Any]) -> str:
     return words
 
 
+def over_words(trials: Sequence[Mapping[str, Any]]) -> str:
+    """Over how many seeds and folds the scores of a sweep's trials are, and what their spread is of."""
+    seeds, folds = (max((int(t.get(key) or 1) for t in trials), default=1) for key in ("seeds", "folds"))
+    if seeds * folds == 1:
+        return "one seed, no spread"
+    if seeds == 1:
+        return f"one seed, mean of {folds} folds"
+    return f"mean of {seeds} seeds" + (f" × {folds} folds" if folds > 1 else "")
+
+
 def simulated(evaluation: Mapping[str, Any], page: bool) -> bool:
     """Whether an evaluation's scores are of a simulation; one that does not say is as its ``page``'s data set."""
     for table in (evaluation, evaluation.get("dataset")):

@@ -35,7 +35,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "train": ("train", "train one network and save it as a bundle"),
     "evaluate": ("evaluate", "how good it is, on people it never met"),
     "sweep": ("sweep", "train and compare every network of a grid, and go on after whatever stopped it"),
-    "report": ("report", "one HTML page from evaluations and bundles"),
+    "report": ("report", "one HTML page from evaluations and bundles, or of a sweep"),
     "live": ("live", "read a toy and say what it feels, 20 times a second"),
     "toy": ("toy", "a virtual toy that speaks the wire format over a pty or TCP"),
     "simulate": ("simulate", "recordings of virtual people, as the authors' recorder would leave them"),
