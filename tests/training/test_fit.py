@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +12,9 @@ import pytest
 from plushsense.core.errors import TrainingError
 from plushsense.models.arch import Arch
 from plushsense.models.reference import Network
+from plushsense.runs.journal import Journal
 from plushsense.training.spec import TrainSpec
+from plushsense.training.state import FitState
 from plushsense.windows.cut import WindowSet
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed (extra train)")
@@ -147,3 +150,22 @@ def test_a_long_training_passes_through_the_end_of_a_short_one(made: Make) -> No
     for name, values in short.weights.items():
         assert np.array_equal(values, long.kept[2][name])
         assert np.array_equal(long.weights[name], long.kept[4][name])
+
+
+@pytest.mark.parametrize("padding", ["stream", "causal"])
+def test_a_training_goes_on_as_if_it_had_never_stopped(made: Make, tmp_path: Path, padding: str) -> None:
+    spec = replace(SPEC, epochs=7, halve_every=2, patience=None, turn_deg=20.0)
+    train = replace(made(50), vectors=())
+    whole = fit(train, made(20, seed=4), arch(padding=padding), spec, keep=(3, 5))
+    short = fit(train, made(20, seed=4), arch(padding=padding), replace(spec, epochs=3))
+    journal = Journal(tmp_path)
+    journal.save("short", short.state.to_arrays())  # type: ignore[union-attr]
+    state = FitState.from_arrays(journal.load("short"))
+    assert state.epoch == 3
+    went_on = fit(train, made(20, seed=4), arch(padding=padding), spec, keep=(3, 5), start=state)
+    assert went_on.history == whole.history
+    assert sorted(went_on.kept) == [5] and sorted(whole.kept) == [3, 5]
+    for name, values in whole.weights.items():
+        assert np.array_equal(values, went_on.weights[name])
+    with pytest.raises(TrainingError, match="leave patience out"):
+        fit(train, None, arch(padding=padding), replace(spec, patience=3), start=state)

@@ -17,6 +17,7 @@ from plushsense.models.net import Net
 from plushsense.training.augment import Turn
 from plushsense.training.engine import Engine, Windows, engine, is_fast, slices
 from plushsense.training.spec import TrainSpec
+from plushsense.training.state import FitState
 from plushsense.windows.cut import WindowSet
 from plushsense.windows.features import Scaler
 
@@ -35,7 +36,7 @@ class Fitted:
     ``weights`` as ``models/reference`` takes them; ``history`` one row an epoch: epoch (from 1), train_loss,
     train_accuracy (means over the epoch's batches, as they were trained on), validation_loss, validation_accuracy
     (None without validation), learning_rate; ``best_epoch`` the one whose weights these are; ``kept`` the weights
-    after the epochs that were asked for.
+    after the epochs that were asked for; ``state`` where it can go on from, without early stopping.
     """
 
     weights: dict[str, NDArray[np.float32]]
@@ -44,6 +45,7 @@ class Fitted:
     best_epoch: int
     seconds: float
     kept: dict[int, dict[str, NDArray[np.float32]]] = field(default_factory=dict)
+    state: FitState | None = None
 
 
 def fit(
@@ -53,11 +55,13 @@ def fit(
     spec: TrainSpec | None = None,
     progress: Progress | None = None,
     keep: Collection[int] = (),
+    start: FitState | None = None,
 ) -> Fitted:
     """Train ``arch`` on ``train``; ``validation`` decides when to stop. The same seed gives the same weights.
 
     ``keep``: epochs after which the weights are kept as well. At a constant rate a long training passes through the
-    end of every shorter one.
+    end of every shorter one. ``start``: go on from there, with the same windows and settings but more epochs; what
+    comes out is to the last bit what a training without a stop gives.
 
     Raises:
         TrainingError: when the windows do not fit the network, or the loss is no longer a number.
@@ -67,21 +71,29 @@ def fit(
     _check(train, arch, "train on")
     if validation is not None and len(validation):
         _check(validation, arch, "validate on")
+    if start is not None and spec.patience is not None:
+        raise TrainingError("A training with early stopping cannot go on from a state: leave patience out.")
     device = _device(spec.device)
     scaler = Scaler.fit(train.x)
     x, y = _tensors(train, scaler, arch, device)
     watched = None if validation is None or not len(validation) else _tensors(validation, scaler, arch, device)
     with torch.random.fork_rng(devices=[]), _repeatable(device), _threads(spec.threads, arch, device):
         torch.manual_seed(spec.seed)
-        net = engine(arch, Net(arch), device, min(spec.batch, len(train)), spec.threads)
+        fresh = Net(arch)
+        if start is not None:
+            fresh.import_weights(start.weights)
+        net = engine(arch, fresh, device, min(spec.batch, len(train)), spec.threads)
         order = torch.Generator().manual_seed(spec.seed)
         turn = Turn(train.vectors, scaler, spec.turn_deg, device)
         adam = torch.optim.Adam(net.parameters, lr=spec.learning_rate, fused=True)
+        if start is not None:
+            _restore(adam, net, start)
+            order.set_state(torch.from_numpy(start.random.copy()))
         with closing(net):
-            history: list[dict[str, Any]] = []
+            history: list[dict[str, Any]] = [] if start is None else [dict(row) for row in start.history]
             kept: dict[int, dict[str, NDArray[np.float32]]] = {}
             best_epoch, best_score, best = 0, float("-inf"), net.export_weights()
-            for epoch in range(1, spec.epochs + 1):
+            for epoch in range(len(history) + 1, spec.epochs + 1):
                 row: dict[str, Any] = {"epoch": epoch}
                 for group in adam.param_groups:
                     group["lr"] = spec.learning_rate_at(epoch)
@@ -104,7 +116,30 @@ def fit(
                         break
             if best_epoch == 0:
                 best_epoch, best = len(history), net.export_weights()
-    return Fitted(best, scaler, history, best_epoch, time.perf_counter() - began, kept)
+            state = None if spec.patience is not None else _state(adam, net, order, history)
+    return Fitted(best, scaler, history, best_epoch, time.perf_counter() - began, kept, state)
+
+
+def _state(adam: torch.optim.Adam, net: Engine, order: torch.Generator, history: list[dict[str, Any]]) -> FitState:
+    held = [adam.state[p] for p in net.parameters if p in adam.state]
+    return FitState(
+        epoch=len(history),
+        steps=int(held[0]["step"]) if held else 0,
+        weights=net.export_weights(),
+        means=[one["exp_avg"].cpu().numpy().copy() for one in held],
+        squares=[one["exp_avg_sq"].cpu().numpy().copy() for one in held],
+        random=order.get_state().numpy().copy(),
+        history=[dict(row) for row in history],
+    )
+
+
+def _restore(adam: torch.optim.Adam, net: Engine, start: FitState) -> None:
+    for p, mean, square in zip(net.parameters, start.means, start.squares, strict=True):
+        adam.state[p] = {
+            "step": torch.tensor(float(start.steps), device=p.device),
+            "exp_avg": torch.from_numpy(mean.copy()).to(p.device),
+            "exp_avg_sq": torch.from_numpy(square.copy()).to(p.device),
+        }
 
 
 def predict(

@@ -1,0 +1,51 @@
+"""Where a training stands between two epochs, so that it can go on as if it had never stopped."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+_WEIGHT, _MEAN, _SQUARE = "weight:", "mean:", "square:"
+
+
+@dataclass(frozen=True)
+class FitState:
+    """After ``epoch``: the weights; Adam's ``means`` and ``squares`` of each parameter after ``steps`` steps; what
+    draws order and turns (``random``); the history so far."""
+
+    epoch: int
+    steps: int
+    weights: dict[str, NDArray[np.float32]]
+    means: Sequence[NDArray[np.float32]]
+    squares: Sequence[NDArray[np.float32]]
+    random: NDArray[np.uint8]
+    history: list[dict[str, Any]]
+
+    def to_arrays(self) -> dict[str, Any]:
+        """Arrays and plain values by name, as a journal takes them."""
+        arrays: dict[str, Any] = {"epoch": self.epoch, "steps": self.steps, "history": self.history}
+        arrays |= {_WEIGHT + name: values for name, values in self.weights.items()}
+        for prefix, several in ((_MEAN, self.means), (_SQUARE, self.squares)):
+            arrays |= {f"{prefix}{i}": values for i, values in enumerate(several)}
+        return arrays | {"random": self.random}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, Any]) -> FitState:
+        """What `to_arrays` gave; other names beside it are passed over."""
+
+        def several(prefix: str) -> list[NDArray[np.float32]]:
+            return [arrays[f"{prefix}{i}"] for i in range(sum(name.startswith(prefix) for name in arrays))]
+
+        return cls(
+            epoch=int(arrays["epoch"]),
+            steps=int(arrays["steps"]),
+            weights={n.removeprefix(_WEIGHT): v for n, v in arrays.items() if n.startswith(_WEIGHT)},
+            means=several(_MEAN),
+            squares=several(_SQUARE),
+            random=arrays["random"],
+            history=list(arrays["history"]),
+        )
