@@ -195,13 +195,14 @@ def test_a_bad_grid_is_refused_with_all_its_problems(cli: Any, dataset: Dataset,
     grid = tmp_path / "bad.toml"
     grid.write_text(
         '[grid]\narchitectures = ["14d1_39d2_41d4", "100_300", "9x"]\nfilters = [[4, 6]]\nepoch = [1]\n'
-        'epochs = [5, 2]\nbatches = [64, 4000]\nsplit = "by-subject:50"\n'
+        'epochs = [5, 2]\nbatches = [2, 4000]\npadding = "mirorr"\nsplit = "by-subject:50"\n'
     )
     ran = cli("sweep", dataset.path, "--grid", grid, "--json")
     assert (ran.status, ran.out) == (2, "")
     for words in (
-        "The grid has 6 problems", "Unknown key 'epoch'", "Did you mean 'epochs'?", "'9x'", "4/6 are only 2",
-        "receptive field of 399", "do not ascend", "by-subject:50 needs at least 50 people",
+        "The grid has 8 problems", "Unknown key 'epoch'", "Did you mean 'epochs'?", "'9x'", "4/6 are only 2",
+        "receptive field of 399", "Unknown padding", "A batch of 4000", "do not ascend",
+        "by-subject:50 needs at least 50 people",
     ):  # fmt: skip
         assert words in ran.err, words
     assert not (dataset.path / "cache").exists() and not (dataset.path / "evaluations").exists()
@@ -210,6 +211,8 @@ def test_a_bad_grid_is_refused_with_all_its_problems(cli: Any, dataset: Dataset,
     )
     assert small.status == 1 and len(small.json["problems"]) == 2
     assert any("A batch of 4000 is larger than the" in line for line in small.json["problems"])
+    small = cli("sweep", dataset.path, "--batches", "4000", "--epochs", "2", "--split", "by-me", "--dry-run", "--json")
+    assert ["A batch of 4000" in line or "Unknown split" in line for line in small.json["problems"]] == [True, True]
     assert "Unknown grid 'papr'" in cli("sweep", dataset.path, "--grid", "papr").err
     assert "no seeds" in cli("sweep", dataset.path, "--seeds", "0").err
     (tmp_path / "file").write_text("")
