@@ -151,7 +151,7 @@ def test_one_that_diverges_is_told_and_the_others_go_on(
     monkeypatch.setattr(room, "fit", fit)
     found = sweep(dataset, epochs=(1, 2, 3), out=tmp_path, **SMALL)
     said = {(f["arch"], f["epochs"], f["why"]) for f in found.summary["failed"]}
-    assert said == {("9", 3, "the loss is no number")}
+    assert said == {("9", 3, "the loss is no number")}, "once for each batch"
     status = {(row["arch"], row["epochs"]): row["status"] for row in found.trials.iter_rows(named=True)}
     assert status == {("5d1_5d2", e): "done" for e in (1, 2, 3)} | {
         ("9", 1): "done",
@@ -160,6 +160,9 @@ def test_one_that_diverges_is_told_and_the_others_go_on(
     }
     assert found.trials.filter(polars.col("status") == "failed")["accuracy"].null_count() == 2
     assert found.summary["done"] == 10
+    # Nothing of it went well: there is no curve either.
+    alone = sweep(dataset, epochs=(3,), out=tmp_path, overwrite=True, **SMALL)
+    assert (alone.summary["done"], len(alone.summary["failed"]), len(frame(tmp_path, "curves"))) == (2, 2, 2 * 3)
 
 
 def test_a_grid_file_from_the_command_line(cli: Any, dataset: Dataset, tmp_path: Path) -> None:
