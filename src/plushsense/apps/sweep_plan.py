@@ -41,13 +41,15 @@ class GridProblems(ConfigError):
 
 @dataclass(frozen=True)
 class Task:
-    """One training of one fold: ``epochs`` are those after which it is scored; ``span`` picks the windows."""
+    """One training of one fold: ``epochs`` are those after which it is scored; ``span`` picks the windows; ``id`` the
+    job's."""
 
     arch: Arch
     spec: TrainSpec
     epochs: tuple[int, ...]
     span: int
     fold: int
+    id: str = ""
 
     @property
     def nested(self) -> bool:
@@ -215,9 +217,9 @@ def _planned(dataset: Dataset, grid: GridSpec, cut: _Cut) -> Plan:
                 size = len(fold.train) if batch == FULL else int(batch)
                 task = Task(arch, replace(spec, epochs=training.epochs[-1], batch=size, seed=seed), training.epochs,
                             span, i)  # fmt: skip
-                job = Job(job_id({**base, **_settings(task), "fold": of_folds[i]}), task)
-                jobs[job.id] = job
-                runs.append(Run(job.id, seed, fold.name, span, i, size))
+                known = job_id({**base, **_settings(task), "fold": of_folds[i]})
+                jobs[known] = Job(known, replace(task, id=known))
+                runs.append(Run(known, seed, fold.name, span, i, size))
         trials += [
             PlannedTrial(_trial_id(base, trial, spec, of_folds), trial, tuple(runs)) for trial in training.trials
         ]
