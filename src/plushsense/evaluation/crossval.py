@@ -132,7 +132,7 @@ def evaluate(
     asked = parse_split(split)
     folds = fold_windows(train_windows, score_windows, asked, seed)
     base = {"version": _VERSION, "key": dict(key or {}), "windows": _prints(train_windows, score_windows)}
-    jobs = [Job(job_id({**base, "fold": _fold_print(fold)}), fold) for fold in folds]
+    jobs = [Job(job_id({**base, "fold": fold_print(fold)}), fold) for fold in folds]
     told = _Teller(len(folds), progress)
     results = run_jobs(
         jobs,
@@ -159,8 +159,8 @@ def evaluate(
     )
     return Evaluation(
         split=asked,
-        context=_context(score_windows),
-        train_context=_context(train_windows),
+        context=context_of(score_windows),
+        train_context=context_of(train_windows),
         seeds=[seed],
         table=scores(predictions, records, score_windows.affects, asked.apart),
         histories=[list(outcome["history"]) for outcome in outcomes],
@@ -217,7 +217,7 @@ class _Teller:
             self._progress(FoldProgress(self._done, self._folds, job.task.name, epoch, epochs, self._resumed))
 
 
-def _context(windows: WindowSet) -> str:
+def context_of(windows: WindowSet) -> str:
     """The kind of context of a set: "stream" where any window has a real past, else "loop" or "inside"."""
     present = set(np.unique(windows.context).tolist())
     return next((kind for kind in ("stream", "loop") if kind in present), "inside")
@@ -225,18 +225,20 @@ def _context(windows: WindowSet) -> str:
 
 def _prints(train: WindowSet, score: WindowSet) -> list[str]:
     """The content of both sets, hashed: other windows are other jobs."""
-    first = _print(train)
-    return [first, first if score is train else _print(score)]
+    first = windows_print(train)
+    return [first, first if score is train else windows_print(score)]
 
 
-def _print(windows: WindowSet) -> str:
+def windows_print(windows: WindowSet) -> str:
+    """The content of a set, hashed: what jobs on it go by."""
     digest = hashlib.sha256(repr((windows.x.shape, windows.labels, windows.recording_ids)).encode())
     for array in (windows.x, windows.y, windows.recording):
         digest.update(np.ascontiguousarray(array).data)
     return digest.hexdigest()
 
 
-def _fold_print(fold: WindowFold) -> str:
+def fold_print(fold: WindowFold) -> str:
+    """Which windows a fold trains on, validates on and tests, hashed."""
     digest = hashlib.sha256()
     for index in (fold.train, fold.validation, fold.test):
         digest.update(len(index).to_bytes(8, "little") + index.astype("<i8").tobytes())

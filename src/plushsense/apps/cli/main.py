@@ -34,6 +34,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "arch": ("arch", "count a network: parameters, receptive field, multiply-accumulates, state"),
     "train": ("train", "train one network and save it as a bundle"),
     "evaluate": ("evaluate", "how good it is, on people it never met"),
+    "baselines": ("baselines", "classical programs, LSTMs and our network side by side, and what a leaky split hides"),
     "report": ("report", "one HTML page from evaluations and bundles"),
     "live": ("live", "read a toy and say what it feels, 20 times a second"),
     "toy": ("toy", "a virtual toy that speaks the wire format over a pty or TCP"),
@@ -44,6 +45,7 @@ VERBS: dict[str, tuple[str, str]] = {
 STOPPED = {
     "demo": "what was finished is kept, and the same command goes on from there",
     "evaluate": "finished folds are kept, and the same command goes on from there",
+    "baselines": "finished folds are kept, and the same command goes on from there",
     "simulate": "nothing was written",
     "import": "nothing was written, or with --add nothing by halves: the same command goes on",
     "record": "what was recorded is kept, and the same command goes on from there",
