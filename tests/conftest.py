@@ -67,3 +67,10 @@ def publish_tools() -> None:
     for module in ("mlcroissant", "frictionless", "rocrate", "datacite", "sklearn"):
         if importlib.util.find_spec(module) is None:
             missing("publish", f"{module} is not installed")
+
+
+@pytest.fixture(scope="session")
+def scikit_learn() -> None:
+    """Scikit-learn (extra baselines)."""
+    if importlib.util.find_spec("sklearn") is None:
+        missing("baselines", "sklearn is not installed")

@@ -95,8 +95,9 @@ def cost_words(result: Mapping[str, Any]) -> str:
     """What sizes and times are, and whose."""
     return (
         "Size: classical programs as they are pickled in memory, our network as its bundle, recurrent ones as their "
-        "float32 weights. Times in milliseconds a window, read alone (median) or many at once, and seconds of training "
-        f"(median over folds), with everything from raw samples to probabilities, on this machine: {result['machine']}."
+        "float32 weights. Processor time in milliseconds a window, read alone (median) or many at once, and seconds of "
+        "training (median over folds), with everything from raw samples to probabilities, on this machine: "
+        f"{result['machine']}."
     )
 
 
