@@ -75,7 +75,8 @@ def test_refusals_are_sentences(cli: Cli, dataset: Dataset, tmp_path: Path) -> N
         (("--pca", "maybe"), "Unknown choice 'maybe' for PCA: accepted are both, no, yes."),
         (("--split", "windows"), "needs a number of folds"),
         (("--split", "windows:3,windows:3"), "asked for twice"),
-        (("--split", ","), "No split is given"),
+        (("--split", ",", "--models", "knn"), "No split is given"),
+        (("--models", "boosting", "--features", "flattened", "--pca", "no"), "No program is left to compare"),
     ):
         ran = cli("baselines", dataset.path, *words, *place)
         assert ran.status == 2 and said in ran.err and ran.out == "" and "Traceback" not in ran.err, ran.err

@@ -126,6 +126,13 @@ def test_decision_values_keep_their_order() -> None:
     assert found[0, 3] > found[0, 2] > found[0, 1] == 0
 
 
+def test_what_takes_too_long_is_left_out() -> None:
+    asked = classical(["knn", "boosting"], ["statistics", "flattened"], [False, True], SAMPLES, 3)
+    assert len(asked) == 7
+    assert ("boosting", "flattened", False) not in {(c.name, c.features, c.pca) for c in asked}
+    assert all(c.key["seed"] == 3 and c.key["library"].startswith("scikit-learn ") for c in asked)
+
+
 def test_what_is_refused() -> None:
     train = made()
     with pytest.raises(BadInput, match="gesture 1 only"):

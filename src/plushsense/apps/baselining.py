@@ -23,7 +23,7 @@ from plushsense.core.extras import need
 from plushsense.core.gestures import GestureSet
 from plushsense.core.signal import Layout
 from plushsense.dataset.store import Dataset, write_atomically
-from plushsense.evaluation.baselines import BASELINES, FEATURES, ROCKETS, classical, rockets
+from plushsense.evaluation.baselines import BASELINES, FEATURES, ROCKETS, TITLES, TOO_LONG, classical, rockets
 from plushsense.evaluation.compare import CompareProgress, Contender, Reader, compare
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
@@ -184,6 +184,11 @@ def baselines(
     gestures = choose_classes(dataset, config.evaluation.classes, warn)
     network = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
     windows = windows_for(dataset, network, config.windows, gestures, warn)
+    for name, view, reduced in TOO_LONG:
+        if name in names and view in features and reduced in PCA[pca]:
+            warn(
+                f"left out: {TITLES[name]} on {view} windows {'with' if reduced else 'without'} PCA, which takes too long"
+            )
     table = compare(
         windows,
         contenders(names, features, PCA[pca], config, network, dataset.layout, gestures, windows),

@@ -112,6 +112,8 @@ def compare(
         MissingExtraError: without threadpoolctl, which comes with scikit-learn.
     """
     need("threadpoolctl", extra="baselines")
+    if not contenders:
+        raise ConfigError("No program is left to compare: name one or more, such as  --models forest,knn")
     asked = _parsed(splits)
     folds = {split.text: fold_windows(windows, windows, split, seed) for split in asked}
     base = {"version": _VERSION, "windows": windows_print(windows), "rate_hz": windows.rate_hz}

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 SIMULATION = "SIMULATION: these scores are of the virtual toy and say nothing about a real one."
 COUNTS = (
     "Only the number by person counts: in the leaky split overlapping windows of one recording, and recordings of one "
-    "person, stand on both sides, so that a program is paid for recognising what it has already seen, and a new person "
-    "is nobody it has seen."
+    "person, stand on both sides, so that a program is paid for recognising what it has already seen, while whoever "
+    "touches the toy next is new to it."
 )
 LEAKY = (
     "A leaky split has overlapping windows of one recording, and recordings of one person, on both sides: its numbers "
