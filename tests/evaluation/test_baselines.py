@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,46 +13,31 @@ from plushsense.core.errors import BadInput, ConfigError
 from plushsense.evaluation.baselines import (
     BASELINES,
     FEATURES,
-    ROCKETS,
     TITLES,
     ClassicalFit,
     ClassicalReader,
     classical,
     likelihoods,
 )
-from plushsense.windows.cut import WindowSet
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from fakes import rhythms
 
 pytestmark = pytest.mark.usefixtures("scikit_learn")
 
 SAMPLES = 50
 
 
-def made(n: int = 60, seed: int = 0, classes: int = 3, samples: int = SAMPLES) -> WindowSet:
-    """Windows of three rhythms and strengths with noise, on two channels."""
-    rng = np.random.default_rng(seed)
-    y = np.arange(n) % classes
-    time = np.arange(samples) + rng.integers(0, 30, (n, 1))
-    wave = (300 + 250 * y[:, None]) * np.sin(2 * np.pi * time / (8 + 12 * y[:, None]))
-    x = wave[:, None, :] * np.array([1.0, 0.5])[:, None] + rng.normal(0, 60, (n, 2, samples))
-    none = np.full((n, 2), -1, dtype=np.int64)
-    labels = tuple(f"gesture {k}" for k in range(classes))
-    return WindowSet(
-        x=x.astype(np.int32), y=y.astype(np.int64), labels=labels, affects=("none",) * classes, families=labels,
-        recording=np.arange(n, dtype=np.int64), recording_ids=tuple(f"P/{i:03d}" for i in range(n)),
-        subject=np.array([f"P{i % 5}" for i in range(n)]), context=np.full(n, "inside"), stream=np.full(n, ""),
-        window_rows=none, recording_rows=none, rate_hz=100.0, inputs=("a", "b"),
-    )  # fmt: skip
-
-
 def fitted(name: str = "knn", features: str = "statistics", pca: bool = False, seed: int = 0) -> ClassicalReader:
-    reader = ClassicalFit(name, features, pca, SAMPLES, seed)(made(), made(0))
+    reader = ClassicalFit(name, features, pca, SAMPLES, seed)(rhythms(), rhythms(0))
     assert isinstance(reader, ClassicalReader)
     return reader
 
 
 @pytest.mark.parametrize("name", list(BASELINES))
 def test_every_baseline_learns_gives_probabilities_and_repeats_itself(name: str) -> None:
-    test = made(30, seed=9)
+    test = rhythms(30, seed=9)
     for features, pca in (("statistics", False), ("statistics", True), ("flattened", True)):
         once, again = fitted(name, features, pca), fitted(name, features, pca)
         read = once(test)
@@ -64,17 +51,17 @@ def test_every_baseline_learns_gives_probabilities_and_repeats_itself(name: str)
 
 @pytest.mark.parametrize("name", ["forest", "extra-trees", "mlp", "subspace-knn"])
 def test_another_seed_is_another_program(name: str) -> None:
-    test = made(30, seed=9)
+    test = rhythms(30, seed=9)
     noisy = replace(test, x=test.x + np.random.default_rng(3).integers(-400, 400, test.x.shape).astype(np.int32))
     assert not np.array_equal(fitted(name, seed=0)(noisy), fitted(name, seed=1)(noisy))
 
 
 def test_scaling_and_pca_are_fitted_to_the_training_windows_only() -> None:
-    train = made()
+    train = rhythms()
     # Planted: windows to validate and to test of another level and size would show in a mean and in a direction.
-    other = replace(made(40, seed=5), x=made(40, seed=5).x * 50 + 90_000)
+    other = replace(rhythms(40, seed=5), x=rhythms(40, seed=5).x * 50 + 90_000)
     fit = ClassicalFit("knn", "flattened", True, SAMPLES, 0)
-    with_them, without = fit(train, other), fit(train, made(0))
+    with_them, without = fit(train, other), fit(train, rhythms(0))
     assert isinstance(with_them, ClassicalReader) and isinstance(without, ClassicalReader)
     with_them(other)
     flat = FEATURES["flattened"](train, SAMPLES)
@@ -90,7 +77,7 @@ def test_scaling_and_pca_are_fitted_to_the_training_windows_only() -> None:
 
 
 def test_classical_programs_read_the_end_of_a_longer_window() -> None:
-    long = made(30, samples=80)
+    long = rhythms(30, samples=80)
     past = np.random.default_rng(1).integers(-9000, 9000, (30, 2, 80 - SAMPLES))
     other = replace(long, x=np.concatenate([past, long.x[:, :, -SAMPLES:]], axis=2).astype(np.int32))
     reader = fitted("rbf-svm")
@@ -100,16 +87,16 @@ def test_classical_programs_read_the_end_of_a_longer_window() -> None:
 
 
 def test_a_size_is_what_the_program_holds() -> None:
-    small, large = (ClassicalFit("knn", "flattened", False, SAMPLES, 0)(made(n), made(0)) for n in (60, 600))
+    small, large = (ClassicalFit("knn", "flattened", False, SAMPLES, 0)(rhythms(n), rhythms(0)) for n in (60, 600))
     # Nearest neighbours hold their windows: 540 more of 100 values of 8 bytes, and a class each.
     assert large.size_bytes - small.size_bytes == pytest.approx(540 * (100 * 8 + 8), rel=0.05)
 
 
 def test_a_gesture_that_was_not_trained_on_gets_nothing() -> None:
-    train = made()
+    train = rhythms()
     two = train.take(np.flatnonzero(train.y != 1))
     for name in ("knn", "rbf-svm", "cubic-svm"):
-        read = ClassicalFit(name, "statistics", False, SAMPLES, 0)(two, made(0))(train)
+        read = ClassicalFit(name, "statistics", False, SAMPLES, 0)(two, rhythms(0))(train)
         assert (read[:, 1] == 0).all() and read.sum(axis=1) == pytest.approx(np.ones(60), abs=1e-5)
 
 
@@ -134,23 +121,10 @@ def test_what_takes_too_long_is_left_out() -> None:
 
 
 def test_what_is_refused() -> None:
-    train = made()
+    train = rhythms()
     with pytest.raises(BadInput, match="gesture 1 only"):
-        ClassicalFit("knn", "statistics", False, SAMPLES, 0)(train.take(np.flatnonzero(train.y == 1)), made(0))
+        ClassicalFit("knn", "statistics", False, SAMPLES, 0)(train.take(np.flatnonzero(train.y == 1)), rhythms(0))
     with pytest.raises(ConfigError, match="Unknown baseline 'forrest'.* Did you mean 'forest'"):
         classical(["forrest"], ["statistics"], [False], SAMPLES, 0)
     with pytest.raises(ConfigError, match="Unknown features 'statistic'.* Did you mean 'statistics'"):
         classical(["forest"], ["statistic"], [False], SAMPLES, 0)
-
-
-@pytest.mark.parametrize("name", list(ROCKETS))
-def test_a_rocket_learns_and_repeats_itself(name: str) -> None:
-    pytest.importorskip("aeon")
-    from plushsense.evaluation.baselines import rockets
-
-    (contender,) = rockets([name], SAMPLES, 0)
-    contender.fit.prepare(made())  # type: ignore[attr-defined]
-    test = made(30, seed=9)
-    once, again = contender.fit(made(), made(0)), contender.fit(made(), made(0))
-    assert (once(test).argmax(axis=1) == test.y).mean() > 0.8
-    assert np.array_equal(once(test), again(test)) and once.size_bytes > 10_000

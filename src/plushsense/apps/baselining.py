@@ -23,8 +23,9 @@ from plushsense.core.extras import need
 from plushsense.core.gestures import GestureSet
 from plushsense.core.signal import Layout
 from plushsense.dataset.store import Dataset, write_atomically
-from plushsense.evaluation.baselines import BASELINES, FEATURES, ROCKETS, TITLES, TOO_LONG, classical, rockets
+from plushsense.evaluation.baselines import BASELINES, FEATURES, TITLES, TOO_LONG, classical
 from plushsense.evaluation.compare import CompareProgress, Contender, Reader, compare
+from plushsense.evaluation.rockets import ROCKETS, rockets
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.models.reference import Network
@@ -186,9 +187,8 @@ def baselines(
     windows = windows_for(dataset, network, config.windows, gestures, warn)
     for name, view, reduced in TOO_LONG:
         if name in names and view in features and reduced in PCA[pca]:
-            warn(
-                f"left out: {TITLES[name]} on {view} windows {'with' if reduced else 'without'} PCA, which takes too long"
-            )
+            how = "with" if reduced else "without"
+            warn(f"left out: {TITLES[name]} on {view} windows {how} PCA, which takes too long")
     table = compare(
         windows,
         contenders(names, features, PCA[pca], config, network, dataset.layout, gestures, windows),
