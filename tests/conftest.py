@@ -85,3 +85,10 @@ def mlflow_here() -> None:
     for module in ("mlflow", "sqlalchemy", "alembic"):
         if importlib.util.find_spec(module) is None:
             missing("mlflow", f"{module} is not installed")
+
+
+@pytest.fixture(scope="session")
+def scikit_learn() -> None:
+    """Scikit-learn (extra baselines)."""
+    if importlib.util.find_spec("sklearn") is None:
+        missing("baselines", "sklearn is not installed")
