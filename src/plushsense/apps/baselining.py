@@ -129,6 +129,9 @@ def contenders(
     made += rockets([m for m in models if m in ROCKETS], samples, spec.seed)
     if NETWORK in models or set(models) & set(RECURRENT):
         need("torch", extra="train")
+        from plushsense.training.fit import placed
+
+        spec = placed(spec)
     vectors = [list(v) for v in windows.vectors]
     for name in (m for m in models if m in RECURRENT):
         from plushsense.training.recurrent import RECURRENT_VERSION, UNITS
@@ -155,6 +158,7 @@ def baselines(
     pca: str = "both",
     out: str | os.PathLike[str] | None = None,
     overwrite: bool = False,
+    cluster: str | None = None,
     progress: Callable[[CompareProgress], None] | None = None,
     warn: Warn = silent,
 ) -> dict[str, Any]:
@@ -167,6 +171,7 @@ def baselines(
         config: as for `evaluate`; its split is not used.
         splits: such as "leave-one-subject-out", "by-subject:5", "windows:5" (leaky); the gap between them is reported.
         models: names of `MODELS` and sets of `SETS`.
+        cluster: address of a Ray cluster that does the work instead of this machine's processes.
         pca: "both", "no" or "yes"; it concerns the classical programs.
         out: a folder for the table as JSON, CSV and a page; a comparison of other settings or data that is there is
             refused unless ``overwrite``.
@@ -195,6 +200,7 @@ def baselines(
         asked,
         journal=Journal(dataset.path / "cache" / "baselines"),
         workers=config.evaluation.processes,
+        cluster=cluster,
         seed=config.evaluation.seed,
         progress=progress,
     )

@@ -95,6 +95,7 @@ def compare(
     *,
     journal: Journal | None = None,
     workers: int = 1,
+    cluster: str | None = None,
     seed: int = 0,
     progress: Callable[[CompareProgress], None] | None = None,
 ) -> dict[str, Any]:
@@ -131,7 +132,9 @@ def compare(
             ]
     everything = [job for some in jobs.values() for job in some]
     told = _Teller(len(everything), progress)
-    results = run_jobs(everything, _work, shared=windows, workers=workers, journal=journal, on_done=told.done)
+    results = run_jobs(
+        everything, _work, shared=windows, workers=workers, journal=journal, cluster=cluster, on_done=told.done
+    )
     rows = [
         _row(contenders[i], split, folds[split.text], [results[job.id] for job in jobs[i, split.text]], windows)
         for i in range(len(contenders))

@@ -110,6 +110,7 @@ def evaluate(
     journal: Journal | None = None,
     key: Mapping[str, Any] | None = None,
     workers: int = 1,
+    cluster: str | None = None,
     seed: int = 0,
     progress: Callable[[FoldProgress], None] | None = None,
 ) -> Evaluation:
@@ -122,6 +123,7 @@ def evaluate(
         key: with a journal, everything that ``fit_predict`` depends on (network, schedule, its seed). The windows
             and the folds go into a job's id by themselves.
         workers: folds at a time, each in a process of its own.
+        cluster: address of a Ray cluster that does the folds instead.
         seed: of the split.
 
     Raises:
@@ -139,6 +141,7 @@ def evaluate(
         _FoldWork(fit_predict),
         shared=(train_windows, None if score_windows is train_windows else score_windows),
         workers=workers,
+        cluster=cluster,
         journal=journal,
         on_done=told.done,
         on_report=told.epoch,

@@ -35,6 +35,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--pca", default="both", help="for classical models: both (default), no or yes")
     parser.add_argument("--workers", type=int, metavar="N", help="folds at a time (default 0: one a processor)")
+    parser.add_argument("--cluster", metavar="ADDRESS", help="work on a Ray cluster instead (default: on this machine)")
     parser.add_argument(
         "--out",
         metavar="DIR",
@@ -54,7 +55,9 @@ def run(args: argparse.Namespace) -> int:
     asked |= {"features": _words(args.features), "pca": args.pca}
     name = f"baselines_{comparison_id(dataset, config, **asked)[:8]}"
     out = Path(args.out) if args.out else dataset.path / "evaluations" / name
-    result = baselines(dataset, config, **asked, out=out, overwrite=args.force, progress=_shown(), warn=warn)
+    result = baselines(
+        dataset, config, **asked, out=out, overwrite=args.force, cluster=args.cluster, progress=_shown(), warn=warn
+    )
     result |= {"out": str(out), "report": str(out / PAGE)}
     say(f"written: {out}")
     emit(args, result, lines(result))
