@@ -151,7 +151,7 @@ def test_one_that_diverges_is_told_and_the_others_go_on(
     monkeypatch.setattr(room, "fit", fit)
     found = sweep(dataset, epochs=(1, 2, 3), out=tmp_path, **SMALL)
     said = {(f["arch"], f["epochs"], f["why"]) for f in found.summary["failed"]}
-    assert said == {("9", 3, "the loss is no number")}
+    assert said == {("9", 3, "the loss is no number")}, "once for each batch"
     status = {(row["arch"], row["epochs"]): row["status"] for row in found.trials.iter_rows(named=True)}
     assert status == {("5d1_5d2", e): "done" for e in (1, 2, 3)} | {
         ("9", 1): "done",
@@ -160,6 +160,9 @@ def test_one_that_diverges_is_told_and_the_others_go_on(
     }
     assert found.trials.filter(polars.col("status") == "failed")["accuracy"].null_count() == 2
     assert found.summary["done"] == 10
+    # Nothing of it went well: there is no curve either.
+    alone = sweep(dataset, epochs=(3,), out=tmp_path, overwrite=True, **SMALL)
+    assert (alone.summary["done"], len(alone.summary["failed"]), len(frame(tmp_path, "curves"))) == (2, 2, 2 * 3)
 
 
 def test_a_grid_file_from_the_command_line(cli: Any, dataset: Dataset, tmp_path: Path) -> None:
@@ -195,13 +198,14 @@ def test_a_bad_grid_is_refused_with_all_its_problems(cli: Any, dataset: Dataset,
     grid = tmp_path / "bad.toml"
     grid.write_text(
         '[grid]\narchitectures = ["14d1_39d2_41d4", "100_300", "9x"]\nfilters = [[4, 6]]\nepoch = [1]\n'
-        'epochs = [5, 2]\nbatches = [64, 4000]\nsplit = "by-subject:50"\n'
+        'epochs = [5, 2]\nbatches = [2, 4000]\npadding = "mirorr"\nsplit = "by-subject:50"\n'
     )
     ran = cli("sweep", dataset.path, "--grid", grid, "--json")
     assert (ran.status, ran.out) == (2, "")
     for words in (
-        "The grid has 6 problems", "Unknown key 'epoch'", "Did you mean 'epochs'?", "'9x'", "4/6 are only 2",
-        "receptive field of 399", "do not ascend", "by-subject:50 needs at least 50 people",
+        "The grid has 8 problems", "Unknown key 'epoch'", "Did you mean 'epochs'?", "'9x'", "4/6 are only 2",
+        "receptive field of 399", "Unknown padding", "A batch of 4000", "do not ascend",
+        "by-subject:50 needs at least 50 people",
     ):  # fmt: skip
         assert words in ran.err, words
     assert not (dataset.path / "cache").exists() and not (dataset.path / "evaluations").exists()
@@ -210,6 +214,8 @@ def test_a_bad_grid_is_refused_with_all_its_problems(cli: Any, dataset: Dataset,
     )
     assert small.status == 1 and len(small.json["problems"]) == 2
     assert any("A batch of 4000 is larger than the" in line for line in small.json["problems"])
+    small = cli("sweep", dataset.path, "--batches", "4000", "--epochs", "2", "--split", "by-me", "--dry-run", "--json")
+    assert ["A batch of 4000" in line or "Unknown split" in line for line in small.json["problems"]] == [True, True]
     assert "Unknown grid 'papr'" in cli("sweep", dataset.path, "--grid", "papr").err
     assert "no seeds" in cli("sweep", dataset.path, "--seeds", "0").err
     (tmp_path / "file").write_text("")

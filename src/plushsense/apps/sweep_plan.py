@@ -20,7 +20,7 @@ from plushsense.models.arch import Arch
 from plushsense.runs.journal import job_id
 from plushsense.runs.pool import Job
 from plushsense.scoring.splits import Split, parse_split
-from plushsense.training.grid import FULL, GridSpec, Trial, problems, trainings
+from plushsense.training.grid import FULL, GridSpec, Trial, first_line, problems, trainings
 from plushsense.training.spec import TrainSpec
 from plushsense.windows.cut import WindowSet, shared_gestures
 
@@ -109,21 +109,20 @@ def plan(dataset: Dataset, grid: GridSpec, told: Sequence[str] = (), warn: Warn 
     Raises:
         GridProblems: with all problems of the grid on this data set at once, one a line.
     """
-    found = list(told)
-    past = _past(dataset)
-    early = problems(grid, dataset.layout, past)
-    base: _Cut | None = None
+    past, found = _past(dataset), list[str]()
+    cut, fewest = None, None
     try:
-        base = _Cut.of(dataset, grid, warn)
+        cut = _Cut.of(dataset, grid, warn)
+        fewest = len(cut.windows)
+        fewest = min(len(fold.train) for fold in cut.folds())
     except BadInput as cause:
-        early.append(str(cause).splitlines()[0])
-    smallest = None if base is None else min(len(fold.train) for fold in base.folds)
-    found += problems(grid, dataset.layout, past, smallest) if base is not None else early
-    # A grid that does not parse may also fail to be cut, in the same words.
-    found = list(dict.fromkeys(found))
-    if found or base is None:
+        found.append(first_line(cause))
+    # What is wrong with the grid may also keep windows from being cut, in the same words.
+    found = list(dict.fromkeys([*told, *problems(grid, dataset.layout, past, fewest), *found]))
+    if found or cut is None:
         raise GridProblems(found)
-    return _planned(dataset, grid, base)
+    _warn_of_rare(dataset, cut, warn)
+    return _planned(dataset, grid, cut)
 
 
 def _past(dataset: Dataset) -> int:
@@ -135,6 +134,17 @@ def _past(dataset: Dataset) -> int:
     return int(median(reaches)) if reaches else 0
 
 
+def _warn_of_rare(dataset: Dataset, cut: _Cut, warn: Warn) -> None:
+    if cut.split.apart and cut.grid.classes == ALL:
+        rare = set(cut.gestures.labels) - set(shared_gestures(dataset)[0].labels)
+        if rare:
+            warn(
+                f"{len(rare)} of the {len(cut.gestures)} classes are no gesture that 90 % of the people share "
+                f"({', '.join(sorted(rare))}): who is tested may be the only one who made them; "
+                "leave them out with --classes shared"
+            )
+
+
 @dataclass
 class _Cut:
     """Windows and folds, cut once for each span."""
@@ -142,38 +152,43 @@ class _Cut:
     dataset: Dataset
     grid: GridSpec
     gestures: GestureSet
-    split: Split
     sets: dict[int, WindowSet]
     by_span: dict[int, list[WindowFold]]
-    folds: list[WindowFold]
+    window: Arch
 
     @classmethod
     def of(cls, dataset: Dataset, grid: GridSpec, warn: Warn) -> _Cut:
-        """Cut for a window without more past: what every grid needs to know how many there are."""
-        split = parse_split(grid.split)
+        """Cut for a window without more past, which tells of every grid how many windows there are."""
         gestures = choose_classes(dataset, grid.classes, warn)
-        if split.apart and grid.classes == ALL:
-            rare = set(gestures.labels) - set(shared_gestures(dataset)[0].labels)
-            if rare:
-                warn(
-                    f"{len(rare)} of the {len(gestures)} classes are no gesture that 90 % of the people share "
-                    f"({', '.join(sorted(rare))}): who is tested may be the only one who made them; "
-                    "leave them out with --classes shared"
-                )
         window = Arch.parse(
             "1", "1", channels=dataset.layout.n_inputs, padding="mirror", window=dataset.layout.samples(grid.window_s)
         )
-        cut = cls(dataset, grid, gestures, split, {}, {}, [])
-        cut.folds = cut.at(window, warn)[1]
+        cut = cls(dataset, grid, gestures, {}, {}, window)
+        cut.sets[window.span] = windows_for(dataset, window, grid.windows, gestures, warn)
         return cut
 
-    def at(self, arch: Arch, warn: Warn = silent) -> tuple[WindowSet, list[WindowFold]]:
+    @property
+    def split(self) -> Split:
+        """How the windows are divided; ConfigError for an unknown split."""
+        return parse_split(self.grid.split)
+
+    @property
+    def windows(self) -> WindowSet:
+        """Windows without more past."""
+        return self.sets[self.window.span]
+
+    def folds(self) -> list[WindowFold]:
+        """Their folds."""
+        return self.at(self.window)[1]
+
+    def at(self, arch: Arch) -> tuple[WindowSet, list[WindowFold]]:
         """The windows that a network needs, and their folds."""
         # A network that reads no more than a window reads the end of that window.
         span = max(arch.span, arch.window)
         if span not in self.sets:
-            windows = windows_for(self.dataset, arch, self.grid.windows, self.gestures, warn)
-            self.sets[span] = windows
+            self.sets[span] = windows_for(self.dataset, arch, self.grid.windows, self.gestures)
+        if span not in self.by_span:
+            windows = self.sets[span]
             self.by_span[span] = fold_windows(windows, windows, self.split, self.grid.split_seed)
         return self.sets[span], self.by_span[span]
 

@@ -279,7 +279,14 @@ def preview(
         "macs": total,
         "macs_one_by_one": sum(planned.macs(job, nested=False) for job in planned.jobs),
         "windows_mb": sum(windows.x.nbytes for windows in planned.sets.values()) / 1e6,
+        "activations_mb": max(_activation_bytes(job.task) for job in planned.jobs) / 1e6,
         "cost": dict(sorted(shares.items(), key=lambda item: -item[1])),
         "problems": [],
         "grid": spec.to_dict(),
     }
+
+
+def _activation_bytes(task: Task) -> int:
+    """What all layers give for one batch, as float32, once."""
+    arch = task.arch
+    return 4 * task.spec.batch * sum(f * n for f, n in zip(arch.filters, arch.positions, strict=True))

@@ -136,7 +136,7 @@ def problems(
     Args:
         layout: of the toy, for the length of a window in samples.
         past: samples up to the end of a recording that its stream holds, for at least half of the recordings.
-        windows: the fewest that any fold trains on.
+        windows: the fewest that any fold trains on, or more where the split cannot be made.
     """
     found = _of_settings(grid)
     shapes: dict[str, int] = {}
@@ -166,7 +166,7 @@ def problems(
             found.append(f"A batch of {batch} cannot be used: accepted are whole numbers from 2 and '{FULL}'.")
         elif isinstance(batch, int) and windows is not None and batch > windows:
             found.append(
-                f"A batch of {batch} is larger than the {windows} windows that a fold of {grid.split} trains on: "
+                f"A batch of {batch} is larger than the {windows} windows to train on with the split {grid.split}: "
                 f"give at most {windows}, or '{FULL}'."
             )
     found += [f"Seed {seed} cannot be used: accepted are whole numbers from 0." for seed in grid.seeds if seed < 0]
@@ -238,10 +238,12 @@ def _too_long(grid: GridSpec, symbol: str, layout: Layout, past: int | None) -> 
     Without a real past a receptive field may reach beyond the window by less than its widest dilation, as the paper's
     126d2 does: that much is rounding.
     """
+    # An unknown padding or norm is said already.
+    known = replace(grid, padding=grid.padding if grid.padding in PADDINGS else "mirror", norm="batch")
     try:
-        arch = _network(grid, symbol, (1,) * 4, layout, 2)
+        arch = _network(known, symbol, (1,) * 4, layout, 2)
     except BadInput as cause:
-        # Of padding, norm or window, which are said once already.
+        # Of the window, which may be said already.
         return [] if _of_settings(grid) else [first_line(cause)]
     field, window = arch.receptive_field, arch.window
     if grid.padding == "stream" and grid.context == "stream":

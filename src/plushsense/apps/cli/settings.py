@@ -139,7 +139,7 @@ def sweep_shown() -> Callable[[Any], None]:
         text = f"sweep: {at.done} of {at.trainings} trainings"
         text += f" ({at.resumed} from before)" if at.resumed else ""
         fresh = at.share - before
-        if fresh > 0 and not over:
+        if fresh > 0.01 and not over:
             left = (now - began) / fresh * (1 - at.share)
             text += f", {at.share:.0%} of the work, about {_spelt(left)} left"
         if at.best is not None:

@@ -90,7 +90,8 @@ def _dry_run(args: argparse.Namespace, changes: dict[str, Any]) -> int:
             f"{found['trials']} trials in {found['trainings']} trainings of {found['folds']} folds and "
             f"{found['seeds']} seeds together, {found['held']} of them done before",
             f"about {found['macs']:.2e} multiply-accumulates; trial by trial {found['macs_one_by_one']:.2e}",
-            f"memory of the windows: {found['windows_mb']:.0f} MB in each process",
+            f"memory of each process: windows {found['windows_mb']:.0f} MB; what the layers of the largest batch give, "
+            f"{found['activations_mb']:.0f} MB, of which training holds several copies",
             "",
             table(("network", "share of the cost"), [(arch, f"{share:.1%}") for arch, share in found["cost"].items()]),
         ]
