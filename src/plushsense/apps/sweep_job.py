@@ -42,7 +42,7 @@ class TrainAndScore:
             spec = replace(task.spec, epochs=wanted[-1])
             keep = wanted if task.nested else ()
             try:
-                fitted = fit(train, validation, task.arch, spec, lambda at, of, _: report((at, of)), keep)
+                fitted = fit(train, validation, task.arch, spec, lambda at, of, _: report((at, of)), keep, task.start)
             except DivergedError as cause:
                 failed[str(wanted[-1])] = str(cause)
                 wanted = wanted[:-1]
@@ -59,7 +59,10 @@ class TrainAndScore:
             )
         curve = np.array([[row[name] for name in CURVE] for row in fitted.history], dtype=np.float64)
         at = list(wanted) if task.nested else [fitted.best_epoch]
-        return _result(wanted, np.stack(tested), watched, at, curve, fitted.seconds, failed)
+        seconds = task.spent_s + fitted.seconds
+        result = _result(wanted, np.stack(tested), watched, at, curve, seconds, failed)
+        state = fitted.state if task.stateful and not failed else None
+        return result if state is None else {**result, **state.to_arrays()}
 
 
 def _result(
