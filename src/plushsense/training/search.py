@@ -156,6 +156,7 @@ class Costs:
 
     def __init__(self, epoch: Scores, spec: SearchSpec, seeds: int = 1) -> None:
         self.spec = spec
+        self.epoch = epoch
         folds = [*spec.folds, *[epoch.shape[1]] * (len(spec.rungs) - len(spec.folds))]
         self.folds = tuple(folds)
         # (networks, rungs): all that a network has cost once it is done with a rung.

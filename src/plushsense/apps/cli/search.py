@@ -95,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
         overwrite=args.force,
         workers=args.workers,
         cluster=args.cluster,
-        progress=_shown(),
+        progress=search_shown(),
         warn=warn,
         **changes,
     )
@@ -120,7 +120,7 @@ def _dry_run(args: argparse.Namespace, changes: dict[str, Any], asked: dict[str,
     return 0
 
 
-def _shown() -> Callable[[Any], None]:
+def search_shown() -> Callable[[Any], None]:
     """Progress, from `plushsense.apps.searching.SearchProgress`."""
     rewritten = sys.stderr.isatty()
     last = time.monotonic()
