@@ -23,6 +23,9 @@ from plushsense.models.arch import Arch
 
 Scores = NDArray[np.float64]
 
+# Sums in another order differ by less.
+_SLACK = 1 + 1e-9
+
 # What a search may bound: the key, the property of a network, its unit.
 LIMITS: dict[str, tuple[str, str]] = {
     "max_parameters": ("parameters", "parameters"),
@@ -188,10 +191,10 @@ class Costs:
         Raises:
             ConfigError: with the share that suffices.
         """
-        if self.least > self.spec.share * (1 + 1e-9):
+        if self.least > self.spec.share * _SLACK:
             raise ConfigError(
-                f"A share of {self.spec.share:g} of the grid's cost is too small: {self.spec.rungs[0]} epochs of all "
-                f"{len(self.until)} networks and one of them to the end may take {self.least:.3f}; allow a share of "
+                f"A share of {self.spec.share:g} of the grid's cost is too small: all {len(self.until)} networks up to "
+                f"epoch {self.spec.rungs[0]} and one of them to the end may take {self.least:.3f}; allow a share of "
                 f"{math.ceil(self.least * 1000) / 1000:g}, or begin with fewer epochs."
             )
 
@@ -254,7 +257,7 @@ def _go_on(
             left[network] = "score"
             continue
         total, end = paid + step[network], max(dearest, rest[network])
-        if kept and (total > allowed or total + end > money * (1 + 1e-9)):
+        if kept and (total > allowed * _SLACK or total + end > money * _SLACK):
             left[network] = "cost"
             continue
         kept.append(network)
