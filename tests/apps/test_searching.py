@@ -151,7 +151,7 @@ def test_from_the_command_line_to_the_next_command(cli: Any, recordings: Path, t
     text = cli("search", dataset.path, "--grid", grid, "--workers", "1")
     assert text.status == 0, text.err
     assert text.out.startswith("SIMULATION") and "Train it on everybody" in text.out and "bound 75%" in text.out
-    assert "rung 1 of 2, 3 networks: 6 of 6 trainings" in text.err
+    assert "rung 1 of 2, networks 3: 6 of 6 trainings" in text.err
     ran = cli("search", dataset.path, "--grid", grid, "--workers", "1", "--json")
     found = ran.json
     assert found["simulated"] and "(12 from before)" not in ran.err and found["trainings_resumed"] >= 8

@@ -6,6 +6,7 @@ import json
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from statistics import stdev
 from typing import Any
@@ -16,6 +17,7 @@ from plushsense.apps.sweep_tables import Tables
 from plushsense.dataset.store import Dataset, write_atomically
 from plushsense.models.arch import Arch
 from plushsense.runs.journal import job_id
+from plushsense.runs.pool import Job
 from plushsense.training.grid import GridSpec
 from plushsense.training.search import Compared, Costs, Halved, Rung, SearchSpec, pareto, said
 
@@ -38,10 +40,6 @@ class Prepared:
     costs: Costs
     left_out: tuple[Arch, ...]
 
-    def __post_init__(self) -> None:
-        jobs = [{job.id: job for job in plan.jobs} for plan in self.plans]
-        object.__setattr__(self, "_jobs", jobs)
-
     @property
     def id(self) -> str:
         """The same for the same data and settings."""
@@ -49,8 +47,11 @@ class Prepared:
 
     def macs(self, rung: int, job: str) -> float:
         """Multiply-accumulates of a training up to a rung, from the first epoch."""
-        jobs: list[dict[str, Any]] = self.__dict__["_jobs"]
-        return self.plans[rung].macs(jobs[rung][job])
+        return self.plans[rung].macs(self._jobs[rung][job])
+
+    @cached_property
+    def _jobs(self) -> list[dict[str, Job]]:
+        return [{job.id: job for job in plan.jobs} for plan in self.plans]
 
 
 class SearchTables:

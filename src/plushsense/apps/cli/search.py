@@ -131,7 +131,7 @@ def search_shown() -> Callable[[Any], None]:
         if not over and now - last < (0.2 if rewritten else 5.0):
             return
         last = now
-        text = f"search, rung {at.rung} of {at.rungs}, {at.networks} networks: {at.done} of {at.trainings} trainings"
+        text = f"search, rung {at.rung} of {at.rungs}, networks {at.networks}: {at.done} of {at.trainings} trainings"
         text += f" ({at.resumed} from before)" if at.resumed else ""
         text += f", {at.share:.0%} of the budget"
         text += "" if at.best is None else f", best so far {at.best[0]} {at.best[1]:.3f}"
@@ -207,10 +207,14 @@ def _rungs(s: dict[str, Any], mark: str) -> str:
         error = rung["standard_error"]
         apart = "" if error is None else f", standard error of a difference {figure(error)}"
         text.append(
-            f"after {rung['epochs']} epochs: {rung['entered']} networks on {rung['folds']} folds, "
+            f"up to epoch {rung['epochs']}: {_several(rung['entered'], 'network')} on {_several(rung['folds'], 'fold')}, "
             f"{rung['share']:.1%} of the grid's cost{apart}"
         )
     return "\n".join(text)
+
+
+def _several(n: int, what: str) -> str:
+    return f"{n} {what}{'s' * (n != 1)}"
 
 
 def _finalist(row: dict[str, Any]) -> tuple[object, ...]:
