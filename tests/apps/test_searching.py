@@ -130,8 +130,11 @@ def test_limits_are_kept_before_anything_runs(cli: Any, dataset: Dataset) -> Non
     assert dry.status == 0, dry.err
     assert dry.json["candidates"] + len(dry.json["left_out"]) == 3 and dry.json["candidates"] == 2
     assert "over 120" in dry.json["left_out"][0]["why"]
+    assert "1 of 3 networks are beyond the limits and left out: 20 with 2" in dry.err
     none = cli("search", dataset.path, *words, "--max-macs-per-step", "10")
     assert none.status == 2 and "None of the 3 networks" in none.err and "MAC a step" in none.err
+    free = cli("search", dataset.path, *words[:-2], "--dry-run", "--json")
+    assert free.json["bound_share"] > 0.25 and "3 networks are too few" in free.err
     small = cli("search", dataset.path, *words[:-1], "0.05")
     assert small.status == 2 and "too small" in small.err and "allow a share of" in small.err
     bad = cli("search", dataset.path, *words, "--rungs", "4,2", "--eta", "0.5", "--padding", "strem", "--json")

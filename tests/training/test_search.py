@@ -143,10 +143,14 @@ def test_a_share_that_is_too_small_says_which_suffices() -> None:
     with pytest.raises(
         ConfigError, match=r"all 3 networks up to epoch 4 and one of them to the end may take 0\.813"
     ) as refused:
-        search(Curves(steady, units=1), costs, rungs=(4, 60))
+        search(Curves(steady, units=1), costs, rungs=(4, 60), share=0.25)
     share = float(str(refused.value).split("share of ")[-1].split(",")[0])
     curves = Curves(lambda network, epochs: 1.0 - network / 10, units=1)
     assert search(curves, costs, rungs=(4, 60), share=share).best == 0
+    # Where none is given: two can be trained to the end.
+    few = search(Curves(steady), np.ones((4, 3)))
+    assert few.bound / few.whole == pytest.approx(0.534) and len(few.rungs[-1].rung.entered) == 2
+    assert search(Curves(steady), np.ones((1, 3))).spent == 60 * 3
 
 
 def test_what_fails_is_left_out() -> None:

@@ -121,7 +121,7 @@ def summed_up(ready: Prepared, found: Halved, tables: SearchTables, dataset: Dat
             "bound_macs": found.bound,
             "grid_macs": found.whole,
             "share": found.spent / found.whole,
-            "bound_share": ready.spec.share,
+            "bound_share": ready.costs.share,
             "training_seconds": round(tables.seconds, 1),
         },
         "ranked_by": "macro_f1",

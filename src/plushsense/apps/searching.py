@@ -30,7 +30,7 @@ from plushsense.runs.journal import Journal, Result
 from plushsense.runs.pool import Job, run_jobs
 from plushsense.training.grid import GridSpec
 from plushsense.training.gridfile import changed
-from plushsense.training.search import Costs, Rung, Scores, SearchSpec, halving, none_left, problems
+from plushsense.training.search import QUARTER, Costs, Rung, Scores, SearchSpec, halving, none_left, problems
 from plushsense.training.searchfile import asked_of, load_search
 from plushsense.training.state import FitState
 
@@ -115,7 +115,18 @@ def prepare(
     epoch = np.array([[macs[run.job] / spec.rungs[-1] for run in t.runs[:folds]] for t in last.trials])
     costs = Costs(epoch, spec, len(settled.seeds))
     costs.check()
+    if spec.share is None and costs.share > QUARTER:
+        warn(
+            f"{len(last.trials)} networks are too few to find the best for a quarter of their cost: up to "
+            f"{costs.share:.0%} may be spent"
+        )
     over = dict.fromkeys(arch for arch in archs if spec.over(arch))
+    if over:
+        filters: dict[str, list[str]] = {}
+        for arch in over:
+            filters.setdefault(arch.symbol, []).append("/".join(map(str, arch.filters)))
+        named = "; ".join(f"{symbol} with {', '.join(several)}" for symbol, several in filters.items())
+        warn(f"{len(over)} of {len(dict.fromkeys(archs))} networks are beyond the limits and left out: {named}")
     return Prepared(settled, spec, tuple(plans), costs, tuple(over))
 
 
@@ -212,7 +223,7 @@ def preview_search(
         "seeds": len(ready.grid.seeds),
         "grid_macs": costs.whole,
         "bound_macs": costs.bound,
-        "bound_share": ready.spec.share,
+        "bound_share": ready.costs.share,
         "first_share": float(costs.step(0).sum()) / costs.whole,
         "least_share": costs.least,
         "grid": ready.grid.to_dict(),

@@ -23,6 +23,9 @@ from plushsense.models.arch import Arch
 
 Scores = NDArray[np.float64]
 
+# Of the grid's cost, where nothing is said.
+QUARTER = 0.25
+
 # Sums in another order differ by less.
 _SLACK = 1 + 1e-9
 
@@ -42,14 +45,16 @@ class SearchSpec:
         rungs: epochs after which networks are compared; those of the last are trained to the end.
         folds: how many folds the rungs before the last look at, one number each; empty: all of them.
         share: of the cost of the whole grid (every allowed network, last rung, all folds and seeds): at most this.
-        eta: of each rung one in so many goes on, where cost allows.
+            None: a quarter; where so few networks are allowed that not even one could be paid to the end, as much as
+            the first rung and two of them take.
+        eta: of each rung one in so many goes on, and two at least, where cost allows.
         max_parameters, max_state_bytes, max_macs_per_step: networks beyond are left out before anything runs; the
             state is that of int8 streaming, a step 50 ms.
     """
 
     rungs: tuple[int, ...] = (4, 15, 60)
     folds: tuple[int, ...] = ()
-    share: float = 0.25
+    share: float | None = None
     eta: float = 2.0
     max_parameters: int | None = None
     max_state_bytes: int | None = None
@@ -85,7 +90,7 @@ def problems(spec: SearchSpec, folds: int | None = None) -> list[str]:
             found.append(f"The folds {_listed(spec.folds)} cannot be used: whole numbers from 1 that do not fall.")
         elif folds is not None and spec.folds[-1] > folds:
             found.append(f"The folds {_listed(spec.folds)} are more than the split has: it has {folds}.")
-    if not 0.0 < spec.share <= 1.0:
+    if spec.share is not None and not 0.0 < spec.share <= 1.0:
         found.append(f"The share {spec.share:g} cannot be used: accepted is above 0, up to 1.")
     if not (math.isfinite(spec.eta) and spec.eta > 1.0):
         found.append(f"eta is {spec.eta:g}: accepted is above 1.")
@@ -167,7 +172,14 @@ class Costs:
             [seeds * e * epoch[:, :f].sum(axis=1) for e, f in zip(spec.rungs, folds, strict=True)], axis=1
         )
         self.whole = float(self.until[:, -1].sum())
-        self.bound = spec.share * self.whole
+        self.share = self._usual() if spec.share is None else spec.share
+        self.bound = self.share * self.whole
+
+    def _usual(self) -> float:
+        if self.least <= QUARTER:
+            return QUARTER
+        two = np.sort(self.rest(0))[-2:].sum()
+        return min(1.0, _up(float(self.step(0).sum() + two) / self.whole))
 
     def step(self, rung: int) -> Scores:
         """From the rung before to this one, by network."""
@@ -191,11 +203,11 @@ class Costs:
         Raises:
             ConfigError: with the share that suffices.
         """
-        if self.least > self.spec.share * _SLACK:
+        if self.least > self.share * _SLACK:
             raise ConfigError(
-                f"A share of {self.spec.share:g} of the grid's cost is too small: all {len(self.until)} networks up to "
+                f"A share of {self.share:g} of the grid's cost is too small: all {len(self.until)} networks up to "
                 f"epoch {self.spec.rungs[0]} and one of them to the end may take {self.least:.3f}; allow a share of "
-                f"{math.ceil(self.least * 1000) / 1000:g}, or begin with fewer epochs."
+                f"{_up(self.least):g}, or begin with fewer epochs."
             )
 
 
@@ -249,7 +261,9 @@ def _go_on(
     """Who is trained for the next rung, the best first. What is left is meant for all coming rungs alike."""
     allowed = money / (len(costs.spec.rungs) - rung)
     step, rest = costs.step(rung), costs.rest(rung)
-    cut = means[order[min(len(order), math.ceil(entered / costs.spec.eta)) - 1]]
+    # Two at least: who comes out of the end should have beaten somebody there.
+    wanted = max(2, math.ceil(entered / costs.spec.eta))
+    cut = means[order[min(len(order), wanted) - 1]]
     kept: list[int] = []
     paid, dearest = 0.0, 0.0
     for network in order:
@@ -287,6 +301,10 @@ def pareto(rows: Sequence[tuple[float, ...]]) -> list[bool]:
         return all(x >= y for x, y in pairs) and any(x > y for x, y in pairs)
 
     return [not any(beats(other, row) for other in rows) for row in rows]
+
+
+def _up(share: float) -> float:
+    return math.ceil(share * 1000) / 1000
 
 
 def _listed(values: Sequence[int]) -> str:

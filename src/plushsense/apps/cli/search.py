@@ -49,7 +49,12 @@ def add(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--rungs", metavar="N,…", help="epochs after which networks are compared (4,15,60)")
     parser.add_argument("--folds", metavar="N,…", help="folds that the rungs before the last look at (default: all)")
-    parser.add_argument("--share", type=float, metavar="X", help="of the cost of the whole grid, at most (0.25)")
+    parser.add_argument(
+        "--share",
+        type=float,
+        metavar="X",
+        help="of the cost of the whole grid, at most (0.25; more if only few networks fit)",
+    )
     parser.add_argument("--eta", type=float, metavar="X", help="one in X goes on from each rung, if cost allows (2)")
     parser.add_argument("--seeds", type=int, metavar="N", help="seeds of every training, 0 to N - 1 (1)")
     parser.add_argument("--architectures", metavar="SPEC,…", help="only these networks (default: the grid's)")
@@ -112,7 +117,8 @@ def _dry_run(args: argparse.Namespace, changes: dict[str, Any], asked: dict[str,
     text = [f"left out: {row['arch']} {row['filters']}: {row['why']}" for row in found["left_out"]]
     rungs = ", ".join(f"{e} epochs on {f} folds" for e, f in zip(found["rungs"], found["folds"], strict=True))
     text += [
-        f"{found['candidates']} networks, split {found['split']}, {found['seeds']} seeds; compared after {rungs}",
+        f"{_several(found['candidates'], 'network')}, split {found['split']}, {_several(found['seeds'], 'seed')}; "
+        f"compared after {rungs}",
         f"at most {found['bound_macs']:.2e} multiply-accumulates, {found['bound_share']:.0%} of the whole grid's "
         f"{found['grid_macs']:.2e}; the first rung takes {found['first_share']:.1%}",
     ]
@@ -153,10 +159,10 @@ def lines(s: dict[str, Any]) -> list[str]:
     if s["leaky"]:
         out.append("LEAKY: windows of one recording stand on both sides of this split; the scores flatter.")
     mark = " (leaky)" if s["leaky"] else ""
-    out += [f"left out: {row['arch']} {row['filters']}: {row['why']}" for row in s["left_out"]]
-    seeds = len(s["grid"]["seeds"])
+    beyond = f" within the limits, {len(s['left_out'])} beyond" if s["left_out"] else ""
     out.append(
-        f"{s['candidates']} networks, split {s['split']}, context {s['context']}, {seeds} seed{'s' * (seeds > 1)}\n"
+        f"{_several(s['candidates'], 'network')}{beyond}; split {s['split']}, context {s['context']}, "
+        f"{_several(len(s['grid']['seeds']), 'seed')}\n"
     )
     out.append(_rungs(s, mark))
     best, cost = s["winner"], s["cost"]
@@ -206,9 +212,9 @@ def _rungs(s: dict[str, Any], mark: str) -> str:
     for rung in s["rungs"]:
         error = rung["standard_error"]
         apart = "" if error is None else f", standard error of a difference {figure(error)}"
+        entered, folds = _several(rung["entered"], "network"), _several(rung["folds"], "fold")
         text.append(
-            f"up to epoch {rung['epochs']}: {_several(rung['entered'], 'network')} on {_several(rung['folds'], 'fold')}, "
-            f"{rung['share']:.1%} of the grid's cost{apart}"
+            f"up to epoch {rung['epochs']}: {entered} on {folds}, {rung['share']:.1%} of the grid's cost{apart}"
         )
     return "\n".join(text)
 
