@@ -32,9 +32,8 @@ from numpy.typing import NDArray
 
 import plushsense as ps
 from plushsense.apps.cli.search import search_shown
-from plushsense.apps.cli.settings import sweep_shown
 from plushsense.apps.searching import prepare
-from plushsense.apps.sweeping import Sweep
+from plushsense.apps.sweeping import Sweep, live_table
 from plushsense.core.errors import PlushSenseError
 from plushsense.models.arch import PAPER_ARCHITECTURES
 from plushsense.training.grid import GridSpec
@@ -173,7 +172,7 @@ def prove(args: argparse.Namespace) -> int:
     say(f"searches: {time.monotonic() - began:.0f} s; now the grid")
     at = tuple(sorted({*args.rungs, *(e for e in args.at if e < last)}))
     swept = ps.sweep(
-        dataset, grid, **changes, epochs=at, seeds=every, workers=args.workers, progress=sweep_shown(),
+        dataset, grid, **changes, epochs=at, seeds=every, workers=args.workers, table=live_table,
     )  # fmt: skip
     if swept.summary["done"] < swept.summary["trials"]:
         say(f"{swept.summary['trials'] - swept.summary['done']} trials of the grid failed: no comparison.")

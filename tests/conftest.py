@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import tempfile
+import time
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -85,3 +89,56 @@ def mlflow_here() -> None:
     for module in ("mlflow", "sqlalchemy", "alembic"):
         if importlib.util.find_spec(module) is None:
             missing("mlflow", f"{module} is not installed")
+
+
+@pytest.fixture(scope="session")
+def scikit_learn() -> None:
+    """Scikit-learn (extra baselines)."""
+    if importlib.util.find_spec("sklearn") is None:
+        missing("baselines", "sklearn is not installed")
+
+
+# Bytes: a small /dev/shm must hold two.
+_STORE = 80 * 2**20
+
+
+@pytest.fixture(scope="module")
+def two_nodes(cluster_possible: None) -> Iterator[Any]:
+    """A head and a second node on this machine; nothing of it is left afterwards."""
+    import ray
+    from ray.cluster_utils import Cluster
+
+    with tempfile.TemporaryDirectory(prefix="ps", ignore_cleanup_errors=True) as folder:
+        # A short path: it holds sockets, whose names may have 107 bytes. Nothing is written to /tmp/ray.
+        patch = pytest.MonkeyPatch()
+        patch.setenv("RAY_TMPDIR", folder)
+        jobs = str(REPO / "tests" / "runs")
+        patch.setenv("PYTHONPATH", os.pathsep.join(filter(None, [jobs, os.environ.get("PYTHONPATH")])))
+        head = {"num_cpus": 1, "object_store_memory": _STORE, "include_dashboard": False, "temp_dir": f"{folder}/ray"}
+        Path(folder, "ray").mkdir()
+        cluster = Cluster(initialize_head=True, head_node_args=head)
+        try:
+            cluster.add_node(num_cpus=1, object_store_memory=_STORE)
+            yield cluster
+        finally:
+            ray.shutdown()
+            cluster.shutdown()
+            patch.undo()
+        left = _processes_of(folder)
+        for _ in range(100):
+            if not left:
+                break
+            time.sleep(0.1)
+            left = _processes_of(folder)
+        assert left == []
+
+
+def _processes_of(folder: str) -> list[str]:
+    found = []
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            if folder.encode() in (process / "cmdline").read_bytes():
+                found.append(process.name)
+        except OSError:
+            continue
+    return found

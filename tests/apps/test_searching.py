@@ -173,10 +173,10 @@ def test_one_that_diverges_is_left_out(dataset: Dataset, tmp_path: Path, monkeyp
 
     real = room.fit
 
-    def fit(train: Any, validation: Any, arch: Any, spec: Any, *rest: Any) -> Any:
+    def fit(train: Any, validation: Any, arch: Any, spec: Any, *rest: Any, **more: Any) -> Any:
         if arch.symbol == "9":
             raise DivergedError("the loss is no number")
-        return real(train, validation, arch, spec, *rest)
+        return real(train, validation, arch, spec, *rest, **more)
 
     monkeypatch.setattr(room, "fit", fit)
     found = search(dataset, out=tmp_path, **QUICK, **SMALL).summary

@@ -16,8 +16,8 @@ import pytest
 from polars.testing import assert_frame_equal
 
 import plushsense as ps
-from plushsense.apps.sweeping import SweepProgress, sweep
-from plushsense.core.errors import ConfigError, DivergedError
+from plushsense.apps.sweeping import JOURNAL, UNFINISHED, SweepProgress, sweep
+from plushsense.core.errors import ConfigError, DivergedError, TrainingError
 from plushsense.dataset.importers import import_recordings
 from plushsense.dataset.store import Dataset
 
@@ -143,10 +143,10 @@ def test_one_that_diverges_is_told_and_the_others_go_on(
 
     real = room.fit
 
-    def fit(train: Any, validation: Any, arch: Any, spec: Any, *rest: Any) -> Any:
+    def fit(train: Any, validation: Any, arch: Any, spec: Any, *rest: Any, **more: Any) -> Any:
         if arch.symbol == "9" and spec.epochs > 2:
             raise DivergedError("the loss is no number")
-        return real(train, validation, arch, spec, *rest)
+        return real(train, validation, arch, spec, *rest, **more)
 
     monkeypatch.setattr(room, "fit", fit)
     found = sweep(dataset, epochs=(1, 2, 3), out=tmp_path, **SMALL)
@@ -163,6 +163,69 @@ def test_one_that_diverges_is_told_and_the_others_go_on(
     # Nothing of it went well: there is no curve either.
     alone = sweep(dataset, epochs=(3,), out=tmp_path, overwrite=True, **SMALL)
     assert (alone.summary["done"], len(alone.summary["failed"]), len(frame(tmp_path, "curves"))) == (2, 2, 2 * 3)
+
+
+def test_a_long_training_goes_on_where_it_was_stopped(
+    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from plushsense.training import fit as room
+
+    whole = sweep(dataset, epochs=(2, 6), out=tmp_path / "whole", **SMALL)
+    shutil.rmtree(dataset.path.joinpath(*JOURNAL))
+    real, begun = room.fit, []
+
+    def fit(*given: Any, start: Any, save: Any, **more: Any) -> Any:
+        begun.append(0 if start is None else start.epoch)
+
+        def stop(state: Any) -> None:
+            save(state)
+            if state.epoch == 4 and len(begun) == 1:
+                raise KeyboardInterrupt
+
+        return real(*given, start=start, save=stop, save_every_s=0.0, **more)
+
+    monkeypatch.setattr(room, "fit", fit)
+    with pytest.raises(KeyboardInterrupt):
+        sweep(dataset, epochs=(2, 6), out=tmp_path / "again", **SMALL)
+    unfinished = dataset.path.joinpath(*UNFINISHED)
+    assert len(list(unfinished.iterdir())) == 1
+    again = sweep(dataset, epochs=(2, 6), out=tmp_path / "again", **SMALL)
+    assert begun[:2] == [0, 4] and not any(begun[2:])
+    assert not list(unfinished.iterdir())
+    assert_frame_equal(again.trials.drop("seconds"), whole.trials.drop("seconds"), check_exact=True)
+
+
+def test_what_keeps_the_first_trainings_from_being_done_ends_the_sweep(
+    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from plushsense.training import fit as room
+
+    def broken(*given: Any, **more: Any) -> Any:
+        raise TrainingError("no way to train here")
+
+    monkeypatch.setattr(room, "fit", broken)
+    with pytest.raises(TrainingError, match="no way to train here"):
+        sweep(dataset, epochs=(1,), out=tmp_path, **SMALL)
+
+
+def test_one_lost_training_is_told_and_its_trials_wait(
+    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from plushsense.training import fit as room
+
+    real = room.fit
+
+    def fit(train: Any, validation: Any, arch: Any, *rest: Any, **more: Any) -> Any:
+        if arch.symbol == "9":
+            raise MemoryError("no memory for it")
+        return real(train, validation, arch, *rest, **more)
+
+    monkeypatch.setattr(room, "fit", fit)
+    found = sweep(dataset, epochs=(1,), out=tmp_path, **SMALL)
+    assert found.summary["trainings_lost"] == 2 == len(found.summary["failed"])
+    assert set(found.trials["status"]) == {"done", "waiting"}
+    monkeypatch.setattr(room, "fit", real)
+    assert sweep(dataset, epochs=(1,), out=tmp_path, **SMALL).summary["failed"] == []
 
 
 def test_a_grid_file_from_the_command_line(cli: Any, dataset: Dataset, tmp_path: Path) -> None:
@@ -184,7 +247,7 @@ def test_a_grid_file_from_the_command_line(cli: Any, dataset: Dataset, tmp_path:
         "sweep", dataset.path, "--grid", grid, "--split", "by-subject:2", "--classes", "shared", "--seeds", "2"
     )
     assert people.status == 0 and "leaky" not in people.out.lower()
-    assert "8 of 8 trainings" in people.err
+    assert "8 of 8 done" in people.err
 
 
 def test_scores_of_a_simulation_say_so(cli: Any, recordings: Path, tmp_path: Path) -> None:

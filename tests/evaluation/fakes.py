@@ -112,3 +112,20 @@ def refuses(train: WindowSet, validation: WindowSet, test: WindowSet, progress: 
 
 def misshapen(train: WindowSet, validation: WindowSet, test: WindowSet, progress: Any, /) -> FoldOutput:
     return FoldOutput(np.zeros((1, 3), dtype=np.float32))
+
+
+def rhythms(n: int = 60, seed: int = 0, classes: int = 3, samples: int = 50) -> WindowSet:
+    """Windows of three rhythms and strengths with noise, on two channels."""
+    rng = np.random.default_rng(seed)
+    y = np.arange(n) % classes
+    time = np.arange(samples) + rng.integers(0, 30, (n, 1))
+    wave = (300 + 250 * y[:, None]) * np.sin(2 * np.pi * time / (8 + 12 * y[:, None]))
+    x = wave[:, None, :] * np.array([1.0, 0.5])[:, None] + rng.normal(0, 60, (n, 2, samples))
+    none = np.full((n, 2), -1, dtype=np.int64)
+    labels = tuple(f"gesture {k}" for k in range(classes))
+    return WindowSet(
+        x=x.astype(np.int32), y=y.astype(np.int64), labels=labels, affects=("none",) * classes, families=labels,
+        recording=np.arange(n, dtype=np.int64), recording_ids=tuple(f"P/{i:03d}" for i in range(n)),
+        subject=np.array([f"P{i % 5}" for i in range(n)]), context=np.full(n, "inside"), stream=np.full(n, ""),
+        window_rows=none, recording_rows=none, rate_hz=100.0, inputs=("a", "b"),
+    )  # fmt: skip

@@ -149,8 +149,8 @@ def test_features_of_a_known_wave() -> None:
     assert rms[1] == 7
     assert energy[1] == 400 * 49
     assert slow[0] < 1e-3 * quick[0]
-    # Power of a sine over half the spectrum: T a² / 4.
-    assert quick[0] == pytest.approx(400 * 500**2 / 4, rel=1e-3)
+    # The mean square of a sine.
+    assert quick[0] == pytest.approx(500**2 / 2, rel=1e-3)
     assert np.abs(seen["movement"].reshape(8, 3)[0]).max() < 1e-6, "no level"
     assert features(frames.slice(0, 3), ACCEL) is None
 

@@ -5,12 +5,10 @@ from __future__ import annotations
 import os
 import socket
 import sys
-import tempfile
 import threading
 import time
 import types
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,47 +25,6 @@ sys.path.insert(0, HERE)
 import work  # noqa: E402 - nodes import it by this path too
 
 SMALL = 80 * 2**20
-
-
-@pytest.fixture(scope="module")
-def two_nodes(cluster_possible: None) -> Iterator[Any]:
-    """A head and a second node on this machine; nothing of it is left afterwards."""
-    import ray
-    from ray.cluster_utils import Cluster
-
-    with tempfile.TemporaryDirectory(prefix="ps", ignore_cleanup_errors=True) as folder:
-        # A short path: it holds sockets, whose names may have 107 bytes. Nothing is written to /tmp/ray.
-        patch = pytest.MonkeyPatch()
-        patch.setenv("RAY_TMPDIR", folder)
-        patch.setenv("PYTHONPATH", os.pathsep.join(filter(None, [HERE, os.environ.get("PYTHONPATH")])))
-        head = {"num_cpus": 1, "object_store_memory": SMALL, "include_dashboard": False, "temp_dir": f"{folder}/ray"}
-        Path(folder, "ray").mkdir()
-        cluster = Cluster(initialize_head=True, head_node_args=head)
-        try:
-            cluster.add_node(num_cpus=1, object_store_memory=SMALL)
-            yield cluster
-        finally:
-            ray.shutdown()
-            cluster.shutdown()
-            patch.undo()
-        left = _processes_of(folder)
-        for _ in range(100):
-            if not left:
-                break
-            time.sleep(0.1)
-            left = _processes_of(folder)
-        assert left == []
-
-
-def _processes_of(folder: str) -> list[str]:
-    found = []
-    for process in Path("/proc").glob("[0-9]*"):
-        try:
-            if folder.encode() in (process / "cmdline").read_bytes():
-                found.append(process.name)
-        except OSError:
-            continue
-    return found
 
 
 def same(one: dict[str, Any], other: dict[str, Any]) -> bool:

@@ -200,6 +200,7 @@ def evaluate(
     filters: Sequence[int] | str | None = None,
     out: str | os.PathLike[str] | None = None,
     overwrite: bool = False,
+    cluster: str | None = None,
     progress: Callable[[FoldProgress], None] | None = None,
     warn: Warn = silent,
     **settings: Any,
@@ -213,6 +214,7 @@ def evaluate(
         split: "leave-one-subject-out" (default), "by-subject:5", "by-recording:5", "windows:5" (leaky).
         out: a folder for ``evaluation.json`` and ``predictions.parquet``; one that holds an evaluation of other
             settings or data is refused unless ``overwrite``.
+        cluster: address of a Ray cluster that trains the folds instead of this machine's processes.
     """
     dataset = opened(dataset)
     config = config or _from_settings(arch, filters, settings)
@@ -238,6 +240,7 @@ def evaluate(
         journal=Journal(dataset.path / "cache" / "folds"),
         key={"arch": network.to_dict(), "training": placed(config.training).key(), "vectors": fit_on.vectors},
         workers=config.evaluation.processes,
+        cluster=cluster,
         seed=config.evaluation.seed,
         progress=progress,
     )

@@ -22,7 +22,7 @@ from plushsense.apps.search_tables import Prepared, SearchTables, left_out, summ
 from plushsense.apps.sweep_job import Outcome, TrainAndScore, outcome
 from plushsense.apps.sweep_plan import GridProblems, Run, Task, plans_by_epochs, processes
 from plushsense.apps.sweep_tables import check_place
-from plushsense.apps.sweeping import JOURNAL, head
+from plushsense.apps.sweeping import JOURNAL, UNFINISHED, head
 from plushsense.core.errors import BadInput, ConfigError
 from plushsense.dataset.store import Dataset
 from plushsense.models.arch import Arch
@@ -245,13 +245,16 @@ class _Trainer:
         progress: Callable[[SearchProgress], None] | None,
     ) -> None:
         self._ready, self._progress = ready, progress
+        self._unfinished = Journal(dataset.path.joinpath(*UNFINISHED))
         self._run = partial(
             run_jobs,
-            work=TrainAndScore(),
+            # Nodes of a cluster do not share a disk: there a training is done whole.
+            work=TrainAndScore(self._unfinished if cluster is None else None),
             shared=(ready.plans[-1].sets, ready.plans[-1].folds),
             workers=workers,
             threads=ready.grid.threads,
             cluster=cluster,
+            gpus=1.0 if cluster is not None and ready.grid.device == "cuda" else 0.0,
             journal=Journal(dataset.path.joinpath(*JOURNAL)),
         )
         self.resumed = 0
@@ -275,7 +278,12 @@ class _Trainer:
                 costs[job.id] = plan.macs(job) - (0 if earlier is None else self._ready.macs(rung.number - 1, earlier))
                 jobs.append(Job(job.id, self._going_on(job.task, earlier, rung)))
         teller = _Teller(self._ready, rung, costs, self._spent, self._best, self._progress)
-        self._results = self._run(jobs, on_done=teller.done, on_report=teller.epoch)
+
+        def done(job: Job, result: Result, resumed: bool) -> None:
+            self._unfinished.discard(job.id)
+            teller.done(job, resumed)
+
+        self._results = self._run(jobs, on_done=done, on_report=teller.epoch)
         self.resumed += teller.resumed
         self._spent += rung.cost
         outcomes = {job: outcome(plan, wanted[job], result) for job, result in self._results.items()}
@@ -329,18 +337,18 @@ class _Teller:
         self._done = self.resumed = 0
         self._running: dict[str, float] = {}
 
-    def done(self, job: Job, result: Result, resumed: bool) -> None:
+    def done(self, job: Job, resumed: bool) -> None:
         self._done += 1
         self.resumed += resumed
         self._running.pop(job.id, None)
         self._spent += self._costs[job.id]
         self._tell(job, 0, 0)
 
-    def epoch(self, job: Job, message: tuple[int, int]) -> None:
+    def epoch(self, job: Job, message: tuple[int, int, float]) -> None:
         from_epoch = 0 if job.task.start is None else job.task.start.epoch
         part = (message[0] - from_epoch) / max(1, message[1] - from_epoch)
         self._running[job.id] = part * self._costs[job.id]
-        self._tell(job, *message)
+        self._tell(job, *message[:2])
 
     def _tell(self, job: Job, epoch: int, epochs: int) -> None:
         if self._progress is None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from plushsense.apps.sweep_plan import Plan, Run, Task
 from plushsense.core.errors import DivergedError
 from plushsense.core.gestures import NOBODY
-from plushsense.runs.journal import Result
+from plushsense.runs.journal import Journal, Result
 from plushsense.runs.pool import Report
 from plushsense.scoring import metrics
 from plushsense.scoring.metrics import Counts
@@ -28,24 +28,38 @@ class TrainAndScore:
     """One training as a job: probabilities of the tested windows after each number of epochs that is scored.
 
     A training whose loss is no longer a number is no reason to stop the others: it is trained up to the longest that
-    goes well, and says why not further. ``at`` is the epoch whose weights are scored.
+    goes well, and says why not further. ``at`` is the epoch whose weights are scored. In ``unfinished`` a long training
+    keeps where it stands, once a minute, and goes on from there.
     """
+
+    unfinished: Journal | None = None
 
     def __call__(self, shared: Any, task: Task, report: Report, /) -> Result:
         from plushsense.training.fit import fit, predict
+        from plushsense.training.state import FitState
 
         sets, folds = shared
         windows, fold = sets[task.span], folds[task.span][task.fold]
         train, validation, test = (windows.take(index) for index in (fold.train, fold.validation, fold.test))
         wanted, failed, fitted = task.epochs, dict[str, str](), None
+        before = None if self.unfinished is None else self.unfinished.find(task.id)
+        start = task.start if before is None else FitState.from_arrays(before)
+
+        def save(state: FitState) -> None:
+            if self.unfinished is not None:
+                self.unfinished.save(task.id, state.to_arrays())
+
         while wanted and fitted is None:
             spec = replace(task.spec, epochs=wanted[-1])
             keep = wanted if task.nested else ()
             try:
-                fitted = fit(train, validation, task.arch, spec, lambda at, of, _: report((at, of)), keep, task.start)
+                fitted = fit(
+                    train, validation, task.arch, spec, lambda at, of, row: report((at, of, row["train_loss"])), keep,
+                    start=start, save=save if task.nested else None,
+                )  # fmt: skip
             except DivergedError as cause:
                 failed[str(wanted[-1])] = str(cause)
-                wanted = wanted[:-1]
+                wanted, start = wanted[:-1], None
         if fitted is None:
             return _result(
                 (), np.zeros((0, len(test), len(windows.labels))), [], [], np.zeros((0, len(CURVE))), 0, failed
@@ -62,7 +76,8 @@ class TrainAndScore:
         seconds = task.spent_s + fitted.seconds
         result = _result(wanted, np.stack(tested), watched, at, curve, seconds, failed)
         state = fitted.state if task.stateful and not failed else None
-        return result if state is None else {**result, **state.to_arrays()}
+        # Weights that were scored on the way are of no more use.
+        return result if state is None else {**result, **replace(state, kept={}).to_arrays()}
 
 
 def _result(

@@ -41,7 +41,8 @@ class GridProblems(ConfigError):
 
 @dataclass(frozen=True)
 class Task:
-    """One training of one fold: ``epochs`` are those after which it is scored; ``span`` picks the windows.
+    """One training of one fold: ``epochs`` are those after which it is scored; ``span`` picks the windows; ``id`` the
+    job's.
 
     ``start`` (a `FitState`) and the ``spent_s`` seconds of training before it change nothing in what comes out;
     ``stateful``: the result holds its state as well, so that another training can go on from there.
@@ -52,6 +53,7 @@ class Task:
     epochs: tuple[int, ...]
     span: int
     fold: int
+    id: str = ""
     start: Any = None
     spent_s: float = 0.0
     stateful: bool = False
@@ -243,9 +245,9 @@ def _planned(dataset: Dataset, grid: GridSpec, cut: _Cut, fits: Callable[[Arch],
                 size = len(fold.train) if batch == FULL else int(batch)
                 task = Task(arch, replace(spec, epochs=training.epochs[-1], batch=size, seed=seed), training.epochs,
                             span, i)  # fmt: skip
-                job = Job(job_id({**base, **_settings(task), "fold": of_folds[i]}), task)
-                jobs[job.id] = job
-                runs.append(Run(job.id, seed, fold.name, span, i, size))
+                known = job_id({**base, **_settings(task), "fold": of_folds[i]})
+                jobs[known] = Job(known, replace(task, id=known))
+                runs.append(Run(known, seed, fold.name, span, i, size))
         trials += [
             PlannedTrial(_trial_id(base, trial, spec, of_folds), trial, tuple(runs)) for trial in training.trials
         ]

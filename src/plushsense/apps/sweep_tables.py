@@ -105,6 +105,7 @@ class Tables:
         self.plan, self.out, self.head = plan, out, dict(head)
         self.outcomes: dict[str, Outcome] = {}
         self.resumed: set[str] = set()
+        self.lost: dict[str, str] = {}
         self.best: dict[str, Any] | None = None
         self._of: dict[str, list[tuple[PlannedTrial, Run]]] = {}
         for planned in plan.trials:
@@ -124,6 +125,10 @@ class Tables:
             self.resumed.add(job)
         elif time.monotonic() >= self._due:
             self.write()
+
+    def lose(self, job: str, why: str) -> None:
+        """Note a training that was given up; its trials wait for another run."""
+        self.lost[job] = why
 
     def trial_rows(self) -> list[dict[str, Any]]:
         """One row a trial, in the order of the grid."""
@@ -145,6 +150,10 @@ class Tables:
             for job, found in self.outcomes.items()
             for epochs, why in found.failed.items()
         ]
+        failed += [
+            {"run": job, **_words(*self._of[job][0]), "epochs": self._of[job][-1][0].trial.epochs, "why": why}
+            for job, why in self.lost.items()
+        ]
         return {
             **self.head,
             "trials": len(rows),
@@ -153,6 +162,7 @@ class Tables:
             "trainings": len(self.plan.jobs),
             "trainings_done": len(self.outcomes),
             "trainings_resumed": len(self.resumed),
+            "trainings_lost": len(self.lost),
             "failed": sorted(failed, key=lambda f: (f["run"], f["epochs"])),
             "seconds": round(time.monotonic() - self._began, 1),
             "training_seconds": round(sum(found.seconds for found in self.outcomes.values()), 1),

@@ -10,26 +10,50 @@ from __future__ import annotations
 import os
 import platform
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from plushsense import __version__
 from plushsense.apps.preparation import Warn, opened, silent
 from plushsense.apps.sweep_job import TrainAndScore
 from plushsense.apps.sweep_plan import GridProblems, Plan, Task, plan, processes
 from plushsense.apps.sweep_tables import TRIALS, Tables, check_place
-from plushsense.core.errors import ConfigError
 from plushsense.core.extras import need
 from plushsense.dataset.store import Dataset
 from plushsense.runs.journal import Journal, Result, job_id
 from plushsense.runs.pool import Job, run_jobs
+from plushsense.runs.table import At, Best, Row, Table
 from plushsense.training.grid import GridSpec
 from plushsense.training.gridfile import changed, load_grid
 
-JOURNAL = ("cache", "sweeps")
+JOURNAL, UNFINISHED = ("cache", "sweeps"), ("cache", "unfinished")
+
+# So many trainings given up, and none done: the rest would go the same way.
+_HOPELESS = 3
+
+
+class Watcher(Protocol):
+    """Who is told of trainings while they are worked off; a context manager around it."""
+
+    def __enter__(self) -> Any: ...
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def on_start(self, job: Job) -> None:
+        """It begins."""
+
+    def on_report(self, job: Job, message: Any) -> None:
+        """It is at (epoch, epochs, loss)."""
+
+    def on_done(self, job: Job, result: Result, resumed: bool) -> None:
+        """It is done, or was before."""
+
+    def on_failed(self, job: Job, error: Exception) -> None:
+        """It was given up."""
 
 
 class SweepProgress(NamedTuple):
@@ -97,6 +121,7 @@ def sweep(
     workers: int = 0,
     cluster: str | None = None,
     progress: Callable[[SweepProgress], None] | None = None,
+    table: Callable[[Plan, Tables], Watcher] | None = None,
     warn: Warn = silent,
     **changes: Any,
 ) -> Sweep:
@@ -111,6 +136,7 @@ def sweep(
         out: default ``evaluations/sweep-<name>`` in the data set; with the split and a hash where the grid was changed.
         workers: trainings at a time; 0: as many as the processors hold.
         cluster: address of a Ray cluster that trains instead of this machine's processes.
+        table: `live_table`, to see the trainings on standard error.
         changes: keys of a grid, as ``epochs=(20,)``, ``architectures=…``, ``seeds=…``, ``threads=2``.
 
     Raises:
@@ -124,12 +150,9 @@ def sweep(
     tables = Tables(planned, place, head(dataset, planned))
     teller = _Teller(planned, tables, progress)
 
-    def done(job: Job, result: Result, resumed: bool) -> None:
-        tables.add(job.id, result, resumed)
-        teller.done(job, resumed)
-
+    watchers = [teller] if table is None else [teller, table(planned, tables)]
     try:
-        _work_off(planned, dataset, processes(workers, spec.threads), cluster, done, teller.epoch)
+        _work_off(planned, dataset, tables, processes(workers, spec.threads), cluster, watchers)
     except BaseException:
         # What is finished stands in the tables; stopped before anything new, those of before stay.
         if len(tables.outcomes) > len(tables.resumed):
@@ -141,23 +164,79 @@ def sweep(
 def _work_off(
     planned: Plan,
     dataset: Dataset,
+    tables: Tables,
     workers: int,
     cluster: str | None,
-    on_done: Callable[[Job, Result, bool], None],
-    on_report: Callable[[Job, Any], None],
+    watchers: Sequence[Watcher],
 ) -> None:
     """The one place where trainings are handed out."""
-    if cluster is not None:
-        raise ConfigError("Training on a cluster is not there yet: leave --cluster out.")
-    run_jobs(
-        planned.jobs,
-        TrainAndScore(),
-        shared=(planned.sets, planned.folds),
-        workers=workers,
-        journal=Journal(dataset.path.joinpath(*JOURNAL)),
-        on_done=on_done,
-        on_report=on_report,
+    results, unfinished = Journal(dataset.path.joinpath(*JOURNAL)), Journal(dataset.path.joinpath(*UNFINISHED))
+
+    def started(job: Job) -> None:
+        for watcher in watchers:
+            watcher.on_start(job)
+
+    def reported(job: Job, message: Any) -> None:
+        for watcher in watchers:
+            watcher.on_report(job, message)
+
+    def done(job: Job, result: Result, resumed: bool) -> None:
+        unfinished.discard(job.id)
+        tables.add(job.id, result, resumed)
+        for watcher in watchers:
+            watcher.on_done(job, result, resumed)
+
+    def failed(job: Job, error: Exception) -> None:
+        tables.lose(job.id, str(error) or type(error).__name__)
+        for watcher in watchers:
+            watcher.on_failed(job, error)
+        # What keeps the first ones from being trained keeps them all.
+        if len(tables.lost) >= _HOPELESS and len(tables.outcomes) == len(tables.resumed):
+            raise error
+
+    with ExitStack() as stack:
+        for watcher in watchers:
+            stack.enter_context(watcher)
+        run_jobs(
+            planned.jobs,
+            # Nodes of a cluster do not share a disk: there a training is done whole.
+            TrainAndScore(unfinished if cluster is None else None),
+            shared=(planned.sets, planned.folds),
+            workers=workers,
+            threads=planned.grid.threads,
+            journal=results,
+            cluster=cluster,
+            gpus=1.0 if cluster is not None and planned.grid.device == "cuda" else 0.0,
+            on_start=started,
+            on_report=reported,
+            on_done=done,
+            on_failed=failed,
+        )
+
+
+def live_table(planned: Plan, tables: Tables) -> Table:
+    """A table of the trainings on standard error: what is done, what runs, the best so far, the time left."""
+
+    def best(job: Job, result: Result) -> Best | None:
+        row = tables.best
+        if row is None:
+            return None
+        marks = " (leaky)" * row["leaky"] + " (simulation)" * row["simulated"]
+        return Best(row["accuracy"], f"{row['arch']} {row['filters']}{marks}")
+
+    rows = {job.id: Row(_named(job.task), planned.macs(job)) for job in planned.jobs}
+    return Table(
+        f"sweep {planned.grid.name}",
+        rows,
+        read=lambda message: At(*message),
+        score=best,
+        score_name="accuracy",
     )
+
+
+def _named(task: Task) -> str:
+    filters = "/".join(map(str, task.arch.filters))
+    return f"{task.arch.symbol} {filters} batch {task.spec.batch} seed {task.spec.seed} fold {task.fold + 1}"
 
 
 def resolve(grid: GridSpec | str | os.PathLike[str], changes: dict[str, Any]) -> tuple[GridSpec, list[str]]:
@@ -224,16 +303,31 @@ class _Teller:
         self._running: dict[str, float] = {}
         self._tables, self._progress = tables, progress
 
-    def done(self, job: Job, resumed: bool) -> None:
+    def __enter__(self) -> _Teller:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Nothing is held."""
+
+    def on_start(self, job: Job) -> None:
+        """Told with its first epoch."""
+
+    def on_failed(self, job: Job, error: Exception) -> None:
+        """Its share is not counted any more."""
+        self._running.pop(job.id, None)
+
+    def on_done(self, job: Job, result: Result, resumed: bool) -> None:
+        """It is done, or was before."""
         self._done += 1
         self._resumed += resumed
         self._running.pop(job.id, None)
         self._finished += self._macs[job.id]
         self._tell(job, 0, 0)
 
-    def epoch(self, job: Job, message: tuple[int, int]) -> None:
+    def on_report(self, job: Job, message: tuple[int, int, float]) -> None:
+        """It is at (epoch, epochs, loss)."""
         self._running[job.id] = message[0] / message[1] * self._macs[job.id]
-        self._tell(job, *message)
+        self._tell(job, *message[:2])
 
     def _tell(self, job: Job, epoch: int, epochs: int) -> None:
         if self._progress is None:

@@ -110,6 +110,7 @@ def evaluate(
     journal: Journal | None = None,
     key: Mapping[str, Any] | None = None,
     workers: int = 1,
+    cluster: str | None = None,
     seed: int = 0,
     progress: Callable[[FoldProgress], None] | None = None,
 ) -> Evaluation:
@@ -122,6 +123,7 @@ def evaluate(
         key: with a journal, everything that ``fit_predict`` depends on (network, schedule, its seed). The windows
             and the folds go into a job's id by themselves.
         workers: folds at a time, each in a process of its own.
+        cluster: address of a Ray cluster that does the folds instead.
         seed: of the split.
 
     Raises:
@@ -139,6 +141,7 @@ def evaluate(
         _FoldWork(fit_predict),
         shared=(train_windows, None if score_windows is train_windows else score_windows),
         workers=workers,
+        cluster=cluster,
         journal=journal,
         on_done=told.done,
         on_report=told.epoch,
@@ -159,8 +162,8 @@ def evaluate(
     )
     return Evaluation(
         split=asked,
-        context=_context(score_windows),
-        train_context=_context(train_windows),
+        context=context_of(score_windows),
+        train_context=context_of(train_windows),
         seeds=[seed],
         table=scores(predictions, records, score_windows.affects, asked.apart),
         histories=[list(outcome["history"]) for outcome in outcomes],
@@ -217,7 +220,7 @@ class _Teller:
             self._progress(FoldProgress(self._done, self._folds, job.task.name, epoch, epochs, self._resumed))
 
 
-def _context(windows: WindowSet) -> str:
+def context_of(windows: WindowSet) -> str:
     """The kind of context of a set: "stream" where any window has a real past, else "loop" or "inside"."""
     present = set(np.unique(windows.context).tolist())
     return next((kind for kind in ("stream", "loop") if kind in present), "inside")
@@ -230,7 +233,7 @@ def _prints(train: WindowSet, score: WindowSet) -> list[str]:
 
 
 def windows_print(windows: WindowSet) -> str:
-    """The content of a set, hashed."""
+    """The content of a set, hashed: what jobs on it go by."""
     digest = hashlib.sha256(repr((windows.x.shape, windows.labels, windows.recording_ids)).encode())
     for array in (windows.x, windows.y, windows.recording):
         digest.update(np.ascontiguousarray(array).data)
@@ -238,7 +241,7 @@ def windows_print(windows: WindowSet) -> str:
 
 
 def fold_print(fold: WindowFold) -> str:
-    """The windows of a fold, hashed."""
+    """Which windows a fold trains on, validates on and tests, hashed."""
     digest = hashlib.sha256()
     for index in (fold.train, fold.validation, fold.test):
         digest.update(len(index).to_bytes(8, "little") + index.astype("<i8").tobytes())

@@ -1,9 +1,9 @@
 """How well a simple program tells the person from the touch: what a data officer must know before data are published.
 
 The attacker is given recordings under the people's codes and one new recording, and says whose it is. It reads
-statistics of each recording (those of the paper's baselines: mean, standard deviation, minimum, maximum, RMS, energy,
-band power 0–1 Hz and 1–3 Hz of every channel) with extremely randomised trees (Geurts, Ernst & Wehenkel 2006). A
-stronger program may do better: the figures are a lower bound of the risk, never a proof of anonymity.
+statistics of each recording (those of the paper's baselines, see ``windows/statistics``) with extremely randomised
+trees (Geurts, Ernst & Wehenkel 2006). A stronger program may do better: the figures are a lower bound of the risk,
+never a proof of anonymity.
 
 Each person counts alike: top-1 and top-5 are averaged over people, so that chance is one in so many people.
 """
@@ -26,12 +26,12 @@ from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
 from plushsense.scoring.metrics import summary
 from plushsense.windows.clock import resample
 from plushsense.windows.features import magnitude
+from plushsense.windows.statistics import statistics
 
 Floats = NDArray[np.float64]
 Texts = NDArray[np.str_]
 Progress = Callable[[int, int], None]
 
-BANDS_HZ = ((0.0, 1.0), (1.0, 3.0))
 COARSE_HZ = 25.0
 FOLDS = 5
 FEWEST_RECORDINGS = 2
@@ -203,23 +203,13 @@ def features(frames: Frames, layout: Layout) -> dict[str, Floats] | None:
         return None
     parts = [magnitude(longest.data[:, [layout.index(n) for n in d.of]])[:, None] for d in layout.derived]
     x = np.concatenate([longest.data, *parts], axis=1).astype(np.float64)
-    touch = _statistics(x, layout.rate_hz)
+    touch = statistics(x.T[None], layout.rate_hz)[0]
     block = max(1, round(layout.rate_hz / COARSE_HZ))
     rows = len(x) // block
     coarse = x[: rows * block].reshape(rows, block, -1).mean(axis=1) if rows >= 4 else x
-    movement = _statistics(coarse - coarse.mean(axis=0), layout.rate_hz / block)
+    movement = statistics((coarse - coarse.mean(axis=0)).T[None], layout.rate_hz / block)[0]
     clock = _clock(frames.device_ms)
     return {"everything": np.concatenate([touch, clock]), "touch": touch, "movement": movement, "clock": clock}
-
-
-def _statistics(x: Floats, rate_hz: float) -> Floats:
-    """The paper's eight of each column: (T, C) → (8 C,)."""
-    spectrum = np.abs(np.fft.rfft(x - x.mean(axis=0), axis=0)) ** 2 / len(x)
-    frequency = np.fft.rfftfreq(len(x), 1.0 / rate_hz)
-    bands = [spectrum[(frequency >= low) & (frequency < high)].sum(axis=0) for low, high in BANDS_HZ]
-    energy = (x**2).sum(axis=0)
-    rms = np.sqrt(energy / len(x))
-    return np.concatenate([x.mean(axis=0), x.std(axis=0), x.min(axis=0), x.max(axis=0), rms, energy, *bands])
 
 
 def _clock(device_ms: NDArray[np.int64]) -> Floats:

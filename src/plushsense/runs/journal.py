@@ -121,3 +121,7 @@ class Journal:
                     f"A result cannot be kept in {self.folder} ({cause.strerror or cause}): make room or the folder "
                     "writable, then run again; finished jobs are kept."
                 ) from cause
+
+    def discard(self, job: str) -> None:
+        """Forget the result of a job, if there is one."""
+        self.path(job).unlink(missing_ok=True)

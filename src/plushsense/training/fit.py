@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import TrainingError
+from plushsense.core.errors import DivergedError, TrainingError
 from plushsense.models.arch import Arch
 from plushsense.models.net import Net
 from plushsense.training.augment import Turn
@@ -56,12 +56,14 @@ def fit(
     progress: Progress | None = None,
     keep: Collection[int] = (),
     start: FitState | None = None,
+    save: Callable[[FitState], None] | None = None,
+    save_every_s: float = 60.0,
 ) -> Fitted:
     """Train ``arch`` on ``train``; ``validation`` decides when to stop. The same seed gives the same weights.
 
     ``keep``: epochs after which the weights are kept as well. At a constant rate a long training passes through the
     end of every shorter one. ``start``: go on from there, with the same windows and settings but more epochs; what
-    comes out is to the last bit what a training without a stop gives.
+    comes out is to the last bit what a training without a stop gives. ``save`` gets such a state now and then.
 
     Raises:
         TrainingError: when the windows do not fit the network, or the loss is no longer a number.
@@ -91,7 +93,8 @@ def fit(
             order.set_state(torch.from_numpy(start.random.copy()))
         with closing(net):
             history: list[dict[str, Any]] = [] if start is None else [dict(row) for row in start.history]
-            kept: dict[int, dict[str, NDArray[np.float32]]] = {}
+            kept = {} if start is None else {epoch: dict(weights) for epoch, weights in start.kept.items()}
+            saved = time.perf_counter()
             best_epoch, best_score, best = 0, float("-inf"), net.export_weights()
             for epoch in range(len(history) + 1, spec.epochs + 1):
                 row: dict[str, Any] = {"epoch": epoch}
@@ -108,6 +111,9 @@ def fit(
                     kept[epoch] = net.export_weights()
                 if progress is not None:
                     progress(epoch, spec.epochs, row)
+                if save is not None and spec.patience is None and time.perf_counter() - saved >= save_every_s:
+                    save(_state(adam, net, order, history, kept))
+                    saved = time.perf_counter()
                 if watched is not None and spec.patience is not None:
                     score = row["validation_accuracy"] if spec.stop_on == "accuracy" else -row["validation_loss"]
                     if score > best_score:
@@ -116,11 +122,17 @@ def fit(
                         break
             if best_epoch == 0:
                 best_epoch, best = len(history), net.export_weights()
-            state = None if spec.patience is not None else _state(adam, net, order, history)
+            state = None if spec.patience is not None else _state(adam, net, order, history, kept)
     return Fitted(best, scaler, history, best_epoch, time.perf_counter() - began, kept, state)
 
 
-def _state(adam: torch.optim.Adam, net: Engine, order: torch.Generator, history: list[dict[str, Any]]) -> FitState:
+def _state(
+    adam: torch.optim.Adam,
+    net: Engine,
+    order: torch.Generator,
+    history: list[dict[str, Any]],
+    kept: Mapping[int, dict[str, NDArray[np.float32]]],
+) -> FitState:
     held = [adam.state[p] for p in net.parameters if p in adam.state]
     return FitState(
         epoch=len(history),
@@ -130,6 +142,7 @@ def _state(adam: torch.optim.Adam, net: Engine, order: torch.Generator, history:
         squares=[one["exp_avg_sq"].cpu().numpy().copy() for one in held],
         random=order.get_state().numpy().copy(),
         history=[dict(row) for row in history],
+        kept=dict(kept),
     )
 
 
@@ -209,7 +222,7 @@ def _check(windows: WindowSet, arch: Arch, what: str, some: bool = True) -> None
 def _still_numbers(row: dict[str, Any], spec: TrainSpec) -> None:
     for name in ("train_loss", "validation_loss"):
         if row[name] is not None and not np.isfinite(row[name]):
-            raise TrainingError(
+            raise DivergedError(
                 f"The {name.replace('_', ' ')} is no longer a number in epoch {row['epoch']} at the learning rate "
                 f"{row['learning_rate']:g}: try a lower one, such as {spec.learning_rate / 10:g}."
             )

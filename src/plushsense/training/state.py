@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-_WEIGHT, _MEAN, _SQUARE = "weight:", "mean:", "square:"
+_WEIGHT, _MEAN, _SQUARE, _KEPT = "weight:", "mean:", "square:", "kept:"
 
 
 @dataclass(frozen=True)
 class FitState:
     """After ``epoch``: the weights; Adam's ``means`` and ``squares`` of each parameter after ``steps`` steps; what
-    draws order and turns (``random``); the history so far."""
+    draws order and turns (``random``); the history so far; the weights ``kept`` after earlier epochs."""
 
     epoch: int
     steps: int
@@ -24,6 +24,7 @@ class FitState:
     squares: Sequence[NDArray[np.float32]]
     random: NDArray[np.uint8]
     history: list[dict[str, Any]]
+    kept: dict[int, dict[str, NDArray[np.float32]]] = field(default_factory=dict)
 
     def to_arrays(self) -> dict[str, Any]:
         """Arrays and plain values by name, as a journal takes them."""
@@ -31,6 +32,8 @@ class FitState:
         arrays |= {_WEIGHT + name: values for name, values in self.weights.items()}
         for prefix, several in ((_MEAN, self.means), (_SQUARE, self.squares)):
             arrays |= {f"{prefix}{i}": values for i, values in enumerate(several)}
+        for epoch, weights in self.kept.items():
+            arrays |= {f"{_KEPT}{epoch}:{name}": values for name, values in weights.items()}
         return arrays | {"random": self.random}
 
     @classmethod
@@ -40,6 +43,11 @@ class FitState:
         def several(prefix: str) -> list[NDArray[np.float32]]:
             return [arrays[f"{prefix}{i}"] for i in range(sum(name.startswith(prefix) for name in arrays))]
 
+        kept: dict[int, dict[str, NDArray[np.float32]]] = {}
+        for name, values in arrays.items():
+            if name.startswith(_KEPT):
+                epoch, _, weight = name.removeprefix(_KEPT).partition(":")
+                kept.setdefault(int(epoch), {})[weight] = values
         return cls(
             epoch=int(arrays["epoch"]),
             steps=int(arrays["steps"]),
@@ -48,4 +56,5 @@ class FitState:
             squares=several(_SQUARE),
             random=arrays["random"],
             history=list(arrays["history"]),
+            kept=kept,
         )

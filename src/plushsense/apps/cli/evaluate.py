@@ -28,6 +28,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="context of the windows to train on: stream or loop (default: as those to score)",
     )
     parser.add_argument("--workers", type=int, metavar="N", help="folds at a time (default 0: one a processor)")
+    parser.add_argument("--cluster", metavar="ADDRESS", help="work on a Ray cluster instead (default: on this machine)")
     parser.add_argument(
         "--out",
         metavar="DIR",
@@ -46,7 +47,15 @@ def run(args: argparse.Namespace) -> int:
     config = settings(args, split=args.split, train_context=args.train_context, workers=args.workers)
     dataset = open_dataset(args.dataset)
     out = Path(args.out) if args.out else dataset.path / "evaluations" / name_of(config, dataset)
-    result = evaluate(dataset, config, out=out, overwrite=args.force, progress=folds_shown("evaluating"), warn=warn)
+    result = evaluate(
+        dataset,
+        config,
+        out=out,
+        overwrite=args.force,
+        cluster=args.cluster,
+        progress=folds_shown("evaluating"),
+        warn=warn,
+    )
     report = write_report(out / PAGE, dataset, [out])
     shown = {**result.to_dict(), "out": str(out), "report": str(report), "simulated": dataset.head.simulated}
     say(f"written: {out}")

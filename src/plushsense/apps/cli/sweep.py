@@ -8,7 +8,7 @@ from typing import Any
 
 from plushsense.apps.cli.evaluate import figure
 from plushsense.apps.cli.output import emit, say, table
-from plushsense.apps.cli.settings import sweep_shown, warn
+from plushsense.apps.cli.settings import warn
 
 # Keys of the grid that an option changes, each an attribute of the arguments.
 _CHANGES = (
@@ -55,7 +55,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from plushsense.apps.sweeping import sweep
+    from plushsense.apps.sweeping import live_table, sweep
 
     changes: dict[str, Any] = {key: getattr(args, key) for key in _CHANGES}
     if args.seeds is not None:
@@ -70,14 +70,14 @@ def run(args: argparse.Namespace) -> int:
         overwrite=args.force,
         workers=args.workers,
         cluster=args.cluster,
-        progress=sweep_shown(),
+        table=live_table,
         warn=warn,
         **changes,
     )
     shown = found.to_dict()
     say(f"written: {found.out}")
     emit(args, shown, lines(shown))
-    return 0
+    return 1 if shown["trainings_lost"] else 0
 
 
 def _dry_run(args: argparse.Namespace, changes: dict[str, Any]) -> int:

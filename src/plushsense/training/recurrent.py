@@ -1,0 +1,132 @@
+"""Recurrent networks to compare with: LSTM and BiLSTM, trained by the schedule and the seed of our own networks.
+
+The paper tried both (section 3.3) and gives no sizes. Here: one layer of 32 units, about as many parameters as the
+default network has; its last state (of both directions, where there are two) goes to a dense layer.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors.numpy import save
+
+from plushsense.core.errors import TrainingError
+from plushsense.core.extras import need
+from plushsense.training.spec import TrainSpec
+from plushsense.windows.cut import WindowSet
+from plushsense.windows.features import Scaler
+
+need("torch", extra="train")
+
+import torch  # noqa: E402
+from torch import Tensor, nn  # noqa: E402
+from torch.nn import functional as F  # noqa: E402
+
+from plushsense.training.augment import Turn  # noqa: E402
+
+# Part of every journalled training: raise it when the same settings would train differently.
+RECURRENT_VERSION = 1
+UNITS = 32
+# Windows at a time where no gradient is kept, and those too few to train on after the first batch.
+_READ, _FEW = 512, 8
+
+
+class Recurrent(nn.Module):
+    """Scaled windows (N, C, T) → logits (N, K)."""
+
+    def __init__(self, channels: int, classes: int, units: int, both_ways: bool) -> None:
+        super().__init__()
+        self.cell = nn.LSTM(channels, units, batch_first=True, bidirectional=both_ways)
+        self.dense = nn.Linear(units * (1 + both_ways), classes)
+
+    def forward(self, x: Tensor) -> Tensor:
+        _, (last, _) = self.cell(x.transpose(1, 2).contiguous())
+        return cast(Tensor, self.dense(torch.cat(tuple(last), dim=1)))
+
+
+@dataclass(frozen=True)
+class RecurrentReader:
+    """A trained recurrent network; ``size_bytes`` is that of its float32 weights as safetensors."""
+
+    net: Recurrent
+    scaler: Scaler
+    samples: int
+    seconds: float
+
+    @property
+    def size_bytes(self) -> int:
+        return len(save({name: tensor.detach().cpu().numpy() for name, tensor in self.net.state_dict().items()}))
+
+    def __call__(self, windows: WindowSet, /) -> NDArray[np.float32]:
+        """Probabilities (N, K)."""
+        device = self.net.dense.weight.device
+        x = torch.from_numpy(self.scaler.apply(windows.x[:, :, -self.samples :])).to(device)
+        with torch.no_grad():
+            parts = [F.softmax(self.net(x[at : at + _READ]), dim=1) for at in range(0, len(x), _READ)]
+        if not parts:
+            return np.zeros((0, len(windows.labels)), dtype=np.float32)
+        found: NDArray[np.float32] = torch.cat(parts).cpu().numpy()
+        return found
+
+
+def fit_recurrent(
+    train: WindowSet, spec: TrainSpec, samples: int, *, both_ways: bool = False, units: int = UNITS
+) -> RecurrentReader:
+    """Train on the last ``samples`` of each window, for all epochs of ``spec``; the same seed gives the same weights.
+
+    Adam, its falling rate, batches, turned vectors and seed are those of ``spec``; ``patience`` is not used.
+
+    Raises:
+        TrainingError: without windows, or when the loss is no longer a number.
+    """
+    if not len(train):
+        raise TrainingError("There are no windows to train on: check the data set, the gestures and the split.")
+    began = time.perf_counter()
+    name = spec.device if spec.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
+    device = torch.device(name)
+    scaler = Scaler.fit(train.x[:, :, -samples:])
+    x = torch.from_numpy(scaler.apply(train.x[:, :, -samples:])).to(device)
+    y = torch.from_numpy(train.y).to(device)
+    before = torch.get_num_threads()
+    torch.set_num_threads(spec.threads)
+    try:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(spec.seed)
+            net = Recurrent(x.shape[1], len(train.labels), units, both_ways).to(device)
+            order = torch.Generator().manual_seed(spec.seed)
+            turn = Turn(train.vectors, scaler, spec.turn_deg, device)
+            adam = torch.optim.Adam(net.parameters(), lr=spec.learning_rate)
+            for epoch in range(1, spec.epochs + 1):
+                for group in adam.param_groups:
+                    group["lr"] = spec.learning_rate_at(epoch)
+                _epoch(net, adam, x, y, spec.batch, order, turn, epoch)
+    finally:
+        torch.set_num_threads(before)
+    return RecurrentReader(net.eval(), scaler, samples, time.perf_counter() - began)
+
+
+def _epoch(
+    net: Recurrent, adam: Any, x: Tensor, y: Tensor, size: int, order: torch.Generator, turn: Turn, epoch: int
+) -> None:
+    shuffled = torch.randperm(len(x), generator=order).to(x.device)
+    total = torch.zeros((), device=x.device)
+    for start in range(0, len(x), size):
+        batch = shuffled[start : start + size]
+        if start and len(batch) < min(_FEW, size):
+            continue
+        loss = F.cross_entropy(net(turn(x[batch], order)), y[batch])
+        adam.zero_grad(set_to_none=True)
+        torch.autograd.backward(loss)
+        # An LSTM's gradient now and then leaps; without a bound one window in a long run ruins the weights.
+        nn.utils.clip_grad_norm_(net.parameters(), 1.0)
+        adam.step()
+        total += loss.detach()
+    if not torch.isfinite(total):
+        raise TrainingError(
+            f"The training loss of the recurrent network is no longer a number in epoch {epoch}: try a lower "
+            "learning rate."
+        )
