@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from plushsense.apps.estimator import PlushClassifier
     from plushsense.apps.reporting import write_report
     from plushsense.apps.retraining import forget
+    from plushsense.apps.searching import search
     from plushsense.apps.sweeping import sweep
     from plushsense.core.gestures import GestureSet, load_gestures
     from plushsense.core.signal import Layout, load_layout
@@ -49,6 +50,7 @@ _WHERE = {
     "simulate": "plushsense.apps.api",
     "write_report": "plushsense.apps.reporting",
     "forget": "plushsense.apps.retraining",
+    "search": "plushsense.apps.searching",
     "sweep": "plushsense.apps.sweeping",
     "backup": "plushsense.dataset.backup",
     "check_backup": "plushsense.dataset.backup",
@@ -86,6 +88,7 @@ __all__ = [
     "open_device",
     "pseudonymise",
     "restore",
+    "search",
     "simulate",
     "sweep",
     "train",

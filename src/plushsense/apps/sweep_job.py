@@ -43,7 +43,7 @@ class TrainAndScore:
         train, validation, test = (windows.take(index) for index in (fold.train, fold.validation, fold.test))
         wanted, failed, fitted = task.epochs, dict[str, str](), None
         before = None if self.unfinished is None else self.unfinished.find(task.id)
-        start = None if before is None else FitState.from_arrays(before)
+        start = task.start if before is None else FitState.from_arrays(before)
 
         def save(state: FitState) -> None:
             if self.unfinished is not None:
@@ -73,7 +73,11 @@ class TrainAndScore:
             )
         curve = np.array([[row[name] for name in CURVE] for row in fitted.history], dtype=np.float64)
         at = list(wanted) if task.nested else [fitted.best_epoch]
-        return _result(wanted, np.stack(tested), watched, at, curve, fitted.seconds, failed)
+        seconds = task.spent_s + fitted.seconds
+        result = _result(wanted, np.stack(tested), watched, at, curve, seconds, failed)
+        state = fitted.state if task.stateful and not failed else None
+        # Weights that were scored on the way are of no more use.
+        return result if state is None else {**result, **replace(state, kept={}).to_arrays()}
 
 
 def _result(

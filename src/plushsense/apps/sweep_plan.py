@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from statistics import median
 from typing import Any
@@ -42,7 +42,11 @@ class GridProblems(ConfigError):
 @dataclass(frozen=True)
 class Task:
     """One training of one fold: ``epochs`` are those after which it is scored; ``span`` picks the windows; ``id`` the
-    job's."""
+    job's.
+
+    ``start`` (a `FitState`) and the ``spent_s`` seconds of training before it change nothing in what comes out;
+    ``stateful``: the result holds its state as well, so that another training can go on from there.
+    """
 
     arch: Arch
     spec: TrainSpec
@@ -50,6 +54,9 @@ class Task:
     span: int
     fold: int
     id: str = ""
+    start: Any = None
+    spent_s: float = 0.0
+    stateful: bool = False
 
     @property
     def nested(self) -> bool:
@@ -111,6 +118,25 @@ def plan(dataset: Dataset, grid: GridSpec, told: Sequence[str] = (), warn: Warn 
     Raises:
         GridProblems: with all problems of the grid on this data set at once, one a line.
     """
+    return _planned(dataset, grid, _cut(dataset, grid, told, warn))
+
+
+def plans_by_epochs(
+    dataset: Dataset,
+    grid: GridSpec,
+    told: Sequence[str] = (),
+    warn: Warn = silent,
+    fits: Callable[[Arch], bool] = lambda arch: True,
+) -> list[Plan]:
+    """A plan for each number of epochs of a grid, as if it had no other, on the same windows; as `plan` else.
+
+    ``fits``: which networks to plan for; all plans hold the same ones in the same order.
+    """
+    cut = _cut(dataset, grid, told, warn)
+    return [_planned(dataset, replace(grid, epochs=(epochs,)), cut, fits) for epochs in grid.epochs]
+
+
+def _cut(dataset: Dataset, grid: GridSpec, told: Sequence[str], warn: Warn) -> _Cut:
     past, found = _past(dataset), list[str]()
     cut, fewest = None, None
     try:
@@ -124,7 +150,7 @@ def plan(dataset: Dataset, grid: GridSpec, told: Sequence[str] = (), warn: Warn 
     if found or cut is None:
         raise GridProblems(found)
     _warn_of_rare(dataset, cut, warn)
-    return _planned(dataset, grid, cut)
+    return cut
 
 
 def _past(dataset: Dataset) -> int:
@@ -195,7 +221,7 @@ class _Cut:
         return self.sets[span], self.by_span[span]
 
 
-def _planned(dataset: Dataset, grid: GridSpec, cut: _Cut) -> Plan:
+def _planned(dataset: Dataset, grid: GridSpec, cut: _Cut, fits: Callable[[Arch], bool] = lambda arch: True) -> Plan:
     spec = replace(grid.training, device=_device(grid.device))
     prints: dict[int, tuple[str, list[str]]] = {}
     trials: list[PlannedTrial] = []
@@ -203,6 +229,8 @@ def _planned(dataset: Dataset, grid: GridSpec, cut: _Cut) -> Plan:
     used: set[int] = set()
     for training in trainings(grid, dataset.layout, len(cut.gestures)):
         arch = training.trials[0].arch
+        if not fits(arch):
+            continue
         windows, folds = cut.at(arch)
         span = windows.x.shape[2]
         used.add(span)

@@ -1,0 +1,231 @@
+"""``plushsense search DATASET --max-parameters P --max-state-bytes S --max-macs-per-step M``"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from plushsense.apps.cli.evaluate import figure
+from plushsense.apps.cli.output import emit, say, table
+from plushsense.apps.cli.settings import warn
+
+# Keys of the grid that an option changes, each an attribute of the arguments.
+_CHANGES = (
+    "split",
+    "architectures",
+    "filters",
+    "batches",
+    "padding",
+    "norm",
+    "context",
+    "classes",
+    "device",
+    "threads",
+)
+_ASKED = ("rungs", "folds", "share", "eta", "max_parameters", "max_state_bytes", "max_macs_per_step")
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("dataset", metavar="DATASET", help="data set folder")
+    parser.add_argument(
+        "--grid",
+        default="paper",
+        metavar="GRID",
+        help="whose networks are tried: paper (default, 52), or a TOML file with [grid] and [search]",
+    )
+    parser.add_argument("--max-parameters", type=int, metavar="P", help="only networks of at most P parameters")
+    parser.add_argument(
+        "--max-state-bytes", type=int, metavar="S", help="of at most S bytes of state between samples, 8-bit"
+    )
+    parser.add_argument(
+        "--max-macs-per-step", type=int, metavar="M", help="of at most M multiply-accumulates a step of 50 ms"
+    )
+    parser.add_argument(
+        "--split", metavar="SPLIT", help="by-subject:5 (default), leave-one-subject-out, by-recording:K, windows:K"
+    )
+    parser.add_argument("--rungs", metavar="N,…", help="epochs after which networks are compared (4,15,60)")
+    parser.add_argument("--folds", metavar="N,…", help="folds that the rungs before the last look at (default: all)")
+    parser.add_argument(
+        "--share",
+        type=float,
+        metavar="X",
+        help="of the cost of the whole grid, at most (0.25; more if only few networks fit)",
+    )
+    parser.add_argument("--eta", type=float, metavar="X", help="one in X goes on from each rung, if cost allows (2)")
+    parser.add_argument("--seeds", type=int, metavar="N", help="seeds of every training, 0 to N - 1 (1)")
+    parser.add_argument("--architectures", metavar="SPEC,…", help="only these networks (default: the grid's)")
+    parser.add_argument(
+        "--filters", metavar="SETS", help="only these filters: 4,6,8,8 or several sets, 4/6/8/8,8/12/16/16"
+    )
+    parser.add_argument("--batches", metavar="N,…", help="windows a batch, or full (64)")
+    parser.add_argument("--padding", help="stream (default), causal or mirror")
+    parser.add_argument("--norm", help="batch (default) or layer")
+    parser.add_argument("--context", help="stream (default) or loop")
+    parser.add_argument("--classes", metavar="LABELS", help="shared (default), all, or labels")
+    parser.add_argument(
+        "--out", metavar="DIR", help="folder of search.json and tables (DATASET/evaluations/search-GRID-…)"
+    )
+    parser.add_argument("--force", action="store_true", help="replace another search in --out")
+    parser.add_argument(
+        "--workers", type=int, default=0, metavar="N", help="trainings at a time (default 0: one a processor)"
+    )
+    parser.add_argument("--threads", type=int, metavar="N", help="threads of a training, part of its identity (1)")
+    parser.add_argument(
+        "--cluster", metavar="ADDRESS", help="train on a Ray cluster instead (default: on this machine)"
+    )
+    parser.add_argument("--device", help="auto (default), cpu or cuda")
+    parser.add_argument(
+        "--dry-run", action="store_true", help="say what would be tried, left out and spent; no training"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    from plushsense.apps.searching import search
+
+    changes: dict[str, Any] = {key: getattr(args, key) for key in _CHANGES}
+    if args.seeds is not None:
+        changes["seeds"] = tuple(range(args.seeds))
+    asked = {key: getattr(args, key) for key in _ASKED}
+    if args.dry_run:
+        return _dry_run(args, changes, asked)
+    found = search(
+        args.dataset,
+        args.grid,
+        **asked,
+        out=None if args.out is None else Path(args.out),
+        overwrite=args.force,
+        workers=args.workers,
+        cluster=args.cluster,
+        progress=search_shown(),
+        warn=warn,
+        **changes,
+    )
+    shown = found.to_dict()
+    say(f"written: {found.out}")
+    emit(args, shown, lines(shown))
+    return 0
+
+
+def _dry_run(args: argparse.Namespace, changes: dict[str, Any], asked: dict[str, Any]) -> int:
+    from plushsense.apps.searching import preview_search
+
+    found = preview_search(args.dataset, args.grid, asked=asked, changes=changes, warn=warn)
+    text = [f"left out: {row['arch']} {row['filters']}: {row['why']}" for row in found["left_out"]]
+    rungs = ", ".join(f"{e} epochs on {f} folds" for e, f in zip(found["rungs"], found["folds"], strict=True))
+    text += [
+        f"{_several(found['candidates'], 'network')}, split {found['split']}, {_several(found['seeds'], 'seed')}; "
+        f"compared after {rungs}",
+        f"at most {found['bound_macs']:.2e} multiply-accumulates, {found['bound_share']:.0%} of the whole grid's "
+        f"{found['grid_macs']:.2e}; the first rung takes {found['first_share']:.1%}",
+    ]
+    emit(args, found, text)
+    return 0
+
+
+def search_shown() -> Callable[[Any], None]:
+    """Progress, from `plushsense.apps.searching.SearchProgress`."""
+    rewritten = sys.stderr.isatty()
+    last = time.monotonic()
+
+    def show(at: Any) -> None:
+        nonlocal last
+        now, over = time.monotonic(), at.done == at.trainings
+        if not over and now - last < (0.2 if rewritten else 5.0):
+            return
+        last = now
+        text = f"search, rung {at.rung} of {at.rungs}, networks {at.networks}: {at.done} of {at.trainings} trainings"
+        text += f" ({at.resumed} from before)" if at.resumed else ""
+        text += f", {at.share:.0%} of the budget"
+        text += "" if at.best is None else f", best so far {at.best[0]} {at.best[1]:.3f}"
+        if rewritten:
+            what = f", {at.what} epoch {at.epoch} of {at.epochs}" if at.epoch else ""
+            sys.stderr.write("\r\x1b[K" + text + what + ("\n" if over else ""))
+            sys.stderr.flush()
+        else:
+            say(text)
+
+    return show
+
+
+def lines(s: dict[str, Any]) -> list[str]:
+    """The rungs, the best network, and those that stand beside it."""
+    out = []
+    if s["simulated"]:
+        out.append("SIMULATION: these scores are of the virtual toy and say nothing about a real one.")
+    if s["leaky"]:
+        out.append("LEAKY: windows of one recording stand on both sides of this split; the scores flatter.")
+    mark = " (leaky)" if s["leaky"] else ""
+    beyond = f" within the limits, {len(s['left_out'])} beyond" if s["left_out"] else ""
+    out.append(
+        f"{_several(s['candidates'], 'network')}{beyond}; split {s['split']}, context {s['context']}, "
+        f"{_several(len(s['grid']['seeds']), 'seed')}\n"
+    )
+    out.append(_rungs(s, mark))
+    best, cost = s["winner"], s["cost"]
+    out.append("")
+    out.append(
+        table(
+            ("to the end", "filters", "batch", "parameters", "MAC/step", "state bytes", f"accuracy{mark}",
+             f"macro-F1{mark}", "over folds", "over seeds", ""),
+            [_finalist(row) for row in s["finalists"]],
+        )
+    )  # fmt: skip
+    out.append(
+        "Pareto: none other that was trained to the end is as good and smaller; equal: within one standard error."
+    )
+    out.append(
+        f"\nBest: {best['arch']} with {best['filters']}, macro-F1 {figure(best['macro_f1'])}{mark} over "
+        f"{best['folds']} folds. It is the best of {s['chosen_among']} on these people, which flatters it a little."
+    )
+    small = s["smallest_equal"]
+    if small["trial"] != best["trial"]:
+        out.append(
+            f"Smallest that cannot be told from it: {small['arch']} with {small['filters']}, {small['parameters']:,} "
+            f"parameters, macro-F1 {figure(small['macro_f1'])}{mark}."
+        )
+    out.append(
+        f"Cost: {cost['macs']:.2e} multiply-accumulates of training, {cost['share']:.1%} of the whole grid's "
+        f"{cost['grid_macs']:.2e} (bound {cost['bound_share']:.0%}); {cost['training_seconds']:.0f} s of training."
+    )
+    out.append(f"Train it on everybody:\n  {s['command']}")
+    return out
+
+
+def _rungs(s: dict[str, Any], mark: str) -> str:
+    """One row a network, those that came furthest first: its score after each rung, and where it went."""
+    rows: dict[tuple[str, str, str], list[object]] = {}
+    for i, rung in enumerate(s["rungs"]):
+        for n in rung["networks"]:
+            row = rows.setdefault((n["arch"], n["filters"], n["batch_asked"]), [None] * len(s["rungs"]) + [""])
+            row[i], row[-1] = figure(n["macro_f1"]), n["went"]
+    # The order of the last rung that each was in.
+    names = [(n["arch"], n["filters"], n["batch_asked"]) for rung in reversed(s["rungs"]) for n in rung["networks"]]
+    title = [f"after {rung['epochs']}" for rung in s["rungs"]]
+    text = [
+        f"macro-F1{mark} after each rung of epochs",
+        table(("network", "filters", "batch", *title, ""), [(*name, *rows[name]) for name in dict.fromkeys(names)]),
+    ]
+    for rung in s["rungs"]:
+        error = rung["standard_error"]
+        apart = "" if error is None else f", standard error of a difference {figure(error)}"
+        entered, folds = _several(rung["entered"], "network"), _several(rung["folds"], "fold")
+        text.append(
+            f"up to epoch {rung['epochs']}: {entered} on {folds}, {rung['share']:.1%} of the grid's cost{apart}"
+        )
+    return "\n".join(text)
+
+
+def _several(n: int, what: str) -> str:
+    return f"{n} {what}{'s' * (n != 1)}"
+
+
+def _finalist(row: dict[str, Any]) -> tuple[object, ...]:
+    marks = ["Pareto"] * row["pareto"] + ["equal"] * row["equals_best"]
+    spread = (f"± {figure(row[key])}" if row[key] is not None else "" for key in ("sd_folds", "sd_seeds"))
+    sizes = (row[key] for key in ("parameters", "macs_per_step", "state_bytes_int8"))
+    scores = (figure(row[key]) for key in ("accuracy", "macro_f1"))
+    return (row["arch"], row["filters"], row["batch_asked"], *sizes, *scores, *spread, ", ".join(marks))
