@@ -21,8 +21,8 @@ def test_kill_9_in_the_middle(dataset: Dataset, tmp_path: Path) -> None:
     deadline = time.monotonic() + 90
 
     def whole() -> list[Path]:
-        # A worker may be writing one: that is no finished fold, and its name goes any moment.
-        return [p for p in folds.iterdir() if ".part" not in p.name] if folds.is_dir() else []
+        # Beside finished folds: one that is being written, and claims on those that are trained.
+        return list(folds.glob("[!.]*.npz")) if folds.is_dir() else []
 
     while not whole() and time.monotonic() < deadline:
         assert process.poll() is None, "it was to be killed in the middle"
