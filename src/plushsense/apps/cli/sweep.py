@@ -55,7 +55,8 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from plushsense.apps.sweeping import live_table, sweep
+    from plushsense.apps.sweep_shown import live_table
+    from plushsense.apps.sweeping import sweep
 
     changes: dict[str, Any] = {key: getattr(args, key) for key in _CHANGES}
     if args.seeds is not None:
