@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense import __version__
-from plushsense.apps.config import RunConfig, resolve
+from plushsense.apps.config import RunConfig, from_settings
 from plushsense.apps.places import check_folder, machine
 from plushsense.apps.preparation import Warn, choose_classes, opened, silent, windows_for
 from plushsense.core.errors import ConfigError, nearest
@@ -163,6 +163,7 @@ def baselines(
     cluster: str | None = None,
     progress: Callable[[CompareProgress], None] | None = None,
     warn: Warn = silent,
+    **settings: Any,
 ) -> dict[str, Any]:
     """Classical programs, recurrent networks and our own network on the same windows, under several splits.
 
@@ -170,7 +171,7 @@ def baselines(
     data set's ``cache`` folder; a comparison that was stopped goes on from there.
 
     Args:
-        config: as for `evaluate`; its split is not used.
+        config, settings: as for `evaluate`; its split is not used.
         splits: such as "leave-one-subject-out", "by-subject:5", "windows:5" (leaky); the gap between them is reported.
         models: names of `MODELS` and sets of `SETS`.
         cluster: address of a Ray cluster that does the work instead of this machine's processes.
@@ -183,7 +184,7 @@ def baselines(
         ``preset``, ``training``, ``window_s``, ``id``, ``code_version`` and ``machine``.
     """
     dataset = opened(dataset)
-    config = config or resolve()
+    config = config or from_settings(**settings)
     names = chosen(models)
     identity = comparison_id(dataset, config, splits, models, features, pca)
     asked = [parse_split(text).text for text in splits]

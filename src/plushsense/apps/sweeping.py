@@ -22,7 +22,7 @@ from plushsense.apps.preparation import Warn, opened, silent
 from plushsense.apps.sweep_job import JOURNAL, train_all
 from plushsense.apps.sweep_plan import GridProblems, Plan, Task, plan, processes
 from plushsense.apps.sweep_shown import SweepProgress, Teller, Watcher
-from plushsense.apps.sweep_tables import TRIALS, Tables, check_place
+from plushsense.apps.sweep_tables import RUNS, TRIALS, Tables, check_place
 from plushsense.core.extras import need
 from plushsense.dataset.store import Dataset
 from plushsense.runs.journal import Journal, Result, job_id
@@ -45,6 +45,11 @@ class Sweep:
     def trials(self) -> Any:
         """The table of trials, a polars frame; one row a network, number of epochs and batch."""
         return need("polars", "train").read_parquet(self.out / TRIALS)
+
+    @cached_property
+    def runs(self) -> Any:
+        """The table of runs, a polars frame; one row a trial, seed and fold."""
+        return need("polars", "train").read_parquet(self.out / RUNS)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, ready for JSON."""

@@ -34,8 +34,8 @@ class GridSpec:
 
     ``filters`` are sets of four, of which a network takes as many as it has layers. ``seeds`` are those of the
     trainings; the split has its own, so that all trainings of a grid see the same folds. ``classes`` is "all",
-    "shared" or labels joined by commas. ``threads`` belongs to a training and to its id: another number sums in
-    another order.
+    "shared" or labels joined by commas. ``threads`` belongs to a training and to its id: in PyTorch's own layers
+    another number sums in another order (in ``training/fast`` it does not).
     """
 
     name: str = "grid"
