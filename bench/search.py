@@ -33,7 +33,8 @@ from numpy.typing import NDArray
 import plushsense as ps
 from plushsense.apps.cli.search import search_shown
 from plushsense.apps.searching import prepare
-from plushsense.apps.sweeping import Sweep, live_table
+from plushsense.apps.sweep_shown import live_table
+from plushsense.apps.sweeping import Sweep
 from plushsense.core.errors import PlushSenseError
 from plushsense.models.arch import PAPER_ARCHITECTURES
 from plushsense.training.grid import GridSpec

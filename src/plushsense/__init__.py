@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from plushsense.apps.api import evaluate, load, simulate, train
+    from plushsense.apps.baselining import baselines
     from plushsense.apps.checking import check_dataset
     from plushsense.apps.estimator import PlushClassifier
     from plushsense.apps.reporting import write_report
@@ -49,6 +50,7 @@ _WHERE = {
     "load": "plushsense.apps.api",
     "simulate": "plushsense.apps.api",
     "write_report": "plushsense.apps.reporting",
+    "baselines": "plushsense.apps.baselining",
     "forget": "plushsense.apps.retraining",
     "search": "plushsense.apps.searching",
     "sweep": "plushsense.apps.sweeping",
@@ -75,6 +77,7 @@ __all__ = [
     "StreamClassifier",
     "WindowSpec",
     "backup",
+    "baselines",
     "check_backup",
     "check_dataset",
     "cut_windows",

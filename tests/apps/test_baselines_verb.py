@@ -83,7 +83,7 @@ def test_refusals_are_sentences(cli: Cli, dataset: Dataset, tmp_path: Path) -> N
         assert len([line for line in ran.err.splitlines() if line.startswith("plushsense:")]) == 1
     (tmp_path / "file").write_text("mine")
     ran = cli("baselines", dataset.path, *QUICK, "--out", tmp_path / "file")
-    assert ran.status == 2 and "is a file: give a folder" in ran.err
+    assert ran.status == 2 and "is a file; give a folder" in ran.err
     assert not (tmp_path / "OUT").exists()
 
 

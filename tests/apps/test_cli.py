@@ -37,14 +37,21 @@ def test_every_verb_has_help(verb: str, capsys: pytest.CaptureFixture[str]) -> N
     assert "--json" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("words", [["--help"], ["arch", "14d1", "--filters", "8"], ["info", "--help"]])
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--help"],
+        ["arch", "14d1", "--filters", "8"],
+        *([v, "--help"] for v in ("info", "sweep", "search", "baselines")),
+    ],
+)
 def test_light_verbs_load_nothing_heavy(words: list[str]) -> None:
     code = (
         "import sys\n"
         "from plushsense.apps.cli.main import main\n"
         f"try: main({words!r})\n"
         "except SystemExit: pass\n"
-        "heavy = {'torch', 'polars', 'matplotlib', 'serial', 'scipy'} & set(sys.modules)\n"
+        "heavy = {'torch', 'polars', 'matplotlib', 'serial', 'scipy', 'sklearn', 'ray'} & set(sys.modules)\n"
         "sys.exit(str(heavy) if heavy else 0)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

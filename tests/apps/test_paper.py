@@ -96,11 +96,13 @@ def test_the_table_is_made_and_goes_on_where_it_stood(
     random = next(row for what, row in by_what.items() if what.startswith("14d1_39d2_41d4 8/12/16"))
     assert random["paper"] == "75.0 %"
     assert "leaky" in random["what"]
+    forest = next(row for what, row in by_what.items() if what.startswith("random forest (200) on statistics ("))
+    assert forest["paper"] == "95.9 %" and "leaky" in forest["what"] and forest["n"].startswith("5 folds, ")
     page = (tmp_path / "paper.html").read_text(encoding="utf-8")
     assert "SIMULATION" in page
     assert "0.687 ± 0.114" in page
     folds = {p: p.stat().st_mtime_ns for p in (tmp_path / "DS" / "cache" / "folds").iterdir()}
-    assert len(folds) == 4
+    assert len(folds) == 3
     assert script.main(words) == 0
     assert {p: p.stat().st_mtime_ns for p in (tmp_path / "DS" / "cache" / "folds").iterdir()} == folds
     assert capsys.readouterr().out == said

@@ -10,7 +10,8 @@ import polars
 import pytest
 from polars.testing import assert_frame_equal
 
-from plushsense.apps.sweeping import JOURNAL, sweep
+from plushsense.apps.sweep_job import JOURNAL
+from plushsense.apps.sweeping import sweep
 from plushsense.dataset.importers import import_recordings
 
 GRID: dict[str, Any] = {

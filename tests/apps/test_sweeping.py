@@ -16,7 +16,9 @@ import pytest
 from polars.testing import assert_frame_equal
 
 import plushsense as ps
-from plushsense.apps.sweeping import JOURNAL, UNFINISHED, SweepProgress, sweep
+from plushsense.apps.sweep_job import JOURNAL, UNFINISHED
+from plushsense.apps.sweep_shown import SweepProgress
+from plushsense.apps.sweeping import sweep
 from plushsense.core.errors import ConfigError, DivergedError, TrainingError
 from plushsense.dataset.importers import import_recordings
 from plushsense.dataset.store import Dataset

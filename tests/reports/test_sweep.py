@@ -163,20 +163,6 @@ def test_batches_and_filter_sets_are_in_order_of_size(whole):
     assert sweep.filter_sets == ["/".join(map(str, f)) for f in PAPER_FILTERS]
 
 
-@pytest.mark.parametrize(
-    ("points", "on"),
-    [
-        ([(1, 0.5), (2, 0.6), (3, 0.55)], [True, True, False]),
-        ([(1, 0.5), (1, 0.5)], [True, True]),
-        ([(1, 0.5), (1, 0.6)], [False, True]),
-        ([(1, 0.5), (2, 0.5)], [True, False]),
-        ([], []),
-    ],
-)
-def test_the_front_and_its_ties(points, on):
-    assert compared.front(points) == on
-
-
 def test_the_fronts_hold_what_no_network_beats(whole):
     sweep = read_sweep(whole)
     points = compared.pareto_points(sweep, "parameters")

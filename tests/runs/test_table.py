@@ -6,6 +6,7 @@ import contextlib
 import io
 import os
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -133,6 +134,12 @@ def test_without_a_terminal_lines_without_escapes() -> None:
     assert len(told) == 3 and "\x1b" not in out.getvalue()
 
 
+def listen(end: int, heard: bytearray) -> None:
+    """All that is written: a pseudo-terminal holds 4 kB, and one reading gives no more."""
+    while not heard.endswith(b"over"):
+        heard += os.read(end, 65536)
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="no pseudo-terminal there")
 def test_on_a_terminal_it_is_drawn_in_place_and_a_closed_one_stops_nothing(pty_possible: None) -> None:
     import fcntl
@@ -144,10 +151,15 @@ def test_on_a_terminal_it_is_drawn_in_place_and_a_closed_one_stops_nothing(pty_p
     # As Python opens standard error.
     stream = io.TextIOWrapper(os.fdopen(theirs, "wb", buffering=0), encoding="utf-8", write_through=True)
     with contextlib.suppress(OSError), stream:
+        heard = bytearray()
+        listener = threading.Thread(target=listen, args=(ours, heard), daemon=True)
+        listener.start()
         use(make(stream), pause=0.25)
-        seen = os.read(ours, 65536).decode()
+        stream.write("over")
+        listener.join(10)
+        seen = heard.decode()
         assert "\x1b[" in seen and "epoch 1 of 3" in seen and seen.count("sweep: ") <= 8
-        last = seen.rpartition("\x1b[J")[2].replace("\r", "").splitlines()
+        last = seen.removesuffix("over").rpartition("\x1b[J")[2].replace("\r", "").splitlines()
         assert all(len(text) < 70 for text in last)
         assert "19d1_19d2_19d4_17d8 32/48/64/64 failed: no number" in seen
         assert any(text.startswith("best score 0.600") for text in last)

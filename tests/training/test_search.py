@@ -207,6 +207,20 @@ def test_limits_name_what_is_over() -> None:
     assert f"{smallest:,} parameters, {smallest - 1500:,} over 1,500" in none_left(tight, archs)
 
 
+@pytest.mark.parametrize(
+    ("points", "on"),
+    [
+        ([(0.5, 1), (0.6, 2), (0.55, 3)], [True, True, False]),
+        ([(0.5, 1), (0.5, 1)], [True, True]),
+        ([(0.5, 1), (0.6, 1)], [False, True]),
+        ([(0.5, 1), (0.5, 2)], [True, False]),
+        ([], []),
+    ],
+)
+def test_the_front_of_two_and_its_ties(points: list[tuple[float, ...]], on: list[bool]) -> None:
+    assert pareto(points) == on
+
+
 def test_the_pareto_front() -> None:
     rows = [(0.7, 100, 10), (0.7, 100, 10), (0.6, 50, 10), (0.6, 100, 10), (0.5, 60, 5), (0.5, 50, 20)]
     assert pareto(rows) == [True, True, True, False, True, False]

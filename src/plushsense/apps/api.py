@@ -6,7 +6,7 @@ This is where training and evaluation meet; neither knows of the other.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense import __version__
-from plushsense.apps.config import RunConfig, resolve
+from plushsense.apps.config import RunConfig, from_settings
 from plushsense.apps.preparation import Warn, choose_classes, opened, silent, windows_for
 from plushsense.apps.reporting import check_place, save_evaluation
-from plushsense.core.errors import ConfigError
 from plushsense.core.gestures import NOBODY
 from plushsense.dataset.importers import import_recordings
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
@@ -103,7 +102,7 @@ def train(
         warn: called with one sentence for everything that was left out.
     """
     dataset = opened(dataset)
-    config = config or _from_settings(arch, filters, settings)
+    config = config or from_settings(arch=arch, filters=filters, **settings)
     gestures = choose_classes(dataset, config.evaluation.classes, warn)
     network = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
     windows = windows_for(dataset, network, config.windows, gestures, warn)
@@ -217,7 +216,7 @@ def evaluate(
         cluster: address of a Ray cluster that trains the folds instead of this machine's processes.
     """
     dataset = opened(dataset)
-    config = config or _from_settings(arch, filters, settings)
+    config = config or from_settings(arch=arch, filters=filters, **settings)
     if split is not None:
         config = replace(config, evaluation=replace(config.evaluation, split=split))
     parse_split(config.evaluation.split)
@@ -305,28 +304,3 @@ def import_simulation(
 def _context_said(windows: WindowSet) -> dict[str, int]:
     kinds, counts = np.unique(windows.context, return_counts=True)
     return {str(kind): int(n) for kind, n in zip(kinds, counts, strict=True)}
-
-
-# Where each setting of `train` and `evaluate` belongs.
-_SETTINGS: dict[str, tuple[str, ...]] = {
-    "windows": ("context", "window_s", "step_s", "longest_factor"),
-    "model": ("padding", "norm", "pool_s"),
-    "training": ("preset", "epochs", "batch", "learning_rate", "halve_every", "patience", "device", "turn_deg"),
-    "evaluation": ("classes", "train_context", "workers"),
-    "live": ("smoothing_s",),
-}
-
-
-def _from_settings(arch: str | None, filters: Sequence[int] | str | None, settings: Mapping[str, Any]) -> RunConfig:
-    known = [key for keys in _SETTINGS.values() for key in keys] + ["seed"]
-    for key in settings:
-        if key not in known:
-            from plushsense.core.errors import nearest
-
-            raise ConfigError(f"Unknown setting '{key}': accepted are {', '.join(known)}.{nearest(key, known)}")
-    tables: dict[str, dict[str, Any]] = {
-        table: {key: settings[key] for key in keys if key in settings} for table, keys in _SETTINGS.items()
-    }
-    tables["model"] |= {"arch": arch, "filters": filters}
-    tables["training"]["seed"] = tables["evaluation"]["seed"] = settings.get("seed")
-    return resolve(None, **tables)

@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import os
+import platform
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense import __version__
-from plushsense.apps.config import RunConfig, resolve
+from plushsense.apps.config import RunConfig, from_settings
+from plushsense.apps.places import check_folder, machine
 from plushsense.apps.preparation import Warn, choose_classes, opened, silent, windows_for
 from plushsense.core.errors import ConfigError, nearest
 from plushsense.core.extras import need
@@ -142,7 +144,7 @@ def contenders(
         made.append(Contender(name, RECURRENT[name], "windows", False, fit, key))
     if NETWORK in models:
         key = {"arch": arch.to_dict(), "training": spec.key(), "vectors": vectors}
-        title = f"{arch.symbol} {'/'.join(map(str, arch.filters))} {arch.padding} (ours)"
+        title = f"{arch.title} {arch.padding} (ours)"
         network = NetworkFit(arch, spec, layout, gestures)
         made.append(Contender(NETWORK, title, "windows", False, network, key))
     return made
@@ -161,6 +163,7 @@ def baselines(
     cluster: str | None = None,
     progress: Callable[[CompareProgress], None] | None = None,
     warn: Warn = silent,
+    **settings: Any,
 ) -> dict[str, Any]:
     """Classical programs, recurrent networks and our own network on the same windows, under several splits.
 
@@ -168,7 +171,7 @@ def baselines(
     data set's ``cache`` folder; a comparison that was stopped goes on from there.
 
     Args:
-        config: as for `evaluate`; its split is not used.
+        config, settings: as for `evaluate`; its split is not used.
         splits: such as "leave-one-subject-out", "by-subject:5", "windows:5" (leaky); the gap between them is reported.
         models: names of `MODELS` and sets of `SETS`.
         cluster: address of a Ray cluster that does the work instead of this machine's processes.
@@ -181,7 +184,7 @@ def baselines(
         ``preset``, ``training``, ``window_s``, ``id``, ``code_version`` and ``machine``.
     """
     dataset = opened(dataset)
-    config = config or resolve()
+    config = config or from_settings(**settings)
     names = chosen(models)
     identity = comparison_id(dataset, config, splits, models, features, pca)
     asked = [parse_split(text).text for text in splits]
@@ -212,7 +215,7 @@ def baselines(
         "training": config.training.to_dict(),
         "window_s": config.windows.window_s,
         "id": identity,
-        "machine": machine(),
+        "machine": machine("one thread a program", f"Python {platform.python_version()}"),
         "code_version": __version__,
     }
     if out is not None:
@@ -240,18 +243,6 @@ def comparison_id(
     outcome |= {"splits": [parse_split(text).text for text in splits], "models": chosen(models)}
     outcome |= {"features": list(features), "pca": pca}
     return job_id({"settings": outcome, "data": dataset.hash})
-
-
-def machine() -> str:
-    """The processor and the system in plain words, without the host's name."""
-    import platform
-
-    name = platform.processor() or platform.machine()
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        lines = cpuinfo.read_text(encoding="utf-8", errors="replace").splitlines()
-        name = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), name)
-    return f"{name}, one thread a program, {platform.system()}, Python {platform.python_version()}"
 
 
 def save_baselines(table: dict[str, Any], out: Path) -> None:
@@ -288,8 +279,7 @@ def _check_place(out: Path, identity: str, replace: bool) -> None:
     """Whether a comparison may be written there: better asked before the work than after."""
     need("matplotlib", extra="reports")
     need("jinja2", extra="reports")
-    if out.exists() and not out.is_dir():
-        raise ConfigError(f"The comparison cannot be written to '{out}', which is a file: give a folder.")
+    check_folder(out, "A comparison")
     path = out / TABLE
     if replace or not path.exists():
         return

@@ -239,3 +239,30 @@ def resolve(path: str | Path | None = None, **flags: Mapping[str, Any]) -> RunCo
 
 
 PRESET_NAMES = tuple(PRESETS)
+
+
+# Where each setting of `train`, `evaluate` and `baselines` belongs.
+_SETTINGS: dict[str, tuple[str, ...]] = {
+    "windows": ("context", "window_s", "step_s", "longest_factor"),
+    "model": ("arch", "filters", "padding", "norm", "pool_s"),
+    "training": ("preset", "epochs", "batch", "learning_rate", "halve_every", "patience", "device", "turn_deg"),
+    "evaluation": ("classes", "train_context", "workers"),
+    "live": ("smoothing_s",),
+}
+
+
+def from_settings(**settings: Any) -> RunConfig:
+    """A configuration by names alone: ``arch="14d1_39d2_41d4", preset="loso", epochs=20, seed=1``; None is not given.
+
+    Raises:
+        ConfigError: for a name that there is not, with the nearest.
+    """
+    known = [key for keys in _SETTINGS.values() for key in keys] + ["seed"]
+    for key in settings:
+        if key not in known:
+            raise ConfigError(f"Unknown setting '{key}': accepted are {', '.join(known)}.{nearest(key, known)}")
+    tables: dict[str, dict[str, Any]] = {
+        table: {key: settings[key] for key in keys if key in settings} for table, keys in _SETTINGS.items()
+    }
+    tables["training"]["seed"] = tables["evaluation"]["seed"] = settings.get("seed")
+    return resolve(None, **tables)

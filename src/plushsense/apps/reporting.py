@@ -10,6 +10,7 @@ from typing import Any
 
 from plushsense import __version__
 from plushsense.apps.config import RunConfig
+from plushsense.apps.places import check_folder
 from plushsense.apps.preparation import opened
 from plushsense.core.errors import BadInput, ConfigError
 from plushsense.dataset.store import Dataset, write_atomically
@@ -35,11 +36,7 @@ def check_place(out: Path, config: RunConfig, dataset: Dataset, *, replace: bool
     """
     from plushsense.reports.html import check_place as check_page
 
-    there = next(p for p in (out.absolute(), *out.absolute().parents) if p.exists())
-    if not there.is_dir():
-        raise ConfigError(f"An evaluation cannot be written to '{out}': '{there}' is a file; give a folder.")
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise ConfigError(f"An evaluation cannot be written to '{out}': you may not write in '{there}'.")
+    check_folder(out, "An evaluation")
     check_page(out / PAGE)
     path = out / SCORES
     if replace or not path.exists():
@@ -78,12 +75,11 @@ def save_evaluation(result: Evaluation, dataset: Dataset, config: RunConfig, arc
 
 def evaluation_title(result: Evaluation, arch: Arch, config: RunConfig) -> str:
     """A line that tells one evaluation from another."""
-    filters = "/".join(map(str, arch.filters))
     context = f"{result.context} context"
     if result.train_context != result.context:
         context += f", trained on {result.train_context}"
     training = f"{config.preset} training, seed {config.training.seed}"
-    return f"{arch.symbol} {filters} {arch.padding}, {result.split.text}, {context}, {training}"
+    return f"{arch.title} {arch.padding}, {result.split.text}, {context}, {training}"
 
 
 def card(arch: Arch, **more: Any) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from plushsense.apps.sweep_plan import Plan, PlannedTrial, Run
 from plushsense.apps.sweep_tables import Tables
 from plushsense.dataset.store import Dataset, write_atomically
 from plushsense.models.arch import Arch
+from plushsense.models.symbol import slashed
 from plushsense.runs.journal import job_id
 from plushsense.runs.pool import Job
 from plushsense.training.grid import GridSpec
@@ -133,7 +134,7 @@ def summed_up(ready: Prepared, found: Halved, tables: SearchTables, dataset: Dat
 def left_out(ready: Prepared) -> list[dict[str, str]]:
     """The networks beyond the limits, and by how much."""
     return [
-        {"arch": arch.symbol, "filters": _slashed(arch.filters), "why": said(ready.spec.over(arch))}
+        {"arch": arch.symbol, "filters": slashed(arch.filters), "why": said(ready.spec.over(arch))}
         for arch in ready.left_out
     ]
 
@@ -164,7 +165,7 @@ def _rung(ready: Prepared, compared: Compared) -> dict[str, Any]:
             {
                 "trial": trials[network].id,
                 "arch": trial.arch.symbol,
-                "filters": _slashed(trial.arch.filters),
+                "filters": slashed(trial.arch.filters),
                 "batch_asked": str(trial.batch),
                 "macro_f1": mean if mean == mean else None,
                 "went": went,
@@ -217,7 +218,3 @@ def _command(grid: GridSpec, winner: Mapping[str, Any], dataset: Path, out: Path
 
 def _or_least(value: float) -> float:
     return value if value == value else float("-inf")
-
-
-def _slashed(filters: Sequence[int]) -> str:
-    return "/".join(map(str, filters))

@@ -19,15 +19,16 @@ import numpy as np
 
 from plushsense.apps.preparation import Warn, opened, silent
 from plushsense.apps.search_tables import Prepared, SearchTables, left_out, summed_up, write_summary
-from plushsense.apps.sweep_job import Outcome, TrainAndScore, outcome
+from plushsense.apps.sweep_job import Outcome, outcome, train_all
 from plushsense.apps.sweep_plan import GridProblems, Run, Task, plans_by_epochs, processes
 from plushsense.apps.sweep_tables import check_place
-from plushsense.apps.sweeping import JOURNAL, UNFINISHED, head
+from plushsense.apps.sweeping import head
 from plushsense.core.errors import BadInput, ConfigError
 from plushsense.dataset.store import Dataset
 from plushsense.models.arch import Arch
-from plushsense.runs.journal import Journal, Result
-from plushsense.runs.pool import Job, run_jobs
+from plushsense.models.symbol import slashed
+from plushsense.runs.journal import Result
+from plushsense.runs.pool import Job
 from plushsense.training.grid import GridSpec
 from plushsense.training.gridfile import changed
 from plushsense.training.search import QUARTER, Costs, Rung, Scores, SearchSpec, halving, none_left, problems
@@ -124,7 +125,7 @@ def prepare(
     if over:
         filters: dict[str, list[str]] = {}
         for arch in over:
-            filters.setdefault(arch.symbol, []).append("/".join(map(str, arch.filters)))
+            filters.setdefault(arch.symbol, []).append(slashed(arch.filters))
         named = "; ".join(f"{symbol} with {', '.join(several)}" for symbol, several in filters.items())
         warn(f"{len(over)} of {len(dict.fromkeys(archs))} networks are beyond the limits and left out: {named}")
     return Prepared(settled, spec, tuple(plans), costs, tuple(over))
@@ -245,18 +246,7 @@ class _Trainer:
         progress: Callable[[SearchProgress], None] | None,
     ) -> None:
         self._ready, self._progress = ready, progress
-        self._unfinished = Journal(dataset.path.joinpath(*UNFINISHED))
-        self._run = partial(
-            run_jobs,
-            # Nodes of a cluster do not share a disk: there a training is done whole.
-            work=TrainAndScore(self._unfinished if cluster is None else None),
-            shared=(ready.plans[-1].sets, ready.plans[-1].folds),
-            workers=workers,
-            threads=ready.grid.threads,
-            cluster=cluster,
-            gpus=1.0 if cluster is not None and ready.grid.device == "cuda" else 0.0,
-            journal=Journal(dataset.path.joinpath(*JOURNAL)),
-        )
+        self._train = partial(train_all, dataset, ready.plans[-1], workers=workers, cluster=cluster)
         self.resumed = 0
         self.tables = SearchTables(ready, out, says)
         self._results: dict[str, Result] = {}
@@ -279,11 +269,7 @@ class _Trainer:
                 jobs.append(Job(job.id, self._going_on(job.task, earlier, rung)))
         teller = _Teller(self._ready, rung, costs, self._spent, self._best, self._progress)
 
-        def done(job: Job, result: Result, resumed: bool) -> None:
-            self._unfinished.discard(job.id)
-            teller.done(job, resumed)
-
-        self._results = self._run(jobs, on_done=done, on_report=teller.epoch)
+        self._results = self._train(jobs=jobs, on_done=teller.done, on_report=teller.epoch)
         self.resumed += teller.resumed
         self._spent += rung.cost
         outcomes = {job: outcome(plan, wanted[job], result) for job, result in self._results.items()}
@@ -293,7 +279,7 @@ class _Trainer:
         if np.isfinite(means).any():
             first = int(np.nanargmax(means))
             arch = plan.trials[rung.entered[first]].trial.arch
-            self._best = f"{arch.symbol} {'/'.join(map(str, arch.filters))}", float(means[first])
+            self._best = arch.title, float(means[first])
         return scores
 
     def _jobs_before(self, rung: Rung, runs: Mapping[int, Sequence[Run]]) -> dict[str, str]:
@@ -337,7 +323,7 @@ class _Teller:
         self._done = self.resumed = 0
         self._running: dict[str, float] = {}
 
-    def done(self, job: Job, resumed: bool) -> None:
+    def done(self, job: Job, result: Result, resumed: bool) -> None:
         self._done += 1
         self.resumed += resumed
         self._running.pop(job.id, None)
@@ -354,7 +340,7 @@ class _Teller:
         if self._progress is None:
             return
         task: Task = job.task
-        what = f"{task.arch.symbol} {'/'.join(map(str, task.arch.filters))} batch {task.spec.batch}"
+        what = f"{task.arch.title} batch {task.spec.batch}"
         share = (self._spent + sum(self._running.values())) / self._ready.costs.bound
         rung = self._rung
         at = (rung.number + 1, len(self._ready.plans), len(rung.entered), self._done, len(self._costs), self.resumed)

@@ -1,9 +1,9 @@
-"""One training of a sweep: what is done, and what its result scores."""
+"""The trainings of a sweep or a search: how they are handed out, what one does, and what its result scores."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,14 +13,54 @@ from numpy.typing import NDArray
 from plushsense.apps.sweep_plan import Plan, Run, Task
 from plushsense.core.errors import DivergedError
 from plushsense.core.gestures import NOBODY
+from plushsense.dataset.store import Dataset
 from plushsense.runs.journal import Journal, Result
-from plushsense.runs.pool import Report
+from plushsense.runs.pool import Job, Report, run_jobs
 from plushsense.scoring import metrics
 from plushsense.scoring.metrics import Counts
 from plushsense.windows.cut import WindowSet
 
+# In the data set's folder: finished trainings, and where long ones stand.
+JOURNAL, UNFINISHED = ("cache", "sweeps"), ("cache", "unfinished")
+
 # The columns of a training's curve, as its result holds them; the epoch is the row.
 CURVE = ("train_loss", "train_accuracy", "validation_loss", "validation_accuracy", "learning_rate")
+
+
+def train_all(
+    dataset: Dataset,
+    planned: Plan,
+    jobs: Sequence[Job],
+    *,
+    workers: int,
+    cluster: str | None,
+    on_done: Callable[[Job, Result, bool], None],
+    on_start: Callable[[Job], None] | None = None,
+    on_report: Callable[[Job, Any], None] | None = None,
+    on_failed: Callable[[Job, Exception], None] | None = None,
+) -> dict[str, Result]:
+    """Do those ``jobs`` on the windows of a plan that the data set's journal does not hold; as `run_jobs` else."""
+    unfinished = Journal(dataset.path.joinpath(*UNFINISHED))
+
+    def done(job: Job, result: Result, resumed: bool) -> None:
+        unfinished.discard(job.id)
+        on_done(job, result, resumed)
+
+    return run_jobs(
+        jobs,
+        # Nodes of a cluster do not share a disk: there a training is done whole.
+        TrainAndScore(unfinished if cluster is None else None),
+        shared=(planned.sets, planned.folds),
+        workers=workers,
+        threads=planned.grid.threads,
+        journal=Journal(dataset.path.joinpath(*JOURNAL)),
+        cluster=cluster,
+        gpus=1.0 if cluster is not None and planned.grid.device == "cuda" else 0.0,
+        on_start=on_start,
+        on_report=on_report,
+        on_done=done,
+        on_failed=on_failed,
+    )
 
 
 @dataclass(frozen=True)

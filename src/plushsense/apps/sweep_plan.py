@@ -1,4 +1,9 @@
-"""A sweep before it runs: the windows, the folds, every trial and every training with its id."""
+"""A sweep before it runs: the windows, the folds, every trial and every training with its id.
+
+A *trial* is a network with a number of epochs and a batch: a row of the grid. A *training* is what is trained in one
+go, the trials that differ in their epochs only, with one seed on one fold: a `Job` of the journal, whose `Task` says
+what to do. A *run* is a trial's part of one training.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +15,7 @@ from typing import Any
 
 from plushsense.apps.config import ALL
 from plushsense.apps.preparation import Warn, choose_classes, silent, windows_for
-from plushsense.core.errors import BadInput, ConfigError, TrainingError
-from plushsense.core.extras import need
+from plushsense.core.errors import BadInput, ConfigError
 from plushsense.core.gestures import GestureSet
 from plushsense.dataset.store import Dataset
 from plushsense.evaluation.crossval import fold_print, windows_print
@@ -222,7 +226,10 @@ class _Cut:
 
 
 def _planned(dataset: Dataset, grid: GridSpec, cut: _Cut, fits: Callable[[Arch], bool] = lambda arch: True) -> Plan:
-    spec = replace(grid.training, device=_device(grid.device))
+    from plushsense.training.fit import placed
+
+    # Where it is trained, settled once: it belongs to the id, and every worker must mean the same.
+    spec = placed(grid.training)
     prints: dict[int, tuple[str, list[str]]] = {}
     trials: list[PlannedTrial] = []
     jobs: dict[str, Job] = {}
@@ -259,23 +266,13 @@ def _planned(dataset: Dataset, grid: GridSpec, cut: _Cut, fits: Callable[[Arch],
 
 
 def _settings(task: Task) -> dict[str, Any]:
-    """What a training depends on beside its data and network; where it is computed changes the last digits."""
-    where = {"threads": task.spec.threads, "device": task.spec.device}
-    return {"training": task.spec.key() | where, "epochs": list(task.epochs)}
+    """What a training depends on beside its data and network."""
+    return {"training": task.spec.key(), "epochs": list(task.epochs)}
 
 
 def _trial_id(base: dict[str, Any], trial: Trial, spec: TrainSpec, folds: list[str]) -> str:
     settings = {k: v for k, v in spec.key().items() if k not in ("seed", "batch", "epochs")}
-    where = {"threads": spec.threads, "device": spec.device}
-    return job_id({**base, "training": settings | where, "epochs": trial.epochs, "batch": trial.batch, "folds": folds})
-
-
-def _device(name: str) -> str:
-    """Where it is trained, settled once: it belongs to the id, and every worker must mean the same."""
-    cuda = bool(need("torch", "train").cuda.is_available())
-    if name == "cuda" and not cuda:
-        raise TrainingError("There is no CUDA device to train on: use the device 'auto' or 'cpu'.")
-    return ("cuda" if cuda else "cpu") if name == "auto" else name
+    return job_id({**base, "training": settings, "epochs": trial.epochs, "batch": trial.batch, "folds": folds})
 
 
 def processes(workers: int, threads: int) -> int:

@@ -10,18 +10,21 @@ import math
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
 
 import numpy as np
 
+from plushsense.apps.places import check_folder
 from plushsense.apps.sweep_job import CURVE, Outcome, outcome
 from plushsense.apps.sweep_plan import Plan, PlannedTrial, Run
 from plushsense.core.errors import ConfigError
 from plushsense.core.extras import need
 from plushsense.dataset.store import write_atomically
 from plushsense.models.arch import DEFAULT_FILTERS
+from plushsense.models.symbol import slashed
 from plushsense.scoring import metrics
 from plushsense.scoring.metrics import Counts
 
@@ -124,7 +127,9 @@ class Tables:
         if resumed:
             self.resumed.add(job)
         elif time.monotonic() >= self._due:
-            self.write()
+            # One that somebody holds open (Windows) stays as it is; the last writing is not so lenient.
+            with suppress(OSError):
+                self.write()
 
     def lose(self, job: str, why: str) -> None:
         """Note a training that was given up; its trials wait for another run."""
@@ -235,7 +240,7 @@ class Tables:
         picked = [row["trial"] for row in best[:BEST]]
         seen: set[str] = set()
         for row in best:
-            papers = (row["arch"], row["filters"]) == (PAPERS_CHOICE[0], _slashed(PAPERS_CHOICE[1]))
+            papers = (row["arch"], row["filters"]) == (PAPERS_CHOICE[0], slashed(PAPERS_CHOICE[1]))
             if row["filter_set"] not in seen or papers:
                 seen.add(row["filter_set"])
                 picked.append(row["trial"])
@@ -276,8 +281,8 @@ def _trial_row(planned: PlannedTrial, outcomes: Mapping[str, Outcome]) -> dict[s
     row: dict[str, Any] = {
         "trial": planned.id,
         "arch": arch.symbol,
-        "filters": _slashed(arch.filters),
-        "filter_set": _slashed(trial.filter_set),
+        "filters": slashed(arch.filters),
+        "filter_set": slashed(trial.filter_set),
         "padding": arch.padding,
         "norm": arch.norm,
         "epochs": trial.epochs,
@@ -318,15 +323,11 @@ def _words(planned: PlannedTrial, run: Run) -> dict[str, Any]:
     arch = planned.trial.arch
     return {
         "arch": arch.symbol,
-        "filters": _slashed(arch.filters),
+        "filters": slashed(arch.filters),
         "batch": run.batch,
         "seed": run.seed,
         "fold": run.fold,
     }
-
-
-def _slashed(filters: Sequence[int]) -> str:
-    return "/".join(map(str, filters))
 
 
 def _kind(polars: Any, kind: type[Any]) -> Any:
@@ -353,11 +354,7 @@ def check_place(out: Path, identity: str, *, replace: bool = False) -> None:
     Raises:
         ConfigError: where ``out`` cannot be a folder, or holds (not with ``replace``) a sweep of another grid or data.
     """
-    there = next(p for p in (out.absolute(), *out.absolute().parents) if p.exists())
-    if not there.is_dir():
-        raise ConfigError(f"A sweep cannot be written to '{out}': '{there}' is a file; give a folder.")
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise ConfigError(f"A sweep cannot be written to '{out}': you may not write in '{there}'.")
+    check_folder(out, "A sweep")
     path = out / SUMMARY
     if replace or not path.exists():
         return

@@ -8,68 +8,30 @@ window × class × scored epoch, 182 kB for each of the paper's 156 trainings.
 from __future__ import annotations
 
 import os
-import platform
 import re
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any
 
 from plushsense import __version__
+from plushsense.apps.places import machine
 from plushsense.apps.preparation import Warn, opened, silent
-from plushsense.apps.sweep_job import TrainAndScore
+from plushsense.apps.sweep_job import JOURNAL, train_all
 from plushsense.apps.sweep_plan import GridProblems, Plan, Task, plan, processes
-from plushsense.apps.sweep_tables import TRIALS, Tables, check_place
+from plushsense.apps.sweep_shown import SweepProgress, Teller, Watcher
+from plushsense.apps.sweep_tables import RUNS, TRIALS, Tables, check_place
 from plushsense.core.extras import need
 from plushsense.dataset.store import Dataset
 from plushsense.runs.journal import Journal, Result, job_id
-from plushsense.runs.pool import Job, run_jobs
-from plushsense.runs.table import At, Best, Row, Table
+from plushsense.runs.pool import Job
 from plushsense.training.grid import GridSpec
 from plushsense.training.gridfile import changed, load_grid
 
-JOURNAL, UNFINISHED = ("cache", "sweeps"), ("cache", "unfinished")
-
 # So many trainings given up, and none done: the rest would go the same way.
 _HOPELESS = 3
-
-
-class Watcher(Protocol):
-    """Who is told of trainings while they are worked off; a context manager around it."""
-
-    def __enter__(self) -> Any: ...
-
-    def __exit__(self, *_: object) -> None: ...
-
-    def on_start(self, job: Job) -> None:
-        """It begins."""
-
-    def on_report(self, job: Job, message: Any) -> None:
-        """It is at (epoch, epochs, loss)."""
-
-    def on_done(self, job: Job, result: Result, resumed: bool) -> None:
-        """It is done, or was before."""
-
-    def on_failed(self, job: Job, error: Exception) -> None:
-        """It was given up."""
-
-
-class SweepProgress(NamedTuple):
-    """Where a sweep stands: ``share`` of its work; ``epoch`` of ``epochs`` in ``what``, 0: that training is done.
-
-    ``best`` is the row of the best trial that is complete.
-    """
-
-    done: int
-    trainings: int
-    resumed: int
-    share: float
-    what: str
-    epoch: int
-    epochs: int
-    best: dict[str, Any] | None
 
 
 @dataclass(frozen=True)
@@ -83,6 +45,11 @@ class Sweep:
     def trials(self) -> Any:
         """The table of trials, a polars frame; one row a network, number of epochs and batch."""
         return need("polars", "train").read_parquet(self.out / TRIALS)
+
+    @cached_property
+    def runs(self) -> Any:
+        """The table of runs, a polars frame; one row a trial, seed and fold."""
+        return need("polars", "train").read_parquet(self.out / RUNS)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, ready for JSON."""
@@ -136,7 +103,8 @@ def sweep(
         out: default ``evaluations/sweep-<name>`` in the data set; with the split and a hash where the grid was changed.
         workers: trainings at a time; 0: as many as the processors hold.
         cluster: address of a Ray cluster that trains instead of this machine's processes.
-        table: `live_table`, to see the trainings on standard error.
+        progress: called with where it stands.
+        table: `sweep_shown.live_table`, to see the trainings on standard error.
         changes: keys of a grid, as ``epochs=(20,)``, ``architectures=…``, ``seeds=…``, ``threads=2``.
 
     Raises:
@@ -148,7 +116,7 @@ def sweep(
     place = Path(out) if out is not None else default_place(dataset, grid, spec)
     check_place(place, planned.id, replace=overwrite)
     tables = Tables(planned, place, head(dataset, planned))
-    teller = _Teller(planned, tables, progress)
+    teller = Teller(planned, tables, progress)
 
     watchers = [teller] if table is None else [teller, table(planned, tables)]
     try:
@@ -169,9 +137,6 @@ def _work_off(
     cluster: str | None,
     watchers: Sequence[Watcher],
 ) -> None:
-    """The one place where trainings are handed out."""
-    results, unfinished = Journal(dataset.path.joinpath(*JOURNAL)), Journal(dataset.path.joinpath(*UNFINISHED))
-
     def started(job: Job) -> None:
         for watcher in watchers:
             watcher.on_start(job)
@@ -181,7 +146,6 @@ def _work_off(
             watcher.on_report(job, message)
 
     def done(job: Job, result: Result, resumed: bool) -> None:
-        unfinished.discard(job.id)
         tables.add(job.id, result, resumed)
         for watcher in watchers:
             watcher.on_done(job, result, resumed)
@@ -197,46 +161,17 @@ def _work_off(
     with ExitStack() as stack:
         for watcher in watchers:
             stack.enter_context(watcher)
-        run_jobs(
+        train_all(
+            dataset,
+            planned,
             planned.jobs,
-            # Nodes of a cluster do not share a disk: there a training is done whole.
-            TrainAndScore(unfinished if cluster is None else None),
-            shared=(planned.sets, planned.folds),
             workers=workers,
-            threads=planned.grid.threads,
-            journal=results,
             cluster=cluster,
-            gpus=1.0 if cluster is not None and planned.grid.device == "cuda" else 0.0,
             on_start=started,
             on_report=reported,
             on_done=done,
             on_failed=failed,
         )
-
-
-def live_table(planned: Plan, tables: Tables) -> Table:
-    """A table of the trainings on standard error: what is done, what runs, the best so far, the time left."""
-
-    def best(job: Job, result: Result) -> Best | None:
-        row = tables.best
-        if row is None:
-            return None
-        marks = " (leaky)" * row["leaky"] + " (simulation)" * row["simulated"]
-        return Best(row["accuracy"], f"{row['arch']} {row['filters']}{marks}")
-
-    rows = {job.id: Row(_named(job.task), planned.macs(job)) for job in planned.jobs}
-    return Table(
-        f"sweep {planned.grid.name}",
-        rows,
-        read=lambda message: At(*message),
-        score=best,
-        score_name="accuracy",
-    )
-
-
-def _named(task: Task) -> str:
-    filters = "/".join(map(str, task.arch.filters))
-    return f"{task.arch.symbol} {filters} batch {task.spec.batch} seed {task.spec.seed} fold {task.fold + 1}"
 
 
 def resolve(grid: GridSpec | str | os.PathLike[str], changes: dict[str, Any]) -> tuple[GridSpec, list[str]]:
@@ -273,70 +208,13 @@ def head(dataset: Dataset, planned: Plan) -> dict[str, Any]:
         "labels": list(planned.gestures.labels),
         "affects": list(planned.gestures.affects),
         "windows": max(len(windows) for windows in planned.sets.values()),
-        "machine": machine(grid.threads),
+        "machine": machine(
+            f"{os.cpu_count()} processors",
+            f"{grid.threads} thread{'s' * (grid.threads > 1)} a training",
+            f"PyTorch {need('torch', 'train').__version__}",
+        ),
         "code_version": __version__,
     }
-
-
-def machine(threads: int) -> str:
-    """Processor, threads and PyTorch in plain words."""
-    named = platform.processor() or platform.machine()
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        named = next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        pass
-    torch = need("torch", "train")
-    return (
-        f"{named}, {os.cpu_count()} processors, {threads} thread{'s' * (threads > 1)} a training, "
-        f"PyTorch {torch.__version__}, {platform.system()}"
-    )
-
-
-class _Teller:
-    """Turns what jobs say into `SweepProgress`; the share counts multiply-accumulates, of running trainings too."""
-
-    def __init__(self, planned: Plan, tables: Tables, progress: Callable[[SweepProgress], None] | None) -> None:
-        self._macs = {job.id: planned.macs(job) for job in planned.jobs}
-        self._all = sum(self._macs.values()) or 1
-        self._finished = self._done = self._resumed = 0
-        self._running: dict[str, float] = {}
-        self._tables, self._progress = tables, progress
-
-    def __enter__(self) -> _Teller:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Nothing is held."""
-
-    def on_start(self, job: Job) -> None:
-        """Told with its first epoch."""
-
-    def on_failed(self, job: Job, error: Exception) -> None:
-        """Its share is not counted any more."""
-        self._running.pop(job.id, None)
-
-    def on_done(self, job: Job, result: Result, resumed: bool) -> None:
-        """It is done, or was before."""
-        self._done += 1
-        self._resumed += resumed
-        self._running.pop(job.id, None)
-        self._finished += self._macs[job.id]
-        self._tell(job, 0, 0)
-
-    def on_report(self, job: Job, message: tuple[int, int, float]) -> None:
-        """It is at (epoch, epochs, loss)."""
-        self._running[job.id] = message[0] / message[1] * self._macs[job.id]
-        self._tell(job, *message[:2])
-
-    def _tell(self, job: Job, epoch: int, epochs: int) -> None:
-        if self._progress is None:
-            return
-        task: Task = job.task
-        what = f"{task.arch.symbol} {'/'.join(map(str, task.arch.filters))} batch {task.spec.batch}"
-        share = (self._finished + sum(self._running.values())) / self._all
-        at = (self._done, len(self._macs), self._resumed, share, what, epoch, epochs, self._tables.best)
-        self._progress(SweepProgress(*at))
 
 
 def preview(

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import ArchError, nearest
-from plushsense.models.symbol import MAX_LAYERS, MAX_NUMBER, fail, layer_start, parse_filters, parse_symbol
+from plushsense.models.symbol import MAX_LAYERS, MAX_NUMBER, fail, layer_start, parse_filters, parse_symbol, slashed
 
 Padding = Literal["stream", "causal", "mirror"]
 Norm = Literal["batch", "layer"]
@@ -158,6 +158,11 @@ class Arch:
         """The symbol, spelt as the paper does: dilations are written when any of them is not 1."""
         dilated = any(layer.dilation > 1 for layer in self.layers)
         return "_".join(f"{layer.kernel}d{layer.dilation}" if dilated else f"{layer.kernel}" for layer in self.layers)
+
+    @property
+    def title(self) -> str:
+        """Symbol and filters: ``14d1_39d2_41d4 8/12/16``."""
+        return f"{self.symbol} {slashed(self.filters)}"
 
     @property
     def filters(self) -> tuple[int, ...]:

@@ -1,4 +1,6 @@
-"""The network that training moves, in PyTorch: the same numbers as ``models/reference`` to 1e-5.
+"""The network in PyTorch's own layers: the same numbers as ``models/reference`` to 1e-5.
+
+Training begins from its weights; what ``training/fast`` cannot do (see ``training/engine``) trains with its layers.
 
 Inside, activations are (N, C, 1, T) with the channels last in memory: on a CPU a step of training then takes
 0.5 to 0.75 of the time that Conv1d on (N, C, T) needs, measured over kernels of 14 to 126 taps.

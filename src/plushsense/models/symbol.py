@@ -6,6 +6,7 @@ whole numbers from 1; ``filters = count ("," count)*``.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NoReturn
 
 from plushsense.core.errors import ArchError
@@ -59,6 +60,11 @@ def parse_filters(text: str) -> tuple[int, ...]:
                 symbol=False,
             )
         at += 1
+
+
+def slashed(filters: Iterable[int]) -> str:
+    """Filter counts as tables and names show them: ``8/12/16``."""
+    return "/".join(map(str, filters))
 
 
 def _number(text: str, at: int, what: str, symbol: bool = True) -> tuple[int, int]:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Sequence
 from typing import Any
 
 from plushsense.reports.sweep_results import Network, Sweep, acr, finite
 from plushsense.reports.sweep_rows import Column, Table, schedule, spread
+from plushsense.training.search import pareto as on_front
 
 SHOWN = 20
 """Rows of a long table on the page; its CSV has all."""
@@ -152,14 +152,6 @@ def effect(sweep: Sweep) -> Table:
     )
 
 
-def front(points: Sequence[tuple[float, float]]) -> list[bool]:
-    """Which (cost, score) no other beats: none costs as little and scores more, or costs less and scores as much.
-
-    Equal points beat each other not, so that both are on the front.
-    """
-    return [not any(c <= cost and s >= score and (c < cost or s > score) for c, s in points) for cost, score in points]
-
-
 def pareto_points(sweep: Sweep, cost: str) -> list[dict[str, Any]]:
     """Each network with its cost, its best macro-F1, and whether it is on the front."""
     rows = [
@@ -176,7 +168,7 @@ def pareto_points(sweep: Sweep, cost: str) -> list[dict[str, Any]]:
         for n in sweep.networks
         if (t := n.best("macro_f1")) and finite(t.get(cost)) and t[cost] > 0
     ]
-    for row, on in zip(rows, front([(r["value"], r["macro_f1"]) for r in rows]), strict=True):
+    for row, on in zip(rows, on_front([(r["macro_f1"], r["value"]) for r in rows]), strict=True):
         row["front"] = on
     return sorted(rows, key=lambda r: (r["value"], -r["macro_f1"]))
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from plushsense.models.arch import TABLE3_MISPRINT
+from plushsense.models.symbol import slashed
 from plushsense.reports import sweep_paper as paper
 from plushsense.reports.sweep_results import Network, Row, Sweep, acr, finite
 from plushsense.reports.sweep_rows import Column, Table, name_of, schedule, yes
@@ -97,7 +98,7 @@ def _table3_words(met: int, near: int, off: Sequence[str], other: bool) -> list[
         + (f". Not: {'; '.join(off)}." if off else ".")
     ]
     arch, filters = TABLE3_MISPRINT
-    if any(said.startswith(f"{arch} at {'/'.join(map(str, filters))}") for said in off):
+    if any(said.startswith(f"{arch} at {slashed(filters)}") for said in off):
         words.append(
             f"The cell of {arch} looks like a misprint: the paper's other three sizes of it agree with our count "
             "within 1 %."

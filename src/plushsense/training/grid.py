@@ -16,7 +16,7 @@ from typing import Any
 from plushsense.core.errors import ArchError, BadInput, nearest
 from plushsense.core.signal import Layout
 from plushsense.models.arch import NORMS, PADDINGS, PAPER_ARCHITECTURES, PAPER_FILTERS, Arch
-from plushsense.models.symbol import parse_symbol
+from plushsense.models.symbol import parse_symbol, slashed
 from plushsense.scoring.splits import parse_split
 from plushsense.training.spec import DEVICES, PRESETS, TrainSpec
 from plushsense.windows.cut import CONTEXTS, WindowSpec
@@ -34,8 +34,8 @@ class GridSpec:
 
     ``filters`` are sets of four, of which a network takes as many as it has layers. ``seeds`` are those of the
     trainings; the split has its own, so that all trainings of a grid see the same folds. ``classes`` is "all",
-    "shared" or labels joined by commas. ``threads`` belongs to a training and to its id: another number sums in
-    another order.
+    "shared" or labels joined by commas. ``threads`` belongs to a training and to its id: in PyTorch's own layers
+    another number sums in another order (in ``training/fast`` it does not).
     """
 
     name: str = "grid"
@@ -147,12 +147,14 @@ def problems(
             found.append(first_line(cause))
     for filters in grid.filters:
         if not filters or min(filters) < 1:
-            found.append(f"The filters {_slashed(filters)} cannot be used: accepted are whole numbers from 1.")
+            found.append(
+                f"The filters {slashed(filters) or '(none)'} cannot be used: accepted are whole numbers from 1."
+            )
             continue
         for symbol, layers in shapes.items():
             if len(filters) < layers:
                 found.append(
-                    f"{symbol} has {layers} layers, but the filters {_slashed(filters)} are only {len(filters)}: "
+                    f"{symbol} has {layers} layers, but the filters {slashed(filters)} are only {len(filters)}: "
                     "give one a layer."
                 )
     found += _twice(grid)
@@ -224,7 +226,7 @@ def _twice(grid: GridSpec) -> list[str]:
                 shape = parse_symbol(symbol)
             except ArchError:
                 continue
-            network, said = (shape, filters[: len(shape)]), f"{symbol} with {_slashed(filters)}"
+            network, said = (shape, filters[: len(shape)]), f"{symbol} with {slashed(filters) or '(none)'}"
             if network in seen:
                 other = f"as {seen[network]}" if seen[network] != said else "twice"
                 found.append(f"{said} is the same network {other}: leave one out.")
@@ -265,10 +267,6 @@ def _too_long(grid: GridSpec, symbol: str, layout: Layout, past: int | None) -> 
 def first_line(cause: Exception) -> str:
     """A refusal without the picture below it."""
     return str(cause).splitlines()[0]
-
-
-def _slashed(filters: Iterable[int]) -> str:
-    return "/".join(map(str, filters)) or "(none)"
 
 
 def _listed(values: Iterable[object]) -> str:

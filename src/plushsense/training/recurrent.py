@@ -27,6 +27,7 @@ from torch import Tensor, nn  # noqa: E402
 from torch.nn import functional as F  # noqa: E402
 
 from plushsense.training.augment import Turn  # noqa: E402
+from plushsense.training.fit import placed  # noqa: E402
 
 # Part of every journalled training: raise it when the same settings would train differently.
 RECURRENT_VERSION = 1
@@ -86,8 +87,7 @@ def fit_recurrent(
     if not len(train):
         raise TrainingError("There are no windows to train on: check the data set, the gestures and the split.")
     began = time.perf_counter()
-    name = spec.device if spec.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
-    device = torch.device(name)
+    device = torch.device(placed(spec).device)
     scaler = Scaler.fit(train.x[:, :, -samples:])
     x = torch.from_numpy(scaler.apply(train.x[:, :, -samples:])).to(device)
     y = torch.from_numpy(train.y).to(device)

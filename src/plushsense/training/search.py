@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, TrainingError
 from plushsense.models.arch import Arch
+from plushsense.models.symbol import slashed
 
 Scores = NDArray[np.float64]
 
@@ -113,10 +114,9 @@ def none_left(spec: SearchSpec, archs: Sequence[Arch]) -> str:
         return max(has / may for has, may in spec.over(arch).values())
 
     near = min(archs, key=excess)
-    filters = "/".join(map(str, near.filters))
     return (
-        f"None of the {len(archs)} networks is within the limits; the nearest, {near.symbol} with {filters}, has "
-        f"{said(spec.over(near))}: allow more, or give smaller networks."
+        f"None of the {len(archs)} networks is within the limits; the nearest, {near.symbol} with "
+        f"{slashed(near.filters)}, has {said(spec.over(near))}: allow more, or give smaller networks."
     )
 
 
@@ -294,7 +294,10 @@ def standard_error(scores: Scores) -> float | None:
 
 
 def pareto(rows: Sequence[tuple[float, ...]]) -> list[bool]:
-    """Which rows (score, cost, cost, …) no other one beats: at least as good in all, better in one."""
+    """Which rows (score, cost, cost, …) no other one beats: at least as good in all, better in one.
+
+    Equal rows do not beat each other: both stay.
+    """
 
     def beats(a: tuple[float, ...], b: tuple[float, ...]) -> bool:
         pairs = [(a[0], b[0]), *((-x, -y) for x, y in zip(a[1:], b[1:], strict=True))]

@@ -32,8 +32,9 @@ class TrainSpec:
     validation loss (``stop_on`` "accuracy": a better accuracy) after which training ends with the best weights
     (None: all epochs, and the last weights).
     ``turn_deg`` turns the vectors of training windows at random (see `training.augment`).
-    ``device`` "auto" takes CUDA where it is available. ``threads`` on the CPU: for networks as small as these a
-    second thread gains little, and on a busy machine it made an epoch 25 times slower; run folds side by side.
+    ``device`` "auto" takes CUDA where it is available. ``threads`` on the CPU: those of ``training/fast`` share the
+    chunks of 64 windows of a batch, so that a batch of 64 keeps one busy; PyTorch's own gain little on networks as
+    small as these, and on a busy machine a second one made an epoch 25 times slower. Run folds side by side.
     """
 
     epochs: int = 150

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.apps.cli.output import emit, say, table
-from plushsense.apps.cli.settings import add_settings, settings, warn
+from plushsense.apps.cli.settings import add_settings, add_work, settings, warn
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -34,8 +34,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="what classical models read: statistics, 8 a channel, flattened, all samples, or both (default)",
     )
     parser.add_argument("--pca", default="both", help="for classical models: both (default), no or yes")
-    parser.add_argument("--workers", type=int, metavar="N", help="folds at a time (default 0: one a processor)")
-    parser.add_argument("--cluster", metavar="ADDRESS", help="work on a Ray cluster instead (default: on this machine)")
+    add_work(parser, "folds")
     parser.add_argument(
         "--out",
         metavar="DIR",

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from plushsense.apps.cli.output import emit, say, table
-from plushsense.apps.cli.settings import add_settings, folds_shown, settings, warn
+from plushsense.apps.cli.settings import add_settings, add_work, folds_shown, marks, settings, warn
 
 if TYPE_CHECKING:
     from plushsense.apps.config import RunConfig
@@ -27,8 +27,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         metavar="CONTEXT",
         help="context of the windows to train on: stream or loop (default: as those to score)",
     )
-    parser.add_argument("--workers", type=int, metavar="N", help="folds at a time (default 0: one a processor)")
-    parser.add_argument("--cluster", metavar="ADDRESS", help="work on a Ray cluster instead (default: on this machine)")
+    add_work(parser, "folds")
     parser.add_argument(
         "--out",
         metavar="DIR",
@@ -93,11 +92,7 @@ def spread(score: dict[str, Any]) -> str:
 
 def lines(e: dict[str, Any]) -> list[str]:
     """The scores as text: a row a person, then the means."""
-    out = []
-    if e["simulated"]:
-        out.append("SIMULATION: these scores are of the virtual toy and say nothing about a real one.")
-    if e["leaky"]:
-        out.append("LEAKY: windows of one recording stand on both sides of this split; the scores flatter.")
+    out = marks(e)
     context = (
         e["context"] if e["context"] == e["train_context"] else f"{e['context']} (trained on {e['train_context']})"
     )

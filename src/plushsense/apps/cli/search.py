@@ -11,7 +11,7 @@ from typing import Any
 
 from plushsense.apps.cli.evaluate import figure
 from plushsense.apps.cli.output import emit, say, table
-from plushsense.apps.cli.settings import warn
+from plushsense.apps.cli.settings import add_networks, add_work, marks, warn
 
 # Keys of the grid that an option changes, each an attribute of the arguments.
 _CHANGES = (
@@ -47,8 +47,8 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--split", metavar="SPLIT", help="by-subject:5 (default), leave-one-subject-out, by-recording:K, windows:K"
     )
-    parser.add_argument("--rungs", metavar="N,…", help="epochs after which networks are compared (4,15,60)")
-    parser.add_argument("--folds", metavar="N,…", help="folds that the rungs before the last look at (default: all)")
+    parser.add_argument("--rungs", metavar="N,...", help="epochs after which networks are compared (4,15,60)")
+    parser.add_argument("--folds", metavar="N,...", help="folds that the rungs before the last look at (default: all)")
     parser.add_argument(
         "--share",
         type=float,
@@ -57,26 +57,19 @@ def add(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--eta", type=float, metavar="X", help="one in X goes on from each rung, if cost allows (2)")
     parser.add_argument("--seeds", type=int, metavar="N", help="seeds of every training, 0 to N - 1 (1)")
-    parser.add_argument("--architectures", metavar="SPEC,…", help="only these networks (default: the grid's)")
-    parser.add_argument(
-        "--filters", metavar="SETS", help="only these filters: 4,6,8,8 or several sets, 4/6/8/8,8/12/16/16"
-    )
-    parser.add_argument("--batches", metavar="N,…", help="windows a batch, or full (64)")
+    add_networks(parser)
+    parser.add_argument("--batches", metavar="N,...", help="windows a batch, or full (64)")
     parser.add_argument("--padding", help="stream (default), causal or mirror")
     parser.add_argument("--norm", help="batch (default) or layer")
     parser.add_argument("--context", help="stream (default) or loop")
     parser.add_argument("--classes", metavar="LABELS", help="shared (default), all, or labels")
     parser.add_argument(
-        "--out", metavar="DIR", help="folder of search.json and tables (DATASET/evaluations/search-GRID-…)"
+        "--out",
+        metavar="DIR",
+        help="folder for the tables and search.json (default: DATASET/evaluations/search-GRID-…)",
     )
-    parser.add_argument("--force", action="store_true", help="replace another search in --out")
-    parser.add_argument(
-        "--workers", type=int, default=0, metavar="N", help="trainings at a time (default 0: one a processor)"
-    )
-    parser.add_argument("--threads", type=int, metavar="N", help="threads of a training, part of its identity (1)")
-    parser.add_argument(
-        "--cluster", metavar="ADDRESS", help="train on a Ray cluster instead (default: on this machine)"
-    )
+    parser.add_argument("--force", action="store_true", help="replace a search of another grid or data in --out")
+    add_work(parser, "trainings")
     parser.add_argument("--device", help="auto (default), cpu or cuda")
     parser.add_argument(
         "--dry-run", action="store_true", help="say what would be tried, left out and spent; no training"
@@ -98,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
         **asked,
         out=None if args.out is None else Path(args.out),
         overwrite=args.force,
-        workers=args.workers,
+        workers=args.workers or 0,
         cluster=args.cluster,
         progress=search_shown(),
         warn=warn,
@@ -153,11 +146,7 @@ def search_shown() -> Callable[[Any], None]:
 
 def lines(s: dict[str, Any]) -> list[str]:
     """The rungs, the best network, and those that stand beside it."""
-    out = []
-    if s["simulated"]:
-        out.append("SIMULATION: these scores are of the virtual toy and say nothing about a real one.")
-    if s["leaky"]:
-        out.append("LEAKY: windows of one recording stand on both sides of this split; the scores flatter.")
+    out = marks(s)
     mark = " (leaky)" if s["leaky"] else ""
     beyond = f" within the limits, {len(s['left_out'])} beyond" if s["left_out"] else ""
     out.append(

@@ -1,10 +1,10 @@
-"""The options that train and evaluate share, and the settings they make."""
+"""The options that verbs share, and the settings they make."""
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from plushsense.apps.cli.output import say
@@ -50,6 +50,35 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="TOML file with the tables windows, model, training, evaluation, live; options go over it (default: none)",
     )
+
+
+def add_work(parser: argparse.ArgumentParser, what: str) -> None:
+    """Where it is worked, and how much at a time; ``what`` is done side by side: "folds", "trainings"."""
+    parser.add_argument("--workers", type=int, metavar="N", help=f"{what} at a time (default 0: one a processor)")
+    parser.add_argument(
+        "--cluster",
+        metavar="ADDRESS",
+        help="work on a Ray cluster instead: auto, local, HOST:PORT or ray://HOST:10001 (default: on this machine)",
+    )
+
+
+def add_networks(parser: argparse.ArgumentParser) -> None:
+    """Which networks of a grid; nothing given: the grid's."""
+    parser.add_argument("--architectures", metavar="SPEC,...", help="only these networks (default: the grid's)")
+    parser.add_argument(
+        "--filters", metavar="SETS", help="only these filters: 4,6,8,8 or several sets, 4/6/8/8,8/12/16/16"
+    )
+    parser.add_argument("--threads", type=int, metavar="N", help="threads of a training, part of its identity (1)")
+
+
+def marks(result: Mapping[str, Any]) -> list[str]:
+    """What has to be said before any score: that it is a simulation's, that the split is leaky."""
+    said = []
+    if result["simulated"]:
+        said.append("SIMULATION: these scores are of the virtual toy and say nothing about a real one.")
+    if result["leaky"]:
+        said.append("LEAKY: windows of one recording stand on both sides of this split; the scores flatter.")
+    return said
 
 
 def settings(args: argparse.Namespace, **evaluation: Any) -> RunConfig:

@@ -8,7 +8,7 @@ from typing import Any
 
 from plushsense.apps.cli.evaluate import figure
 from plushsense.apps.cli.output import emit, say, table
-from plushsense.apps.cli.settings import warn
+from plushsense.apps.cli.settings import add_networks, add_work, marks, warn
 
 # Keys of the grid that an option changes, each an attribute of the arguments.
 _CHANGES = (
@@ -30,20 +30,11 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--out", metavar="DIR", help="folder for the tables and sweep.json (default: DATASET/evaluations/sweep-GRID)"
     )
     parser.add_argument("--force", action="store_true", help="replace a sweep of another grid or data in --out")
-    parser.add_argument(
-        "--workers", type=int, default=0, metavar="N", help="trainings at a time (default 0: one a processor)"
-    )
-    parser.add_argument("--threads", type=int, metavar="N", help="threads of a training, part of its identity (1)")
-    parser.add_argument(
-        "--cluster", metavar="ADDRESS", help="train on a Ray cluster instead (default: on this machine)"
-    )
+    add_work(parser, "trainings")
     parser.add_argument("--seeds", type=int, metavar="N", help="seeds of every trial, 0 to N - 1 (default: the grid's)")
-    parser.add_argument("--architectures", metavar="SPEC,…", help="only these networks (default: the grid's)")
-    parser.add_argument(
-        "--filters", metavar="SETS", help="only these filters: 4,6,8,8 or several sets, 4/6/8/8,8/12/16/16"
-    )
-    parser.add_argument("--epochs", metavar="N,…", help="only these numbers of epochs (default: the grid's)")
-    parser.add_argument("--batches", metavar="N,…", help="only these batches, windows or full (default: the grid's)")
+    add_networks(parser)
+    parser.add_argument("--epochs", metavar="N,...", help="only these numbers of epochs (default: the grid's)")
+    parser.add_argument("--batches", metavar="N,...", help="only these batches, windows or full (default: the grid's)")
     parser.add_argument("--padding", help="stream, causal or mirror (default: the grid's; paper mirror)")
     parser.add_argument("--norm", help="batch or layer (default: the grid's; paper batch)")
     parser.add_argument("--context", help="stream or loop (default: the grid's; paper loop)")
@@ -55,7 +46,8 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from plushsense.apps.sweeping import live_table, sweep
+    from plushsense.apps.sweep_shown import live_table
+    from plushsense.apps.sweeping import sweep
 
     changes: dict[str, Any] = {key: getattr(args, key) for key in _CHANGES}
     if args.seeds is not None:
@@ -68,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
         args.grid,
         out=None if args.out is None else Path(args.out),
         overwrite=args.force,
-        workers=args.workers,
+        workers=args.workers or 0,
         cluster=args.cluster,
         table=live_table,
         warn=warn,
@@ -101,11 +93,7 @@ def _dry_run(args: argparse.Namespace, changes: dict[str, Any]) -> int:
 
 def lines(s: dict[str, Any]) -> list[str]:
     """The best trials as text."""
-    out = []
-    if s["simulated"]:
-        out.append("SIMULATION: these scores are of the virtual toy and say nothing about a real one.")
-    if s["leaky"]:
-        out.append("LEAKY: windows of one recording stand on both sides of this split; the scores flatter.")
+    out = marks(s)
     out.append(
         f"grid {s['name']}, split {s['split']}, context {s['context']}: {s['done']} of {s['trials']} trials done "
         f"({s['resumed']} from before)\n"
