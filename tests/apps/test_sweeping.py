@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import pytest
 from polars.testing import assert_frame_equal
 
 import plushsense as ps
+from plushsense.apps import sweep_tables
 from plushsense.apps.sweep_job import JOURNAL, UNFINISHED
 from plushsense.apps.sweep_shown import SweepProgress
 from plushsense.apps.sweeping import sweep
@@ -195,6 +197,41 @@ def test_a_long_training_goes_on_where_it_was_stopped(
     assert begun[:2] == [0, 4] and not any(begun[2:])
     assert not list(unfinished.iterdir())
     assert_frame_equal(again.trials.drop("seconds"), whole.trials.drop("seconds"), check_exact=True)
+
+
+def test_a_state_that_cannot_be_kept_stops_no_training(
+    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from plushsense.training import fit as room
+
+    monkeypatch.setattr(room, "fit", partial(room.fit, save_every_s=0.0))
+    dataset.path.joinpath(*UNFINISHED).parent.mkdir(parents=True)
+    dataset.path.joinpath(*UNFINISHED).write_text("a file where the folder would be")
+    assert sweep(dataset, epochs=(1, 2), out=tmp_path, **SMALL).summary["done"] == 8
+
+
+def test_a_grid_in_another_order_is_the_same_sweep(dataset: Dataset, tmp_path: Path) -> None:
+    first = sweep(dataset, epochs=(1,), seeds=(0, 1), out=tmp_path, **SMALL)
+    turned = SMALL | {"architectures": ("9", "5_5d2"), "batches": ("full", 4)}
+    again = sweep(dataset, epochs=(1,), seeds=(1, 0), out=tmp_path, **turned)
+    assert again.summary["id"] == first.summary["id"] and again.summary["resumed"] == 4
+    assert_frame_equal(again.trials.sort("trial"), first.trials.sort("trial"))
+
+
+def test_of_equals_on_validation_the_test_part_does_not_choose(
+    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = sweep_tables._trial_row
+
+    def alike(*given: Any) -> dict[str, Any]:
+        row = real(*given)
+        return row | {"validation_macro_f1": 0.5, "accuracy": row["parameters"] / 1e6}
+
+    monkeypatch.setattr(sweep_tables, "_trial_row", alike)
+    summary = sweep(dataset, epochs=(1,), out=tmp_path, **SMALL).summary
+    smallest = min(row["parameters"] for row in summary["best"])
+    assert summary["best"][0]["parameters"] > smallest
+    assert summary["best_on_validation"]["parameters"] == smallest
 
 
 def test_what_keeps_the_first_trainings_from_being_done_ends_the_sweep(

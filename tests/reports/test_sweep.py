@@ -337,3 +337,30 @@ def test_nothing_is_cut_off_in_a_small_figure(tmp_path, dataset):
                 box = text.get_window_extent()
                 assert whole.x0 - 1 <= box.x0 and box.x1 <= whole.x1 + 1, (drawing.name, text.get_text())
                 assert whole.y0 - 1 <= box.y0 and box.y1 <= whole.y1 + 1, (drawing.name, text.get_text())
+
+
+def test_a_trial_of_some_folds_is_neither_ranked_nor_averaged(tmp_path: Path) -> None:
+    """One easy person looks better than all together: what is not done wholly compares with nothing."""
+    folder = known(tmp_path / "S", SCORES)
+    frame = polars.read_parquet(folder / "trials.parquet")
+    lucky = (polars.col("arch") == "250") & (polars.col("filters") == "8") & (polars.col("epochs") == 20)
+    lucky &= polars.col("batch_asked") == "64"
+    changes = {"accuracy": 0.99, "macro_f1": 0.99, "validation_accuracy": 0.99, "status": "partial"}
+    frame = frame.with_columns(
+        **{key: polars.when(lucky).then(polars.lit(value)).otherwise(polars.col(key)) for key, value in changes.items()}
+    )
+    frame.write_parquet(folder / "trials.parquet")
+    sweep = read_sweep(folder)
+    assert sweep.best is not None and sweep.best["accuracy"] == 0.8
+    shown = [
+        *sweep_tables.best_trials(sweep).rows,
+        *sweep_tables.table4(sweep).rows,
+        *compared.architecture_table(sweep).rows,
+        *compared.acr_ranking(sweep).rows,
+        *compared.pareto(sweep).rows,
+        *compared.effect(sweep).rows,
+    ]
+    for key in ("accuracy", "highest", "macro_f1", "validated_accuracy"):
+        assert max(row.get(key) or 0.0 for row in shown) <= 0.8, key
+    (network,) = [n for n in sweep.networks if (n.arch, n.filters) == ("250", "8")]
+    assert len(network.done) == 3 and network.mean() == pytest.approx(0.3)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.apps.sweep_plan import Plan, Run, Task
-from plushsense.core.errors import DivergedError
+from plushsense.core.errors import DivergedError, PlushSenseError
 from plushsense.core.gestures import NOBODY
 from plushsense.dataset.store import Dataset
 from plushsense.runs.journal import Journal, Result
@@ -87,7 +88,9 @@ class TrainAndScore:
 
         def save(state: FitState) -> None:
             if self.unfinished is not None:
-                self.unfinished.save(task.id, state.to_arrays())
+                # What cannot be kept (a full disk) costs minutes if it is stopped now; giving it up costs all of it.
+                with suppress(PlushSenseError):
+                    self.unfinished.save(task.id, state.to_arrays())
 
         while wanted and fitted is None:
             spec = replace(task.spec, epochs=wanted[-1])

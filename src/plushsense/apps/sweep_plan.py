@@ -103,8 +103,8 @@ class Plan:
 
     @property
     def id(self) -> str:
-        """The same for the same data and settings."""
-        return job_id({"trials": [t.id for t in self.trials], "runs": sorted(job.id for job in self.jobs)})
+        """The same for the same data and settings, in whatever order a grid lists them."""
+        return job_id({"trials": sorted(t.id for t in self.trials), "runs": sorted(job.id for job in self.jobs)})
 
     def macs(self, job: Job, nested: bool = True) -> int:
         """Multiply-accumulates of a training, about; ``nested`` False: of its trials one by one."""

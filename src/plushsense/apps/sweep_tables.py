@@ -148,7 +148,12 @@ class Tables:
         rows = self.trial_rows()
         done = [row for row in rows if row["status"] == "done"]
         best = sorted(filter(_ranked, rows), key=_rank)
-        chosen = max(best, key=lambda row: row["validation_macro_f1"] or 0.0, default=None)
+        # Among equals the smallest, then the first of the grid: the test part has no say.
+        chosen = min(
+            filter(_ranked, rows),
+            key=lambda row: (-(row["validation_macro_f1"] or 0.0), row["parameters"]),
+            default=None,
+        )
         shown = self._shown(best)
         failed = [
             {"run": job, **_words(*self._of[job][0]), "epochs": epochs, "why": why}

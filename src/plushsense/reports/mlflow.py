@@ -66,7 +66,7 @@ def export_trials(sweep: Sweep, where: str | os.PathLike[str]) -> Exported:
         found = client.get_experiment_by_name(title)
         experiment = found.experiment_id if found else client.create_experiment(title, artifact_location=artifacts)
         there = _there(client, experiment)
-        finished = [t for t in sweep.finished if there.get(str(t["trial"]), ("", ""))[1] != "FINISHED"]
+        finished = [t for t in sweep.done if there.get(str(t["trial"]), ("", ""))[1] != "FINISHED"]
         for trial in finished:
             run = there.get(str(trial["trial"]), ("", ""))[0]
             _log(mlflow, client, experiment, run, sweep, trial)
@@ -75,7 +75,7 @@ def export_trials(sweep: Sweep, where: str | os.PathLike[str]) -> Exported:
         raise ConfigError(
             f"MLflow refuses '{where}' ({said}): give a folder, or a URI such as sqlite:///x.db."
         ) from None
-    return Exported(len(finished), len(sweep.finished) - len(finished), uri, title)
+    return Exported(len(finished), len(sweep.done) - len(finished), uri, title)
 
 
 def _place(where: str) -> tuple[str, str | None]:

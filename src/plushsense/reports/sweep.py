@@ -58,7 +58,7 @@ def write_sweep_report(folder: str | Path, page: str | Path | None = None, *, ti
     page_text = render(sweep, sections, pictures, title=title, files=beside.name)
     put_files(beside, made, before)
     put_page(target, page_text)
-    return Written(target, beside, tuple(beside / name for name in made), len(sweep.finished), sweep.total)
+    return Written(target, beside, tuple(beside / name for name in made), len(sweep.done), sweep.total)
 
 
 def render(
@@ -72,14 +72,14 @@ def render(
     """The page as one HTML text that asks for nothing outside itself; ``pictures`` are the drawings as SVG by name."""
     return fill(
         "sweep.html.j2",
-        title=title or f"Sweep {sweep.name}: {len(sweep.finished)} of {sweep.total} trials",
+        title=title or f"Sweep {sweep.name}: {len(sweep.done)} of {sweep.total} trials",
         made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         simulated=sweep.simulated,
         simulated_title=words.SIMULATED_TITLE,
         simulated_words=words.SIMULATED_WORDS,
         leaky=sweep.leaky,
         leaky_words=words.LEAKY_WORDS,
-        done=len(sweep.finished),
+        done=len(sweep.done),
         total=sweep.total,
         over=words.over_words(sweep.trials),
         about=about_rows(sweep),
@@ -97,7 +97,7 @@ def about_rows(sweep: Sweep) -> list[tuple[str, str]]:
         f"{len(sweep.archs)} architecture{'s' * (len(sweep.archs) != 1)}, "
         f"{len(sweep.filter_sets)} filter set{'s' * (len(sweep.filter_sets) != 1)}; {schedules}"
     )
-    waiting = sweep.total - len(sweep.finished)
+    waiting = sweep.total - len(sweep.done)
     seconds = head.get("seconds")
     tested = {(r.get("seed"), r.get("fold")): int(r["test_windows"]) for r in sweep.runs if r.get("test_windows")}
     scored = sum(tested.values()) // max(1, len({seed for seed, _ in tested}))
@@ -114,7 +114,7 @@ def about_rows(sweep: Sweep) -> list[tuple[str, str]]:
         ("Seeds and folds", words.over_words(sweep.trials)),
         (
             "Trials",
-            f"{len(sweep.finished)} of {sweep.total} done" + (f", {waiting} waiting or partial" if waiting else ""),
+            f"{len(sweep.done)} of {sweep.total} done" + (f", {waiting} waiting or partial" if waiting else ""),
         ),
         ("Classes", words.text(sweep.labels)),
         ("Time", f"{words.number(seconds, 0)} s" if words.number(seconds) != words.DASH else words.DASH),

@@ -58,8 +58,8 @@ def about(sweep: Sweep) -> str:
         f"split {sweep.head.get('split')}" + (" (LEAKY)" if sweep.leaky else ""),
         over_words(sweep.trials),
     ]
-    if len(sweep.finished) < sweep.total:
-        parts.append(f"{len(sweep.finished)} of {sweep.total} trials done")
+    if len(sweep.done) < sweep.total:
+        parts.append(f"{len(sweep.done)} of {sweep.total} trials done")
     if sweep.simulated:
         parts.insert(0, "SIMULATION, says nothing about a real toy")
     return " · ".join(parts)

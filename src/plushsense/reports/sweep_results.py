@@ -24,6 +24,11 @@ def finite(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
+def scored(trial: Row, measure: str = "accuracy") -> bool:
+    """Whether a trial is done wholly and has that score: one of some of its folds or epochs compares with no other."""
+    return finite(trial.get(measure)) and trial.get("status", "done") == "done"
+
+
 def acr(accuracy: float | None, parameters: int | None) -> float | None:
     """Accuracy / log10(parameters) (paper, 3.6.3); None where either is missing or there is 1 parameter."""
     if not finite(accuracy) or not finite(parameters) or accuracy is None or parameters is None or parameters <= 1:
@@ -44,15 +49,15 @@ class Network:
 
     @property
     def done(self) -> list[Row]:
-        return [t for t in self.trials if finite(t["accuracy"])]
+        return [t for t in self.trials if scored(t)]
 
     def best(self, measure: str = "accuracy") -> Row | None:
         """The trial with the highest value; of equal ones the first of the grid."""
-        there = [t for t in self.trials if finite(t.get(measure))]
+        there = [t for t in self.trials if scored(t, measure)]
         return max(there, key=lambda t: float(t[measure])) if there else None
 
     def mean(self, measure: str = "accuracy") -> float | None:
-        there = [float(t[measure]) for t in self.trials if finite(t.get(measure))]
+        there = [float(t[measure]) for t in self.trials if scored(t, measure)]
         return sum(there) / len(there) if there else None
 
 
@@ -87,13 +92,8 @@ class Sweep:
 
     @property
     def done(self) -> list[Row]:
-        """The trials that have a score; of one with status "partial" it is of some of its seeds and folds."""
-        return [t for t in self.trials if finite(t["accuracy"])]
-
-    @property
-    def finished(self) -> list[Row]:
-        """The trials that are done wholly."""
-        return [t for t in self.done if t.get("status", "done") == "done"]
+        """The trials that are done wholly: all that is ranked, drawn or averaged."""
+        return [t for t in self.trials if scored(t)]
 
     @property
     def archs(self) -> list[str]:
