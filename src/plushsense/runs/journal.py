@@ -123,5 +123,6 @@ class Journal:
                 ) from cause
 
     def discard(self, job: str) -> None:
-        """Forget the result of a job, if there is one."""
-        self.path(job).unlink(missing_ok=True)
+        """Forget the result of a job, if there is one and it lets itself be removed (Windows: nobody reads it)."""
+        with suppress(OSError):
+            self.path(job).unlink()
