@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
         **changes,
     )
     shown = found.to_dict()
-    say(f"written: {found.out}")
+    say(f"written: {found.out}; a page of it:  plushsense report {found.out}")
     emit(args, shown, lines(shown))
     return 1 if shown["trainings_lost"] else 0
 
@@ -87,8 +87,10 @@ def _dry_run(args: argparse.Namespace, changes: dict[str, Any]) -> int:
     text = [f"- {line}" for line in found["problems"]]
     if not text:
         text = [
-            f"{found['trials']} trials in {found['trainings']} trainings of {found['folds']} folds and "
-            f"{found['seeds']} seeds together, {found['held']} of them done before",
+            *marks(found),
+            f"{several(found['trials'], 'trial')} in {several(found['trainings'], 'training')} "
+            f"({several(found['folds'], 'fold')}, {several(found['seeds'], 'seed')})",
+            f"{several(found['held'], 'training')} done before; split {found['split']}",
             f"about {found['macs']:.2e} multiply-accumulates; trial by trial {found['macs_one_by_one']:.2e}",
             f"memory of each process: windows {found['windows_mb']:.0f} MB; what the layers of the largest batch give, "
             f"{found['activations_mb']:.0f} MB, of which training holds several copies",
@@ -99,13 +101,23 @@ def _dry_run(args: argparse.Namespace, changes: dict[str, Any]) -> int:
     return 1 if found["problems"] else 0
 
 
-def lines(s: dict[str, Any]) -> list[str]:
-    """The best trials as text."""
+def marks(s: dict[str, Any]) -> list[str]:
+    """What stands above every score of a simulation, and of a leaky split."""
     out = []
     if s["simulated"]:
         out.append("SIMULATION: these scores are of the virtual toy and say nothing about a real one.")
     if s["leaky"]:
         out.append("LEAKY: windows of one recording stand on both sides of this split; the scores flatter.")
+    return out
+
+
+def several(n: int, what: str) -> str:
+    return f"{n} {what}{'s' * (n != 1)}"
+
+
+def lines(s: dict[str, Any]) -> list[str]:
+    """The best trials as text."""
+    out = marks(s)
     out.append(
         f"grid {s['name']}, split {s['split']}, context {s['context']}: {s['done']} of {s['trials']} trials done "
         f"({s['resumed']} from before)\n"
