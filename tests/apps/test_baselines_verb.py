@@ -47,6 +47,7 @@ def test_one_table_of_two_splits_and_what_is_left_behind(cli: Cli, dataset: Data
     assert "http" not in page.replace("http-equiv", "")
     ran = cli(*words)
     assert ran.status == 0 and "(leaky)" in ran.out and "Only the number by person counts" in ran.out
+    assert "macro-F1 (leaky)" in ran.out
     assert "20 of 20 fits (20 from before)" in ran.err
     other = cli("baselines", dataset.path, "--split", "windows:3", *QUICK, "--out", tmp_path / "OUT")
     assert other.status == 2 and "holds a comparison of other settings" in other.err and other.out == ""

@@ -273,6 +273,9 @@ def test_a_grid_file_from_the_command_line(cli: Any, dataset: Dataset, tmp_path:
     dry = cli("sweep", dataset.path, "--grid", grid, "--classes", "shared", "--dry-run", "--json")
     assert dry.status == 0 and (dry.json["trials"], dry.json["held"], dry.json["problems"]) == (2, 0, [])
     assert sum(dry.json["cost"].values()) == pytest.approx(1.0) and dry.json["macs"] > 0
+    told = cli("sweep", dataset.path, "--grid", grid, "--classes", "shared", "--dry-run").out
+    assert "LEAKY" in told and ("SIMULATION" in told) == dry.json["simulated"]
+    assert "2 trials in 2 trainings (1 fold, 1 seed)" in told
     assert not (dataset.path / "evaluations").exists() and not (dataset.path / "cache" / "sweeps").exists()
     ran = cli("sweep", dataset.path, "--grid", grid, "--workers", "1", "--json")
     assert ran.status == 0, ran.err

@@ -14,6 +14,7 @@ The keys are the fields of `GridSpec`; what a file leaves out is as in the paper
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -96,9 +97,20 @@ def over(
             values[key] = read(value)
         except ArchError as cause:
             found.append(f"{first_line(cause)[:-1]}, in {key}{where}.")
+            values |= _readable(key, value, read)
         except (TypeError, ValueError):
             found.append(f"{key}{where} is {value!r}: accepted is {accepted}.")
+            values |= _readable(key, value, read)
     return replace(spec, **values), found
+
+
+def _readable(key: str, value: Any, read: Callable[[Any], Any]) -> dict[str, Any]:
+    """What can be read of a list, so that what else is wrong with the grid is said of it and not of the default."""
+    kept: list[Any] = []
+    for item in value if isinstance(value, list | tuple) else ():
+        with contextlib.suppress(ArchError, TypeError, ValueError):
+            kept += read([item])
+    return {key: tuple(kept)} if kept else {}
 
 
 def unknown(key: str, known: Iterable[str], where: str) -> str:

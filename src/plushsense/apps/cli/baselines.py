@@ -72,7 +72,9 @@ def lines(result: dict[str, Any]) -> list[str]:
     from plushsense.reports.baselines import COUNTS, LEAKY, SIMULATION, cost_words, headings, rows_of, said
 
     gap = ("gap",) if result["gaps"] else ()
-    both = [word for split in headings(result) for word in (f"accuracy, {split}", "macro-F1")]
+    both = []
+    for heading, split in zip(headings(result), result["splits"], strict=True):
+        both += [f"accuracy, {heading}", "macro-F1 (leaky)" if split["leaky"] else "macro-F1"]
     head = ("program", "reads", *both, *gap, "size", "ms alone", "ms batch", "train s")
     rows = []
     for row in rows_of(result):

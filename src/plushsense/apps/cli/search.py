@@ -12,6 +12,7 @@ from typing import Any
 from plushsense.apps.cli.evaluate import figure
 from plushsense.apps.cli.output import emit, say, table
 from plushsense.apps.cli.settings import add_networks, add_work, marks, warn
+from plushsense.apps.cli.sweep import several
 
 # Keys of the grid that an option changes, each an attribute of the arguments.
 _CHANGES = (
@@ -110,7 +111,8 @@ def _dry_run(args: argparse.Namespace, changes: dict[str, Any], asked: dict[str,
     text = [f"left out: {row['arch']} {row['filters']}: {row['why']}" for row in found["left_out"]]
     rungs = ", ".join(f"{e} epochs on {f} folds" for e, f in zip(found["rungs"], found["folds"], strict=True))
     text += [
-        f"{_several(found['candidates'], 'network')}, split {found['split']}, {_several(found['seeds'], 'seed')}; "
+        *marks(found),
+        f"{several(found['candidates'], 'network')}, split {found['split']}, {several(found['seeds'], 'seed')}; "
         f"compared after {rungs}",
         f"at most {found['bound_macs']:.2e} multiply-accumulates, {found['bound_share']:.0%} of the whole grid's "
         f"{found['grid_macs']:.2e}; the first rung takes {found['first_share']:.1%}",
@@ -150,8 +152,8 @@ def lines(s: dict[str, Any]) -> list[str]:
     mark = " (leaky)" if s["leaky"] else ""
     beyond = f" within the limits, {len(s['left_out'])} beyond" if s["left_out"] else ""
     out.append(
-        f"{_several(s['candidates'], 'network')}{beyond}; split {s['split']}, context {s['context']}, "
-        f"{_several(len(s['grid']['seeds']), 'seed')}\n"
+        f"{several(s['candidates'], 'network')}{beyond}; split {s['split']}, context {s['context']}, "
+        f"{several(len(s['grid']['seeds']), 'seed')}\n"
     )
     out.append(_rungs(s, mark))
     best, cost = s["winner"], s["cost"]
@@ -201,15 +203,11 @@ def _rungs(s: dict[str, Any], mark: str) -> str:
     for rung in s["rungs"]:
         error = rung["standard_error"]
         apart = "" if error is None else f", standard error of a difference {figure(error)}"
-        entered, folds = _several(rung["entered"], "network"), _several(rung["folds"], "fold")
+        entered, folds = several(rung["entered"], "network"), several(rung["folds"], "fold")
         text.append(
             f"up to epoch {rung['epochs']}: {entered} on {folds}, {rung['share']:.1%} of the grid's cost{apart}"
         )
     return "\n".join(text)
-
-
-def _several(n: int, what: str) -> str:
-    return f"{n} {what}{'s' * (n != 1)}"
 
 
 def _finalist(row: dict[str, Any]) -> tuple[object, ...]:

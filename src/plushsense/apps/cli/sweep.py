@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
         **changes,
     )
     shown = found.to_dict()
-    say(f"written: {found.out}")
+    say(f"written: {found.out}; a page of it:  plushsense report {found.out}")
     emit(args, shown, lines(shown))
     return 1 if shown["trainings_lost"] else 0
 
@@ -79,8 +79,10 @@ def _dry_run(args: argparse.Namespace, changes: dict[str, Any]) -> int:
     text = [f"- {line}" for line in found["problems"]]
     if not text:
         text = [
-            f"{found['trials']} trials in {found['trainings']} trainings of {found['folds']} folds and "
-            f"{found['seeds']} seeds together, {found['held']} of them done before",
+            *marks(found),
+            f"{several(found['trials'], 'trial')} in {several(found['trainings'], 'training')} "
+            f"({several(found['folds'], 'fold')}, {several(found['seeds'], 'seed')})",
+            f"{several(found['held'], 'training')} done before; split {found['split']}",
             f"about {found['macs']:.2e} multiply-accumulates; trial by trial {found['macs_one_by_one']:.2e}",
             f"memory of each process: windows {found['windows_mb']:.0f} MB; what the layers of the largest batch give, "
             f"{found['activations_mb']:.0f} MB, of which training holds several copies",
@@ -89,6 +91,10 @@ def _dry_run(args: argparse.Namespace, changes: dict[str, Any]) -> int:
         ]
     emit(args, found, text)
     return 1 if found["problems"] else 0
+
+
+def several(n: int, what: str) -> str:
+    return f"{n} {what}{'s' * (n != 1)}"
 
 
 def lines(s: dict[str, Any]) -> list[str]:
