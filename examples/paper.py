@@ -159,6 +159,8 @@ class Paper:
             self.dataset,
             splits=("windows:5",),
             models=dict.fromkeys(("forest",) if self.quick else (name for name, _, _ in BASELINES)),
+            features=("statistics",) if self.quick else ("statistics", "flattened"),
+            pca="no" if self.quick else "both",
             context="loop",
             classes="all",
         )
