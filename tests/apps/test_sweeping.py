@@ -273,6 +273,9 @@ def test_a_grid_file_from_the_command_line(cli: Any, dataset: Dataset, tmp_path:
     dry = cli("sweep", dataset.path, "--grid", grid, "--classes", "shared", "--dry-run", "--json")
     assert dry.status == 0 and (dry.json["trials"], dry.json["held"], dry.json["problems"]) == (2, 0, [])
     assert sum(dry.json["cost"].values()) == pytest.approx(1.0) and dry.json["macs"] > 0
+    assert 0.01 < dry.json["training_mb"] < 5.0
+    plain = cli("sweep", dataset.path, "--grid", grid, "--padding", "causal", "--dry-run")
+    assert "as PyTorch takes it" in plain.out
     told = cli("sweep", dataset.path, "--grid", grid, "--classes", "shared", "--dry-run").out
     assert "LEAKY" in told and ("SIMULATION" in told) == dry.json["simulated"]
     assert "2 trials in 2 trainings (1 fold, 1 seed)" in told

@@ -20,7 +20,7 @@ from plushsense import __version__
 from plushsense.apps.places import machine
 from plushsense.apps.preparation import Warn, opened, silent
 from plushsense.apps.sweep_job import JOURNAL, train_all
-from plushsense.apps.sweep_plan import GridProblems, Plan, Task, plan, processes
+from plushsense.apps.sweep_plan import GridProblems, Plan, plan, processes
 from plushsense.apps.sweep_shown import SweepProgress, Teller, Watcher
 from plushsense.apps.sweep_tables import RUNS, TRIALS, Tables, check_place
 from plushsense.core.extras import need
@@ -237,6 +237,9 @@ def preview(
     shares: dict[str, float] = {}
     for job in planned.jobs:
         shares[job.task.arch.symbol] = shares.get(job.task.arch.symbol, 0.0) + macs[job.id] / total
+    from plushsense.training.engine import step_bytes
+
+    held = [step_bytes(job.task.arch, job.task.spec) for job in planned.jobs]
     return {
         "name": spec.name,
         "id": planned.id,
@@ -251,14 +254,8 @@ def preview(
         "macs": total,
         "macs_one_by_one": sum(planned.macs(job, nested=False) for job in planned.jobs),
         "windows_mb": sum(windows.x.nbytes for windows in planned.sets.values()) / 1e6,
-        "activations_mb": max(_activation_bytes(job.task) for job in planned.jobs) / 1e6,
+        "training_mb": max((n for n in held if n is not None), default=0) / 1e6 if None not in held else None,
         "cost": dict(sorted(shares.items(), key=lambda item: -item[1])),
         "problems": [],
         "grid": spec.to_dict(),
     }
-
-
-def _activation_bytes(task: Task) -> int:
-    """What all layers give for one batch, as float32, once."""
-    arch = task.arch
-    return 4 * task.spec.batch * sum(f * n for f, n in zip(arch.filters, arch.positions, strict=True))

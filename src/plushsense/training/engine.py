@@ -16,6 +16,8 @@ from plushsense.models.arch import Arch
 from plushsense.models.net import Net
 from plushsense.training.augment import Turn
 from plushsense.training.fast.net import FastNet, can
+from plushsense.training.fast.plan import plan_net
+from plushsense.training.spec import TrainSpec
 
 import torch  # isort: skip - after models.net, which says how to install it
 from torch import Tensor
@@ -65,6 +67,14 @@ class Windows:
 def is_fast(arch: Arch, device: torch.device) -> bool:
     """Whether a network trains the fast way on a device."""
     return device.type == "cpu" and can(arch)
+
+
+def step_bytes(arch: Arch, spec: TrainSpec) -> int | None:
+    """What a training step holds beside the data; None where PyTorch's own layers train, which do not say.
+
+    ``spec.device`` is settled (see `plushsense.training.fit.placed`).
+    """
+    return plan_net(arch, spec.batch).bytes if is_fast(arch, torch.device(spec.device)) else None
 
 
 def engine(arch: Arch, net: Net, device: torch.device, batch: int, threads: int) -> Engine:

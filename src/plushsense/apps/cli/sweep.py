@@ -84,8 +84,8 @@ def _dry_run(args: argparse.Namespace, changes: dict[str, Any]) -> int:
             f"({several(found['folds'], 'fold')}, {several(found['seeds'], 'seed')})",
             f"{several(found['held'], 'training')} done before; split {found['split']}",
             f"about {found['macs']:.2e} multiply-accumulates; trial by trial {found['macs_one_by_one']:.2e}",
-            f"memory of each process: windows {found['windows_mb']:.0f} MB; what the layers of the largest batch give, "
-            f"{found['activations_mb']:.0f} MB, of which training holds several copies",
+            f"memory of each process: windows {found['windows_mb']:.0f} MB; a step of the largest training "
+            + ("as PyTorch takes it" if found["training_mb"] is None else f"{found['training_mb']:.0f} MB"),
             "",
             table(("network", "share of the cost"), [(arch, f"{share:.1%}") for arch, share in found["cost"].items()]),
         ]
