@@ -87,7 +87,7 @@ class _Block:
         return out
 
 
-def _taps(x: Floats, layer: ConvLayer) -> Floats:
+def taps_of(x: Floats, layer: ConvLayer) -> Floats:
     """What each position of a layer reads: (N, T, C) → (N, T − reach, kernel, C), a view."""
     x = np.ascontiguousarray(x)
     n, t, c = x.shape
@@ -106,7 +106,7 @@ def _padded(x: Floats, arch: Arch, reach: int) -> Floats:
 
 def _through(x: Floats, block: _Block, arch: Arch) -> Floats:
     """One block over whole windows, (N, T, C) → (N, T', filters), a few windows at a time."""
-    taps = _taps(_padded(x, arch, block.layer.reach), block.layer)
+    taps = taps_of(_padded(x, arch, block.layer.reach), block.layer)
     n, t, width = len(taps), taps.shape[1], len(block.matrix)
     out = np.empty((n, t, block.layer.filters))
     group = max(1, _TAPS_BYTES // (8 * t * width))
@@ -141,6 +141,16 @@ class Network:
         for block in self.blocks:
             z = _through(z, block, self.arch)
         return self.classify(z.mean(axis=1))
+
+    def rectified(self, x: NDArray[np.floating[Any]]) -> list[Floats]:
+        """What each layer's ReLU gives, before normalisation, of scaled windows (N, C, T): [(N, T', F)]; `stream`."""
+        z: Floats = np.ascontiguousarray(x.transpose(0, 2, 1), dtype=np.float64)
+        seen = []
+        for block in self.blocks:
+            taps = taps_of(z, block.layer)
+            seen.append(block.rectified(taps.reshape(-1, len(block.matrix))).reshape(*taps.shape[:2], -1))
+            z = seen[-1] * block.gain + block.shift
+        return seen
 
     def classify(self, pooled: Floats) -> Floats:
         """The dense layer: means over time (N, F) → logits (N, K)."""
@@ -275,7 +285,7 @@ def random_weights(arch: Arch, seed: int) -> dict[str, NDArray[np.float32]]:
             put(f"norm{i}.mean", np.zeros(f))
             put(f"norm{i}.var", np.ones(f))
             block = _Block.of(arch, i, weights)
-            rows = block.rectified(_taps(_padded(x, arch, layer.reach), layer).reshape(-1, taps))
+            rows = block.rectified(taps_of(_padded(x, arch, layer.reach), layer).reshape(-1, taps))
             put(f"norm{i}.mean", rows.mean(axis=0) * np.exp(0.1 * rng.normal(size=f)))
             put(f"norm{i}.var", (rows.var(axis=0) + 1e-3) * np.exp(0.2 * rng.normal(size=f)))
         x = _through(x, _Block.of(arch, i, weights), arch)

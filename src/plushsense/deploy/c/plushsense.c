@@ -1,0 +1,643 @@
+/*
+ * PlushSense: what a soft toy feels, in whole numbers. See plushsense.h for how to use it.
+ *
+ * From top to bottom: small arithmetic - reading the model - the clock (frames to even samples) - inputs - layers -
+ * pooling, dense layer, decision - the five functions that others call.
+ *
+ * Every rule here is stated in PlushSense's Python too (windows/clock, windows/features, models/fixed,
+ * models/integer), which defines what is right.
+ */
+#include "plushsense.h"
+
+#include <stddef.h>
+#include <string.h>
+
+#define GROUP 4u            /* filters computed together, channels read together */
+#define HEAD_BYTES 16u
+#define SCALE_BYTES 8u      /* bias, multiplier and two shifts of one filter */
+#define LOGIT_LIMIT 16384
+#define WEIGHT_ZERO 128u    /* weights are stored with this added: some cores cannot load a signed byte */
+
+/* ---- Small arithmetic ------------------------------------------------------------------------------------------ */
+
+static uint32_t le16(const uint8_t *p)
+{
+    return (uint32_t)p[0] | ((uint32_t)p[1] << 8);
+}
+
+static uint32_t le32(const uint8_t *p)
+{
+    return le16(p) | (le16(p + 2) << 16);
+}
+
+/* The number with these bits in two's complement. */
+static int32_t as_signed(uint32_t bits)
+{
+    return bits <= INT32_MAX ? (int32_t)bits : -(int32_t)(UINT32_MAX - bits) - 1;
+}
+
+/* Floor division by 2^n, also of negative numbers. */
+static int32_t shift_down(int32_t v, uint32_t n)
+{
+    return v >= 0 ? v >> n : ~(~v >> n);
+}
+
+static int32_t within(int32_t v, int32_t low, int32_t high)
+{
+    return v < low ? low : v > high ? high : v;
+}
+
+static uint32_t half(uint32_t shift)
+{
+    return (UINT32_C(1) << shift) >> 1;
+}
+
+/* floor((distance * into + add) / by) for into <= by < 2^24; the product may need more than 32 bits. */
+static uint32_t part_of(uint32_t distance, uint32_t into, uint32_t by, uint32_t add, uint32_t narrow)
+{
+    uint32_t quotient = 0, rest = 0, byte;
+
+    if (distance <= narrow)
+        return (distance * into + add) / by;
+    for (byte = 4; byte-- > 0;) {
+        rest = (rest << 8) + ((distance >> (8 * byte)) & 0xffu) * into;
+        quotient = (quotient << 8) + rest / by;
+        rest %= by;
+    }
+    return quotient + (rest + add) / by;
+}
+
+static uint64_t square(int32_t v)
+{
+    uint32_t size = v < 0 ? 0u - (uint32_t)v : (uint32_t)v;
+    uint32_t high = size >> 16, low = size & 0xffffu;
+
+    return ((uint64_t)(high * high) << 32) + ((uint64_t)(high * low) << 17) + (uint64_t)(low * low);
+}
+
+static uint32_t square_root(uint64_t v)
+{
+    uint64_t root = 0, bit = UINT64_C(1) << 62;
+
+    while (bit > v)
+        bit >>= 2;
+    for (; bit != 0; bit >>= 2) {
+        if (v >= root + bit) {
+            v -= root + bit;
+            root = (root >> 1) + bit;
+        } else {
+            root >>= 1;
+        }
+    }
+    return (uint32_t)root;
+}
+
+/* ---- The model ------------------------------------------------------------------------------------------------- */
+
+static uint32_t checksum(const uint8_t *bytes, uint32_t n) /* CRC-32, as zip and Ethernet have it */
+{
+    uint32_t sum = UINT32_MAX, bit;
+
+    while (n-- > 0) {
+        sum ^= *bytes++;
+        for (bit = 0; bit < 8; bit++)
+            sum = (sum >> 1) ^ ((sum & 1u) != 0 ? UINT32_C(0xedb88320) : 0u);
+    }
+    return ~sum;
+}
+
+static plush_status check(const uint8_t *model, uint32_t bytes)
+{
+    if (bytes < HEAD_BYTES || memcmp(model, "PLSH", 4) != 0)
+        return PLUSH_NOT_A_MODEL;
+    if (le16(model + 4) != PLUSH_IMAGE_VERSION)
+        return PLUSH_OTHER_VERSION;
+    if (le32(model + 8) > bytes || le32(model + 8) <= HEAD_BYTES ||
+        checksum(model + HEAD_BYTES, le32(model + 8) - HEAD_BYTES) != le32(model + 12))
+        return PLUSH_DAMAGED;
+    return PLUSH_OK;
+}
+
+static uint32_t fill_up(uint32_t n)
+{
+    return (n + GROUP - 1) / GROUP * GROUP;
+}
+
+/* A piece of the memory; only reckoned while there is none. */
+static void *take(uint8_t *memory, uint32_t *used, uint32_t bytes)
+{
+    void *piece = memory == NULL ? NULL : memory + *used;
+
+    *used += fill_up(bytes);
+    return piece;
+}
+
+/* Reads a model that check() found good, and hands out the memory. Returns the bytes of it. */
+static uint32_t lay_out(plush_toy *toy, const uint8_t *model, uint8_t *memory)
+{
+    const uint8_t *p = model + HEAD_BYTES;
+    uint32_t used = 0, i;
+
+    toy->layers = p[0];
+    toy->channels = p[1];
+    toy->inputs = p[2];
+    toy->classes = p[3];
+    toy->step = (uint16_t)le16(p + 4);
+    toy->blocks = (uint16_t)le16(p + 6);
+    toy->span = le32(p + 8);
+    toy->period = le32(p + 12);
+    toy->gap = le32(p + 16);
+    toy->units_per_ms = le32(p + 20);
+    toy->smoothing = (uint16_t)le16(p + 24);
+    toy->narrow = (UINT32_MAX - toy->gap) / (2 * toy->gap);
+    toy->ranges = p + 28;
+    toy->input_plan = toy->ranges + 8u * toy->channels;
+    p = toy->input_plan;
+    for (i = 0; i < toy->inputs; i++)
+        p += 2 + p[1] + 12;
+
+    toy->held = (int32_t *)take(memory, &used, 4u * toy->channels);
+    toy->before = (int32_t *)take(memory, &used, 4u * toy->channels);
+    toy->sample = (int32_t *)take(memory, &used, 4u * toy->channels);
+    for (i = 0; i < toy->layers; i++) {
+        plush_layer *layer = &toy->layer[i];
+
+        layer->kernel = (uint16_t)le16(p);
+        layer->dilation = (uint16_t)le16(p + 2);
+        layer->groups = (uint16_t)(fill_up(le16(p + 4)) / GROUP);
+        layer->filters = (uint16_t)le16(p + 6);
+        layer->rows = (uint16_t)((layer->kernel - 1u) * layer->dilation + 1u);
+        layer->scales = p + 8;
+        layer->weights = layer->scales + SCALE_BYTES * layer->filters;
+        p = layer->weights + (uint32_t)layer->kernel * layer->groups * GROUP * fill_up(layer->filters);
+        layer->ring = (uint8_t *)take(memory, &used, (uint32_t)layer->rows * layer->groups * GROUP);
+        layer->row_sums = (uint16_t *)take(memory, &used, 2u * layer->rows);
+        toy->features = layer->filters;
+    }
+    toy->dense = p;
+    toy->dense_weights = p + SCALE_BYTES * toy->classes;
+    toy->names = toy->dense_weights + (uint32_t)toy->classes * toy->features;
+    p = toy->names;
+    for (i = 0; i < toy->classes; i++) {
+        p++;
+        while (*p++ != 0) {
+        }
+    }
+    toy->title = p;
+
+    toy->sums = (uint16_t *)take(memory, &used, 2u * toy->features * toy->blocks);
+    toy->total = (uint32_t *)take(memory, &used, 4u * toy->features);
+    toy->logits = (int32_t *)take(memory, &used, 4u * toy->classes);
+    toy->smooth = (int32_t *)take(memory, &used, 4u * toy->classes);
+    toy->valid = (uint8_t *)take(memory, &used, toy->channels);
+    toy->last = (uint8_t *)take(memory, &used, toy->features);
+    return used;
+}
+
+/* ---- The network ----------------------------------------------------------------------------------------------- */
+
+static uint8_t *newest_row(plush_layer *layer)
+{
+    return layer->ring + (uint32_t)layer->newest * layer->groups * GROUP;
+}
+
+static uint8_t *next_row(plush_layer *layer)
+{
+    layer->newest = (uint16_t)(layer->newest + 1u < layer->rows ? layer->newest + 1u : 0u);
+    return newest_row(layer);
+}
+
+/* The row that was just written is complete. */
+static void close_row(plush_layer *layer)
+{
+    const uint8_t *row = newest_row(layer);
+    uint32_t sum = 0, i;
+
+    for (i = 0; i < layer->groups * GROUP; i++)
+        sum += row[i];
+    layer->row_sums[layer->newest] = (uint16_t)sum;
+}
+
+/* Four products for each of four filters: `x` 4 activations, `w` 4 filters x 4 channels, weights with 128 added.
+ * Three ways to the same sums: two multiplications at once where a core has them; otherwise plain C, in which small
+ * cores must keep the written order, or their few registers overflow. */
+#if defined(__GNUC__) && defined(__ARM_FEATURE_DSP) && defined(__ARM_ARCH_ISA_THUMB)
+
+/* Channels 0 and 2, then 1 and 3, each pair as two halves of a register. */
+#define PLUSH_PAIRS(even, odd, four)                    \
+    __asm__ volatile("uxtb16 %0, %2\n\tuxtb16 %1, %2, ror #8" : "=&r"(even), "=r"(odd) : "r"(four))
+#define PLUSH_FILTER(s, i)                                                                 \
+    do {                                                                                   \
+        uint32_t four, e, o;                                                               \
+        memcpy(&four, w + 4 * (i), 4);                                                     \
+        PLUSH_PAIRS(e, o, four);                                                           \
+        __asm__ volatile("smlad %0, %1, %2, %0\n\tsmlad %0, %3, %4, %0"                    \
+                         : "+r"(s) : "r"(even), "r"(e), "r"(odd), "r"(o));                 \
+        __asm__ volatile("" ::: "memory");                                                 \
+    } while (0)
+#define PLUSH_SIXTEEN              \
+    do {                           \
+        uint32_t both, even, odd;  \
+        memcpy(&both, x, 4);       \
+        PLUSH_PAIRS(even, odd, both); \
+        PLUSH_FILTER(s0, 0);       \
+        PLUSH_FILTER(s1, 1);       \
+        PLUSH_FILTER(s2, 2);       \
+        PLUSH_FILTER(s3, 3);       \
+    } while (0)
+
+#else
+
+#if defined(__GNUC__) && !defined(__x86_64__) && !defined(__aarch64__)
+#define PLUSH_IN_ORDER __asm__ volatile("" ::: "memory")
+#else
+#define PLUSH_IN_ORDER
+#endif
+#define PLUSH_CHANNEL(i)             \
+    do {                             \
+        uint32_t a = x[i];           \
+        s0 += a * w[(i)];            \
+        PLUSH_IN_ORDER;              \
+        s1 += a * w[4 + (i)];        \
+        PLUSH_IN_ORDER;              \
+        s2 += a * w[8 + (i)];        \
+        PLUSH_IN_ORDER;              \
+        s3 += a * w[12 + (i)];       \
+        PLUSH_IN_ORDER;              \
+    } while (0)
+#define PLUSH_SIXTEEN      \
+    do {                   \
+        PLUSH_CHANNEL(0);  \
+        PLUSH_CHANNEL(1);  \
+        PLUSH_CHANNEL(2);  \
+        PLUSH_CHANNEL(3);  \
+    } while (0)
+
+#endif
+
+/* The sums of four filters at one position, of activations times (weight + 128), modulo 2^32. By itself, so that its
+ * loop has all registers. */
+#if defined(__GNUC__)
+__attribute__((noinline))
+#endif
+static const uint8_t *four_sums(const plush_layer *layer, const uint8_t *w, uint32_t sum[GROUP])
+{
+    uint32_t row = layer->groups * GROUP, size = layer->rows * row, stride = layer->dilation * row;
+    uint32_t at = layer->newest * row + row, taps = layer->kernel;
+    uint32_t s0 = 0, s1 = 0, s2 = 0, s3 = 0;
+
+    if (at == size)
+        at = 0;
+    do {
+        const uint8_t *x = layer->ring + at, *end = x + row;
+
+        do {
+            PLUSH_SIXTEEN;
+            w += 16;
+            x += 4;
+        } while (x != end);
+        at += stride;
+        if (at >= size)
+            at -= size;
+    } while (--taps != 0);
+    sum[0] = s0;
+    sum[1] = s1;
+    sum[2] = s2;
+    sum[3] = s3;
+    return w;
+}
+
+/* What every weight's + 128 added to each of those sums. */
+static uint32_t surplus(const plush_layer *layer)
+{
+    uint32_t at = layer->newest + 1u, sum = 0, taps;
+
+    if (at == layer->rows)
+        at = 0;
+    for (taps = layer->kernel; taps > 0; taps--) {
+        sum += layer->row_sums[at];
+        at += layer->dilation;
+        if (at >= layer->rows)
+            at -= layer->rows;
+    }
+    return sum * WEIGHT_ZERO;
+}
+
+/* ReLU, and a sum to 8 bits. */
+static uint32_t requantize(int32_t sum, const uint8_t *scale)
+{
+    uint32_t t;
+
+    if (sum <= 0)
+        return 0;
+    t = (uint32_t)sum >> scale[6];
+    if (t > 65535u)
+        t = 65535u;
+    t = (t * le16(scale + 4) + half(scale[7])) >> scale[7];
+    return t < 255u ? t : 255u;
+}
+
+/* One new position of a layer, (filters) activations. */
+static void advance(const plush_layer *layer, uint8_t *out)
+{
+    const uint8_t *weights = layer->weights, *scale = layer->scales;
+    uint32_t extra = surplus(layer), sum[GROUP], f, i;
+
+    for (f = 0; f < layer->filters; f += GROUP) {
+        weights = four_sums(layer, weights, sum);
+        for (i = 0; i < GROUP && f + i < layer->filters; i++, scale += SCALE_BYTES)
+            out[f + i] = (uint8_t)requantize(as_signed(sum[i] + le32(scale) - extra), scale);
+    }
+}
+
+/* One new sample, whose quantized inputs are in the first ring, through all layers into the pooling. */
+static void network_sample(plush_toy *toy)
+{
+    uint32_t i, f;
+    uint16_t *sums = toy->sums + (uint32_t)toy->block * toy->features;
+
+    for (i = 0; i < toy->layers; i++) {
+        plush_layer *layer = &toy->layer[i];
+
+        close_row(layer);
+        advance(layer, i + 1u < toy->layers ? next_row(layer + 1) : toy->last);
+    }
+    for (f = 0; f < toy->features; f++) {
+        sums[f] = (uint16_t)(sums[f] + toy->last[f]);
+        toy->total[f] += toy->last[f];
+    }
+}
+
+/* ---- From pooled sums to an answer ----------------------------------------------------------------------------- */
+
+/* round(65535 exp(-i / 4)) and round(65535 exp(-i / 256)) */
+static const uint16_t coarse[64] = {
+    65535, 51039, 39749, 30957, 24109, 18776, 14623, 11388, 8869, 6907, 5379, 4190, 3263, 2541, 1979, 1541,
+    1200, 935, 728, 567, 442, 344, 268, 209, 162, 127, 99, 77, 60, 47, 36, 28,
+    22, 17, 13, 10, 8, 6, 5, 4, 3, 2, 2, 1, 1, 1, 1, 1,
+    0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0
+};
+static const uint16_t fine[64] = {
+    65535, 65280, 65025, 64771, 64519, 64267, 64017, 63767, 63519, 63271, 63024, 62779, 62534, 62290, 62047, 61805,
+    61564, 61324, 61085, 60847, 60610, 60374, 60138, 59904, 59670, 59438, 59206, 58975, 58745, 58516, 58288, 58061,
+    57834, 57609, 57384, 57161, 56938, 56716, 56495, 56274, 56055, 55837, 55619, 55402, 55186, 54971, 54757, 54543,
+    54330, 54119, 53908, 53697, 53488, 53280, 53072, 52865, 52659, 52454, 52249, 52045, 51842, 51640, 51439, 51238
+};
+
+/* Where a class's affect stands, and after it its label. */
+static const uint8_t *affect_and_name(const plush_toy *toy, uint32_t gesture)
+{
+    const uint8_t *p = toy->names;
+
+    for (; gesture > 0; gesture--) {
+        p++;
+        while (*p++ != 0) {
+        }
+    }
+    return p;
+}
+
+static void dense(plush_toy *toy)
+{
+    const uint8_t *scale = toy->dense, *w = toy->dense_weights;
+    uint32_t k, f;
+
+    for (k = 0; k < toy->classes; k++, scale += SCALE_BYTES) {
+        uint32_t sum = le32(scale);
+        int32_t t;
+
+        for (f = 0; f < toy->features; f++)
+            sum += toy->total[f] * ((uint32_t)*w++ - WEIGHT_ZERO);
+        t = within(shift_down(as_signed(sum), scale[6]), -32768, 32767);
+        t = shift_down(t * (int32_t)le16(scale + 4) + (int32_t)half(scale[7]), scale[7]);
+        toy->logits[k] = within(t, -LOGIT_LIMIT, LOGIT_LIMIT);
+    }
+}
+
+/* exp of a logit below the highest one by `distance`, in steps of 2^-16 */
+static uint32_t exponential(int32_t distance)
+{
+    return distance < 4096 ? ((uint32_t)coarse[distance >> 6] * fine[distance & 63]) >> 16 : 0;
+}
+
+static void decide(plush_toy *toy)
+{
+    int32_t highest = -LOGIT_LIMIT;
+    uint32_t total = 0, best = 0, k;
+
+    for (k = 0; k < toy->classes; k++)
+        if (toy->logits[k] > highest)
+            highest = toy->logits[k];
+    for (k = 0; k < toy->classes; k++)
+        total += exponential(highest - toy->logits[k]);
+    for (k = 0; k < toy->classes; k++) {
+        uint32_t e = exponential(highest - toy->logits[k]);
+        int32_t now = (int32_t)(((e << 15) + (total >> 1)) / total) * 4096;
+
+        if (toy->started) {
+            /* (now - mean) * weight / 2^15, in two halves so that 32 bits will do */
+            int32_t d = now - toy->smooth[k], high = shift_down(d, 16);
+            uint32_t low = (uint32_t)d & 0xffffu;
+
+            now = toy->smooth[k] + high * 2 * toy->smoothing + (int32_t)((low * toy->smoothing + 16384u) >> 15);
+        }
+        toy->smooth[k] = now;
+        if (now > toy->smooth[best])
+            best = k;
+    }
+    toy->started = 1;
+    toy->answer.gesture = (uint8_t)best;
+    toy->answer.affect = (plush_affect)*affect_and_name(toy, best);
+    toy->answer.confidence = (uint16_t)(toy->smooth[best] >> 12);
+}
+
+/* A step is complete: the answer, and room for the next block of the pooling. */
+static void answer(plush_toy *toy, uint32_t ms)
+{
+    uint16_t *sums;
+    uint32_t f;
+
+    toy->answer.ms = ms;
+    toy->answer.state = toy->warm >= toy->span ? PLUSH_TRACKING : PLUSH_WARMING;
+    if (toy->answer.state == PLUSH_TRACKING) {
+        dense(toy);
+        decide(toy);
+    }
+    toy->filled = 0;
+    toy->block = (uint16_t)(toy->block + 1u < toy->blocks ? toy->block + 1u : 0u);
+    sums = toy->sums + (uint32_t)toy->block * toy->features;
+    for (f = 0; f < toy->features; f++) {
+        toy->total[f] -= sums[f];
+        sums[f] = 0;
+    }
+    toy->answers++;
+    if (toy->on_answer != NULL)
+        toy->on_answer(toy, toy->user);
+}
+
+/* ---- Samples and frames ---------------------------------------------------------------------------------------- */
+
+/* What the network reads of toy->sample, into the first ring. */
+static void read_inputs(plush_toy *toy)
+{
+    const uint8_t *p = toy->input_plan;
+    uint8_t *row = next_row(&toy->layer[0]);
+    uint32_t i, n;
+
+    for (i = 0; i < toy->inputs; i++, p += 12) {
+        const uint8_t *part = p + 2;
+        int32_t x, offset, limit;
+        uint32_t distance;
+
+        if (p[0] == 0) {
+            x = toy->sample[*part++];
+        } else {
+            uint64_t sum = 0;
+
+            for (n = p[1]; n > 0; n--)
+                sum += square(toy->sample[*part++]);
+            x = (int32_t)square_root(sum << 8); /* with 4 fraction bits */
+        }
+        p = part;
+        offset = as_signed(le32(p));
+        limit = (int32_t)(UINT32_MAX >> (17 - p[10]));
+        distance = x >= offset ? (uint32_t)x - (uint32_t)offset : (uint32_t)offset - (uint32_t)x;
+        if (distance > (uint32_t)limit)
+            distance = (uint32_t)limit;
+        x = shift_down(x >= offset ? (int32_t)distance : -(int32_t)distance, p[10]);
+        row[i] = (uint8_t)within(shift_down(x * (int32_t)le16(p + 8) + as_signed(le32(p + 4)), p[11]), 0, 255);
+    }
+}
+
+/* One even sample, in toy->sample. Returns 1 when an answer fell due. */
+static uint32_t push_sample(plush_toy *toy, uint32_t ms)
+{
+    read_inputs(toy);
+    network_sample(toy);
+    toy->answer.sample++;
+    if (toy->warm < toy->span)
+        toy->warm++;
+    if (++toy->filled < toy->step)
+        return 0;
+    answer(toy, ms);
+    return 1;
+}
+
+/* Every channel's value `into` units after the frame before, `between` units before this one; rounded half up. */
+static void interpolate(plush_toy *toy, uint32_t into, uint32_t between)
+{
+    uint32_t i;
+
+    for (i = 0; i < toy->channels; i++) {
+        uint32_t from = (uint32_t)toy->before[i], to = (uint32_t)toy->held[i];
+
+        if (into == between)
+            from = to;
+        else if (toy->held[i] >= toy->before[i])
+            from += part_of(to - from, 2 * into, 2 * between, between, toy->narrow);
+        else
+            from -= part_of(from - to, 2 * into, 2 * between, between - 1, toy->narrow);
+        toy->sample[i] = as_signed(from);
+    }
+}
+
+/* Takes the valid values over. Returns 0 while a channel has not had one. */
+static int hold(plush_toy *toy, const int32_t *values)
+{
+    uint32_t i;
+    int all = 1;
+
+    for (i = 0; i < toy->channels; i++) {
+        const uint8_t *range = toy->ranges + 8 * i;
+
+        if (values[i] >= as_signed(le32(range)) && values[i] <= as_signed(le32(range + 4))) {
+            toy->held[i] = values[i];
+            toy->valid[i] = 1;
+        } else {
+            toy->invalid++;
+        }
+        if (!toy->valid[i])
+            all = 0;
+    }
+    return all;
+}
+
+/* ---- What others call ------------------------------------------------------------------------------------------ */
+
+uint32_t plush_memory_bytes(const uint8_t *model, uint32_t model_bytes)
+{
+    plush_toy toy;
+
+    return check(model, model_bytes) == PLUSH_OK ? lay_out(&toy, model, NULL) : 0;
+}
+
+plush_status plush_begin(plush_toy *toy, const uint8_t *model, uint32_t model_bytes, void *memory,
+                         uint32_t memory_bytes)
+{
+    plush_status status = check(model, model_bytes);
+
+    memset(toy, 0, sizeof *toy);
+    if (status != PLUSH_OK)
+        return status;
+    if (memory == NULL || lay_out(toy, model, NULL) > memory_bytes)
+        return PLUSH_MEMORY_TOO_SMALL;
+    toy->memory = memory;
+    toy->memory_bytes = lay_out(toy, model, (uint8_t *)memory);
+    plush_restart(toy);
+    return PLUSH_OK;
+}
+
+void plush_restart(plush_toy *toy)
+{
+    uint32_t phase = toy->span % toy->step;
+
+    memset(toy->memory, 0, toy->memory_bytes);
+    toy->heard = toy->running = toy->started = 0;
+    toy->block = 0;
+    toy->warm = toy->answer.sample = 0;
+    toy->answer.state = PLUSH_WARMING;
+    /* So that a step ends with the very sample that fills the span. */
+    toy->filled = (uint16_t)(phase == 0 ? 0 : toy->step - phase);
+}
+
+uint32_t plush_push(plush_toy *toy, uint32_t ms, const int32_t *values)
+{
+    uint32_t between, due = 0;
+
+    if (toy->heard && (ms < toy->seen_ms || ms - toy->seen_ms > toy->gap / toy->units_per_ms)) {
+        toy->restarts++;
+        plush_restart(toy);
+    }
+    toy->heard = 1;
+    toy->seen_ms = ms;
+    if (toy->running)
+        memcpy(toy->before, toy->held, 4u * toy->channels);
+    if (!hold(toy, values))
+        return 0;
+    if (!toy->running) {
+        toy->running = 1;
+        toy->last_ms = ms;
+        toy->due = toy->period;
+        memcpy(toy->sample, toy->held, 4u * toy->channels);
+        return push_sample(toy, ms);
+    }
+    between = (ms - toy->last_ms) * toy->units_per_ms;
+    while (between != 0 && toy->due <= between) {
+        interpolate(toy, toy->due, between);
+        due += push_sample(toy, toy->last_ms + toy->due / toy->units_per_ms);
+        toy->due += toy->period;
+    }
+    toy->due -= between;
+    toy->last_ms = ms;
+    return due;
+}
+
+const char *plush_gesture_name(const plush_toy *toy, uint8_t gesture)
+{
+    return gesture < toy->classes ? (const char *)affect_and_name(toy, gesture) + 1 : "";
+}
+
+const char *plush_model_title(const plush_toy *toy)
+{
+    return (const char *)toy->title;
+}

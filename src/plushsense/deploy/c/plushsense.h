@@ -1,0 +1,136 @@
+/*
+ * PlushSense: what a soft toy feels, in whole numbers.
+ *
+ *     static uint32_t memory[PLUSH_MODEL_MEMORY_WORDS];          // from plush_model.h
+ *     static plush_toy toy;
+ *
+ *     plush_begin(&toy, plush_model, PLUSH_MODEL_BYTES, memory, sizeof memory);
+ *     ...
+ *     if (plush_push(&toy, milliseconds, readings) > 0 && toy.answer.state == PLUSH_TRACKING)
+ *         react_to(toy.answer.gesture, toy.answer.affect);
+ *
+ * C99 or C++; no heap, no recursion, no floating point, nothing of the C library but <stdint.h> and <string.h>.
+ * Every toy keeps all it remembers in its own plush_toy and its own memory, so that several can run side by side.
+ * The answers are, bit for bit, those of `plushsense live --engine int8` on the computer.
+ *
+ * Missed ticks. Readings carry the time at which they were taken, and only that time counts: reading late, or several
+ * at once, changes no answer. Readings that are missing for up to the model's gap (100 ms as a rule) are bridged by
+ * interpolation, and every answer that fell due meanwhile is given, in order. After a longer gap, or when the clock
+ * runs backwards (also when it wraps after 2^32 ms), everything remembered is dropped: the toy is warming again.
+ */
+#ifndef PLUSHSENSE_H
+#define PLUSHSENSE_H
+
+#include <stdint.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+#define PLUSH_IMAGE_VERSION 1
+#define PLUSH_MAX_LAYERS 4
+#define PLUSH_ONE 32768 /* a confidence or probability of 1 */
+
+/* What plush_begin says. */
+typedef enum {
+    PLUSH_OK = 0,
+    PLUSH_NOT_A_MODEL = 1,     /* the bytes do not begin with PLSH */
+    PLUSH_OTHER_VERSION = 2,   /* a model for another version of this library */
+    PLUSH_DAMAGED = 3,         /* cut off, or its checksum does not match */
+    PLUSH_MEMORY_TOO_SMALL = 4 /* give plush_memory_bytes() bytes, aligned for uint32_t */
+} plush_status;
+
+typedef enum { PLUSH_WARMING = 0, PLUSH_TRACKING = 1 } plush_state;
+
+typedef enum {
+    PLUSH_AFFECT_NONE = 0,
+    PLUSH_AFFECT_POSITIVE = 1,
+    PLUSH_AFFECT_NEUTRAL = 2,
+    PLUSH_AFFECT_NEGATIVE = 3
+} plush_affect;
+
+/* An answer. While warming, only `ms`, `state` and `sample` mean anything. */
+typedef struct {
+    uint32_t ms;         /* time of the newest sample that it knows, rounded down */
+    uint32_t sample;     /* even samples since the start or the last restart; wraps */
+    plush_state state;
+    uint8_t gesture;     /* class index; see plush_gesture_name() */
+    plush_affect affect;
+    uint16_t confidence; /* smoothed probability of the gesture, in steps of 1/32768 */
+} plush_answer;
+
+/* One layer of the network. */
+typedef struct {
+    uint16_t kernel;
+    uint16_t filters;
+    uint16_t groups;        /* of 4 channels that it reads */
+    uint16_t rows;          /* samples that it remembers */
+    uint16_t dilation;
+    uint16_t newest;        /* row of the newest sample */
+    const uint8_t *scales;  /* of each filter: bias, multiplier, shifts */
+    const uint8_t *weights;
+    uint8_t *ring;          /* rows x groups x 4 activations */
+    uint16_t *row_sums;     /* of each row, the sum of its activations */
+} plush_layer;
+
+/* A toy: everything about one stream. Fields from `answer` to `invalid` may be read, no field may be written. */
+typedef struct plush_toy {
+    plush_answer answer;     /* the newest one */
+    uint32_t answers;        /* how many there were; wraps, like all counts */
+    uint32_t restarts;       /* gaps and clock resets */
+    uint32_t invalid;        /* values out of their valid range, for which the last valid one stood in */
+
+    /* Called with every answer, also when one frame completes several; may be NULL. Set it after plush_begin(). */
+    void (*on_answer)(const struct plush_toy *toy, void *user);
+    void *user;
+
+    /* The model, as it was read. */
+    uint8_t layers, channels, inputs, classes;
+    uint16_t step, blocks, features;
+    uint32_t span, period, gap, units_per_ms, narrow;
+    uint16_t smoothing;
+    void *memory;
+    uint32_t memory_bytes;
+    const uint8_t *ranges, *input_plan, *dense, *dense_weights, *names, *title;
+    plush_layer layer[PLUSH_MAX_LAYERS];
+
+    /* Clock: all in the model's own units of time, reckoned from the newest frame, so that nothing grows. */
+    uint8_t heard, running;  /* a frame has come; samples are being made */
+    uint32_t seen_ms, last_ms;
+    uint32_t due;            /* from the last usable frame to the next sample */
+    uint8_t *valid;          /* of each channel: whether it has had a valid value */
+    int32_t *held, *before, *sample;
+
+    /* Pooling and smoothing. */
+    uint16_t filled, block;
+    uint8_t *last;           /* the last layer's newest activations */
+    uint16_t *sums;          /* blocks x features */
+    uint32_t *total;         /* of each feature: its sum over all blocks */
+    uint32_t warm;           /* samples, up to the span */
+    uint8_t started;         /* the smoothing has begun */
+    int32_t *logits;         /* of each class, in steps of 1/256 */
+    int32_t *smooth;         /* of each class: probability in steps of 2^-27 */
+} plush_toy;
+
+/* Bytes of memory that a toy with this model needs; 0 when these bytes are no usable model. */
+uint32_t plush_memory_bytes(const uint8_t *model, uint32_t model_bytes);
+
+/* Makes a toy ready. The model's bytes and the memory must stay where they are. */
+plush_status plush_begin(plush_toy *toy, const uint8_t *model, uint32_t model_bytes, void *memory,
+                         uint32_t memory_bytes);
+
+/* Takes the readings of one moment in: `ms` is the toy's own clock, `values` the measured channels in the order of
+ * the layout. Returns how many answers fell due, mostly 0 or 1; the newest is in toy->answer. */
+uint32_t plush_push(plush_toy *toy, uint32_t ms, const int32_t *values);
+
+/* Forgets the past, as after a gap; the counts stay. */
+void plush_restart(plush_toy *toy);
+
+/* The label of a class, and of the model (its architecture and filters). */
+const char *plush_gesture_name(const plush_toy *toy, uint8_t gesture);
+const char *plush_model_title(const plush_toy *toy);
+
+#ifdef __cplusplus
+}
+#endif
+#endif

@@ -1,0 +1,125 @@
+"""A trained network in whole numbers: batch normalisation folded, 8-bit weights and activations, fixed-point scales.
+
+Folding is exact: a normalisation after ReLU moves into the layer that reads it, and at the last layer through the
+mean into the dense layer. Where the 8 bits of each input and activation lie is found on windows of the training
+people only (`calibrate`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import ArchError, BundleError
+from plushsense.models.arch import NORM_EPSILON, Arch
+from plushsense.models.fixed import InputScale, LogitScale, Requantize, split_ratio
+from plushsense.models.integer import IntegerDense, IntegerLayer, IntegerNetwork
+from plushsense.models.reference import Network
+from plushsense.windows.features import Scaler
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Ranges:
+    """What 8 bits have to hold: scaled inputs from ``low`` to ``high`` (C,), activations of each layer from 0 to
+    ``tops`` (F,), before normalisation."""
+
+    low: Floats
+    high: Floats
+    tops: tuple[Floats, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, ready for JSON."""
+        return {"low": self.low.tolist(), "high": self.high.tolist(), "tops": [t.tolist() for t in self.tops]}
+
+    @classmethod
+    def from_dict(cls, table: Mapping[str, Any]) -> Ranges:
+        """Ranges from plain values.
+
+        Raises:
+            BundleError: for a key that is missing.
+        """
+        try:
+            tops = tuple(np.asarray(t, dtype=np.float64) for t in table["tops"])
+            return cls(np.asarray(table["low"], dtype=np.float64), np.asarray(table["high"], dtype=np.float64), tops)
+        except KeyError as missing:
+            raise BundleError(f"The calibration in the bundle lacks {missing}: train again.") from None
+
+
+def calibrate(network: Network, x: NDArray[np.floating[Any]]) -> Ranges:
+    """The ranges of scaled training windows (N, C, T) on their way through the network."""
+    outside = 1e-4
+    low, high = np.quantile(x, [outside, 1 - outside], axis=(0, 2))
+    tops = [np.zeros(f) for f in network.arch.filters]
+    for at in range(0, len(x), 256):
+        for top, z in zip(tops, network.rectified(x[at : at + 256]), strict=True):
+            np.maximum(top, np.quantile(z, 1 - outside, axis=(0, 1)), out=top)
+    return Ranges(low, high, tuple(tops))
+
+
+def refuse_undeployable(arch: Arch) -> None:
+    """Refuse a network that has no meaning in the toy: ArchError with the reason and the nearest one that has."""
+    if arch.padding != "stream":
+        raise ArchError(
+            f"{arch.title} has the padding '{arch.padding}', with which a decision cannot be made sample by sample: "
+            f"train {arch.symbol} with --padding stream."
+        )
+    if arch.norm != "batch":
+        raise ArchError(
+            f"{arch.title} has {arch.norm} normalisation, which cannot be folded into a convolution: "
+            f"train {arch.symbol} with --norm batch."
+        )
+
+
+def quantize(arch: Arch, weights: Mapping[str, NDArray[Any]], scaler: Scaler, ranges: Ranges) -> IntegerNetwork:
+    """The network in whole numbers.
+
+    Raises:
+        ArchError: for a network that cannot be deployed.
+        BundleError: for ranges of another network, or sums beyond 32 bits.
+    """
+    refuse_undeployable(arch)
+    span = np.maximum(ranges.high - ranges.low, 1e-6)
+    unit, start = span / 255, ranges.low
+    layers = []
+    for i, top in enumerate(ranges.tops):
+        w, b = weights[f"conv{i}.weight"].astype(np.float64), weights[f"conv{i}.bias"].astype(np.float64)
+        b = b + np.einsum("fck,c->f", w, start)
+        whole, bias, size = _eight_bits(w * unit[:, None], b)
+        top = np.maximum(top, 1e-6)
+        layers.append(IntegerLayer(whole, bias, Requantize(*_split(size / (top / 255), 255))))
+        gain = weights[f"norm{i}.gain"] / np.sqrt(weights[f"norm{i}.var"].astype(np.float64) + NORM_EPSILON)
+        unit, start = gain * top / 255, weights[f"norm{i}.shift"] - weights[f"norm{i}.mean"] * gain
+    w, b = weights["dense.weight"].astype(np.float64), weights["dense.bias"].astype(np.float64)
+    whole, bias, size = _eight_bits(w * unit / arch.pooled, b + w @ start)
+    dense = IntegerDense(whole, bias, LogitScale(*_split(size * 256, 1 << 14)))
+    return IntegerNetwork(arch, _input_scale(scaler, ranges.low, span / 255), tuple(layers), dense)
+
+
+def _eight_bits(w: Floats, b: Floats) -> tuple[NDArray[np.int8], NDArray[np.int64], Floats]:
+    """Weights (F, …) and biases (F,) in units (F,) of their own: the largest weight becomes ±127."""
+    rows = np.abs(w).reshape(len(w), -1).max(axis=1)
+    size = np.maximum(np.maximum(rows / 127, np.abs(b) / (1 << 29)), 1e-30)
+    whole = np.rint(w / size.reshape(-1, *[1] * (w.ndim - 1))).astype(np.int8)
+    return whole, np.rint(b / size).astype(np.int64), size
+
+
+def _split(ratios: Floats, full: int) -> NDArray[np.int64]:
+    """Columns before, multiplier, after of each ratio; a sum of full / ratio gives ``full``."""
+    return np.array([split_ratio(float(r), full / float(r)) for r in ratios], dtype=np.int64).T
+
+
+def _input_scale(scaler: Scaler, low: Floats, unit: Floats) -> InputScale:
+    rows = []
+    for offset, scale, start, size in zip(scaler.offset, scaler.scale, low, unit, strict=True):
+        ratio = float(scale / size)
+        middle = round(float(offset + (start + 127.5 * size) / scale))
+        before, multiplier, after = split_ratio(ratio, 128 / ratio + 1, most_after=22)
+        there = ((middle - offset) * scale - start) / size
+        rows.append((middle, before, multiplier, round((there + 0.5) * 2.0**after), after))
+    return InputScale(*np.array(rows, dtype=np.int64).T)
