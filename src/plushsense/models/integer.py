@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from plushsense.core.errors import BadInput, BundleError
 from plushsense.models.arch import Arch
-from plushsense.models.fixed import InputScale, Ints, LogitScale, Bytes, Requantize
+from plushsense.models.fixed import Bytes, InputScale, Ints, LogitScale, Requantize
 from plushsense.models.reference import check_windows, taps_of
 from plushsense.models.state import CHUNK, Floats, Pool, Ring
 
