@@ -34,6 +34,7 @@ from plushsense.models.integer import IntegerNetwork
 
 MAGIC = b"PLSH"
 IMAGE_VERSION = 1
+HEAD_BYTES = 16
 AFFECT_CODES = {"none": 0, "positive": 1, "neutral": 2, "negative": 3}
 GROUP = 4  # filters computed together, and channels read together
 
@@ -101,12 +102,8 @@ class IntegerModel:
             found.append(("", struct.pack("<iiHBB", *row)))
         for n, (layer, read, part) in enumerate(zip(arch.layers, arch.inputs, self.network.layers, strict=True), 1):
             shape = struct.pack("<HHHH", layer.kernel, layer.dilation, read, layer.filters)
-            found.append(
-                (
-                    f"layer {n}: kernel {layer.kernel}, dilation {layer.dilation}, reads {read}, {layer.filters} filters",
-                    shape,
-                )
-            )
+            what = f"kernel {layer.kernel}, dilation {layer.dilation}, reads {read} channels, {layer.filters} filters"
+            found.append((f"layer {n}: {what}", shape))
             found.append((f"layer {n}: bias, multiplier, shifts of each filter", _scales(part.bias, part.scale)))
             for first, group in enumerate(grouped(part.weights)):
                 last = min(GROUP * first + GROUP, layer.filters)
@@ -131,7 +128,7 @@ class IntegerModel:
 
 def head(body: bytes) -> bytes:
     """The 16 bytes that stand before a body of an image."""
-    return MAGIC + struct.pack("<HHII", IMAGE_VERSION, 0, len(body) + 16, zlib.crc32(body))
+    return MAGIC + struct.pack("<HHII", IMAGE_VERSION, 0, len(body) + HEAD_BYTES, zlib.crc32(body))
 
 
 def _scales(bias: NDArray[np.int64], scale: Requantize | LogitScale) -> bytes:
@@ -146,3 +143,19 @@ def grouped(weights: NDArray[np.int8]) -> NDArray[np.uint8]:
     full[:f, :c] = weights
     split = full.reshape(len(full) // GROUP, GROUP, full.shape[1] // GROUP, GROUP, k)
     return np.ascontiguousarray(split.transpose(0, 4, 2, 1, 3) + 128).astype(np.uint8)
+
+
+def memory_bytes(model: IntegerModel) -> int:
+    """Bytes that the toy remembers in: what ``plush_memory_bytes`` says of the model's image."""
+    arch, measured = model.network.arch, len(model.layout.channels)
+
+    def whole(n: int) -> int:
+        return -(-n // GROUP) * GROUP
+
+    rings = sum(
+        (layer.reach + 1) * whole(read) + whole(2 * (layer.reach + 1))
+        for layer, read in zip(arch.layers, arch.inputs, strict=True)
+    )
+    features = arch.filters[-1]
+    pooling = whole(2 * features * (arch.pooled // arch.step)) + 4 * features + whole(features)
+    return 3 * 4 * measured + rings + pooling + 2 * 4 * arch.classes + whole(measured)
