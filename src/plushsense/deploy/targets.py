@@ -1,4 +1,4 @@
-"""Machines that a C program can be built for and run on here: this one, and three chips that QEMU plays.
+"""Machines that a C program can be built for and run on here: this one, and chips that QEMU plays.
 
 The emulators run on a clock of their own (``-icount``), so that counts are the same in every run. They count
 instructions, not cycles, and nothing here is a real chip. A microcontroller is a line of `TARGETS`, its start-up and
@@ -46,6 +46,8 @@ class Target:
 
 _BARE = ("-nostdlib", "-nostartfiles", "-ffunction-sections", "-fdata-sections")
 _QUIET = ("-nographic", "-monitor", "none", "-serial", "none")
+_NATIVE = ("-semihosting-config", "enable=on,target=native")
+_MPS2 = ("qemu-system-arm", "-M", "mps2-an386", *_QUIET, *_NATIVE, "-icount", "shift=6,sleep=off", "-kernel")
 
 TARGETS: dict[str, Target] = {
     "host": Target(
@@ -78,10 +80,18 @@ TARGETS: dict[str, Target] = {
         runtime=("cortex-m4.c", "bare.c"),
         flags=("-mcpu=cortex-m4", "-mthumb", *_BARE),
         link=("-T", str(RUNTIME / "cortex-m4.ld"), "-lc", "-lgcc"),
-        run=(
-            *("qemu-system-arm", "-M", "mps2-an386", *_QUIET),
-            *("-semihosting-config", "enable=on,target=native", "-icount", "shift=6,sleep=off", "-kernel"),
-        ),
+        run=_MPS2,
+    ),
+    "cortex-m0": Target(
+        name="cortex-m0",
+        title="Arm Cortex-M0+ code (the RP2040's) on QEMU's Cortex-M4",
+        compiler="arm-none-eabi-gcc",
+        packages={"arm-none-eabi-gcc": "gcc-arm-none-eabi", "qemu-system-arm": "qemu-system-arm"},
+        libraries={"libc.a": "libnewlib-arm-none-eabi"},
+        runtime=("cortex-m4.c", "bare.c"),
+        flags=("-mcpu=cortex-m0plus", "-mthumb", *_BARE),
+        link=("-T", str(RUNTIME / "cortex-m4.ld"), "-lc", "-lgcc"),
+        run=_MPS2,
     ),
     "riscv32": Target(
         name="riscv32",
@@ -91,10 +101,11 @@ TARGETS: dict[str, Target] = {
         libraries={"picolibc.specs": "picolibc-riscv64-unknown-elf"},
         runtime=("riscv32_start.S", "riscv32.c", "bare.c"),
         flags=("--specs=picolibc.specs", "-march=rv32imc_zicsr", "-mabi=ilp32", "-msmall-data-limit=0", *_BARE),
-        link=("-T", str(RUNTIME / "riscv32.ld"), "-lc", "-lgcc"),
+        # Without _zicsr, or the compiler does not find its libraries for 32 bits.
+        link=("-march=rv32imc", "-T", str(RUNTIME / "riscv32.ld"), "-lc", "-lgcc"),
         run=(
             *("qemu-system-riscv32", "-M", "virt", "-bios", "none", *_QUIET),
-            *("-semihosting-config", "enable=on,target=native", "-icount", "shift=0,sleep=off", "-kernel"),
+            *(*_NATIVE, "-icount", "shift=0,sleep=off", "-kernel"),
         ),
     ),
 }
@@ -146,8 +157,9 @@ def missing_tools(target: str, *, cc: str | None = None) -> list[str]:
     if cc is not None:
         tools = {cc: Path(cc).name} | {t: p for t, p in tools.items() if t != machine.compiler}
     missing = [package for tool, package in tools.items() if shutil.which(tool) is None]
-    if not missing or machine.compiler not in [t for t in tools if shutil.which(t) is None]:
-        missing += [p for f, p in (machine.libraries or {}).items() if not _finds(machine.compiler, f)]
+    for file, package in (machine.libraries or {}).items():
+        if shutil.which(machine.compiler) is None or not _finds(machine.compiler, file):
+            missing.append(package)
     return list(dict.fromkeys(missing))
 
 
@@ -266,7 +278,7 @@ def _shortened(said: str) -> str:
 
 @cache
 def _finds(compiler: str, file: str) -> bool:
-    return os.path.isabs(said_by([compiler, f"-print-file-name={file}"]).strip())
+    return Path(said_by([compiler, f"-print-file-name={file}"]).strip()).is_absolute()
 
 
 def _blobs(blobs: Mapping[str, Path]) -> str:
