@@ -222,7 +222,7 @@ static int read_input_plan(plush_toy *toy, source *from)
             if (parts[n] >= toy->channels)
                 return 0;
         bias = as_signed(le32(scale + 4));
-        if (bias <= -MOST_INPUT_BIAS || bias >= MOST_INPUT_BIAS || le16(scale + 8) > MOST_MULTIPLIER ||
+        if (bias < -MOST_INPUT_BIAS || bias >= MOST_INPUT_BIAS || le16(scale + 8) > MOST_MULTIPLIER ||
             scale[10] > MOST_INPUT_SHIFT || scale[11] > MOST_SHIFT)
             return 0;
     }
