@@ -760,7 +760,7 @@ plush_status plush_begin(plush_toy *toy, const uint8_t *model, uint32_t model_by
 
 void plush_restart(plush_toy *toy)
 {
-    uint32_t beyond;
+    uint32_t phase;
 
     if (toy->memory == NULL) /* plush_begin() has not said PLUSH_OK */
         return;
@@ -773,8 +773,8 @@ void plush_restart(plush_toy *toy)
     toy->answer.affect = PLUSH_AFFECT_NONE;
     toy->answer.confidence = 0;
     /* So that a step ends with the very sample that fills the span. */
-    beyond = toy->span % toy->step;
-    toy->filled = (uint16_t)(beyond == 0 ? 0 : toy->step - beyond);
+    phase = toy->span % toy->step;
+    toy->filled = (uint16_t)(phase == 0 ? 0 : toy->step - phase);
 }
 
 uint32_t plush_push(plush_toy *toy, uint32_t ms, const int32_t *values)
