@@ -6,15 +6,8 @@ rounding, a clamp), there by exact text that must stand in ``plushsense.c`` once
 
 from __future__ import annotations
 
-import struct
 from dataclasses import dataclass
 from typing import Literal
-
-import numpy as np
-from numpy.typing import NDArray
-
-from plushsense.core.errors import BadInput
-from plushsense.models.image import GROUP, head
 
 _HEAD, _FIXED, _SCALE, _INT32 = 16, 28, 8, (1 << 31) - 1
 
