@@ -6,17 +6,21 @@ channels, the validity rule and the smoothing stay with the caller.
 
 from __future__ import annotations
 
+import contextlib
+import uuid
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from numpy.typing import NDArray
 
 from plushsense.core.errors import BadInput, ConfigError, nearest
+from plushsense.deploy.convert.as_espdl import to_espdl
 from plushsense.deploy.convert.as_onnx import to_integer_onnx, to_onnx
 from plushsense.deploy.convert.as_tflite import to_integer_tflite, to_tflite
-from plushsense.deploy.convert.facts import Converted, Job
+from plushsense.deploy.convert.facts import Converted, Job, Made
 from plushsense.models.bundle import Bundle
 from plushsense.models.integer import IntegerNetwork
 
@@ -29,7 +33,7 @@ class Format:
 
     file_name: str
     holds: str
-    write: Callable[[Job, Path], Converted]
+    write: Callable[[Job], Made]
     integer: bool = False
 
 
@@ -38,6 +42,11 @@ CONVERTERS: dict[str, Format] = {
     "onnx-int8": Format("model.int8.onnx", "ONNX, int8 with QuantizeLinear", to_integer_onnx, integer=True),
     "tflite": Format("model.tflite", "LiteRT, floats", to_tflite),
     "tflite-int8": Format("model.int8.tflite", "LiteRT, int8 convolutions", to_integer_tflite, integer=True),
+    "espdl": Format("model.espdl", "ESP-DL for the ESP32-S3, int8", to_espdl),
+    "espdl-esp32": Format("model.esp32.espdl", "ESP-DL for the ESP32, int8", partial(to_espdl, target="esp32")),
+    "espdl-esp32p4": Format(
+        "model.esp32p4.espdl", "ESP-DL for the ESP32-P4, int8", partial(to_espdl, target="esp32p4")
+    ),
 }
 
 
@@ -65,9 +74,16 @@ def convert(
         raise ConfigError(
             f"Unknown format '{format_name}': accepted are {', '.join(CONVERTERS)}.{nearest(format_name, CONVERTERS)}"
         )
+    made = CONVERTERS[format_name].write(Job.of(bundle, integer, windows))
     path = Path(path)
+    part = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        return CONVERTERS[format_name].write(Job.of(bundle, integer, windows), path)
+        part.write_bytes(made.data)
+        part.replace(path)
     except OSError as cause:
         raise BadInput(f"'{path}' cannot be written ({cause}): choose another place.") from None
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+    return Converted(path, len(made.data), made.largest_difference, made.notes)

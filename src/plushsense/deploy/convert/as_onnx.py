@@ -7,7 +7,6 @@ Both read ``raw`` (N, C, span) float32, whole numbers as the toy measures them, 
 from __future__ import annotations
 
 import importlib.util
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,9 +19,9 @@ from plushsense.deploy.convert.facts import (
     NOT_EXACT,
     PROBABILITIES,
     RAW,
-    Converted,
     Floats,
     Job,
+    Made,
     compare,
     describe,
     input_codes,
@@ -186,21 +185,19 @@ def answers(model: bytes, windows: NDArray[Any]) -> NDArray[np.float32] | None:
 _UNCHECKED = "Not tried: run  pip install 'plushsense[onnx]'  to have it compared in onnxruntime."
 
 
-def to_onnx(job: Job, path: Path) -> Converted:
+def to_onnx(job: Job) -> Made:
     """The float network."""
     model = float_model(job.bundle)
     found = answers(model, job.windows)
     largest, said = (None, _UNCHECKED) if found is None else compare(found, job, "ONNX")
-    path.write_bytes(model)
-    return Converted(path, len(model), largest, (said, f"Input '{RAW}' (N, {job.bundle.arch.channels}, span)."))
+    return Made(model, largest, (said, f"Input '{RAW}' (N, {job.bundle.arch.channels}, span)."))
 
 
-def to_integer_onnx(job: Job, path: Path) -> Converted:
+def to_integer_onnx(job: Job) -> Made:
     """The network in whole numbers: close to the toy's, not equal in every bit."""
     network = job.whole("onnx-int8")
     model = integer_model(job.bundle, network)
     found = answers(model, job.windows)
     expected = network.forward(job.windows) / 256
     largest, said = (None, _UNCHECKED) if found is None else compare(found, job, "ONNX", expected, exact=False)
-    path.write_bytes(model)
-    return Converted(path, len(model), largest, (said, NOT_EXACT))
+    return Made(model, largest, (said, NOT_EXACT))

@@ -9,7 +9,6 @@ Micro interpreters have.
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,9 +21,9 @@ from plushsense.deploy.convert.facts import (
     NOT_EXACT,
     PROBABILITIES,
     RAW,
-    Converted,
     Floats,
     Job,
+    Made,
     compare,
     describe,
     input_codes,
@@ -266,19 +265,17 @@ def answers(model: bytes, windows: NDArray[Any]) -> NDArray[np.float32]:
     return np.concatenate([run(**{RAW: np.ascontiguousarray(row[None])})[LOGITS] for row in rows])
 
 
-def to_tflite(job: Job, path: Path) -> Converted:
+def to_tflite(job: Job) -> Made:
     """The float network."""
     model = float_model(job.bundle)
     largest, said = compare(answers(model, job.windows), job, "LiteRT")
-    path.write_bytes(model)
-    return Converted(path, len(model), largest, (said, f"Input '{RAW}' (1, span, {job.bundle.arch.channels})."))
+    return Made(model, largest, (said, f"Input '{RAW}' (1, span, {job.bundle.arch.channels})."))
 
 
-def to_integer_tflite(job: Job, path: Path) -> Converted:
+def to_integer_tflite(job: Job) -> Made:
     """The network with int8 convolutions: close to the toy's, not equal in every bit."""
     network = job.whole("tflite-int8")
     model = integer_model(job.bundle, network)
     expected = network.forward(job.windows) / 256
     largest, said = compare(answers(model, job.windows), job, "LiteRT", expected, exact=False)
-    path.write_bytes(model)
-    return Converted(path, len(model), largest, (said, NOT_EXACT))
+    return Made(model, largest, (said, NOT_EXACT))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +28,8 @@ LIMIT = LOGIT_LIMIT / 256  # of logits in the network in whole numbers
 # Logits in float32 against the reference in float64, relative to the largest logit; above it nothing is written.
 TOLERANCE = 1e-4
 NOT_EXACT = (
-    "Compared with the network in whole numbers, which the C in the toy equals bit for bit; this file only comes close: "
-    "a code may differ by 1 where this runtime rounds the other way."
+    "Compared with the network in whole numbers, which the C in the toy equals bit for bit; this file only comes "
+    "close: a code may differ by 1 where this runtime rounds the other way."
 )
 
 
@@ -49,14 +49,23 @@ class Converted:
 
 
 @dataclass(frozen=True)
+class Made:
+    """What a converter gives: the file's bytes, and as in `Converted`."""
+
+    data: bytes
+    largest_difference: float | None
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class Job:
     """What a converter is given: the bundle, its network in whole numbers where a format needs it, raw windows
-    (N, C, T) to try and to calibrate with."""
+    (N, C, T) to try and to calibrate with: ``given`` ones first, then made-up ones."""
 
     bundle: Bundle
     integer: IntegerNetwork | None
     windows: Windows
-    made_up: bool
+    given: int
 
     @classmethod
     def of(cls, bundle: Bundle, integer: IntegerNetwork | None, windows: NDArray[Any] | None) -> Job:
@@ -70,14 +79,18 @@ class Job:
             check_windows(bundle.arch, windows.shape)
             given = windows[:, :, windows.shape[2] - bundle.arch.span :].astype(np.int64)
             tried = np.concatenate([given, tried])
-        return cls(bundle, integer, tried, windows is None or not len(windows))
+        return cls(bundle, integer, tried, 0 if windows is None else len(windows))
+
+    def thinned(self, most: int) -> Job:
+        """At most ``most`` of the given windows, evenly taken, and the made-up ones."""
+        given = self.windows[: self.given][:: max(1, -(-self.given // most))]
+        return replace(self, windows=np.concatenate([given, self.windows[self.given :]]), given=len(given))
 
     @property
     def tried(self) -> str:
         """The windows, in words."""
-        made = len(made_up_windows(self.bundle))
-        given = len(self.windows) - made
-        return f"{made} made-up windows" if not given else f"{given} windows that were given and {made} made-up ones"
+        made = len(self.windows) - self.given
+        return f"{made} made-up windows" if not self.given else f"{self.given} given and {made} made-up windows"
 
     def reference(self) -> NDArray[np.float64]:
         """Logits (N, K) of the float network."""
@@ -90,6 +103,11 @@ class Job:
             raise BadInput(
                 f"The format '{format_name}' writes the network in whole numbers, and none was given: "
                 "give integer=, as plushsense export does, or take the float format."
+            )
+        if self.integer.arch != self.bundle.arch:
+            raise BundleError(
+                f"The integer network is {self.integer.arch.title}, the bundle {self.bundle.arch.title}: "
+                "give the one that was made from this bundle."
             )
         return self.integer
 
@@ -104,7 +122,9 @@ def made_up_windows(bundle: Bundle, n: int = 24) -> Windows:
         * rng.choice([0.5, 1, 3], n)[:, None, None]
     )
     scaler = bundle.scaler
-    return np.rint(scaler.offset[:, None] + scaled / scaler.scale[:, None]).astype(np.int64)
+    unit = 1 / np.where(scaler.scale == 0, 1.0, scaler.scale)
+    raw: Windows = np.rint(scaler.offset[:, None] + scaled * unit[:, None]).astype(np.int64)
+    return raw
 
 
 def scaling(scaler: Scaler) -> tuple[Floats, Floats, Floats]:
@@ -126,7 +146,7 @@ def input_codes(network: IntegerNetwork) -> tuple[Floats, Floats, Floats]:
 
 def sum_scales(multiplier: NDArray[Any], before: NDArray[Any], after: NDArray[Any]) -> NDArray[np.float64]:
     """What a sum is multiplied by; never 0, which runtimes refuse: 2^-32 of any sum is less than half."""
-    return np.maximum(multiplier * np.ldexp(1.0, -(before + after)), 2.0**-32)
+    return np.asarray(np.maximum(multiplier * np.ldexp(1.0, -(before + after)), 2.0**-32))
 
 
 def describe(bundle: Bundle) -> dict[str, str]:
