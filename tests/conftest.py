@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import shutil
 import tempfile
 import time
 from collections.abc import Iterator
@@ -46,6 +47,14 @@ def pty_possible() -> None:
             os.close(end)
     except (ImportError, OSError) as cause:
         missing("pty", f"no pseudo-terminal here: {cause}")
+
+
+@pytest.fixture(scope="session")
+def c_compiler() -> str:
+    """A C compiler of this machine: ``gcc``."""
+    if shutil.which("gcc") is None:
+        missing("compilers", "gcc is not installed")
+    return "gcc"
 
 
 @pytest.fixture(scope="session")

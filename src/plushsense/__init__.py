@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from plushsense.apps.baselining import baselines
     from plushsense.apps.checking import check_dataset
     from plushsense.apps.estimator import PlushClassifier
+    from plushsense.apps.exporting import export
     from plushsense.apps.reporting import write_report
     from plushsense.apps.retraining import forget
     from plushsense.apps.searching import search
@@ -49,6 +50,7 @@ _WHERE = {
     "evaluate": "plushsense.apps.api",
     "load": "plushsense.apps.api",
     "simulate": "plushsense.apps.api",
+    "export": "plushsense.apps.exporting",
     "write_report": "plushsense.apps.reporting",
     "baselines": "plushsense.apps.baselining",
     "forget": "plushsense.apps.retraining",
@@ -82,6 +84,7 @@ __all__ = [
     "check_dataset",
     "cut_windows",
     "evaluate",
+    "export",
     "forget",
     "import_recordings",
     "load",

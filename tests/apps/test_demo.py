@@ -26,6 +26,7 @@ def test_demo_twice(cli: Callable[..., Any], tmp_path: Path, monkeypatch: pytest
     assert {"dataset", "bundle", "report", "export", "scores"} <= set(found)
     assert found["scores"]["split"] == "by-subject:2"
     assert [g["affect"] for g in found["live"]["gestures"]]
+    assert (Path(found["export"]) / "plushsense.c").is_file()
     assert "say nothing about a real toy" in ran.err
     assert "simulation" in Path(found["report"]).read_text().lower()
     again = cli("demo", "--quick", "--out", out)

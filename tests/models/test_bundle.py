@@ -60,6 +60,16 @@ def test_the_same_bundle_gives_the_same_bytes(tmp_path: Path) -> None:
     assert Bundle.load(tmp_path / "a.plush").save(tmp_path / "c.plush").read_bytes() == one
 
 
+def test_a_calibration_comes_back_and_a_bundle_without_one_is_written_as_before(tmp_path: Path) -> None:
+    before = make().save(tmp_path / "before.plush")
+    assert b"calibration" not in before.read_bytes(), "bundles of before have no such key"
+    assert Bundle.load(before).calibration == {}
+    kept = {"low": [0.1 + 0.2, -1e-300], "tops": [[1 / 3]]}
+    made = make(calibration=kept).save(tmp_path / "m.plush")
+    assert Bundle.load(made).calibration == kept, "to the last bit"
+    assert Bundle.load(made).save(tmp_path / "again.plush").read_bytes() == made.read_bytes()
+
+
 def test_every_flipped_byte_is_noticed(tmp_path: Path) -> None:
     path = make().save(tmp_path / "m.plush")
     good = path.read_bytes()

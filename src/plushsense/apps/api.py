@@ -21,6 +21,7 @@ from plushsense.apps.reporting import check_place, save_evaluation
 from plushsense.core.gestures import NOBODY
 from plushsense.dataset.importers import import_recordings
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
+from plushsense.deploy.calibration import calibration
 from plushsense.evaluation.crossval import Evaluation, FoldOutput, FoldProgress
 from plushsense.evaluation.crossval import evaluate as crossvalidate
 from plushsense.evaluation.folds import WindowFold, fold_windows
@@ -149,6 +150,7 @@ def train(
             "scores": scores,
             "code_version": __version__,
         },
+        calibration=calibration(network, fitted.weights, fitted.scaler, windows.x[train_at]),
     )
     return Trained(bundle, fitted.history, scores)
 

@@ -5,6 +5,7 @@ What it shows is that everything works together. Its scores are of a simulation.
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,10 +13,12 @@ from typing import Any
 
 from plushsense.apps.api import evaluate, import_simulation, simulate, train
 from plushsense.apps.config import resolve
+from plushsense.apps.exporting import export
 from plushsense.apps.reporting import write_report
 from plushsense.core.errors import ConfigError
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.store import Dataset
+from plushsense.deploy.emit import FACTS
 from plushsense.devices.opening import open_device
 from plushsense.devices.virtual.device import VirtualDevice
 from plushsense.live.loop import run as run_loop
@@ -51,7 +54,7 @@ def run_demo(out: Path, *, quick: bool = False, stage: Stage, progress: Progress
     """Run the demo into ``out``; a second run takes up what the first one finished.
 
     Returns:
-        paths of ``dataset``, ``bundle`` and ``report``, ``export`` (None: not built yet), and ``scores``.
+        paths of ``dataset``, ``bundle`` and ``report``, ``export``, and ``scores``.
     """
     size = QUICK if quick else FULL
     out.mkdir(parents=True, exist_ok=True)
@@ -60,7 +63,7 @@ def run_demo(out: Path, *, quick: bool = False, stage: Stage, progress: Progress
         raise ConfigError(f"'{out}' holds something that is not a demo: give a new or empty folder with --out.")
     mark.write_text("Written by  plushsense demo . A simulation; this folder can be deleted.\n", encoding="utf-8")
     name = f"{size.people}x{size.repetitions}"
-    stage(f"1/5  {size.people} virtual people record {size.repetitions} × 17 gestures, and the recordings are imported")
+    stage(f"1/6  {size.people} virtual people record {size.repetitions} × 17 gestures, and the recordings are imported")
     dataset = _dataset(
         out / f"dataset-{name}",
         out / f"recordings-{name}",
@@ -70,10 +73,10 @@ def run_demo(out: Path, *, quick: bool = False, stage: Stage, progress: Progress
         progress=progress,
     )
     config = resolve(None, training={"epochs": size.epochs, "halve_every": max(1, size.epochs // 4)})
-    stage(f"2/5  train {config.model.arch} on {len(dataset.subjects)} people; a few of them only watch")
+    stage(f"2/6  train {config.model.arch} on {len(dataset.subjects)} people; a few of them only watch")
     trained = train(dataset, config, progress=lambda epoch, epochs, _: progress("training", epoch, epochs))
     bundle = trained.save(out / "model.plush")
-    stage(f"3/5  score it on people left out, in {size.folds} folds")
+    stage(f"3/6  score it on people left out, in {size.folds} folds")
     evaluation = out / f"evaluation-{name}"
     result = evaluate(
         dataset,
@@ -83,16 +86,18 @@ def run_demo(out: Path, *, quick: bool = False, stage: Stage, progress: Progress
         overwrite=True,
         progress=lambda at: progress("folds", at.done, at.folds),
     ).to_dict()
-    stage(f"4/5  live: {size.live_s:.0f} s of a virtual person it never met")
+    stage(f"4/6  live: {size.live_s:.0f} s of a virtual person it never met")
     heard = _live(bundle, size.live_s)
-    stage("5/5  report")
+    stage("5/6  C for the toy, which gives the same answers")
+    exported = _export(bundle, out / "export")
+    stage("6/6  report")
     report = write_report(out / "report.html", dataset, [evaluation], [bundle], title="PlushSense demo")
     return {
         "simulation": SIMULATION,
         "dataset": str(dataset.path),
         "bundle": str(bundle),
         "report": str(report),
-        "export": None,
+        "export": str(exported),
         "scores": {key: result[key] for key in ("split", "context", "leaky", "accuracy", "macro_f1", "by_recording")},
         "live": heard,
     }
@@ -107,6 +112,13 @@ def _dataset(
     if not raw.exists():
         simulate(raw, people=people, repetitions=repetitions, seed=seed, progress=progress)
     return import_simulation(raw, dest, progress)
+
+
+def _export(bundle: Path, folder: Path) -> Path:
+    """The folder of an earlier demo gives way to the new one."""
+    if (folder / FACTS).is_file():
+        shutil.rmtree(folder)
+    return export(bundle, folder).folder
 
 
 def _live(bundle: Path, seconds: float) -> dict[str, Any]:

@@ -31,6 +31,7 @@ from plushsense.core.errors import ArrayError
 from plushsense.core.extras import need
 from plushsense.core.gestures import GestureSet
 from plushsense.core.signal import Layout, load_layout
+from plushsense.deploy.calibration import calibration
 from plushsense.live.decide import DecideSpec
 from plushsense.models.arch import DEFAULT_FILTERS, DEFAULT_SYMBOL, Arch
 from plushsense.models.bundle import Bundle
@@ -220,6 +221,7 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
                 "training": spec.to_dict(),
                 "code_version": __version__,
             },
+            calibration=calibration(arch, fitted.weights, fitted.scaler, windows.x[~watching]),
         )
         return self
 

@@ -23,6 +23,8 @@ from plushsense.windows.features import Scaler
 
 Floats = NDArray[np.float64]
 
+_AT_ONCE = 16  # windows: what their layers read is held whole
+
 
 @dataclass(frozen=True, eq=False)
 class Ranges:
@@ -49,17 +51,27 @@ class Ranges:
             return cls(np.asarray(table["low"], dtype=np.float64), np.asarray(table["high"], dtype=np.float64), tops)
         except KeyError as missing:
             raise BundleError(f"The calibration in the bundle lacks {missing}: train again.") from None
+        except (TypeError, ValueError) as cause:
+            raise BundleError(f"The calibration in the bundle cannot be read ({cause}): train again.") from None
+
+    def check(self, arch: Arch) -> None:
+        """Refuse ranges of another network: BundleError."""
+        needed = [arch.channels, arch.channels, *arch.filters]
+        parts = [self.low, self.high, *self.tops]
+        if [p.shape for p in parts] != [(n,) for n in needed] or not all(np.isfinite(p).all() for p in parts):
+            raise BundleError(f"The calibration is not that of {arch.title}, or holds no numbers: train again.")
 
 
 def calibrate(network: Network, x: NDArray[np.floating[Any]]) -> Ranges:
     """The ranges of scaled training windows (N, C, T) on their way through the network."""
     outside = 1e-4
     low, high = np.quantile(x, [outside, 1 - outside], axis=(0, 2))
-    tops = [np.zeros(f) for f in network.arch.filters]
-    for at in range(0, len(x), 256):
-        for top, z in zip(tops, network.rectified(x[at : at + 256]), strict=True):
-            np.maximum(top, np.quantile(z, 1 - outside, axis=(0, 1)), out=top)
-    return Ranges(low, high, tuple(tops))
+    seen: list[list[Floats]] = [[] for _ in network.arch.filters]
+    for at in range(0, len(x), _AT_ONCE):
+        for kept, z in zip(seen, network.rectified(x[at : at + _AT_ONCE]), strict=True):
+            kept.append(z.reshape(-1, z.shape[2]))
+    tops = tuple(np.quantile(np.concatenate(kept), 1 - outside, axis=0) for kept in seen)
+    return Ranges(low, high, tops)
 
 
 def refuse_undeployable(arch: Arch) -> None:
@@ -84,6 +96,7 @@ def quantize(arch: Arch, weights: Mapping[str, NDArray[Any]], scaler: Scaler, ra
         BundleError: for ranges of another network, or sums beyond 32 bits.
     """
     refuse_undeployable(arch)
+    ranges.check(arch)
     span = np.maximum(ranges.high - ranges.low, 1e-6)
     unit, start = span / 255, ranges.low
     layers = []

@@ -41,7 +41,8 @@ class Bundle:
 
     ``windowing``, ``decision`` and ``provenance`` are plain values for JSON: how the windows were cut, how
     live decisions are smoothed, where the weights come from (data set hash, subjects, code version, split,
-    scores).
+    scores). ``calibration`` says what 8 bits have to hold in a deployed network (``deploy/quantize``): ranges of the
+    training windows, nobody's samples. It may be empty, and is in bundles of before.
 
     Raises:
         BundleError: when the parts do not fit each other.
@@ -55,6 +56,7 @@ class Bundle:
     windowing: dict[str, Any] = field(default_factory=dict)
     decision: dict[str, Any] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
+    calibration: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_weights(self.arch, self.weights)
@@ -152,6 +154,7 @@ class Bundle:
                 content["windowing"],
                 content["decision"],
                 content["provenance"],
+                content.get("calibration", {}),
             )
             implied = bundle._implied()
             changed = [key for key in implied if content.get(key) != implied[key]]
@@ -189,6 +192,7 @@ class Bundle:
                 "windowing": self.windowing,
                 "decision": self.decision,
                 "provenance": self.provenance,
+                **({"calibration": self.calibration} if self.calibration else {}),
                 **self._implied(),
             }
         )

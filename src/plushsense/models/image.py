@@ -34,6 +34,7 @@ from plushsense.models.integer import IntegerNetwork
 
 MAGIC = b"PLSH"
 IMAGE_VERSION = 1
+HEAD_BYTES = 16
 AFFECT_CODES = {"none": 0, "positive": 1, "neutral": 2, "negative": 3}
 GROUP = 4  # filters computed together, and channels read together
 
@@ -65,44 +66,69 @@ class IntegerModel:
             if found > 255:
                 raise BundleError(f"The model has {found} {what}: in the toy there may be at most 255.")
 
-    def to_bytes(self) -> bytes:
-        """The image."""
+    def sections(self) -> list[tuple[str, bytes]]:
+        """What follows the head, piece by piece with what each is."""
         arch, layout = self.network.arch, self.layout
         unit = math.gcd(1000, layout.period_us)
-        body = struct.pack(
-            "<BBBBHHIIIIHH",
-            len(arch.layers),
-            len(layout.channels),
-            arch.channels,
-            arch.classes,
-            arch.step,
-            arch.pooled // arch.step,
-            arch.span,
-            layout.period_us // unit,
-            layout.gap_ms * (1000 // unit),
-            1000 // unit,
-            self.smoothing,
-            0,
-        )
-        for low, high in zip(layout.valid_min_int, layout.valid_max_int, strict=True):
-            body += struct.pack("<ii", low, high)
+        found = [
+            (
+                "layers, measured channels, inputs, classes; step, blocks; span; period, gap, units a ms; smoothing, 0",
+                struct.pack(
+                    "<BBBBHHIIIIHH",
+                    len(arch.layers),
+                    len(layout.channels),
+                    arch.channels,
+                    arch.classes,
+                    arch.step,
+                    arch.pooled // arch.step,
+                    arch.span,
+                    layout.period_us // unit,
+                    layout.gap_ms * (1000 // unit),
+                    1000 // unit,
+                    self.smoothing,
+                    0,
+                ),
+            )
+        ]
+        for name, low, high in zip(layout.names, layout.valid_min_int, layout.valid_max_int, strict=True):
+            found.append((f"channel '{name}': valid from {low} to {high}", struct.pack("<ii", low, high)))
         derived = {d.name: tuple(layout.index(part) for part in d.of) for d in layout.derived}
         scale = self.network.inputs
         for i, name in enumerate(layout.inputs):
             parts = derived.get(name) or (layout.index(name),)
-            body += bytes([name in derived, len(parts), *parts])
-            body += struct.pack(
-                "<iiHBB", *(int(getattr(scale, n)[i]) for n in ("offset", "bias", "multiplier", "before", "after"))
-            )
-        for layer, read, part in zip(arch.layers, arch.inputs, self.network.layers, strict=True):
-            body += struct.pack("<HHHH", layer.kernel, layer.dilation, read, layer.filters)
-            body += _scales(part.bias, part.scale) + grouped(part.weights).tobytes()
+            row = (int(getattr(scale, n)[i]) for n in ("offset", "bias", "multiplier", "before", "after"))
+            plan = bytes([name in derived, len(parts), *parts])
+            found.append((f"input '{name}': where from; offset, bias, multiplier, shifts", plan))
+            found.append(("", struct.pack("<iiHBB", *row)))
+        for n, (layer, read, part) in enumerate(zip(arch.layers, arch.inputs, self.network.layers, strict=True), 1):
+            shape = struct.pack("<HHHH", layer.kernel, layer.dilation, read, layer.filters)
+            what = f"kernel {layer.kernel}, dilation {layer.dilation}, reads {read} channels, {layer.filters} filters"
+            found.append((f"layer {n}: {what}", shape))
+            found.append((f"layer {n}: bias, multiplier, shifts of each filter", _scales(part.bias, part.scale)))
+            for first, group in enumerate(grouped(part.weights)):
+                last = min(GROUP * first + GROUP, layer.filters)
+                what = f"layer {n}: weights of filters {GROUP * first + 1} to {last}, tap by tap"
+                found.append((what, group.tobytes()))
         dense = self.network.dense
-        body += _scales(dense.bias, dense.scale) + (dense.weights.astype(np.int16) + 128).astype(np.uint8).tobytes()
+        found.append(("dense layer: bias, multiplier, shifts of each class", _scales(dense.bias, dense.scale)))
+        found.append(
+            ("dense layer: weights of each class", (dense.weights.astype(np.int16) + 128).astype(np.uint8).tobytes())
+        )
         for gesture in self.gestures.gestures:
-            body += bytes([AFFECT_CODES[gesture.affect]]) + gesture.label.encode() + b"\0"
-        body += arch.title.encode() + b"\0"
-        return MAGIC + struct.pack("<HHII", IMAGE_VERSION, 0, len(body) + 16, zlib.crc32(body)) + body
+            label = bytes([AFFECT_CODES[gesture.affect]]) + gesture.label.encode() + b"\0"
+            found.append((f"class '{gesture.label}', {gesture.affect}", label))
+        found.append((f"title '{arch.title}'", arch.title.encode() + b"\0"))
+        return found
+
+    def to_bytes(self) -> bytes:
+        """The image."""
+        body = b"".join(piece for _, piece in self.sections())
+        return head(body) + body
+
+
+def head(body: bytes) -> bytes:
+    """The 16 bytes that stand before a body of an image."""
+    return MAGIC + struct.pack("<HHII", IMAGE_VERSION, 0, len(body) + HEAD_BYTES, zlib.crc32(body))
 
 
 def _scales(bias: NDArray[np.int64], scale: Requantize | LogitScale) -> bytes:
@@ -117,3 +143,19 @@ def grouped(weights: NDArray[np.int8]) -> NDArray[np.uint8]:
     full[:f, :c] = weights
     split = full.reshape(len(full) // GROUP, GROUP, full.shape[1] // GROUP, GROUP, k)
     return np.ascontiguousarray(split.transpose(0, 4, 2, 1, 3) + 128).astype(np.uint8)
+
+
+def memory_bytes(model: IntegerModel) -> int:
+    """Bytes that the toy remembers in: what ``plush_memory_bytes`` says of the model's image."""
+    arch, measured = model.network.arch, len(model.layout.channels)
+
+    def whole(n: int) -> int:
+        return -(-n // GROUP) * GROUP
+
+    rings = sum(
+        (layer.reach + 1) * whole(read) + whole(2 * (layer.reach + 1))
+        for layer, read in zip(arch.layers, arch.inputs, strict=True)
+    )
+    features = arch.filters[-1]
+    pooling = whole(2 * features * (arch.pooled // arch.step)) + 4 * features + whole(features)
+    return 3 * 4 * measured + rings + pooling + 2 * 4 * arch.classes + whole(measured)

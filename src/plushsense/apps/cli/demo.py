@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
             f"data set  {done['dataset']}",
             f"bundle    {done['bundle']}",
             f"report    {done['report']}   (open it in a browser)",
-            "C export  not built yet",
+            f"C export  {done['export']}   (prove it: plushsense verify {done['export']})",
             f"{time.monotonic() - began:.0f} s. {SIMULATION}",
         ],
     )

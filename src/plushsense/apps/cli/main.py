@@ -38,6 +38,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "sweep": ("sweep", "train and compare every network of a grid, and go on after whatever stopped it"),
     "search": ("search", "the best network within limits of size, for a share of what a whole sweep costs"),
     "report": ("report", "one HTML page from evaluations and bundles, or of a sweep"),
+    "export": ("exporting", "C for the toy that gives the same answers, bit for bit"),
     "live": ("live", "read a toy and say what it feels, 20 times a second"),
     "toy": ("toy", "a virtual toy that speaks the wire format over a pty or TCP"),
     "simulate": ("simulate", "recordings of virtual people, as the authors' recorder would leave them"),
@@ -60,6 +61,7 @@ STOPPED = {
     "publish": "there is no zip; a folder that was written whole can be proved with  plushsense publish --check OUT",
     "train": "no bundle was written",
     "report": "no page was written",
+    "export": "nothing was written",
 }
 
 

@@ -1,0 +1,41 @@
+"""``plushsense export BUNDLE OUT``"""
+
+from __future__ import annotations
+
+import argparse
+
+from plushsense.apps.cli.output import emit, say
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("bundle", metavar="BUNDLE", help="a .plush bundle, trained with padding stream and norm batch")
+    parser.add_argument("out", metavar="OUT", help="new or empty folder")
+    parser.add_argument(
+        "--dataset",
+        metavar="DS",
+        help="the data set that it was trained on: calibrates on its training people's windows (default: what training "
+        "kept in the bundle)",
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    from plushsense.apps.exporting import export
+
+    done = export(args.bundle, args.out, dataset=args.dataset, warn=lambda what: say(f"warning: {what}"))
+    facts = done.facts
+    simulated = (
+        ["  SIMULATION: trained on a virtual toy; it knows no real person's touch"] if facts["simulated"] else []
+    )
+    emit(
+        args,
+        done.to_dict(),
+        [
+            f"{args.out}: {facts['title']}, {facts['classes']} gestures, layout {facts['layout']}",
+            *simulated,
+            f"  model             {done.flash_bytes:,} bytes of flash; the code comes on top (plushsense profile)",
+            f"  memory            {done.ram_bytes:,} bytes of RAM a toy",
+            f"  a step            {facts['step_ms']:g} ms, {facts['macs_per_step']:,} MACs",
+            f"  prove it          plushsense verify {args.out}",
+        ],
+    )
+    return 0

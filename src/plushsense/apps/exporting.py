@@ -1,0 +1,40 @@
+"""A bundle becomes a folder for the toy: quantized, printed as C, with golden vectors and packages."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from plushsense.apps.calibrating import calibrated_on
+from plushsense.apps.preparation import Warn, silent
+from plushsense.dataset.store import Dataset
+from plushsense.deploy.calibration import integer_model
+from plushsense.deploy.emit import Exported, emit
+from plushsense.models.bundle import Bundle
+
+
+def export(
+    bundle: Bundle | str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    dataset: Dataset | str | os.PathLike[str] | None = None,
+    warn: Warn = silent,
+) -> Exported:
+    """Write what a toy needs to run a bundle's network: C99, the model as data, golden vectors.
+
+    Args:
+        bundle: with ``stream`` padding and batch normalisation.
+        out: a folder that does not exist yet, or is empty.
+        dataset: the one that the bundle was trained on; calibrates anew, or for the first time where the bundle
+            holds no calibration.
+        warn: told what may matter.
+
+    Raises:
+        ArchError: for a network that has no meaning in the toy, with the nearest that has.
+        BundleError: for a bundle without calibration.
+        BadInput: for a folder that is taken.
+    """
+    given = bundle if isinstance(bundle, Bundle) else Bundle.load(Path(bundle))
+    if dataset is not None:
+        given = calibrated_on(given, dataset, warn)
+    return emit(integer_model(given), given, Path(out))

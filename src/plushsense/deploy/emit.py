@@ -1,0 +1,268 @@
+"""The export folder: the C library as it is, this model as data, golden vectors, and the facts of it all."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import uuid
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from plushsense import __version__
+from plushsense.core.errors import BadInput
+from plushsense.deploy.golden import write_golden
+from plushsense.models.bundle import Bundle
+from plushsense.models.image import HEAD_BYTES, IntegerModel, head, memory_bytes
+
+FACTS = "export.json"
+IMAGE = "plush_model.bin"
+BUNDLE = "model.plush"
+LIBRARY = ("plushsense.h", "plushsense.c")
+MODEL = ("plush_model.h", "plush_model.c")
+GOLDEN = "golden"
+TOY_BYTES = 288  # of a plush_toy where pointers have 32 bits (a test compiles it)
+_PEOPLE = ("subjects", "validation_subjects")
+_PER_LINE = 16
+
+Extra = Callable[[Path, dict[str, Any]], object]
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What an export wrote: ``files`` relative to ``folder``.
+
+    ``flash_bytes`` is the model's data (the code comes on top: ``plushsense profile`` measures it), ``ram_bytes`` the
+    memory of one toy with its struct, where pointers have 32 bits.
+    """
+
+    folder: Path
+    files: tuple[str, ...]
+    flash_bytes: int
+    ram_bytes: int
+    facts: dict[str, Any]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The object that ``plushsense export --json`` prints."""
+        return {
+            **{key: value for key, value in self.facts.items() if key != "files"},
+            "folder": str(self.folder),
+            "files": list(self.files),
+            "flash_bytes": self.flash_bytes,
+            "ram_bytes": self.ram_bytes,
+        }
+
+
+def emit(model: IntegerModel, bundle: Bundle, out: str | Path, extras: Sequence[Extra] = ()) -> Exported:
+    """Write an export folder; it appears whole or not at all.
+
+    Args:
+        model: what the toy will compute with, made from ``bundle``.
+        bundle: kept beside it, for names, scores and the float engine; who it was trained on is left out.
+        out: a folder that does not exist yet, or is empty.
+        extras: what else to write once the rest stands (packages for build systems, other formats).
+
+    Raises:
+        BadInput: when the folder holds something already, or cannot be written.
+    """
+    out = Path(out)
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise BadInput(f"'{out}' is there already, and an export overwrites nothing: give a new or empty folder.")
+    part = out.with_name(f".{out.name}-unfinished-{uuid.uuid4().hex[:8]}")
+    try:
+        part.mkdir(parents=True)
+        facts = _write(model, bundle, part)
+        for extra in extras:
+            extra(part, facts)
+        found = sorted(p.relative_to(part).as_posix() for p in part.rglob("*") if p.is_file())
+        facts["files"] = sorted({*found, FACTS})
+        (part / FACTS).write_text(json.dumps(facts, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        if out.exists():
+            out.rmdir()
+        part.rename(out)
+    except OSError as cause:
+        raise BadInput(f"The export '{out}' cannot be written ({cause}): choose another place.") from None
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+    return Exported(out, tuple(facts["files"]), facts["model_bytes"], facts["memory_bytes"] + TOY_BYTES, facts)
+
+
+def read_facts(folder: str | Path) -> dict[str, Any]:
+    """The facts of an export folder.
+
+    Raises:
+        BadInput: when it is none.
+    """
+    path = Path(folder) / FACTS
+    try:
+        facts = json.loads(path.read_text(encoding="utf-8"))
+        needed = {"title", "channels", "classes", "memory_bytes", "model_bytes"} - set(facts)
+    except FileNotFoundError:
+        raise BadInput(f"'{folder}' is no export: make one with plushsense export BUNDLE OUT.") from None
+    except (OSError, ValueError, TypeError) as cause:
+        raise BadInput(f"'{path}' cannot be read ({cause}): export the model again.") from None
+    if needed:
+        raise BadInput(f"'{path}' lacks {', '.join(sorted(needed))}: export the model again.")
+    return dict(facts)
+
+
+def _write(model: IntegerModel, bundle: Bundle, folder: Path) -> dict[str, Any]:
+    library = files("plushsense.deploy") / "c"
+    for name in LIBRARY:
+        (folder / name).write_bytes((library / name).read_bytes())
+    bundle = replace(bundle, provenance=without_people(bundle.provenance))
+    image = model.to_bytes()
+    facts = _facts(model, bundle, len(image))
+    (folder / IMAGE).write_bytes(image)
+    (folder / MODEL[0]).write_text(_header(facts), encoding="utf-8")
+    (folder / MODEL[1]).write_text(_source(model, facts), encoding="utf-8")
+    bundle.save(folder / BUNDLE)
+    write_golden(model, bundle.scaler, folder / GOLDEN)
+    return facts
+
+
+def _facts(model: IntegerModel, bundle: Bundle, model_bytes: int) -> dict[str, Any]:
+    arch, layout = model.network.arch, model.layout
+    names = c_names(model.gestures.labels)
+    return {
+        "title": arch.title,
+        "symbol": arch.symbol,
+        "filters": list(arch.filters),
+        "layout": layout.name,
+        "channels": [{"name": c.name, "unit": c.unit} for c in layout.channels],
+        "inputs": list(layout.inputs),
+        "classes": arch.classes,
+        "gestures": [
+            {"label": g.label, "affect": g.affect, "c_name": name}
+            for g, name in zip(model.gestures.gestures, names, strict=True)
+        ],
+        "step": arch.step,
+        "step_ms": arch.step * layout.period_us / 1000,
+        "span": arch.span,
+        "receptive_field": arch.receptive_field,
+        "pool": arch.pooled,
+        "period_us": layout.period_us,
+        "rate_hz": layout.rate_hz,
+        "gap_ms": layout.gap_ms,
+        "smoothing": model.smoothing,
+        "parameters": arch.parameters,
+        "macs_per_step": arch.macs_per_step,
+        "macs_per_window": arch.macs_per_window,
+        "model_bytes": model_bytes,
+        "memory_bytes": memory_bytes(model),
+        "simulated": bool(bundle.provenance.get("simulated", False)),
+        "provenance": bundle.provenance,
+        "code_version": __version__,
+    }
+
+
+def without_people(provenance: Mapping[str, Any]) -> dict[str, Any]:
+    """A bundle's provenance for strangers: how many people it was trained on, not who."""
+    names = {str(n) for key in _PEOPLE if isinstance(provenance.get(key), list) for n in provenance[key]}
+    named = re.compile(
+        "|".join(rf"(?<!\w){re.escape(n)}(?!\w)" for n in sorted(names, key=len, reverse=True)) or "(?!)"
+    )
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {key: plain(each) for key, each in value.items() if str(key) not in names}
+        if isinstance(value, list | tuple):
+            return [plain(each) for each in value]
+        return named.sub("…", value) if isinstance(value, str) else value
+
+    kept = {key: plain(value) for key, value in provenance.items() if key not in _PEOPLE}
+    return kept | {key: len(provenance[key]) for key in _PEOPLE if isinstance(provenance.get(key), list)}
+
+
+def c_names(labels: Sequence[str]) -> tuple[str, ...]:
+    """Labels as the ends of C identifiers, each different: ``Back stroke 1`` becomes ``BACK_STROKE_1``."""
+    found: list[str] = []
+    for label in labels:
+        plain = "".join(c if c.isascii() and c.isalnum() else " " for c in label)
+        name = "_".join(plain.upper().split()) or "GESTURE"
+        number, free = 2, name
+        while free in found:
+            number, free = number + 1, f"{name}_{number}"
+        found.append(free)
+    return tuple(found)
+
+
+def _comment(text: str) -> str:
+    """Text that may stand in a C comment."""
+    return text.replace("*/", "* /").replace("/*", "/ *").replace("\\", "/").replace("\n", " ")
+
+
+def _header(facts: dict[str, Any]) -> str:
+    gestures = "".join(
+        f"    PLUSH_{g['c_name']} = {i}, /* {_comment(g['label'])}: {g['affect']} */\n"
+        for i, g in enumerate(facts["gestures"])
+    )
+    channels = "".join(
+        f"    PLUSH_CHANNEL_{name} = {i}, /* {_comment(c['name'])}, {_comment(c['unit'])} */\n"
+        for i, (name, c) in enumerate(
+            zip(c_names([c["name"] for c in facts["channels"]]), facts["channels"], strict=True)
+        )
+    )
+    simulated = "\n * Trained on a simulation: it knows no real person's touch." if facts["simulated"] else ""
+    return f"""/*
+ * The model {_comment(facts["title"])}, as plushsense.c reads it. Made by PlushSense {facts["code_version"]}.
+ * A step of {facts["step_ms"]:g} ms; warming for {facts["span"]} samples at {facts["rate_hz"]:g} Hz.{simulated}
+ */
+#ifndef PLUSH_MODEL_H
+#define PLUSH_MODEL_H
+
+#include <stdint.h>
+
+#ifdef __cplusplus
+extern "C" {{
+#endif
+
+#define PLUSH_MODEL_BYTES {facts["model_bytes"]}u
+#define PLUSH_MODEL_MEMORY_BYTES {facts["memory_bytes"]}u /* what a toy with this model remembers in */
+#define PLUSH_MODEL_MEMORY_WORDS (PLUSH_MODEL_MEMORY_BYTES / 4u)
+#define PLUSH_MODEL_CHANNELS {len(facts["channels"])}
+#define PLUSH_MODEL_CLASSES {facts["classes"]}
+#define PLUSH_MODEL_PERIOD_US {facts["period_us"]}
+#define PLUSH_MODEL_STEP {facts["step"]} /* samples from one answer to the next */
+#define PLUSH_MODEL_SPAN {facts["span"]} /* samples until the first answer */
+
+/* The order of the values that plush_push() takes, in the layout '{_comment(facts["layout"])}'. */
+enum {{
+{channels}}};
+
+/* The classes. */
+enum {{
+{gestures}}};
+
+extern const uint8_t plush_model[PLUSH_MODEL_BYTES];
+
+#ifdef __cplusplus
+}}
+#endif
+#endif
+"""
+
+
+def _source(model: IntegerModel, facts: dict[str, Any]) -> str:
+    sections = model.sections()
+    top = head(b"".join(piece for _, piece in sections))
+    lines = [
+        "/*",
+        f" * The model {_comment(facts['title'])}: the bytes of {IMAGE}, section by section.",
+        " * Numbers of more than one byte are little-endian; weights stand with 128 added, for four filters at a time:",
+        " * for every tap, for every four channels, 4 weights of each filter. The format is told in PlushSense's",
+        " * models/image.",
+        " */",
+        '#include "plush_model.h"',
+        "",
+        "const uint8_t plush_model[PLUSH_MODEL_BYTES] = {",
+    ]
+    for what, piece in [(f"head: PLSH, version, bytes, CRC-32 of what follows ({HEAD_BYTES} bytes)", top), *sections]:
+        if what:
+            lines.append(f"    /* {_comment(what)} */")
+        for at in range(0, len(piece), _PER_LINE):
+            lines.append("    " + " ".join(f"{v}," for v in piece[at : at + _PER_LINE]))
+    return "\n".join([*lines, "};", ""])

@@ -1,0 +1,214 @@
+"""Golden vectors: frames that a toy may meet at its worst, and the answers that ``models/integer`` gives to them.
+
+The frames are made up: an export is given away, and no person's recording belongs in it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import BadInput
+from plushsense.core.signal import MAGNITUDE_FRACTION_BITS, Layout
+from plushsense.models.fixed import SMOOTH_EXTRA_BITS, smooth, softmax
+from plushsense.models.image import AFFECT_CODES, IntegerModel
+from plushsense.windows.clock import Clock
+from plushsense.windows.features import SampleInputs, Scaler
+
+FRAMES, ANSWERS = "frames.bin", "answers.bin"
+COLUMNS = ("frame", "ms", "sample", "state", "gesture", "affect", "confidence", "restarts", "invalid")
+Ints = NDArray[np.int64]
+_MS_BITS = 32
+_INT32 = -(1 << 31), (1 << 31) - 1
+
+
+def answers_of(model: IntegerModel, frames: Ints) -> NDArray[np.int32]:
+    """What the toy answers to frames (n, 1 + C), the first column its clock in ms: (answers, 9 + 2 K) int32.
+
+    The columns are `COLUMNS`, then the K logits in steps of 1/256 and the K smoothed probabilities in steps of 2^-27;
+    from gesture to confidence, logits and probabilities are 0 while warming. ``frame`` is the row that completed the
+    step, ``restarts`` and ``invalid`` the counts until then; times and counts wrap at 2^32.
+    """
+    arch, layout = model.network.arch, model.layout
+    affects = [AFFECT_CODES[g.affect] for g in model.gestures.gestures]
+    clock, inputs, stepper = Clock(layout), SampleInputs(layout), model.network.stepper()
+    classes, phase, period = arch.classes, arch.span % arch.step, layout.period_us
+    rows: list[list[int]] = []
+    mean: Ints | None = None
+    block: list[list[int]] = []
+    count = 0
+    for at, (ms, *values) in enumerate(frames.tolist()):
+        samples = clock.push(ms, values)
+        if clock.restarted:
+            stepper.reset()
+            mean, block, count = None, [], 0
+        for later, sample in zip(range(len(samples) - 1, -1, -1), samples, strict=True):
+            count += 1
+            block.append(inputs(sample))
+            if count % arch.step != phase:
+                continue
+            time_ms = ((clock.now_us or 0) - later * period) // 1000
+            logits = stepper.push(np.array(block, dtype=np.int64))
+            block = []
+            row = [at, time_ms, count, 0, 0, 0, 0, clock.restarts, clock.invalid, *[0] * (2 * classes)]
+            if logits:
+                mean = smooth(mean, softmax(logits[-1]), model.smoothing)
+                best = int(mean.argmax())
+                row[3:7] = 1, best, affects[best], int(mean[best]) >> SMOOTH_EXTRA_BITS
+                row[9:] = [*logits[-1].tolist(), *mean.tolist()]
+            rows.append(row)
+    table = np.array(rows, dtype=np.int64).reshape(len(rows), len(COLUMNS) + 2 * classes)
+    return (table & 0xFFFFFFFF).astype(np.uint32).view(np.int32)
+
+
+def golden_frames(layout: Layout, scaler: Scaler, span: int, seed: int = 1) -> Ints:
+    """Frames (n, 1 + C) that try what can go wrong: the first column is the toy's clock in ms.
+
+    Each part lasts longer than ``span``, so that every restart is followed by answers: touches with a jittering clock
+    and lost frames; values out of range (also from the start, where there is no valid one yet); gaps just bridged and
+    just too long; equal stamps; a clock that starts again; channels stuck at the ends of their range, and jumping
+    between them; the clock's wrap at 2^32.
+    """
+    make = _Maker(layout, scaler, np.random.default_rng(seed))
+    part = span + 150
+    make.touches(6, garbage_channel=0)
+    make.touches(part + 300, lost=0.03)
+    make.touches(part, garbage=0.05)
+    make.wait(layout.gap_ms)
+    make.touches(60)
+    make.wait(layout.gap_ms + 1)
+    make.touches(part, equal=0.1)
+    make.now = 5
+    make.touches(part)
+    for kind in ("low", "high", "jump"):
+        make.extremes(span + 30, kind)
+    make.touches(part)
+    make.now = (1 << _MS_BITS) - 1 - part * 6
+    make.touches(part + 300)
+    return np.array(make.rows, dtype=np.int64)
+
+
+class _Maker:
+    """Frames one after the other; ``now`` is the next one's time in ms."""
+
+    def __init__(self, layout: Layout, scaler: Scaler, rng: np.random.Generator) -> None:
+        self.layout, self.rng = layout, rng
+        self.low, self.high = layout.valid_min_int, layout.valid_max_int
+        self.mean, self.spread = _measured(layout, scaler)
+        self.rows: list[list[int]] = []
+        self.now = 1000
+        self._owed = 0.0
+        self._walk = np.zeros(len(self.mean))
+        self._phase = rng.uniform(0, 6, len(self.mean))
+
+    def pace(self) -> int:
+        """Milliseconds to the next frame, on the average one period."""
+        self._owed += self.layout.period_us / 1000
+        whole = int(self._owed)
+        self._owed -= whole
+        return whole
+
+    def wait(self, ms: int) -> None:
+        """The next frame comes so long after the last one."""
+        self.now = self.rows[-1][0] + ms
+
+    def put(self, values: Ints) -> None:
+        self.rows.append([self.now & 0xFFFFFFFF, *values.tolist()])
+
+    def touches(
+        self, n: int, *, lost: float = 0.0, garbage: float = 0.0, equal: float = 0.0, garbage_channel: int | None = None
+    ) -> None:
+        """Something like gestures: a slow wandering, at times a rhythm, noise."""
+        rng, c = self.rng, len(self.mean)
+        for k in range(n):
+            self._walk = 0.98 * self._walk + 0.2 * rng.normal(size=c)
+            rhythm = np.sin(len(self.rows) * (0.05 + 0.02 * (k // 97 % 9)) + self._phase) * (k // 61 % 3)
+            wanted = self.mean + self.spread * (self._walk + rhythm + 0.1 * rng.normal(size=c))
+            values = np.clip(np.rint(wanted), self.low, self.high).astype(np.int64)
+            spoilt = np.flatnonzero(rng.random(c) < garbage)
+            if garbage_channel is not None:
+                spoilt = np.array([garbage_channel])
+            for channel in spoilt:
+                values[channel] = self._garbage(int(channel))
+            if rng.random() >= lost:
+                self.put(values)
+            if rng.random() >= equal:
+                self.now += max(0, self.pace() + int(rng.integers(-2, 3)))
+
+    def extremes(self, n: int, kind: str) -> None:
+        for k in range(n):
+            top = kind == "high" or (kind == "jump" and bool(k // 3 % 2))
+            self.put(self.high if top else self.low)
+            self.now += self.pace()
+
+    def _garbage(self, channel: int) -> int:
+        """A value out of the channel's range, where 32 bits have one."""
+        low, high = int(self.low[channel]), int(self.high[channel])
+        outside = [v for v in (low - 1, high + 1, *_INT32) if not low <= v <= high and _INT32[0] <= v <= _INT32[1]]
+        return int(self.rng.choice(outside)) if outside else int(self.rng.integers(low, high))
+
+
+def _measured(layout: Layout, scaler: Scaler) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Mean and spread of each measured channel that the scaling of the inputs speaks of."""
+    c = len(layout.channels)
+    mean, spread = np.zeros(c), np.full(c, 100.0)
+    derived = {d.name: d.of for d in layout.derived}
+    for name, offset, scale in zip(layout.inputs, scaler.offset, scaler.scale, strict=True):
+        parts = derived.get(name, (name,))
+        unit = len(parts) ** 0.5 * (1 << MAGNITUDE_FRACTION_BITS) if name in derived else 1.0
+        for part in parts:
+            mean[layout.index(part)] = offset / unit
+            spread[layout.index(part)] = max(1.0, 1 / scale / unit)
+    return mean, spread
+
+
+def write_golden(model: IntegerModel, scaler: Scaler, folder: Path) -> list[Path]:
+    """Write the golden vectors into a folder: `FRAMES`, `ANSWERS` and what they hold."""
+    frames = golden_frames(model.layout, scaler, model.network.arch.span)
+    answers = answers_of(model, frames)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / FRAMES).write_bytes((frames & 0xFFFFFFFF).astype("<u4").tobytes())
+    (folder / ANSWERS).write_bytes(answers.astype("<i4").tobytes())
+    classes = model.network.arch.classes
+    (folder / "README.md").write_text(
+        f"""# Golden vectors
+
+Made up, no person's recording: {len(frames)} frames with lost ones, garbage, gaps, clock resets and a wrap of the
+clock, and the {len(answers)} answers that PlushSense gives to them. `plushsense verify` feeds them to the C in this
+export and compares every number.
+
+- `{FRAMES}`: rows of 32-bit little-endian numbers: the toy's clock in ms (unsigned), then the measured channels
+  ({", ".join(model.layout.names)}).
+- `{ANSWERS}`: rows of 32-bit little-endian numbers: {", ".join(COLUMNS)}, {classes} logits in steps of 1/256,
+  {classes} smoothed probabilities in steps of 2^-27. From gesture to confidence, logits and probabilities are 0 while
+  warming.
+""",
+        encoding="utf-8",
+    )
+    return [folder / FRAMES, folder / ANSWERS, folder / "README.md"]
+
+
+def read_golden(folder: Path, channels: int, classes: int) -> tuple[Ints, NDArray[np.int32]]:
+    """The frames (n, 1 + C) and answers (m, 9 + 2 K) of a folder.
+
+    Raises:
+        BadInput: for a file that is missing or does not hold whole rows.
+    """
+    found = []
+    for name, columns, kind in ((FRAMES, 1 + channels, "<i4"), (ANSWERS, len(COLUMNS) + 2 * classes, "<i4")):
+        path = folder / name
+        try:
+            data = path.read_bytes()
+        except OSError as cause:
+            raise BadInput(f"The golden vectors '{path}' cannot be read ({cause}): export the model again.") from None
+        if not data or len(data) % (4 * columns):
+            raise BadInput(
+                f"The golden vectors '{path}' have {len(data)} bytes, which are no whole rows of {columns} numbers: "
+                "export the model again."
+            )
+        found.append(np.frombuffer(data, dtype=kind).reshape(-1, columns))
+    frames = found[0].astype(np.int64)
+    frames[:, 0] &= 0xFFFFFFFF
+    return frames, found[1].astype(np.int32)

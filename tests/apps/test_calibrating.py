@@ -1,0 +1,53 @@
+"""Training keeps a calibration of its own people's windows; a bundle of before gets the same from its data set."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import plushsense as ps
+from plushsense.apps.calibrating import calibrated_on
+from plushsense.apps.preparation import choose_classes, windows_for
+from plushsense.core.errors import BundleError
+from plushsense.dataset.store import Dataset
+from plushsense.deploy.calibration import calibration, integer_model
+from plushsense.windows.cut import WindowSpec
+
+
+def test_training_calibrates_on_the_windows_it_trained_on_and_no_others(dataset: Dataset) -> None:
+    bundle = ps.train(dataset, epochs=1, filters=(4, 4, 4)).bundle
+    spec = WindowSpec(**bundle.windowing)
+    windows = windows_for(dataset, bundle.arch, spec, choose_classes(dataset, "all"))
+    trained_on = np.isin(windows.subject, bundle.provenance["subjects"])
+    assert 0 < trained_on.sum() < len(windows), "somebody was held back"
+
+    def of(mask: np.ndarray) -> dict[str, object]:
+        return calibration(bundle.arch, bundle.weights, bundle.scaler, windows.x[mask])
+
+    assert bundle.calibration == of(trained_on)
+    assert bundle.calibration != of(np.ones(len(windows), dtype=bool)), "held-back people would show"
+    again = calibrated_on(replace(bundle, calibration={}), dataset)
+    assert again.calibration == bundle.calibration
+    assert integer_model(again).to_bytes() == integer_model(bundle).to_bytes()
+
+
+def test_data_of_other_content_is_used_with_a_word_and_of_other_people_refused(dataset: Dataset) -> None:
+    bundle = replace(ps.train(dataset, epochs=1, filters=(4, 4, 4)).bundle, calibration={})
+    said: list[str] = []
+    origin = bundle.provenance
+    other = replace(bundle, provenance=origin | {"dataset_hash": "0", "subjects": [*origin["subjects"], "P99"]})
+    assert calibrated_on(other, dataset, said.append).calibration
+    assert any("content" in line for line in said) and any("P99" in line for line in said)
+    with pytest.raises(BundleError, match="holds no window of the 1 people"):
+        calibrated_on(replace(bundle, provenance=origin | {"subjects": ["P99"]}), dataset)
+    with pytest.raises(BundleError, match="held-back ones could slip in"):
+        calibrated_on(replace(bundle, provenance=origin | {"split": "windows:holdout"}), dataset)
+
+
+def test_the_classifier_of_arrays_has_a_calibration(scikit_learn: None) -> None:
+    rng = np.random.default_rng(0)
+    x = np.cumsum(rng.normal(size=(24, 3, 160)), axis=2)
+    model = ps.PlushClassifier(arch="5d1_4d2", filters=(4, 4), epochs=1, random_state=0).fit(x, np.arange(24) % 2)
+    assert integer_model(model.to_bundle()).to_bytes()

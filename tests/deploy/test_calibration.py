@@ -1,0 +1,95 @@
+"""A bundle carries what its toy needs: ranges of training windows, and from them always the same whole numbers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from plushsense.core.errors import ArchError, BundleError
+from plushsense.core.gestures import Gesture, GestureSet
+from plushsense.core.signal import load_layout
+from plushsense.deploy.calibration import calibrated, calibration, integer_model, integer_network
+from plushsense.deploy.quantize import Ranges
+from plushsense.live.decide import DecideSpec
+from plushsense.models.arch import Arch
+from plushsense.models.bundle import Bundle
+from plushsense.models.reference import random_weights
+from plushsense.windows.features import Scaler
+
+GESTURES = GestureSet("three", (Gesture("tap", "positive"), Gesture("hold", "neutral"), Gesture("hit", "negative")))
+
+
+def windows(seed: int = 0, n: int = 30, samples: int = 60) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return np.rint(np.cumsum(rng.normal(size=(n, 3, samples)), axis=2) * 300).astype(np.int32)
+
+
+def make(padding: str = "stream", norm: str = "batch") -> Bundle:
+    arch = Arch.parse("5d1_4d3", (6, 5), channels=3, classes=3, padding=padding, norm=norm, window=48, step=4)
+    return Bundle(arch, random_weights(arch, 3), load_layout("accel-3"), Scaler.fit(windows()), GESTURES)
+
+
+def test_the_same_bundle_gives_the_same_image_also_once_it_was_saved() -> None:
+    one, two = calibrated(make(), windows()), calibrated(make(), windows())
+    image = integer_model(one).to_bytes()
+    assert image == integer_model(two).to_bytes()
+    assert image == integer_model(Bundle.from_bytes(one.to_bytes())).to_bytes()
+    assert image != integer_model(calibrated(make(), windows() * 2)).to_bytes(), "the ranges matter"
+
+
+def test_the_whole_numbers_answer_as_the_floats_do() -> None:
+    bundle = calibrated(make(), windows())
+    x = windows(seed=1, n=200)
+    wanted = bundle.network().forward(bundle.scaler.apply(x))
+    found = integer_network(bundle).forward(x) / 256
+    assert (wanted.argmax(axis=1) == found.argmax(axis=1)).mean() > 0.95
+    assert np.abs(wanted - found).max() < 0.15 * np.abs(wanted).max()
+
+
+def test_the_smoothing_is_the_bundles_unless_told_otherwise() -> None:
+    bundle = calibrated(replace(make(), decision={"smoothing_s": 0.0}), windows())
+    assert integer_model(bundle).smoothing == 1 << 15
+    step_s = bundle.arch.step / bundle.layout.rate_hz
+    assert integer_model(bundle, DecideSpec(0.3)).smoothing == round(-np.expm1(-step_s / 0.3) * 2**15)
+
+
+def test_no_more_than_ranges_is_kept() -> None:
+    bundle = make()
+    kept = calibration(bundle.arch, bundle.weights, bundle.scaler, windows(n=500))
+    again = calibration(bundle.arch, bundle.weights, bundle.scaler, windows(n=30))
+    shapes = [{name: [np.shape(v) for v in values] for name, values in table.items()} for table in (kept, again)]
+    assert shapes[0] == shapes[1], "what is kept does not grow with the recordings"
+    assert Ranges.from_dict(kept).to_dict() == kept
+
+
+@pytest.mark.parametrize(("padding", "norm", "named"), [("mirror", "batch", "mirror"), ("stream", "layer", "layer")])
+def test_what_cannot_be_deployed_has_no_calibration_and_says_why(padding: str, norm: str, named: str) -> None:
+    bundle = make(padding, norm)
+    assert calibration(bundle.arch, bundle.weights, bundle.scaler, windows()) == {}
+    for refused in (integer_model, lambda b: calibrated(b, windows())):
+        with pytest.raises(ArchError, match=named):
+            refused(bundle)
+
+
+def test_a_bundle_without_calibration_says_what_to_do() -> None:
+    with pytest.raises(BundleError, match=r"no calibration.*train it again.*--dataset"):
+        integer_model(make())
+    with pytest.raises(BundleError, match="no windows to calibrate on"):
+        calibrated(make(), windows()[:0])
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [
+        {"low": [0.0] * 3, "high": [1.0] * 3},
+        {"low": [0.0] * 2, "high": [1.0] * 2, "tops": [[1.0] * 6, [1.0] * 5]},
+        {"low": [0.0] * 3, "high": [1.0] * 3, "tops": [[1.0] * 6]},
+        {"low": [0.0] * 3, "high": [1.0, 2.0, None], "tops": [[1.0] * 6, [1.0] * 5]},
+        {"low": "x", "high": [1.0] * 3, "tops": [[1.0] * 6, [1.0] * 5]},
+    ],
+)
+def test_a_calibration_of_another_network_or_of_no_numbers_is_refused(broken: dict[str, object]) -> None:
+    with pytest.raises(BundleError, match="train again"):
+        integer_model(replace(make(), calibration=broken))

@@ -1,0 +1,152 @@
+"""The export folder: what stands in it, that it compiles, that nothing is overwritten and nobody is named."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from plushsense.core.errors import BadInput
+from plushsense.core.gestures import GestureSet, load_gestures
+from plushsense.core.signal import load_layout
+from plushsense.deploy.emit import TOY_BYTES, c_names, emit, read_facts, without_people
+from plushsense.deploy.golden import answers_of, golden_frames, read_golden
+from plushsense.deploy.quantize import calibrate, quantize
+from plushsense.models.arch import Arch
+from plushsense.models.bundle import Bundle
+from plushsense.models.image import IntegerModel, memory_bytes
+from plushsense.models.reference import Network, random_weights
+from plushsense.windows.features import Scaler
+
+PEOPLE = {"subjects": ["Anna", "P02"], "validation_subjects": ["Bo"], "scores": {"said": "people: Bo, P02", "f1": 0.5}}
+
+
+def made(layout: str = "accel-3", symbol: str = "9d1_5d2", filters: str = "4,6") -> tuple[IntegerModel, Bundle]:
+    read = load_layout(layout)
+    gestures = load_gestures("plush-18")
+    arch = Arch.parse(symbol, filters, channels=read.n_inputs, classes=len(gestures), window=60)
+    weights = random_weights(arch, 3)
+    rng = np.random.default_rng(1)
+    windows = np.rint(np.cumsum(rng.normal(size=(12, arch.channels, arch.span + 40)), axis=2) * 60 + 900).astype(
+        np.int64
+    )
+    scaler = Scaler.fit(windows)
+    network = quantize(arch, weights, scaler, calibrate(Network(arch, weights), scaler.apply(windows)))
+    bundle = Bundle(arch, weights, read, scaler, gestures, provenance=dict(PEOPLE))
+    return IntegerModel(network, read, gestures, 5000), bundle
+
+
+def test_the_folder(tmp_path: Path) -> None:
+    model, bundle = made()
+    done = emit(model, bundle, tmp_path / "out")
+    assert {
+        "plushsense.h",
+        "plushsense.c",
+        "plush_model.h",
+        "plush_model.c",
+        "plush_model.bin",
+        "model.plush",
+        "golden/frames.bin",
+        "golden/answers.bin",
+        "golden/README.md",
+        "export.json",
+    } <= set(done.files)
+    assert {p.relative_to(tmp_path / "out").as_posix() for p in (tmp_path / "out").rglob("*") if p.is_file()} == set(
+        done.files
+    )
+    facts = read_facts(tmp_path / "out")
+    assert facts["memory_bytes"] == memory_bytes(model)
+    assert (tmp_path / "out" / "plush_model.bin").read_bytes() == model.to_bytes()
+    assert done.flash_bytes == len(model.to_bytes()) == facts["model_bytes"]
+    assert json.loads(json.dumps(done.to_dict()))["ram_bytes"] == facts["memory_bytes"] + TOY_BYTES
+    frames, answers = read_golden(tmp_path / "out" / "golden", 3, 18)
+    assert np.array_equal(answers, answers_of(model, frames))
+    assert set(answers[:, 3]) == {0, 1}
+    assert answers[-1, 7] >= 4  # restarts: two gaps or resets, a wrap, …
+    assert answers[-1, 8] > 25  # invalid values
+    with pytest.raises(BadInput, match="overwrites nothing"):
+        emit(model, bundle, tmp_path / "out")
+    assert not list(tmp_path.glob(".out*"))
+
+
+def test_a_folder_that_cannot_be_finished_leaves_nothing(tmp_path: Path) -> None:
+    def fail(folder: Path, facts: object) -> None:
+        raise OSError("no more")
+
+    with pytest.raises(BadInput, match="no more"):
+        emit(*made(), tmp_path / "out", extras=[fail])
+    assert not list(tmp_path.iterdir())
+
+
+def test_nobody_is_named(tmp_path: Path) -> None:
+    emit(*made(), tmp_path / "out")
+    for path in (tmp_path / "out").rglob("*"):
+        if path.is_file():
+            assert not any(name in path.read_bytes() for name in (b"Anna", b"P02", b"Bo,"))
+    assert without_people(PEOPLE) == {
+        "subjects": 2,
+        "validation_subjects": 1,
+        "scores": {"said": "people: …, …", "f1": 0.5},
+    }
+
+
+@pytest.mark.parametrize("layout", ["plush-15", "phone-6"])
+def test_golden_frames_reach_what_they_should(layout: str) -> None:
+    model, bundle = made(layout)
+    read = model.layout
+    frames = golden_frames(read, bundle.scaler, model.network.arch.span)
+    steps = np.diff(frames[:, 0])
+    assert (
+        (steps == read.gap_ms).any()
+        and (steps > read.gap_ms).any()
+        and (steps == 0).any()
+        and (steps < -(1 << 31)).any()
+    )
+    values = frames[:, 1:]
+    assert (values == read.valid_min_int).all(axis=1).any() and (values == read.valid_max_int).all(axis=1).any()
+    assert ((values < read.valid_min_int) | (values > read.valid_max_int)).any()
+    assert values.min() >= -(1 << 31) and values.max() < 1 << 31
+
+
+def test_the_model_as_c(tmp_path: Path, c_compiler: str) -> None:
+    model, bundle = made()
+    emit(model, bundle, tmp_path / "out")
+    main = tmp_path / "main.c"
+    main.write_text(
+        '#include <stdio.h>\n#include "plush_model.h"\n#include "plushsense.h"\n'
+        "static uint32_t memory[PLUSH_MODEL_MEMORY_WORDS];\nstatic plush_toy toy;\n"
+        "int main(void) { fwrite(plush_model, 1, PLUSH_MODEL_BYTES, stdout);\n"
+        "return (int)plush_begin(&toy, plush_model, PLUSH_MODEL_BYTES, memory, sizeof memory) + PLUSH_AT_REST; }\n"
+    )
+    out = tmp_path / "out"
+    words = [c_compiler, "-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror", f"-I{out}"]
+    sources = [str(main), str(out / "plushsense.c"), str(out / "plush_model.c")]
+    subprocess.run([*words, *sources, "-o", str(tmp_path / "run")], check=True)
+    ran = subprocess.run([str(tmp_path / "run")], capture_output=True, check=True)
+    assert ran.stdout == model.to_bytes()
+
+
+def test_c_names() -> None:
+    labels = ("Back stroke 1", "back-stroke 1", "3 taps", "Öhr", "!", "Back stroke 1 2")
+    assert c_names(labels) == ("BACK_STROKE_1", "BACK_STROKE_1_2", "3_TAPS", "HR", "GESTURE", "BACK_STROKE_1_2_2")
+
+
+def test_labels_cannot_break_out_of_comments(tmp_path: Path) -> None:
+    model, bundle = made()
+    table = bundle.gestures.to_dict()
+    table["gestures"][0]["label"] = "a */ int b; /* \\"
+    gestures = GestureSet.from_dict(table, "test")
+    changed = IntegerModel(model.network, model.layout, gestures, model.smoothing)
+    emit(changed, Bundle(bundle.arch, bundle.weights, bundle.layout, bundle.scaler, gestures), tmp_path / "out")
+    assert "a */" not in (tmp_path / "out" / "plush_model.c").read_text()
+
+
+def test_no_export_is_said(tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match="is no export"):
+        read_facts(tmp_path)
+    (tmp_path / "export.json").write_text("{}")
+    with pytest.raises(BadInput, match="lacks channels"):
+        read_facts(tmp_path)
