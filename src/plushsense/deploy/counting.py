@@ -32,8 +32,9 @@ class Cost:
     """What one target says. Instructions, bytes; None where the target counts nothing (the host).
 
     ``step`` is the mean over `STEPS` decisions with the jitter of a real toy, ``even`` with even stamps,
-    ``step_most`` the dearest of them; ``gap`` is the dearest single call, which bridges the longest gap; ``stages`` of
-    an even step, ``clock`` what they leave of it. ``stack_functions`` is what the compiler says of each function.
+    ``step_most`` the dearest of them; ``gap`` is the dearest single call, which bridges the longest gap; ``stages``
+    add up to ``step``, ``clock`` (with the check of values) being what the others leave of it. ``stack_functions`` is
+    what the compiler says of each function.
     """
 
     target: str
@@ -130,7 +131,7 @@ def count(folder: Path, target: str, facts: Mapping[str, Any], optimise: str = "
                 target, sources, work / "stages", include=[folder], defines=defines, optimise=optimise, blobs=blobs
             )
             stages = _stages(staged)
-            stages = {"clock": _mean(rows_even[:, 0]) - sum(stages.values()), **stages}
+            stages = {"clock": _mean(rows_jittered[:-1, 0]) - sum(stages.values()), **stages}
         objects = {"plushsense": whole.objects[2], "plush_model": whole.objects[1]}
         return Cost(
             target=target,
@@ -157,17 +158,19 @@ def _mean(counts: Ints) -> int:
 def _streams(folder: Path, facts: Mapping[str, Any]) -> tuple[Ints, Ints]:
     """Frames at even times, and the same readings with jitter and, at the end, the longest gap that is bridged.
 
-    The readings are the clean touches near the beginning of the golden frames.
+    The readings are the clean touches near the beginning of the golden frames. What is counted begins and ends with a
+    frame without jitter, so that it holds whole samples only.
     """
     span, step, period_us = int(facts["span"]), int(facts["step"]), int(facts["period_us"])
     frames, _ = read_golden(folder / GOLDEN, len(facts["channels"]), int(facts["classes"]))
     clean = frames[6 : 6 + span, 1:]
     if len(clean) < span:
         raise BadInput(f"'{folder / GOLDEN}' holds too few frames: export the model again.")
-    n = span + (STEPS + 1) * step
+    n = span + STEPS * step
     values = np.resize(clean, (n, clean.shape[1]))
     at_us = 1_000_000 + np.arange(n) * period_us
     jitter = np.random.default_rng(5).integers(-period_us // 5, period_us // 5 + 1, n)
+    jitter[[0, span - 1, n - 1]] = 0
     even = np.column_stack([at_us // 1000, values])
     jittered = np.column_stack([(at_us + jitter) // 1000, values])
     last = np.concatenate([[jittered[-1, 0] + int(facts["gap_ms"])], values[0]])
@@ -180,17 +183,18 @@ def _written(frames: Ints, file: Path) -> Path:
 
 
 def _whole(program: Program, step: int) -> tuple[list[int], Ints, Ints]:
-    """Five numbers about the toy; then rows (steps, 3) of the even and of the jittered stream, tracking only."""
+    """Five numbers about the toy; then the rows (`STEPS`, 3) after the first decision of the even stream, and those of
+    the jittered one with the gap's as one more."""
     numbers = np.frombuffer(program.run(), dtype="<u4").astype(np.int64)
     table = numbers[5:].reshape(-1, 3)
     first = int(np.flatnonzero(table[:, 2] == 2)[0])
-    streams = [part[part[:, 2] == 1] for part in (table[:first], table[first + 1 : -1])]
-    if min(len(part) for part in streams) < STEPS:
+    even, jittered = (part[part[:, 2] == 1][1:] for part in (table[:first], table[first + 1 : -1]))
+    if (len(even), len(jittered)) != (STEPS, STEPS + 1):
         raise ProgramError(
-            f"The C in the export gave fewer answers on {program.target.name} than {STEPS} steps of {step} samples "
-            "should: plushsense verify says where it goes wrong."
+            f"The C in the export gave {len(even)} answers on {program.target.name} where {STEPS} steps of {step} "
+            "samples should: plushsense verify says where it goes wrong."
         )
-    return numbers[:5].tolist(), streams[0], streams[1]
+    return numbers[:5].tolist(), even, jittered
 
 
 def _stages(program: Program) -> dict[str, int]:
