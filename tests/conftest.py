@@ -58,6 +58,24 @@ def c_compiler() -> str:
 
 
 @pytest.fixture(scope="session")
+def all_compilers(c_compiler: str) -> None:
+    """Every compiler of this machine that the toy's C is tried with."""
+    for tool in ("clang", "g++"):
+        if shutil.which(tool) is None:
+            missing("compilers", f"{tool} is not installed")
+
+
+@pytest.fixture(scope="session")
+def emulators(c_compiler: str) -> None:
+    """Compilers and emulators of every chip."""
+    from plushsense.deploy.targets import TARGETS, missing_tools
+
+    for name in TARGETS:
+        if lacks := missing_tools(name):
+            missing("emulators", f"{name} lacks {' '.join(lacks)}")
+
+
+@pytest.fixture(scope="session")
 def lsl_possible() -> None:
     """The lab streaming layer, and a network on which a stream of this process is found."""
     try:
