@@ -7,7 +7,7 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -123,6 +123,19 @@ def scikit_learn() -> None:
     """Scikit-learn (extra baselines)."""
     if importlib.util.find_spec("sklearn") is None:
         missing("baselines", "sklearn is not installed")
+
+
+@pytest.fixture(scope="session")
+def target_here() -> Callable[[str], str]:
+    """Makes sure that programs can be built for a target of `plushsense.deploy.targets` and run, and hands it back."""
+    from plushsense.deploy.targets import missing_tools
+
+    def here(target: str) -> str:
+        if packages := missing_tools(target):
+            missing("compilers" if target == "host" else "emulators", f"{target} needs {' '.join(packages)}")
+        return target
+
+    return here
 
 
 # Bytes: a small /dev/shm must hold two.
