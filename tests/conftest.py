@@ -7,7 +7,7 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +55,18 @@ def c_compiler() -> str:
     if shutil.which("gcc") is None:
         missing("compilers", "gcc is not installed")
     return "gcc"
+
+
+@pytest.fixture(scope="session")
+def installed() -> Callable[..., None]:
+    """Asks for compilers by the names of their programs."""
+
+    def ask(*programs: str) -> None:
+        for program in programs:
+            if shutil.which(program) is None:
+                missing("compilers", f"{program} is not installed")
+
+    return ask
 
 
 @pytest.fixture(scope="session")
