@@ -131,6 +131,28 @@ def mlflow_here() -> None:
 
 
 @pytest.fixture(scope="session")
+def onnx_here() -> None:
+    """ONNX and the runtime that tries it (extra onnx)."""
+    for module in ("onnx", "onnxruntime"):
+        if importlib.util.find_spec(module) is None:
+            missing("onnx", f"{module} is not installed")
+
+
+@pytest.fixture(scope="session")
+def litert_here() -> None:
+    """LiteRT (extra tflite)."""
+    if importlib.util.find_spec("ai_edge_litert") is None:
+        missing("tflite", "ai-edge-litert is not installed")
+
+
+@pytest.fixture(scope="session")
+def espdl_here() -> None:
+    """Espressif's quantizer (extra espdl), which wants an environment of its own."""
+    if importlib.util.find_spec("esp_ppq") is None:
+        missing("espdl", "esp-ppq is not installed")
+
+
+@pytest.fixture(scope="session")
 def scikit_learn() -> None:
     """Scikit-learn (extra baselines)."""
     if importlib.util.find_spec("sklearn") is None:
