@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,9 +11,10 @@ import pytest
 import plushsense as ps
 from plushsense.apps.calibrating import calibrated_on
 from plushsense.apps.preparation import choose_classes, windows_for
-from plushsense.core.errors import BundleError
+from plushsense.core.errors import ArchError, BundleError, ConfigError
 from plushsense.dataset.store import Dataset
 from plushsense.deploy.calibration import calibration, integer_model
+from plushsense.models.bundle import Bundle
 from plushsense.windows.cut import WindowSpec
 
 
@@ -51,3 +53,36 @@ def test_the_classifier_of_arrays_has_a_calibration(scikit_learn: None) -> None:
     x = np.cumsum(rng.normal(size=(24, 3, 160)), axis=2)
     model = ps.PlushClassifier(arch="5d1_4d2", filters=(4, 4), epochs=1, random_state=0).fit(x, np.arange(24) % 2)
     assert integer_model(model.to_bundle()).to_bytes()
+
+
+def test_fine_tuning_for_8_bits_keeps_the_ranges_it_was_made_for(dataset: Dataset, tmp_path: Path) -> None:
+    said: list[str] = []
+    plain = ps.train(dataset, epochs=4, filters=(4, 4, 4), warn=said.append)
+    tuned = ps.train(dataset, epochs=4, filters=(4, 4, 4), quantize_aware=2)
+    assert tuned.bundle.calibration == plain.bundle.calibration
+    assert not np.array_equal(tuned.bundle.weights["dense.weight"], plain.bundle.weights["dense.weight"])
+    assert (plain.bundle.provenance["quantize_aware"], tuned.bundle.provenance["quantize_aware"]) == (0, 2)
+    again = Bundle.load(tuned.save(tmp_path / "m.plush"))
+    assert integer_model(again).to_bytes() == integer_model(tuned.bundle).to_bytes()
+    for one in (plain, tuned):
+        found = one.scores["int8"]
+        assert 0.5 < found["agreement"] <= 1 and 0 <= found["macro_f1"] <= 1
+    poor = plain.scores["int8"]["agreement"] < 0.95
+    assert any("--quantize-aware" in line for line in said) == poor
+    assert ps.train(dataset, epochs=1, filters=(4, 4, 4), padding="mirror").scores["int8"] is None
+
+
+def test_fine_tuning_what_cannot_be_deployed_is_refused_before_training(dataset: Dataset) -> None:
+    with pytest.raises(ArchError, match="mirror"):
+        ps.train(dataset, epochs=1, filters=(4, 4, 4), padding="mirror", quantize_aware=1)
+    with pytest.raises(ConfigError, match="quantize_aware is -1"):
+        ps.train(dataset, epochs=1, filters=(4, 4, 4), quantize_aware=-1)
+
+
+def test_many_changed_answers_are_said(dataset: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    from plushsense.apps import api
+
+    monkeypatch.setattr(api, "_AGREEMENT", 1.1)
+    said: list[str] = []
+    ps.train(dataset, epochs=1, filters=(4, 4, 4), warn=said.append)
+    assert [line for line in said if "8 bits change" in line and "--quantize-aware 10" in line]

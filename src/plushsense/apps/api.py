@@ -18,6 +18,7 @@ from plushsense import __version__
 from plushsense.apps.config import RunConfig, from_settings
 from plushsense.apps.preparation import Warn, choose_classes, opened, silent, windows_for
 from plushsense.apps.reporting import check_place, save_evaluation
+from plushsense.core.errors import ConfigError
 from plushsense.core.gestures import NOBODY
 from plushsense.dataset.importers import import_recordings
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
@@ -38,6 +39,9 @@ from plushsense.windows.cut import WindowSet
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+# Of the held-back windows, the share on which float and 8 bits have to say the same; below it training says so.
+_AGREEMENT = 0.95
 
 EpochProgress = Callable[[int, int, dict[str, Any]], None]
 
@@ -96,6 +100,7 @@ def train(
     *,
     arch: str | None = None,
     filters: Sequence[int] | str | None = None,
+    quantize_aware: int = 0,
     progress: EpochProgress | None = None,
     warn: Warn = silent,
     **settings: Any,
@@ -109,20 +114,34 @@ def train(
     Args:
         config: resolved settings; or give ``arch``, ``filters`` and settings such as ``preset="loso"``,
             ``context="loop"``, ``epochs=20``, ``seed=1``, ``classes="all"``, ``padding``, ``norm``.
+        quantize_aware: epochs of fine-tuning for 8 bits after the training (see `training.quantized`); 0: none.
         progress: called with (epoch, epochs at most, the epoch's row).
-        warn: called with one sentence for everything that was left out.
+        warn: called with one sentence for everything that was left out, and when 8 bits change many answers.
     """
     dataset = opened(dataset)
     config = config or from_settings(arch=arch, filters=filters, **settings)
+    if quantize_aware < 0:
+        raise ConfigError(f"quantize_aware is {quantize_aware}: accepted are 0 (off) and more epochs.")
     gestures = choose_classes(dataset, config.evaluation.classes, warn)
     network = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
+    if quantize_aware:
+        refuse_undeployable(network)
     windows = windows_for(dataset, network, config.windows, gestures, warn)
     division = _divide(windows, config)
     train_at, test_at = division.train, division.fold.test
     from plushsense.training.fit import fit, predict
 
     fitted = fit(windows.take(train_at), windows.take(division.watch), network, config.training, progress)
-    probabilities = predict(network, fitted.weights, fitted.scaler, windows.take(test_at), config.training.device)
+    weights, scaler = fitted.weights, fitted.scaler
+    kept = calibration(network, weights, scaler, windows.x[train_at])
+    if quantize_aware:
+        from plushsense.training.quantized import fine_tune
+
+        mine = windows.take(train_at)
+        tuned = fine_tune(mine, network, weights, scaler, kept, config.training, quantize_aware, progress)
+        weights = tuned.weights
+    test = windows.take(test_at)
+    probabilities = predict(network, weights, scaler, test, config.training.device)
     predictions = gather(windows, [(division.fold.name, test_at)], [probabilities])
     sizes = (len(train_at), len(division.watch), len(test_at))
     record = FoldRecord(division.fold.name, division.fold.subjects, sizes, len(fitted.history), fitted.seconds)
@@ -137,12 +156,25 @@ def train(
         "nobody": figures["nobody"],
         "best_epoch": fitted.best_epoch,
         "simulated": dataset.head.simulated,
+        "int8": None,
     }
+    if kept:
+        integer = quantize(network, weights, scaler, Ranges.from_dict(kept))
+        deployed = gather(windows, [(division.fold.name, test_at)], [integer_probabilities(integer, test.x)])
+        after = score_predictions(deployed, [record], windows.affects, division.split.apart)
+        same = float((deployed.predicted == predictions.predicted).mean())
+        scores["int8"] = {"accuracy": after["accuracy"]["mean"], "macro_f1": after["macro_f1"]["mean"]}
+        scores["int8"] |= {"agreement": same}
+        if same < _AGREEMENT:
+            more = "more epochs of --quantize-aware" if quantize_aware else "--quantize-aware 10"
+            warn(
+                f"8 bits change {100 * (1 - same):.1f} % of the answers on the windows that were held back: try {more}"
+            )
     bundle = Bundle(
         arch=network,
-        weights=fitted.weights,
+        weights=weights,
         layout=dataset.layout,
-        scaler=fitted.scaler,
+        scaler=scaler,
         gestures=gestures,
         windowing=config.to_dict()["windows"],
         decision=config.live.to_dict(),
@@ -156,11 +188,12 @@ def train(
             "context": _context_said(windows),
             "preset": config.preset,
             "training": config.training.to_dict(),
+            "quantize_aware": quantize_aware,
             "seconds": round(fitted.seconds, 1),
             "scores": scores,
             "code_version": __version__,
         },
-        calibration=calibration(network, fitted.weights, fitted.scaler, windows.x[train_at]),
+        calibration=kept,
     )
     return Trained(bundle, fitted.history, scores)
 

@@ -15,6 +15,14 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("dataset", metavar="DATASET", help="data set folder")
     parser.add_argument("--out", metavar="FILE", default="model.plush", help="the bundle to write (model.plush)")
     parser.add_argument("--force", action="store_true", help="replace a bundle that is already there")
+    parser.add_argument(
+        "--quantize-aware",
+        type=int,
+        default=0,
+        metavar="EPOCHS",
+        help="fine-tune for 8 bits after the training, for so many epochs (default 0: off; training says when it "
+        "would be worth it)",
+    )
     add_settings(parser)
 
 
@@ -23,9 +31,10 @@ def run(args: argparse.Namespace) -> int:
 
     if Path(args.out).exists() and not args.force:
         raise ConfigError(f"'{args.out}' is already there: choose another --out, or --force to replace it.")
-    done = train(args.dataset, settings(args), progress=epochs_shown(), warn=warn)
+    done = train(args.dataset, settings(args), quantize_aware=args.quantize_aware, progress=epochs_shown(), warn=warn)
     bundle = done.save(args.out)
     scores = done.scores
+    int8 = scores["int8"]
     mark = "  [SIMULATION]" if scores["simulated"] else ""
     emit(
         args,
@@ -35,6 +44,14 @@ def run(args: argparse.Namespace) -> int:
             f"epoch {scores['best_epoch']} of {len(done.history)} kept{mark}",
             f"accuracy {figure(scores['accuracy'])}, macro-F1 {figure(scores['macro_f1'])} on {scores['windows']} "
             f"windows of {scores['said']}.",
+            *(
+                [
+                    f"In 8 bits, as in the toy: accuracy {figure(int8['accuracy'])}, macro-F1 "
+                    f"{figure(int8['macro_f1'])}; the same answer on {100 * int8['agreement']:.1f} % of them."
+                ]
+                if int8
+                else []
+            ),
         ],
     )
     return 0

@@ -1,0 +1,162 @@
+"""Quantization-aware fine-tuning: weights that still say the same once they are rounded to 8 bits.
+
+The forward pass computes what ``models/integer`` computes, weights in steps of their filter's largest and activations
+in 255 steps of a fixed range, with the biases that ``deploy/quantize`` gives; only its fixed-point scales are left
+out, which move an activation by less than a hundredth of a step but where it stands on an edge. The gradient goes
+straight through every rounding. Batch normalisation is frozen. The float network teaches: what is learnt is its
+answers, not the labels anew, so that a few epochs on the training windows cannot overfit what they were fitted to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import TrainingError
+from plushsense.models.arch import NORM_EPSILON, Arch
+from plushsense.models.net import Net
+from plushsense.training.augment import Turn
+from plushsense.training.engine import slices
+from plushsense.training.spec import TrainSpec
+from plushsense.windows.cut import WindowSet
+from plushsense.windows.features import Scaler
+
+import torch  # isort: skip - after models.net, which says how to install it
+from torch import Tensor
+from torch.nn import functional as F
+
+Weights = dict[str, NDArray[np.float32]]
+_READ = 256
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """``weights`` after the last epoch; ``history`` one row an epoch: epoch (from 1), train_loss (cross-entropy
+    against the float network's answers, above their own entropy), learning_rate."""
+
+    weights: Weights
+    history: list[dict[str, Any]]
+
+
+def fine_tune(
+    train: WindowSet,
+    arch: Arch,
+    weights: Weights,
+    scaler: Scaler,
+    calibration: Mapping[str, Any],
+    spec: TrainSpec,
+    epochs: int,
+    progress: Callable[[int, int, dict[str, Any]], None] | None = None,
+) -> Tuned:
+    """Fine-tune trained weights for the ranges of ``calibration``, which stay those of the deployed network.
+
+    Batch, turning, seed and device are those of ``spec``, the rate is the last of its schedule. The same seed gives
+    the same weights.
+
+    Raises:
+        TrainingError: for a network that cannot be deployed, no calibration, or fewer epochs than 1.
+    """
+    if arch.padding != "stream" or arch.norm != "batch" or not calibration:
+        raise TrainingError(
+            f"{arch.title} cannot be deployed, so there is nothing to fine-tune it for: train it with --padding stream "
+            "and --norm batch."
+        )
+    if epochs < 1:
+        raise TrainingError(f"{epochs} epochs of fine-tuning are asked for: accepted are 1 and more.")
+    x = torch.from_numpy(scaler.apply(train.x[:, :, train.x.shape[2] - arch.span :]))
+    rate = spec.learning_rate_at(spec.epochs)
+    history: list[dict[str, Any]] = []
+    with torch.random.fork_rng(devices=[]):
+        teacher = Net(arch)
+        teacher.import_weights(weights)
+        teacher.eval()
+        network = Rounded(arch, weights, calibration)
+        turn = Turn(train.vectors, scaler, spec.turn_deg, torch.device("cpu"))
+        random = torch.Generator().manual_seed(spec.seed)
+        adam = torch.optim.Adam(network.parameters, lr=rate)
+        for epoch in range(1, epochs + 1):
+            order, total = torch.randperm(len(x), generator=random), 0.0
+            for at in slices(len(x), spec.batch):
+                batch = turn(x[order[at]], random)
+                with torch.no_grad():
+                    wanted = F.log_softmax(teacher(batch), dim=1)
+                loss = F.kl_div(F.log_softmax(network(batch), dim=1), wanted, reduction="batchmean", log_target=True)
+                adam.zero_grad(set_to_none=True)
+                torch.autograd.backward(loss)
+                adam.step()
+                total += float(loss.detach()) * len(batch)
+            history.append({"epoch": epoch, "train_loss": total / len(x), "learning_rate": rate})
+            if progress is not None:
+                progress(epoch, epochs, history[-1] | {"validation_accuracy": None})
+    return Tuned(network.export_weights(), history)
+
+
+class Rounded:
+    """A network that computes as it will once it is deployed, and lets gradients through.
+
+    ``parameters`` are convolutions, gains, shifts and the dense layer; ``mean`` and ``var`` stay.
+    """
+
+    def __init__(self, arch: Arch, weights: Mapping[str, NDArray[Any]], calibration: Mapping[str, Any]) -> None:
+        self.arch = arch
+        self._tensors = {name: torch.from_numpy(np.array(w, dtype=np.float32)) for name, w in weights.items()}
+        frozen = (".mean", ".var")
+        self.parameters = [t.requires_grad_() for name, t in self._tensors.items() if not name.endswith(frozen)]
+        self._low, self._high = (torch.tensor(calibration[name], dtype=torch.float32) for name in ("low", "high"))
+        self._tops = [torch.tensor(top, dtype=torch.float32).clamp_min(1e-6) for top in calibration["tops"]]
+        self._means = [torch.tensor(mean, dtype=torch.float32) for mean in calibration["means"]]
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """Logits (N, K) of scaled windows (N, C, span)."""
+        of, arch = self._tensors, self.arch
+        unit = (self._high - self._low).clamp_min(1e-6) / 255
+        start, mean = self._low, self._means[0]
+        codes = _whole((x - start[:, None]) / unit[:, None])
+        for i, (layer, top) in enumerate(zip(arch.layers, self._tops, strict=True)):
+            w, b = _rounded(of[f"conv{i}.weight"], of[f"conv{i}.bias"], unit, start, mean)
+            sums = F.conv1d(codes, w, b, dilation=layer.dilation)
+            codes = _whole(sums / (top / 255)[:, None])
+            gain = of[f"norm{i}.gain"] / torch.sqrt(of[f"norm{i}.var"] + NORM_EPSILON)
+            unit, start = gain * top / 255, of[f"norm{i}.shift"] - of[f"norm{i}.mean"] * gain
+            mean = gain * self._means[i + 1] + start
+        w, b = _rounded(of["dense.weight"], of["dense.bias"], unit, start, mean)
+        return F.linear(codes.mean(dim=2), w, b)
+
+    def logits(self, x: Tensor) -> Tensor:
+        """Logits (N, K) without gradients, a few windows at a time."""
+        with torch.no_grad():
+            return torch.cat([self(x[at]) for at in slices(len(x), _READ)])
+
+    def export_weights(self) -> Weights:
+        """A copy of the weights, as ``models/reference`` takes them."""
+        return {name: t.detach().numpy().copy() for name, t in self._tensors.items()}
+
+
+def _straight(x: Tensor, rounded: Tensor) -> Tensor:
+    """``rounded``, with the gradient of ``x``."""
+    return x + (rounded - x).detach()
+
+
+def _whole(x: Tensor) -> Tensor:
+    """To the numbers of 8 bits; beyond them there is no gradient."""
+    held = x.clamp(0.0, 255.0)
+    return _straight(held, torch.floor(held + 0.5))
+
+
+def _rounded(w: Tensor, b: Tensor, unit: Tensor, start: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
+    """Weights (F, C, …) for numbers in steps ``unit`` (C,) from ``start``, rounded as ``deploy/quantize`` does it, and
+    the biases, which undo what rounding does to the mean."""
+    each = (1, -1, *[1] * (w.ndim - 2))
+    scaled = w * unit.reshape(each)
+    step = (scaled.detach().abs().flatten(1).amax(dim=1) / 127).clamp_min(1e-30).reshape(-1, *[1] * (w.ndim - 1))
+    rounded = _straight(scaled, torch.round(scaled / step) * step)
+    read = torch.where(unit == 0, torch.zeros_like(unit), (mean - start) / torch.where(unit == 0, 1.0, unit))
+    lost = (
+        (scaled - rounded).flatten(2).sum(dim=2) @ read.detach() if w.ndim > 2 else (scaled - rounded) @ read.detach()
+    )
+    through = w.flatten(2).sum(dim=2) @ start if w.ndim > 2 else w @ start
+    return rounded, b + through + lost
