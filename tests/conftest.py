@@ -58,6 +58,36 @@ def c_compiler() -> str:
 
 
 @pytest.fixture(scope="session")
+def all_compilers(c_compiler: str) -> None:
+    """Every compiler of this machine that the toy's C is tried with."""
+    for tool in ("clang", "g++"):
+        if shutil.which(tool) is None:
+            missing("compilers", f"{tool} is not installed")
+
+
+@pytest.fixture(scope="session")
+def emulators(c_compiler: str) -> None:
+    """Compilers and emulators of every chip."""
+    from plushsense.deploy.targets import TARGETS, missing_tools
+
+    for name in TARGETS:
+        if lacks := missing_tools(name):
+            missing("emulators", f"{name} lacks {' '.join(lacks)}")
+
+
+@pytest.fixture(scope="session")
+def installed() -> Callable[..., None]:
+    """Asks for compilers by the names of their programs."""
+
+    def ask(*programs: str) -> None:
+        for program in programs:
+            if shutil.which(program) is None:
+                missing("compilers", f"{program} is not installed")
+
+    return ask
+
+
+@pytest.fixture(scope="session")
 def lsl_possible() -> None:
     """The lab streaming layer, and a network on which a stream of this process is found."""
     try:
@@ -98,6 +128,28 @@ def mlflow_here() -> None:
     for module in ("mlflow", "sqlalchemy", "alembic"):
         if importlib.util.find_spec(module) is None:
             missing("mlflow", f"{module} is not installed")
+
+
+@pytest.fixture(scope="session")
+def onnx_here() -> None:
+    """ONNX and the runtime that tries it (extra onnx)."""
+    for module in ("onnx", "onnxruntime"):
+        if importlib.util.find_spec(module) is None:
+            missing("onnx", f"{module} is not installed")
+
+
+@pytest.fixture(scope="session")
+def litert_here() -> None:
+    """LiteRT (extra tflite)."""
+    if importlib.util.find_spec("ai_edge_litert") is None:
+        missing("tflite", "ai-edge-litert is not installed")
+
+
+@pytest.fixture(scope="session")
+def espdl_here() -> None:
+    """Espressif's quantizer (extra espdl), which wants an environment of its own."""
+    if importlib.util.find_spec("esp_ppq") is None:
+        missing("espdl", "esp-ppq is not installed")
 
 
 @pytest.fixture(scope="session")

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-
 from opponents.case import Case
 
 HERE = Path(__file__).resolve().parent

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,17 +14,15 @@ import pytest
 
 from plushsense.core.errors import ArchError, BadInput, BundleError, ConfigError, MissingExtraError
 from plushsense.core.gestures import load_gestures
-from plushsense.core.recfile import read_recording
+from plushsense.core.recfile import read_stream
 from plushsense.core.signal import load_layout
-from plushsense.deploy.convert import CONVERTERS, as_onnx, as_tflite, convert
+from plushsense.deploy.calibration import calibrated, deployable, integer_network
+from plushsense.deploy.convert import as_onnx, as_tflite, convert
 from plushsense.deploy.convert.facts import Job, compare, made_up_windows
-from plushsense.deploy.quantize import calibrate, quantize
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
-from plushsense.models.integer import IntegerNetwork
 from plushsense.models.reference import random_weights
-from plushsense.windows.features import Scaler
-from tests.conftest import missing
+from plushsense.windows.features import Scaler, inputs
 
 # symbol, filters, layout, settings: every padding and normalisation, one layer to four, one reflection and several.
 NETS: list[tuple[str, tuple[int, ...], str, dict[str, Any]]] = [
@@ -49,12 +47,8 @@ def made(net: tuple[str, tuple[int, ...], str, dict[str, Any]], seed: int = 1, *
     # Offsets of thousands and fractions, as real z-scores have.
     scaler = Scaler(rng.normal(size=arch.channels) * 5000, np.exp(-rng.uniform(1, 8, arch.channels)))
     parts = {"provenance": {"simulated": True}} | parts
-    return Bundle(arch, random_weights(arch, seed), layout, scaler, gestures.subset(gestures.labels[:7]), **parts)
-
-
-def whole(bundle: Bundle) -> IntegerNetwork:
-    scaled = bundle.scaler.apply(made_up_windows(bundle, 64))
-    return quantize(bundle.arch, bundle.weights, bundle.scaler, calibrate(bundle.network(), scaled))
+    bundle = Bundle(arch, random_weights(arch, seed), layout, scaler, gestures.subset(gestures.labels[:7]), **parts)
+    return calibrated(bundle, made_up_windows(bundle, 64)) if deployable(arch) else bundle
 
 
 def others(bundle: Bundle, n: int = 20, seed: int = 5) -> np.ndarray[Any, np.dtype[np.int64]]:
@@ -64,25 +58,6 @@ def others(bundle: Bundle, n: int = 20, seed: int = 5) -> np.ndarray[Any, np.dty
     raw = np.rint(bundle.scaler.offset[:, None] + x / bundle.scaler.scale[:, None]).astype(np.int64)
     raw[-1] = np.where(rng.random(raw[-1].shape) < 0.5, -30000, 30000)
     return raw
-
-
-@pytest.fixture(scope="session")
-def onnx_here() -> None:
-    for module in ("onnx", "onnxruntime"):
-        if importlib.util.find_spec(module) is None:
-            missing("onnx", f"{module} is not installed")
-
-
-@pytest.fixture(scope="session")
-def litert_here() -> None:
-    if importlib.util.find_spec("ai_edge_litert") is None:
-        missing("tflite", "ai-edge-litert is not installed")
-
-
-@pytest.fixture(scope="session")
-def espdl_here() -> None:
-    if importlib.util.find_spec("esp_ppq") is None:
-        missing("espdl", "esp-ppq is not installed")
 
 
 def assert_floats(found: Any, bundle: Bundle, raw: Any) -> None:
@@ -116,8 +91,8 @@ def test_litert_answers_as_the_network(net: Any, tmp_path: Path, litert_here: No
 def test_int8_comes_close_to_the_integers(name: str, net: Any, tmp_path: Path, request: pytest.FixtureRequest) -> None:
     request.getfixturevalue("onnx_here" if name == "onnx-int8" else "litert_here")
     bundle = made(net)
-    integer = whole(bundle)
-    done = convert(bundle, tmp_path / "m", name, integer=integer)
+    integer = integer_network(bundle)
+    done = convert(bundle, tmp_path / "m", name)
     raw = others(bundle, 60)
     room = as_onnx if name == "onnx-int8" else as_tflite
     found, expected = room.answers(done.path.read_bytes(), raw), integer.forward(raw) / 256
@@ -132,13 +107,10 @@ def test_int8_comes_close_to_the_integers(name: str, net: Any, tmp_path: Path, r
 
 def test_real_windows(real_data: Path, onnx_here: None, litert_here: None) -> None:
     bundle = made(("14d1_19d2_19d4", (8, 12, 16), "accel-3", {}))
-    rows = [
-        np.asarray(read_recording(path, bundle.layout).values)[: bundle.arch.span]
-        for path in sorted((real_data / "makeability-gestures" / "P07").glob("*.csv"))
-        if path.name != "fulldatastream.csv"
-    ]
-    raw = np.stack([r.T for r in rows if len(r) == bundle.arch.span]).astype(np.int64)
-    assert len(raw) > 3
+    stream = real_data / "makeability-gestures" / "P07" / "fulldatastream.csv"
+    values = inputs(read_stream(stream, bundle.layout).frames.values, bundle.layout)
+    raw = np.stack([values[at : at + bundle.arch.span].T for at in range(0, len(values) - bundle.arch.span, 400)])
+    assert len(raw) > 10
     fitted = Bundle(bundle.arch, bundle.weights, bundle.layout, Scaler.fit(raw), bundle.gestures)
     assert_floats(as_onnx.answers(as_onnx.float_model(fitted), raw), fitted, raw)
     assert_floats(as_tflite.answers(as_tflite.float_model(fitted), raw), fitted, raw)
@@ -182,7 +154,7 @@ def test_a_file_that_answers_otherwise_is_refused(tmp_path: Path, onnx_here: Non
     changed["conv0.weight"] = changed["conv0.weight"].copy()
     changed["conv0.weight"][0, 0, 0] += 0.05
     other = Bundle(bundle.arch, changed, bundle.layout, bundle.scaler, bundle.gestures)
-    job = Job.of(bundle, None, None)
+    job = Job.of(bundle, None)
     with pytest.raises(BundleError, match="answers otherwise"):
         compare(as_onnx.answers(as_onnx.float_model(other), job.windows), job, "ONNX")
 
@@ -226,13 +198,10 @@ def test_a_missing_package_says_how_to_install_it(
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("name", [n for n, f in CONVERTERS.items() if f.integer])
-def test_int8_needs_the_integers_of_this_bundle(name: str, tmp_path: Path) -> None:
-    bundle = made(NETS[1])
-    with pytest.raises(BadInput, match="none was given"):
-        convert(bundle, tmp_path / "m", name)
-    with pytest.raises(BundleError, match="made from this bundle"):
-        convert(bundle, tmp_path / "m", name, integer=whole(made(NETS[2])))
+@pytest.mark.parametrize("name", ["onnx-int8", "tflite-int8"])
+def test_int8_refuses_what_has_no_whole_numbers(name: str, tmp_path: Path) -> None:
+    with pytest.raises(BundleError, match="holds no calibration"):
+        convert(replace(made(NETS[1]), calibration={}), tmp_path / "m", name)
     with pytest.raises(ArchError, match="padding 'mirror'"):
         convert(made(NETS[4]), tmp_path / "m", name)
     assert not list(tmp_path.iterdir())

@@ -8,11 +8,11 @@ import shutil
 import uuid
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from plushsense import __version__
 from plushsense.core.errors import BadInput
 from plushsense.deploy.golden import write_golden
 from plushsense.models.bundle import Bundle
@@ -155,7 +155,7 @@ def _facts(model: IntegerModel, bundle: Bundle, model_bytes: int) -> dict[str, A
         "memory_bytes": memory_bytes(model),
         "simulated": bool(bundle.provenance.get("simulated", False)),
         "provenance": bundle.provenance,
-        "code_version": __version__,
+        "code_version": version("plushsense"),
     }
 
 

@@ -12,8 +12,8 @@ from typing import Any
 
 from plushsense.core.errors import LayoutError
 from plushsense.core.signal import DELAY_MS, DEVICE_MS, Channel, Layout
-from plushsense.core.signal import MAGNITUDE_FRACTION_BITS as FRACTION
 from plushsense.deploy.emit import c_names, comment
+from plushsense.deploy.golden import measured
 from plushsense.windows.features import Scaler
 
 TEMPLATES = (
@@ -111,7 +111,7 @@ _READ = """\
     for (uint32_t i = 0; i < PLUSH_MODEL_CHANNELS; i++) {
         switch (sources[i].from) {
 @if touch@
-        case TOUCH:
+        case FROM_TOUCH:
             values[i] = read_touch(sources[i].number);
 @if total@
             if (values[i] != MISSING)
@@ -120,12 +120,12 @@ _READ = """\
             break;
 @end@
 @if motion@
-        case MOTION:
+        case FROM_MOTION:
             values[i] = moved ? (int32_t)((int64_t)motion[sources[i].number] * sources[i].factor / 65536) : MISSING;
             break;
 @end@
 @if other@
-        case OTHER:
+        case FROM_OTHER:
             values[i] = read_other(sources[i].number);
             break;
 @end@
@@ -135,18 +135,18 @@ _READ = """\
     }
 @if total@
     for (uint32_t i = 0; i < PLUSH_MODEL_CHANNELS; i++)
-        if (sources[i].from == TOTAL)
+        if (sources[i].from == FROM_TOTAL)
             values[i] = total;
 @end@"""
 
 _SOURCES = """\
-enum {{ TOUCH, TOTAL, MOTION, OTHER }};
+enum {{ FROM_TOUCH, FROM_TOTAL, FROM_MOTION, FROM_OTHER }};
 #define MISSING INT32_MIN /* no reading: out of its valid range, so that the last valid value stands in for it */
 
 static const struct {{
     uint8_t from;
-    uint8_t number; /* TOUCH: {what}. MOTION: 0 to 2 acceleration x, y, z; 3 to 5 rotation x, y, z. */
-    int32_t factor; /* MOTION: from counts of the sensor to steps of the channel, in 1/65536 */
+    uint8_t number; /* touch: {what}; motion: 0 to 2 acceleration x, y, z; 3 to 5 rotation x, y, z. */
+    int32_t factor; /* motion: from counts of the sensor to steps of the channel, in 1/65536 */
 }} sources[PLUSH_MODEL_CHANNELS] = {{
 {rows}
 }};"""
@@ -158,7 +158,9 @@ def _table(layout: Layout, sources: list[_Source], number: str) -> str:
         at = s.pin if s.kind == "TOUCH" and number == "pin" else s.pad
         said = {"TOTAL": ": the sum of all pads", "OTHER": ": see read_other()"}.get(s.kind, "")
         said = ": NO PAD IS LEFT for it" if s.kind == "TOUCH" and at == _NO_PAD else said
-        rows.append(f"    {{{s.kind}, {at}, {s.factor}}}, /* {comment(channel.name)}, {comment(channel.unit)}{said} */")
+        rows.append(
+            f"    {{FROM_{s.kind}, {at}, {s.factor}}}, /* {comment(channel.name)}, {comment(channel.unit)}{said} */"
+        )
     what = "the GPIO" if number == "pin" else "the touch pad (T0 is GPIO 4; T2 2, T3 15, T4 13, T5 12, T6 14, T7 27)"
     return _SOURCES.format(what=what, rows="\n".join(rows))
 
@@ -215,21 +217,10 @@ def _line_bytes(layout: Layout, written: list[tuple[int, int]]) -> int:
 
 def _usual(layout: Layout, scaler: Scaler) -> list[tuple[int, int]]:
     """Of each channel the mean and the spread in training, as far as the scaling tells it, within the valid range."""
-    mean, spread = [0.0] * layout.n_channels, [0.0] * layout.n_channels
-    derived = {d.name: d.of for d in layout.derived}
-    for i, name in enumerate(layout.inputs):
-        at, wide = float(scaler.offset[i]), 1.0 / float(scaler.scale[i])
-        if name in derived:
-            # A magnitude tells the length of the vector only: all of it in the last axis, as of a toy that lies flat.
-            parts = [layout.index(part) for part in derived[name]]
-            mean[parts[-1]] = at / (1 << FRACTION)
-            for part in parts:
-                spread[part] = wide / (1 << FRACTION)
-        else:
-            mean[layout.index(name)], spread[layout.index(name)] = at, wide
+    mean, spread = measured(layout, scaler)
     rows = []
     for at, wide, low, high in zip(
-        mean, spread, layout.valid_min_int.tolist(), layout.valid_max_int.tolist(), strict=True
+        mean.tolist(), spread.tolist(), layout.valid_min_int.tolist(), layout.valid_max_int.tolist(), strict=True
     ):
         middle = min(max(round(at), low), high)
         rows.append((middle, min(round(wide), (high - middle) // 2, (middle - low) // 2)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from plushsense.deploy.emit import BUNDLE, FACTS, IMAGE, TOY_BYTES, c_names
@@ -71,9 +71,9 @@ def handbook(bundle: Bundle, facts: Mapping[str, Any]) -> str:
                 ],
             ),
             "",
-            "A value outside its range is no reading: the last valid one stands in, and `toy.invalid` counts it. Before",
-            "every channel has had a valid value there are no answers. The sensors must be those of the recordings:",
-            "same sign, scale and order. `plush_fake.c` of the example shows where the values lay in training.",
+            "A value outside its range is no reading: the last valid one stands in, and `toy.invalid` counts it. There",
+            "are no answers before every channel has had a valid value. The sensors must be those of the recordings: same",
+            "sign, scale and order. `plush_fake.c` of the example shows where the values lay in training.",
             "",
             "## What comes out",
             "",
@@ -95,8 +95,7 @@ def handbook(bundle: Bundle, facts: Mapping[str, Any]) -> str:
             "",
             *_table(("", ""), [(f"`{name}`", what) for name, what in _HOLDS.items()]),
             "",
-            "No recording is in it, and none can be read out of it: the golden frames are made up. "
-            f"`{BUNDLE}` and `{FACTS}` say",
+            f"No recording is in it: the golden frames are made up. `{BUNDLE}` and `{FACTS}` say",
             "how many people the model was trained on, not who. A network was made from people's recordings all the",
             "same: the consent they gave, and the licence of the data set, decide to whom it may be given.",
             "",
@@ -150,25 +149,25 @@ void frame(uint32_t ms, const int32_t *values, void (*react)(plush_affect, const
 }}
 ```
 
-One task or interrupt uses a toy at a time. Several toys may share a model, each with a `plush_toy` and memory of its own.
+One task or interrupt uses a toy at a time. Several toys may share a model, each with its own `plush_toy` and memory.
 
-**When plush_begin() fails** it says why (`plush_status`); a toy that has not begun must not be pushed. Show it, and go on
-sending frames: the example blinks the status.
+**When plush_begin() fails** it says why (`plush_status`); a toy that has not begun must not be pushed. Show it, and
+go on sending frames: the example blinks the status.
 
-**Missed ticks.** Only the time that comes with a frame counts. Who comes late reads once, with the true time, and does not
-make up for ticks that went by. Up to {gap} ms are bridged by interpolation, and every answer that fell due is given;
+**Missed ticks.** Only the time that comes with a frame counts. Who comes late reads once, with the true time, and does
+not make up for ticks that went by. Up to {gap} ms are bridged by interpolation, and every answer that fell due is given;
 after a longer gap, or when the clock runs backwards, the toy is warming again (`toy.restarts` counts it).
 
 ## Prove it, measure it
 
-`plushsense verify .` compiles the library and the model that stand here and compares every answer with those in `golden`,
-bit for bit; `--target xtensa`, `cortex-m4`, `riscv32` do it on emulated chips. The packages below hold copies of these
+`plushsense verify .` compiles the library and the model that stand here and compares every answer with those in
+`golden`, bit for bit; `--target xtensa`, `cortex-m4`, `riscv32` do it on emulated chips. The packages below hold copies of these
 files: whoever edits one edits it here, and copies. `plushsense profile .` counts instructions, flash, RAM and stack.
 
 ## Another model without compiling
 
-Put `{image}` of another export into flash and begin on its bytes, which must stay readable (on an ESP32: a data partition
-and `esp_partition_mmap()`). They need no alignment. The checksum is looked at first.
+Put `{image}` of another export into flash and begin on its bytes, which must stay readable (on an ESP32: a data
+partition and `esp_partition_mmap()`). They need no alignment. The checksum is looked at first.
 
 ```c
 #include "plushsense.h"
@@ -187,7 +186,7 @@ plush_status swap(const uint8_t *model, uint32_t bytes, uint8_t channels)
 """
 
 
-def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> list[str]:
+def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> list[str]:
     return ["| " + " | ".join(row) + " |" for row in (head, tuple("---" for _ in head), *rows)]
 
 
@@ -205,8 +204,8 @@ def _affect_said(facts: Mapping[str, Any]) -> list[str]:
         return []
     return [
         f"Nobody told an affect for {len(untold)} of {facts['classes']} gestures: the library then says",
-        "`PLUSH_AFFECT_NONE`, and the example gives each such gesture a colour of its own. Affect is told in the gesture",
-        "set (`plushsense train --gestures FILE`).",
+        "`PLUSH_AFFECT_NONE`, and the example gives each such gesture a colour of its own. Affect is told in the",
+        "gesture set (`plushsense train --gestures FILE`).",
         "",
     ]
 

@@ -43,7 +43,8 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from plushsense.dataset.index import open_dataset
-    from plushsense.deploy.verify import Export, verify
+    from plushsense.deploy.vectors import Export
+    from plushsense.deploy.verify import verify
 
     if args.subject and not args.dataset:
         raise ConfigError("--subject chooses people of a data set: give --dataset too.")
@@ -56,7 +57,8 @@ def run(args: argparse.Namespace) -> int:
             say(f"plushsense: these recordings make {sum(v.samples for v in vectors):,} samples, not {args.samples:,}.")
     else:
         vectors = export.made_up(args.samples or 0)
-    done = verify(export, _listed(args.target), vectors, faults=args.faults, progress=bar("verify"))
+    plant = (lambda fault: True) if args.faults else None
+    done = verify(export, _listed(args.target), vectors, plant=plant, progress=bar("verify"))
     emit(args, {"export": args.export, **done.to_dict()}, _text(done))
     return 0 if done.passed else 1
 

@@ -407,15 +407,13 @@ static uint32_t surplus(plush_layer *layer)
         s01 = _mm_add_epi32(s01, _mm_madd_epi16(a, _mm_unpacklo_epi8(b, zero)));         \
         s23 = _mm_add_epi32(s23, _mm_madd_epi16(a, _mm_unpackhi_epi8(b, zero)));         \
     } while (0)
-#define PLUSH_GIVE                                             \
-    do {                                                       \
-        uint32_t halves[8];                                    \
-        _mm_storeu_si128((__m128i *)(void *)halves, s01);      \
-        _mm_storeu_si128((__m128i *)(void *)(halves + 4), s23); \
-        sum[0] = halves[0] + halves[1];                        \
-        sum[1] = halves[2] + halves[3];                        \
-        sum[2] = halves[4] + halves[5];                        \
-        sum[3] = halves[6] + halves[7];                        \
+#define PLUSH_GIVE                                     \
+    do {                                               \
+        uint32_t halves[8];                            \
+        memcpy(halves, &s01, sizeof s01);              \
+        memcpy(halves + 4, &s23, sizeof s23);          \
+        for (taps = 0; taps < GROUP; taps++)           \
+            sum[taps] = halves[2 * taps] + halves[2 * taps + 1]; \
     } while (0)
 
 #else

@@ -22,7 +22,6 @@ from plushsense.deploy.convert.as_onnx import to_integer_onnx, to_onnx
 from plushsense.deploy.convert.as_tflite import to_integer_tflite, to_tflite
 from plushsense.deploy.convert.facts import Converted, Job, Made
 from plushsense.models.bundle import Bundle
-from plushsense.models.integer import IntegerNetwork
 
 __all__ = ["CONVERTERS", "Converted", "Format", "convert"]
 
@@ -34,14 +33,13 @@ class Format:
     file_name: str
     holds: str
     write: Callable[[Job], Made]
-    integer: bool = False
 
 
 CONVERTERS: dict[str, Format] = {
     "onnx": Format("model.onnx", "ONNX, floats", to_onnx),
-    "onnx-int8": Format("model.int8.onnx", "ONNX, int8 with QuantizeLinear", to_integer_onnx, integer=True),
+    "onnx-int8": Format("model.int8.onnx", "ONNX, int8 with QuantizeLinear", to_integer_onnx),
     "tflite": Format("model.tflite", "LiteRT, floats", to_tflite),
-    "tflite-int8": Format("model.int8.tflite", "LiteRT, int8 convolutions", to_integer_tflite, integer=True),
+    "tflite-int8": Format("model.int8.tflite", "LiteRT, int8 convolutions", to_integer_tflite),
     "espdl": Format("model.espdl", "ESP-DL for the ESP32-S3, int8", to_espdl),
     "espdl-esp32": Format("model.esp32.espdl", "ESP-DL for the ESP32, int8", partial(to_espdl, target="esp32")),
     "espdl-esp32p4": Format(
@@ -55,26 +53,24 @@ def convert(
     path: str | Path,
     format_name: str,
     *,
-    integer: IntegerNetwork | None = None,
     windows: NDArray[Any] | None = None,
 ) -> Converted:
     """Write ``bundle`` to ``path`` in a format of `CONVERTERS`, tried in that format's runtime before it is written.
 
     Args:
-        integer: the network in whole numbers, which the int8 formats hold.
         windows: raw integer windows (N, C, T) to try it on, beside made-up ones.
 
     Raises:
         ConfigError: for an unknown format.
         MissingExtraError: with the install command, when the format's package is not there.
         ArchError, BadInput: for a network that the format cannot hold.
-        BundleError: when the result does not give the network's answers.
+        BundleError: when the result does not give the network's answers; for int8, a bundle without calibration.
     """
     if format_name not in CONVERTERS:
         raise ConfigError(
             f"Unknown format '{format_name}': accepted are {', '.join(CONVERTERS)}.{nearest(format_name, CONVERTERS)}"
         )
-    made = CONVERTERS[format_name].write(Job.of(bundle, integer, windows))
+    made = CONVERTERS[format_name].write(Job.of(bundle, windows))
     path = Path(path)
     part = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.part")
     try:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from plushsense.core.errors import BundleError
 from plushsense.core.extras import need
 from plushsense.deploy.convert.facts import LOGITS, Floats, Job, Made, compare, describe
-from plushsense.deploy.quantize import calibrate, refuse_undeployable
+from plushsense.deploy.quantize import Ranges, calibrate, refuse_undeployable
 from plushsense.models.arch import NORM_EPSILON
 from plushsense.models.bundle import Bundle
 
@@ -100,7 +100,10 @@ def to_espdl(job: Job, target: str = "esp32s3") -> Made:
     job = job.thinned(_MOST)
     scaled = bundle.scaler.apply(job.windows)
     some = scaled[: job.given or None]
-    model = plain_model(bundle, calibrate(bundle.network(), some).tops)
+    ranges = Ranges.from_dict(bundle.calibration) if bundle.calibration else calibrate(bundle.network(), some)
+    if not job.given:
+        some = np.clip(some, ranges.low[:, None], ranges.high[:, None]).astype(np.float32)
+    model = plain_model(bundle, ranges.tops)
     facts = describe(bundle) | {"input": f"'{SCALED}': (value - offset) * scale a channel, (1, C, span)"}
     facts |= {k: json.dumps(v) for k, v in bundle.scaler.to_dict().items()}
     data, found = _quantized(bundle, model, some, scaled, target, facts)

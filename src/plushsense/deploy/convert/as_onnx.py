@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.extras import need
+from plushsense.deploy.calibration import integer_network
 from plushsense.deploy.convert.facts import (
     LIMIT,
     LOGITS,
@@ -195,7 +196,7 @@ def to_onnx(job: Job) -> Made:
 
 def to_integer_onnx(job: Job) -> Made:
     """The network in whole numbers: close to the toy's, not equal in every bit."""
-    network = job.whole("onnx-int8")
+    network = integer_network(job.bundle)
     model = integer_model(job.bundle, network)
     found = answers(model, job.windows)
     expected = network.forward(job.windows) / 256

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.extras import need
+from plushsense.deploy.calibration import integer_network
 from plushsense.deploy.convert.facts import (
     LIMIT,
     LOGITS,
@@ -274,7 +275,7 @@ def to_tflite(job: Job) -> Made:
 
 def to_integer_tflite(job: Job) -> Made:
     """The network with int8 convolutions: close to the toy's, not equal in every bit."""
-    network = job.whole("tflite-int8")
+    network = integer_network(job.bundle)
     model = integer_model(job.bundle, network)
     expected = network.forward(job.windows) / 256
     largest, said = compare(answers(model, job.windows), job, "LiteRT", expected, exact=False)

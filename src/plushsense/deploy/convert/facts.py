@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import BadInput, BundleError
-from plushsense.deploy.quantize import refuse_undeployable
+from plushsense.core.errors import BundleError
 from plushsense.models.bundle import Bundle
 from plushsense.models.fixed import LOGIT_LIMIT
 from plushsense.models.integer import IntegerNetwork
@@ -59,16 +58,15 @@ class Made:
 
 @dataclass(frozen=True)
 class Job:
-    """What a converter is given: the bundle, its network in whole numbers where a format needs it, raw windows
-    (N, C, T) to try and to calibrate with: ``given`` ones first, then made-up ones."""
+    """What a converter is given: the bundle, and raw windows (N, C, T) to try and to calibrate with: ``given`` ones
+    first, then made-up ones."""
 
     bundle: Bundle
-    integer: IntegerNetwork | None
     windows: Windows
     given: int
 
     @classmethod
-    def of(cls, bundle: Bundle, integer: IntegerNetwork | None, windows: NDArray[Any] | None) -> Job:
+    def of(cls, bundle: Bundle, windows: NDArray[Any] | None) -> Job:
         """With made-up windows beside the given ones.
 
         Raises:
@@ -79,7 +77,7 @@ class Job:
             check_windows(bundle.arch, windows.shape)
             given = windows[:, :, windows.shape[2] - bundle.arch.span :].astype(np.int64)
             tried = np.concatenate([given, tried])
-        return cls(bundle, integer, tried, 0 if windows is None else len(windows))
+        return cls(bundle, tried, 0 if windows is None else len(windows))
 
     def thinned(self, most: int) -> Job:
         """At most ``most`` of the given windows, evenly taken, and the made-up ones."""
@@ -95,21 +93,6 @@ class Job:
     def reference(self) -> NDArray[np.float64]:
         """Logits (N, K) of the float network."""
         return self.bundle.network().forward(self.bundle.scaler.apply(self.windows))
-
-    def whole(self, format_name: str) -> IntegerNetwork:
-        """The network in whole numbers; refused where there is none."""
-        if self.integer is None:
-            refuse_undeployable(self.bundle.arch)
-            raise BadInput(
-                f"The format '{format_name}' writes the network in whole numbers, and none was given: "
-                "give integer=, as plushsense export does, or take the float format."
-            )
-        if self.integer.arch != self.bundle.arch:
-            raise BundleError(
-                f"The integer network is {self.integer.arch.title}, the bundle {self.bundle.arch.title}: "
-                "give the one that was made from this bundle."
-            )
-        return self.integer
 
 
 def made_up_windows(bundle: Bundle, n: int = 24) -> Windows:

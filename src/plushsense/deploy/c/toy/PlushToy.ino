@@ -15,19 +15,19 @@
 #include "plush_reaction.h"
 
 #if defined(__AVR__)
-#error "This model needs a board with 32 bits and 24 KB of flash for it: an ESP32, RP2040, nRF52, SAMD or STM32."
+#error "This model needs a board with 32 bits: an ESP32, RP2040, nRF52, SAMD or STM32."
 #endif
 
 /* ---- Settings: yours to change --------------------------------------------------------------------------------- */
 
 #define SENSORS_FAKE 0  /* nothing attached: made-up readings, to see that all the rest works */
 #define SENSORS_WIRED 1 /* what the table `sources` says */
-#define SENSORS_LINES 2 /* another board, or a computer, sends frames as lines on PORT */
+#define SENSORS_LINES 2 /* another board, or a computer, sends frames as lines on LINE_PORT */
 #ifndef SENSORS
 #define SENSORS SENSORS_FAKE
 #endif
 
-#define PORT Serial /* where lines go, and come from; 115200 baud as the computer expects */
+#define LINE_PORT Serial /* where lines go, and come from; 115200 baud as the computer expects */
 #ifndef TELL_ANSWERS
 #define TELL_ANSWERS (SENSORS == SENSORS_LINES) /* 1: a line for each answer, for your eyes, instead of the frames */
 #endif
@@ -58,6 +58,9 @@ static void begin_motion()
 {
     Wire.begin();
     Wire.setClock(400000);
+#if defined(ARDUINO_ARCH_ESP32)
+    Wire.setTimeOut(5); /* ms: a sensor that hangs must not hold the toy up */
+#endif
     motion_register(0x6B, 0x01); /* PWR_MGMT_1: awake, clock of the gyroscope */
     motion_register(0x1A, 0x03); /* CONFIG: low pass */
     motion_register(0x1B, 0x00); /* GYRO_CONFIG: 250 degrees/s */
@@ -105,7 +108,7 @@ static void read_sensors(uint32_t, int32_t *values)
 {
 @read@
 }
-#else
+#elif SENSORS == SENSORS_FAKE
 /* The working stand-in while nothing is attached. */
 static void read_sensors(uint32_t ms, int32_t *values)
 {
@@ -137,8 +140,8 @@ static void show(const plush_look &look)
  * sees it as a lost frame. (On a board whose availableForWrite() is always 0, write without asking.) */
 static void tell(const char *line, uint32_t n)
 {
-    if (PORT.availableForWrite() >= static_cast<int>(n))
-        PORT.write(reinterpret_cast<const uint8_t *>(line), n);
+    if (LINE_PORT.availableForWrite() >= static_cast<int>(n))
+        LINE_PORT.write(reinterpret_cast<const uint8_t *>(line), n);
 }
 
 static void tell_answer(const plush_toy *toy, void *)
@@ -179,9 +182,9 @@ static void frame(uint32_t ms, const int32_t *values)
 void setup()
 {
 #if defined(ARDUINO_ARCH_ESP32)
-    PORT.setTxBufferSize(1024); /* before begin(): a whole line must fit */
+    LINE_PORT.setTxBufferSize(1024); /* before begin(): a whole line must fit */
 #endif
-    PORT.begin(115200);
+    LINE_PORT.begin(115200);
     for (uint8_t pin : eye_pins)
         pinMode(pin, OUTPUT);
     pinMode(voice_pin, OUTPUT);
@@ -211,8 +214,8 @@ void loop()
     static plush_wire wire;
     uint32_t sent_ms;
 
-    while (PORT.available() > 0)
-        if (plush_wire_read(&wire, static_cast<char>(PORT.read()), &sent_ms, values))
+    while (LINE_PORT.available() > 0)
+        if (plush_wire_read(&wire, static_cast<char>(LINE_PORT.read()), &sent_ms, values))
             frame(sent_ms, values);
 #endif
     if (static_cast<int32_t>(now_us - due_us) < 0)

@@ -25,12 +25,12 @@
 
 #define SENSORS_FAKE 0  /* nothing attached: made-up readings, to see that all the rest works */
 #define SENSORS_WIRED 1 /* what the table `sources` says */
-#define SENSORS_LINES 2 /* another board, or a computer, sends frames as lines on PORT */
+#define SENSORS_LINES 2 /* another board, or a computer, sends frames as lines on LINE_PORT */
 #ifndef SENSORS
 #define SENSORS SENSORS_FAKE
 #endif
 
-#define PORT UART_NUM_0 /* where lines go, and come from; sdkconfig.defaults keeps the log away from it */
+#define LINE_PORT UART_NUM_0 /* where lines go, and come from; sdkconfig.defaults keeps the log away from it */
 #ifndef TELL_ANSWERS
 #define TELL_ANSWERS (SENSORS == SENSORS_LINES) /* 1: a line for each answer, for your eyes, instead of the frames */
 #endif
@@ -116,7 +116,7 @@ static void begin_touch(void)
     ESP_ERROR_CHECK(touch_pad_init());
     ESP_ERROR_CHECK(touch_pad_set_fsm_mode(TOUCH_FSM_MODE_TIMER));
     for (i = 0; i < PLUSH_MODEL_CHANNELS; i++)
-        if (sources[i].from == TOUCH)
+        if (sources[i].from == FROM_TOUCH)
             ESP_ERROR_CHECK(touch_pad_config((touch_pad_t)sources[i].number, 0));
 }
 
@@ -228,8 +228,8 @@ static void begin_lines(void)
                           .flow_ctrl = UART_HW_FLOWCTRL_DISABLE,
                           .source_clk = UART_SCLK_DEFAULT};
 
-    ESP_ERROR_CHECK(uart_driver_install(PORT, 1024, 1024, 0, NULL, 0));
-    ESP_ERROR_CHECK(uart_param_config(PORT, &port));
+    ESP_ERROR_CHECK(uart_driver_install(LINE_PORT, 1024, 1024, 0, NULL, 0));
+    ESP_ERROR_CHECK(uart_param_config(LINE_PORT, &port));
 }
 
 /* Feeling goes before telling: a line for which there is no room now is left out, rather than to wait. The computer
@@ -238,8 +238,8 @@ static void tell(const char *line, uint32_t n)
 {
     size_t room = 0;
 
-    if (uart_get_tx_buffer_free_size(PORT, &room) == ESP_OK && room >= n)
-        uart_write_bytes(PORT, line, n);
+    if (uart_get_tx_buffer_free_size(LINE_PORT, &room) == ESP_OK && room >= n)
+        uart_write_bytes(LINE_PORT, line, n);
 }
 
 static void tell_answer(const plush_toy *toy, void *user)
@@ -290,7 +290,7 @@ static void hear(void)
     char heard[128];
     int n, i;
 
-    while ((n = uart_read_bytes(PORT, heard, sizeof heard, 0)) > 0)
+    while ((n = uart_read_bytes(LINE_PORT, heard, sizeof heard, 0)) > 0)
         for (i = 0; i < n; i++)
             if (plush_wire_read(&wire, heard[i], &ms, values))
                 frame(ms, values);

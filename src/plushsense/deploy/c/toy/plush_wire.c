@@ -122,7 +122,7 @@ int plush_wire_read(plush_wire *wire, char c, uint32_t *ms, int32_t *values)
     if (c >= '0' && c <= '9') {
         uint32_t digit = (uint32_t)(c - '0');
 
-        wire->digits = 1;
+        wire->begun = wire->digits = 1;
 @if decimal@
         if (wire->decimals > 0 && wire->decimals < 255)
             wire->decimals++;
@@ -133,21 +133,22 @@ int plush_wire_read(plush_wire *wire, char c, uint32_t *ms, int32_t *values)
             wire->number = MOST;
         return 0;
     }
-    if ((c == '-' || c == '+') && wire->sign == 0 && wire->digits == 0) {
+    if ((c == '-' || c == '+') && !wire->begun) {
+        wire->begun = 1;
         wire->sign = c;
         return 0;
     }
 @if decimal@
     if (c == '.' && wire->decimals == 0) {
-        wire->decimals = 1;
+        wire->begun = wire->decimals = 1;
         return 0;
     }
 @end@
     if (!end && c != ' ' && c != '\t' && c != ',' && c != ';')
         wire->bad = 1;
-    else if ((wire->digits != 0 || wire->sign != 0) && !take(wire))
+    else if (wire->begun && !take(wire))
         wire->bad = 1;
-    wire->digits = 0;
+    wire->begun = wire->digits = 0;
 @if decimal@
     wire->decimals = 0;
 @end@

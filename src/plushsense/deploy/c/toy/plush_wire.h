@@ -20,9 +20,10 @@ extern "C" {
 typedef struct {
     uint8_t joined;    /* a line end was heard: what follows is a whole line */
     uint8_t bad;       /* something in this line is no number */
-    uint8_t digits;    /* the number has a digit */
+    uint8_t begun;     /* a number is being read */
+    uint8_t digits;    /* it has a digit */
 @if decimal@
-    uint8_t decimals;  /* of the number, with its point */
+    uint8_t decimals;  /* 0: no point yet; else 1 + its places */
 @end@
     char sign;
     uint16_t field;    /* of the line, from 0 */
