@@ -84,7 +84,7 @@ def _counts(found: Profile) -> list[str]:
     )
     return [
         "",
-        f"Instructions, counted (mean of {STEPS} steps with a real toy's jitter)",
+        f"Instructions, counted (mean of {STEPS} steps; frames come up to a fifth of a period early or late)",
         table(["", *(c.target for c in costs)], rows),
         *textwrap.wrap(again, 118),
     ]

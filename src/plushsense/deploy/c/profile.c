@@ -5,7 +5,7 @@
  *     PLUSH_STAGES  takes plushsense.c in, so that each stage can be called by itself
  *
  * EVEN and JITTERED hold rows of 32-bit numbers, milliseconds and the measured channels: the same readings at even
- * times, and with the jitter of a real toy and a long gap at the end. What is written are rows of 32-bit numbers.
+ * times, and somewhat early or late with a long gap at the end. What is written are rows of 32-bit numbers.
  */
 /* In angle brackets: those of the export, not the ones beside this file. */
 #ifdef PLUSH_STAGES
