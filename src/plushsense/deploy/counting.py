@@ -31,11 +31,11 @@ Ints = NDArray[np.int64]
 class Cost:
     """What one target says. Instructions, bytes; None where the target counts nothing (the host).
 
-    ``step`` is the mean over `STEPS` decisions with frames up to a fifth of a period early or late, ``even`` with even
-    stamps, ``step_most`` the dearest of them; ``gap`` is the dearest single call, which bridges the longest gap;
-    ``stages`` add up to ``step``, ``clock`` (with the check of values) being what the others leave of it. ``stack_push``,
-    ``stack_begin`` and ``stack_memory_bytes`` are how deep the stack went below the caller of these functions, without
-    a callback; ``stack_functions`` is the frame that the compiler gives to each function.
+    ``step`` is the mean over `STEPS` decisions with frames up to a fifth of a period early or late, ``even`` with
+    even stamps, ``step_most`` the dearest step; ``gap`` is the dearest single call, which bridges the longest gap;
+    ``stages`` add up to ``step``, ``clock`` (with the check of values) being what the others leave of it.
+    ``stack_push``, ``stack_begin`` and ``stack_memory_bytes`` are how deep the stack went below the caller of these
+    functions, without a callback; ``stack_functions`` is the frame that the compiler gives to each function.
     """
 
     target: str
