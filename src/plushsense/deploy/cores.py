@@ -11,7 +11,7 @@ class Core:
     """One chip: its clock, the target whose instructions stand for its own, and cycles for each of them.
 
     ``flash_mb_s`` is set where code and model lie in flash behind a serial bus and a small cache: how fast that bus
-    fills the cache, in MB/s.
+    fills the cache, in MB/s. ``why`` says where the two bounds come from.
     """
 
     name: str
@@ -23,43 +23,50 @@ class Core:
     why: str
     flash_mb_s: float | None = None
 
+    @property
+    def reasons(self) -> str:
+        """Where the bounds come from, in words."""
+        if self.flash_mb_s is None:
+            return self.why
+        return (
+            f"{self.why}; high also fetches code and model from the serial flash anew for every sample, at "
+            f"{self.flash_mb_s:g} MB/s, as if its cache had kept nothing (in RAM they never are)"
+        )
+
 
 _LX = (
-    "plain C for lx106 stands for it: a sibling without zero-overhead loops and with division in software, so the "
-    "count is rather too high; seven pipeline stages (datasheet), so a value that was just loaded or multiplied waits "
-    "one or two cycles, and in the inner loop nearly every instruction does"
+    "counted on lx106, a sibling without zero-overhead loops and with division in software, so the count is rather too "
+    "high; seven pipeline stages (ESP32 datasheet), so what was just loaded or multiplied is there one or two cycles "
+    "late, and in the inner loop nearly every instruction waits for it; the S3's vector unit is not used"
 )
-_SPI = "; high also reads code and model from flash again for every sample, as if its cache had kept nothing"
 # 2 bits at 80 MHz are 20 MB/s (esptool, SPI flash modes: DIO), less command, address and waiting of each cache line.
 _DIO = 15.0
 
 CORES: dict[str, Core] = {
-    "esp32": Core("esp32", "ESP32 (Xtensa LX6)", 240, "xtensa", 1.3, 2.4, _LX + _SPI, _DIO),
-    "esp32-s2": Core("esp32-s2", "ESP32-S2 (Xtensa LX7)", 240, "xtensa", 1.3, 2.4, _LX + _SPI, _DIO),
-    "esp32-s3": Core(
-        "esp32-s3", "ESP32-S3 (Xtensa LX7)", 240, "xtensa", 1.3, 2.4, _LX + "; its vector unit is not used" + _SPI, _DIO
-    ),
+    "esp32": Core("esp32", "ESP32 (Xtensa LX6)", 240, "xtensa", 1.3, 2.4, _LX, _DIO),
+    "esp32-s2": Core("esp32-s2", "ESP32-S2 (Xtensa LX7)", 240, "xtensa", 1.3, 2.4, _LX, _DIO),
+    "esp32-s3": Core("esp32-s3", "ESP32-S3 (Xtensa LX7)", 240, "xtensa", 1.3, 2.4, _LX, _DIO),
     "esp32-c3": Core(
         "esp32-c3",
-        "ESP32-C3 (RISC-V RV32IMC)",
+        "ESP32-C3 (RV32IMC)",
         160,
         "riscv32",
         1.1,
         2.0,
-        "its own instruction set; four pipeline stages (datasheet), so a value that was just loaded waits about one "
-        "cycle, and a taken branch costs one or two" + _SPI,
+        "its own instruction set; four pipeline stages in order (technical reference manual), so what was just loaded "
+        "is there about one cycle late, and a taken branch costs one or two cycles more",
         _DIO,
     ),
     "nrf52": Core(
         "nrf52",
-        "nRF52832 or nRF52840 (Cortex-M4)",
+        "nRF52 (Cortex-M4)",
         64,
         "cortex-m4",
         1.2,
         2.2,
         "its own instruction set; a load takes one or two cycles and a taken branch two to four (Arm, Cortex-M4 "
-        "Technical Reference Manual, table of instructions); high adds two cycles of waiting for the flash to each "
-        "weight that is read",
+        "technical reference manual, table of instructions); high adds two cycles of waiting for the flash to each "
+        "load of weights",
     ),
     "rp2040": Core(
         "rp2040",
@@ -69,7 +76,7 @@ CORES: dict[str, Core] = {
         1.4,
         2.0,
         "its own instruction set, counted on a core that runs it too; a load takes two cycles, a taken branch two, "
-        "a product one (Arm, Cortex-M0+ instruction summary)" + _SPI,
+        "a product one (Arm, Cortex-M0+ instruction summary)",
         12.0,
     ),
 }
@@ -91,16 +98,19 @@ class Estimate:
         return "yes" if self.high_ms <= self.step_ms else "no" if self.low_ms > self.step_ms else "unsure"
 
     @property
-    def verdict(self) -> str:
+    def answer(self) -> str:
         """In words, with the share of the core and what is left of a step."""
-        rate = f"fits {1000 / self.step_ms:g} Hz"
-        if self.fits == "no":
-            return f"{rate}: no, a step of {self.step_ms:g} ms would take at least {self.low_ms:.3g} ms"
-        low, high = (100 * ms / self.step_ms for ms in (self.low_ms, self.high_ms))
+        low, high = (f"{100 * ms / self.step_ms:.2g}" for ms in (self.low_ms, self.high_ms))
+        if self.fits == "yes":
+            return f"yes, uses about {low} to {high} % of the core, {self.step_ms - self.high_ms:.0f} ms left a step"
         if self.fits == "unsure":
-            return f"{rate}: not sure, it would use about {low:.2g} to {high:.3g} % of the core"
-        left = self.step_ms - self.high_ms
-        return f"{rate}: yes, uses about {low:.2g} to {high:.2g} % of the core, {left:.0f} ms left a step"
+            return f"not sure, it would use about {low} to {float(high):g} % of the core"
+        return f"no, it would use {float(low):g} % of the core or more"
+
+    @property
+    def verdict(self) -> str:
+        """The answer as a whole sentence."""
+        return f"fits {1000 / self.step_ms:g} Hz: {self.answer}"
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, ready for JSON."""
@@ -117,7 +127,7 @@ class Estimate:
             "high": round(self.high_ms, 3),
             "fits": self.fits,
             "verdict": self.verdict,
-            "why": core.why,
+            "why": core.reasons,
         }
 
 

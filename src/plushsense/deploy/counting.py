@@ -186,6 +186,10 @@ def _whole(program: Program, step: int) -> tuple[list[int], Ints, Ints]:
     """Five numbers about the toy; then the rows (`STEPS`, 3) after the first decision of the even stream, and those of
     the jittered one with the gap's as one more."""
     numbers = np.frombuffer(program.run(), dtype="<u4").astype(np.int64)
+    if not len(numbers):
+        raise ProgramError(
+            f"The C in the export refuses its own model on {program.target.name}: export the model again."
+        )
     table = numbers[5:].reshape(-1, 3)
     first = int(np.flatnonzero(table[:, 2] == 2)[0])
     even, jittered = (part[part[:, 2] == 1][1:] for part in (table[:first], table[first + 1 : -1]))

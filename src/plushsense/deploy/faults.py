@@ -51,7 +51,7 @@ TEXTS = (
     _Text(
         "index",
         "a layer reads from its newest row on, not from its oldest",
-        "uint32_t at = layer->newest * row + row, taps = layer->kernel;",
+        "uint32_t at = oldest(layer) * row, taps = layer->kernel;",
         "uint32_t at = layer->newest * row, taps = layer->kernel;",
     ),
     _Text(
@@ -112,8 +112,8 @@ TEXTS = (
     _Text(
         "rounding",
         "the magnitude loses its fraction",
-        "x = (int32_t)square_root(sum << 8);",
-        "x = (int32_t)(square_root(sum) << 4);",
+        "x = as_signed(square_root(sum << 8));",
+        "x = as_signed(square_root(sum) << 4);",
         "magnitude",
     ),
     _Text(

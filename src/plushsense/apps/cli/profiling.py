@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import textwrap
 from typing import TYPE_CHECKING
 
 from plushsense.apps.cli.output import bar, emit, say, table
@@ -75,14 +76,17 @@ def _counts(found: Profile) -> list[str]:
         ["network, for each MAC", *(f"{c.stages['network'] / found.arch.macs_per_step:.2f}" for c in costs)],
     ]
     window, times = found.window_instructions, found.arch.macs_per_window / found.arch.macs_per_step
+    again = (
+        f"Were the whole span of {found.arch.span} samples recomputed at every step: {found.arch.macs_per_window:,} "
+        f"MACs, {times:.0f} times as many; by the same count for each MAC about "
+        + ", ".join(f"{window[c.target] / 1e6:.1f} M on {c.target}" for c in costs)
+        + " (estimate)."
+    )
     return [
         "",
         f"Instructions, counted (mean of {STEPS} steps with a real toy's jitter)",
         table(["", *(c.target for c in costs)], rows),
-        f"Were the whole span of {found.arch.span} samples recomputed at every step: "
-        f"{found.arch.macs_per_window:,} MACs, {times:.0f} times as many; by the same count for each MAC about "
-        + ", ".join(f"{window[c.target] / 1e6:.1f} M on {c.target}" for c in costs)
-        + " (estimate).",
+        *textwrap.wrap(again, 118),
     ]
 
 
@@ -107,12 +111,11 @@ def _bytes(costs: list[Cost]) -> list[str]:
     needs = "; ".join(f"{c.target}: {', '.join(c.needs) or 'nothing'}" for c in costs)
     heap = sorted({s for c in costs for s in c.heap})
     floats = sorted({s for c in costs for s in c.floats})
-    return [
-        "Bytes",
-        table(["", *(c.target for c in costs)], rows),
-        f"Heap: {', '.join(heap) or 'none'}. Floating point: {', '.join(floats) or 'none'}. Proved by what the object "
-        f"needs from outside: {needs}.",
-    ]
+    proof = (
+        f"Heap: {', '.join(heap) or 'none'}. Floating point: {', '.join(floats) or 'none'}. All that plushsense.o "
+        f"needs from outside, on {needs}."
+    )
+    return ["Bytes", table(["", *(c.target for c in costs)], rows), *textwrap.wrap(proof, 118)]
 
 
 def _times(found: Profile) -> list[str]:
@@ -123,21 +126,25 @@ def _times(found: Profile) -> list[str]:
     rows = [
         [
             e.core.title,
-            f"{e.core.mhz} MHz",
+            e.core.mhz,
             e.core.target,
             f"{e.core.cycles_low:g} to {e.core.cycles_high:g}",
-            f"{e.low_ms:.2g} to {e.high_ms:.2g} ms",
-            e.verdict,
+            f"{e.low_ms:.2g} to {e.high_ms:.2g}",
+            e.answer,
         ]
         for e in found.estimates.values()
     ]
     why: dict[str, list[str]] = {}
     for e in found.estimates.values():
-        why.setdefault(e.core.why, []).append(e.core.title.partition(" (")[0])
+        why.setdefault(e.core.reasons, []).append(e.core.title.partition(" (")[0])
     return [
         "",
-        f"Time of a step, ESTIMATED. {SAID}",
-        table(["chip", "clock", "counted on", "cycles each", "a step", "verdict"], rows),
-        "Why these bounds:",
-        *(f"  {', '.join(names)}: {words}." for words, names in why.items()),
+        *textwrap.wrap(f"Time of a step, ESTIMATED. {SAID}", 118),
+        table(["chip", "MHz", "counted on", "cycles each", "ms a step", f"fits {1000 / found.step_ms:g} Hz"], rows),
+        "Where the bounds come from:",
+        *(line for words, names in why.items() for line in _wrapped(f"{', '.join(names)}: {words}.")),
     ]
+
+
+def _wrapped(text: str) -> list[str]:
+    return textwrap.wrap(text, 116, initial_indent="  ", subsequent_indent="    ")

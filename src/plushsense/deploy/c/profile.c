@@ -7,13 +7,14 @@
  * EVEN and JITTERED hold rows of 32-bit numbers, milliseconds and the measured channels: the same readings at even
  * times, and with the jitter of a real toy and a long gap at the end. What is written are rows of 32-bit numbers.
  */
+/* In angle brackets: those of the export, not the ones beside this file. */
 #ifdef PLUSH_STAGES
-#include "plushsense.c"
+#include <plushsense.c>
 #else
-#include "plushsense.h"
+#include <plushsense.h>
 #endif
-#include "plush_model.h"
-#include "target.h"
+#include <plush_model.h>
+#include <target.h>
 
 #define END_OF_ROWS 2
 #define ROW (1 + PLUSH_MODEL_CHANNELS)
@@ -104,7 +105,7 @@ int main(void)
     measure_asking();
     then = target_instructions();
     if (!begin())
-        return 1;
+        return 0; /* and nothing is written */
     took = since(then);
     put(sizeof toy);
     put(plush_memory_bytes(plush_model, PLUSH_MODEL_BYTES));
@@ -162,7 +163,7 @@ int main(void)
 {
     measure_asking();
     if (!begin())
-        return 1;
+        return 0; /* and nothing is written */
     count_stages(rows(EVEN), rows(EVEN_end));
     return 0;
 }
