@@ -73,6 +73,13 @@ def own(small: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(small, tmp_path / "out"))
 
 
+@pytest.fixture(scope="session")
+def emulators(target_here: Callable[[str], str]) -> None:
+    """Compilers and emulators of every target."""
+    for name in TARGETS:
+        target_here(name)
+
+
 def plainly(setting: Setting) -> bool:
     return setting.optimise == "-O2" and setting.cc in (None, "gcc") and not setting.image and not setting.cpp
 
@@ -191,6 +198,11 @@ def test_a_file_edited_by_hand_is_what_is_tested(
     assert said["max_abs_diff"] >= 1
     assert said["first"].startswith("On host (gcc -O0), golden: answer ")
     assert "'confidence' should be " in said["first"] and said["first"].count(".") == 1
+
+
+def test_the_folders_own_header_is_what_the_caller_reads(c_compiler: str, own: Path) -> None:
+    edit(own / "plushsense.h", "typedef struct plush_toy {", "typedef struct plush_toy {\n    uint32_t mine[5];")
+    assert verify(Export(own), ["host"], only=lambda s: s.optimise == "-O2" and s.cc == "gcc").passed
 
 
 def test_an_image_that_was_edited(c_compiler: str, own: Path) -> None:
