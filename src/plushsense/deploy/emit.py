@@ -8,11 +8,11 @@ import shutil
 import uuid
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from plushsense import __version__
 from plushsense.core.errors import BadInput
 from plushsense.deploy.golden import write_golden
 from plushsense.models.bundle import Bundle
@@ -24,7 +24,7 @@ BUNDLE = "model.plush"
 LIBRARY = ("plushsense.h", "plushsense.c")
 MODEL = ("plush_model.h", "plush_model.c")
 GOLDEN = "golden"
-TOY_BYTES = 288  # of a plush_toy where pointers have 32 bits (a test compiles it)
+TOY_BYTES = 304  # of a plush_toy where pointers have 32 bits (a test compiles it)
 _PEOPLE = ("subjects", "validation_subjects")
 _PER_LINE = 16
 
@@ -155,7 +155,7 @@ def _facts(model: IntegerModel, bundle: Bundle, model_bytes: int) -> dict[str, A
         "memory_bytes": memory_bytes(model),
         "simulated": bool(bundle.provenance.get("simulated", False)),
         "provenance": bundle.provenance,
-        "code_version": __version__,
+        "code_version": version("plushsense"),
     }
 
 
