@@ -21,8 +21,8 @@ _INT32 = (-2147483648.0, 2147483647.0)
 
 
 def magnitude_limit(n: int) -> int:
-    """The largest component of n whose magnitude, with its fraction bits, is sure to fit 32 bits: 2²⁷ / √n."""
-    return math.isqrt(2 ** (62 - 2 * MAGNITUDE_FRACTION_BITS) // n)
+    """The largest component of n whose magnitude, with its fraction bits, is sure to stay below 2³¹: under 2²⁷ / √n."""
+    return math.isqrt((2 ** (62 - 2 * MAGNITUDE_FRACTION_BITS) - 1) // n)
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ BUNDLE = "model.plush"
 LIBRARY = ("plushsense.h", "plushsense.c")
 MODEL = ("plush_model.h", "plush_model.c")
 GOLDEN = "golden"
-TOY_BYTES = 288  # of a plush_toy where pointers have 32 bits (a test compiles it)
+TOY_BYTES = 304  # of a plush_toy where pointers have 32 bits (a test compiles it)
 _PEOPLE = ("subjects", "validation_subjects")
 _PER_LINE = 16
 
@@ -190,25 +190,25 @@ def c_names(labels: Sequence[str]) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _comment(text: str) -> str:
-    """Text that may stand in a C comment."""
+def comment(text: str) -> str:
+    """Text as it may stand in a C comment."""
     return text.replace("*/", "* /").replace("/*", "/ *").replace("\\", "/").replace("\n", " ")
 
 
 def _header(facts: dict[str, Any]) -> str:
     gestures = "".join(
-        f"    PLUSH_{g['c_name']} = {i}, /* {_comment(g['label'])}: {g['affect']} */\n"
+        f"    PLUSH_GESTURE_{g['c_name']} = {i}, /* {comment(g['label'])}: {g['affect']} */\n"
         for i, g in enumerate(facts["gestures"])
     )
     channels = "".join(
-        f"    PLUSH_CHANNEL_{name} = {i}, /* {_comment(c['name'])}, {_comment(c['unit'])} */\n"
+        f"    PLUSH_CHANNEL_{name} = {i}, /* {comment(c['name'])}, {comment(c['unit'])} */\n"
         for i, (name, c) in enumerate(
             zip(c_names([c["name"] for c in facts["channels"]]), facts["channels"], strict=True)
         )
     )
     simulated = "\n * Trained on a simulation: it knows no real person's touch." if facts["simulated"] else ""
     return f"""/*
- * The model {_comment(facts["title"])}, as plushsense.c reads it. Made by PlushSense {facts["code_version"]}.
+ * The model {comment(facts["title"])}, as plushsense.c reads it. Made by PlushSense {facts["code_version"]}.
  * A step of {facts["step_ms"]:g} ms; warming for {facts["span"]} samples at {facts["rate_hz"]:g} Hz.{simulated}
  */
 #ifndef PLUSH_MODEL_H
@@ -229,7 +229,7 @@ extern "C" {{
 #define PLUSH_MODEL_STEP {facts["step"]} /* samples from one answer to the next */
 #define PLUSH_MODEL_SPAN {facts["span"]} /* samples until the first answer */
 
-/* The order of the values that plush_push() takes, in the layout '{_comment(facts["layout"])}'. */
+/* The order of the values that plush_push() takes, in the layout '{comment(facts["layout"])}'. */
 enum {{
 {channels}}};
 
@@ -251,7 +251,7 @@ def _source(model: IntegerModel, facts: dict[str, Any]) -> str:
     top = head(b"".join(piece for _, piece in sections))
     lines = [
         "/*",
-        f" * The model {_comment(facts['title'])}: the bytes of {IMAGE}, section by section.",
+        f" * The model {comment(facts['title'])}: the bytes of {IMAGE}, section by section.",
         " * Numbers of more than one byte are little-endian; weights stand with 128 added, for four filters at a time:",
         " * for every tap, for every four channels, 4 weights of each filter. The format is told in PlushSense's",
         " * models/image.",
@@ -262,7 +262,7 @@ def _source(model: IntegerModel, facts: dict[str, Any]) -> str:
     ]
     for what, piece in [(f"head: PLSH, version, bytes, CRC-32 of what follows ({HEAD_BYTES} bytes)", top), *sections]:
         if what:
-            lines.append(f"    /* {_comment(what)} */")
+            lines.append(f"    /* {comment(what)} */")
         for at in range(0, len(piece), _PER_LINE):
             lines.append("    " + " ".join(f"{v}," for v in piece[at : at + _PER_LINE]))
     return "\n".join([*lines, "};", ""])

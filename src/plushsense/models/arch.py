@@ -241,10 +241,12 @@ class Arch:
 
     @property
     def state_bytes_int8(self) -> int:
-        """Bytes kept between samples with 8-bit activations.
+        """Bytes that the network itself has to keep between samples with 8-bit activations.
 
         ``stream``: a ring of reach + 1 samples before each layer, and pool / step block sums of 16 bits for
         each feature. Otherwise the ring of the window, without the activations that are recomputed from it.
+        What a toy really needs is a little more (rings filled up to fours, the clock, sums, probabilities):
+        `plushsense.models.image.memory_bytes`.
         """
         if self.pool is None:
             return self.window * self.channels

@@ -44,10 +44,17 @@ class _Table:
     RANGES: dict[str, tuple[int, int]]
 
     def __post_init__(self) -> None:
+        rows: int | None = None
         for name, (low, high) in self.RANGES.items():
-            values = np.asarray(getattr(self, name), dtype=np.int64)
-            if values.ndim != 1 or (values.size and not low <= values.min() <= values.max() <= high):
-                raise BundleError(f"A fixed-point scale has {name} {values.tolist()}; accepted are {low} to {high}.")
+            given = np.asarray(getattr(self, name))
+            values = given.astype(np.int64) if given.dtype.kind in "iu" or not given.size else None
+            if values is None or values.ndim != 1 or (values.size and not low <= values.min() <= values.max() <= high):
+                raise BundleError(
+                    f"A fixed-point scale has {name} {given.tolist()}; accepted are whole numbers from {low} to {high}."
+                )
+            rows = len(values) if rows is None else rows
+            if len(values) != rows:
+                raise BundleError(f"A fixed-point scale has {len(values)} {name} for {rows} rows: give one for each.")
             object.__setattr__(self, name, values)
 
     def __len__(self) -> int:
@@ -59,8 +66,11 @@ class _Table:
 
     @classmethod
     def from_dict(cls: type[_T], table: Mapping[str, Any]) -> _T:
-        """A table from plain values."""
-        return cls(**{field.name: np.asarray(table[field.name], dtype=np.int64) for field in fields(cls)})  # type: ignore[arg-type]
+        """A table from plain values; BundleError for a column that is missing or does not fit."""
+        try:
+            return cls(**{field.name: np.asarray(table[field.name]) for field in fields(cls)})  # type: ignore[arg-type]
+        except (KeyError, ValueError, OverflowError) as cause:
+            raise BundleError(f"A fixed-point scale does not fit: {cause}. Train or export again.") from None
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +107,7 @@ class InputScale(_Table):
 class Requantize(_Table):
     """ReLU and sums to 8 bits, a filter each.
 
-    A sum below 0 gives 0; else ``t = sum >> before``, at most 65535; ``(t * multiplier + half) >> after``, at most
+    A sum up to 0 gives 0; else ``t = sum >> before``, at most 65535; ``(t * multiplier + half) >> after``, at most
     255, where half is ``2^after >> 1``.
     """
 
@@ -137,7 +147,8 @@ class LogitScale(_Table):
 def split_ratio(ratio: float, highest: float, most_after: int = 30) -> tuple[int, int, int]:
     """(before, multiplier, after) that multiply by ``ratio``; arguments reach up to ``highest``.
 
-    ``before`` shifts ``highest`` under 2^15, so that only bits of no weight are lost; the multiplier has 15 bits.
+    ``before`` shifts ``highest`` under 2^15, so that only bits of no weight are lost; the multiplier has 15 bits. A
+    ratio beyond what they can hold gives the largest multiplier: with it every whole number saturates.
     """
     if not (ratio > 0 and np.isfinite(ratio) and highest >= 0 and np.isfinite(highest)):
         return 0, 0, 0

@@ -13,7 +13,10 @@ of all that follows the head. Then, one after the other:
   (filled up): 4 filters × 4 channels
 - a class: i32 bias, u16 multiplier, u8 before, u8 after; then classes × features weights, each as weight + 128
 - a class: u8 affect (0 none, 1 positive, 2 neutral, 3 negative), its label in UTF-8 and a 0
-- the model's title in UTF-8 and a 0
+- the model's title in UTF-8 and a 0, with which the image ends
+
+The C library believes none of it unseen: it refuses an image in which a count or a scale is out of the ranges that
+`IntegerModel` and `plushsense.models.fixed` accept, a section is not whole, or the span is not that of the layers.
 """
 
 from __future__ import annotations
@@ -29,7 +32,7 @@ from numpy.typing import NDArray
 from plushsense.core.errors import BundleError
 from plushsense.core.gestures import GestureSet
 from plushsense.core.signal import Layout
-from plushsense.models.fixed import LogitScale, Requantize
+from plushsense.models.fixed import PROBABILITY_BITS, LogitScale, Requantize
 from plushsense.models.integer import IntegerNetwork
 
 MAGIC = b"PLSH"
@@ -37,6 +40,7 @@ IMAGE_VERSION = 1
 HEAD_BYTES = 16
 AFFECT_CODES = {"none": 0, "positive": 1, "neutral": 2, "negative": 3}
 GROUP = 4  # filters computed together, and channels read together
+MOST_CLOCK_UNITS = 1 << 22  # of the gap and the period: interpolation then needs no more than 32 bits
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +48,9 @@ class IntegerModel:
     """All that the toy computes with: network, layout (clock, validity, inputs), gestures, weight of a new step.
 
     ``smoothing`` is in steps of 2^-15 (`plushsense.models.fixed.smoothing_weight`).
+
+    Raises:
+        BundleError: when the parts do not fit together, or the toy could not hold them.
     """
 
     network: IntegerNetwork
@@ -65,11 +72,44 @@ class IntegerModel:
         ):
             if found > 255:
                 raise BundleError(f"The model has {found} {what}: in the toy there may be at most 255.")
+        for n, layer in enumerate(arch.layers, 1):
+            if layer.reach + 1 >= 1 << 16:
+                raise BundleError(
+                    f"Layer {n} of {arch.title} remembers {layer.reach + 1} samples: in the toy there may be at most "
+                    "65535, so take a shorter kernel or a smaller dilation."
+                )
+        if arch.pooled // arch.step >= 1 << 16:
+            raise BundleError(
+                f"{arch.title} pools {arch.pooled // arch.step} steps: in the toy there may be at most 65535, so take "
+                "a smaller pool or a longer step."
+            )
+        if not 1 <= self.smoothing <= 1 << PROBABILITY_BITS:
+            raise BundleError(
+                f"The smoothing weight is {self.smoothing}: accepted are 1 to {1 << PROBABILITY_BITS} (no smoothing)."
+            )
+        if not 1 <= self.layout.gap_ms * self._units_per_ms <= MOST_CLOCK_UNITS:
+            raise BundleError(
+                f"Layout '{self.layout.name}' bridges gaps of {self.layout.gap_ms} ms: at {self.layout.rate_hz:g} Hz "
+                f"the toy accepts 1 to {MOST_CLOCK_UNITS // self._units_per_ms} ms."
+            )
+        for derived in self.layout.derived:
+            if len(derived.of) > 255:
+                raise BundleError(
+                    f"Channel '{derived.name}' is made of {len(derived.of)} others: the toy takes at most 255."
+                )
+        for gesture in self.gestures.gestures:
+            if "\0" in gesture.label or gesture.label.encode(errors="replace").decode() != gesture.label:
+                raise BundleError(f"The gesture {gesture.label!r} has a character that the toy cannot keep: rename it.")
+
+    @property
+    def _units_per_ms(self) -> int:
+        """The clock's unit is the largest part of a millisecond of which the period is a whole number."""
+        return 1000 // math.gcd(1000, self.layout.period_us)
 
     def sections(self) -> list[tuple[str, bytes]]:
         """What follows the head, piece by piece with what each is."""
         arch, layout = self.network.arch, self.layout
-        unit = math.gcd(1000, layout.period_us)
+        units_per_ms = self._units_per_ms
         found = [
             (
                 "layers, measured channels, inputs, classes; step, blocks; span; period, gap, units a ms; smoothing, 0",
@@ -82,9 +122,9 @@ class IntegerModel:
                     arch.step,
                     arch.pooled // arch.step,
                     arch.span,
-                    layout.period_us // unit,
-                    layout.gap_ms * (1000 // unit),
-                    1000 // unit,
+                    layout.period_us * units_per_ms // 1000,
+                    layout.gap_ms * units_per_ms,
+                    units_per_ms,
                     self.smoothing,
                     0,
                 ),
@@ -131,6 +171,24 @@ def head(body: bytes) -> bytes:
     return MAGIC + struct.pack("<HHII", IMAGE_VERSION, 0, len(body) + HEAD_BYTES, zlib.crc32(body))
 
 
+def memory_bytes(model: IntegerModel) -> int:
+    """Bytes of memory that a toy needs beside its ``plush_toy``: what the C's ``plush_memory_bytes`` says."""
+    arch, channels = model.network.arch, len(model.layout.channels)
+    features = arch.filters[-1]
+    pieces = [4 * channels] * 3  # held, before, the sample being made
+    for layer, read in zip(arch.layers, arch.inputs, strict=True):
+        pieces.append((layer.reach + 1) * _filled(read))
+        pieces.append(4 * (layer.dilation if layer.kernel > 1 else 1))  # sums under the taps
+    pieces.append(2 * features * (arch.pooled // arch.step))
+    pieces += [4 * features, 4 * arch.classes, 4 * arch.classes]  # sums, logits, smoothed probabilities
+    pieces += [channels, features]  # which channels are valid, the newest features
+    return sum(_filled(piece) for piece in pieces)
+
+
+def _filled(n: int) -> int:
+    return -(-n // GROUP) * GROUP
+
+
 def _scales(bias: NDArray[np.int64], scale: Requantize | LogitScale) -> bytes:
     rows = zip(bias, scale.multiplier, scale.before, scale.after, strict=True)
     return b"".join(struct.pack("<iHBB", *(int(v) for v in row)) for row in rows)
@@ -139,23 +197,7 @@ def _scales(bias: NDArray[np.int64], scale: Requantize | LogitScale) -> bytes:
 def grouped(weights: NDArray[np.int8]) -> NDArray[np.uint8]:
     """Weights (F, C, K) as the toy reads them, each + 128 and filled up with 128: (F / 4, K, C / 4, 4, 4)."""
     f, c, k = weights.shape
-    full = np.zeros((-(-f // GROUP) * GROUP, -(-c // GROUP) * GROUP, k), dtype=np.int16)
+    full = np.zeros((_filled(f), _filled(c), k), dtype=np.int16)
     full[:f, :c] = weights
     split = full.reshape(len(full) // GROUP, GROUP, full.shape[1] // GROUP, GROUP, k)
     return np.ascontiguousarray(split.transpose(0, 4, 2, 1, 3) + 128).astype(np.uint8)
-
-
-def memory_bytes(model: IntegerModel) -> int:
-    """Bytes that the toy remembers in: what ``plush_memory_bytes`` says of the model's image."""
-    arch, measured = model.network.arch, len(model.layout.channels)
-
-    def whole(n: int) -> int:
-        return -(-n // GROUP) * GROUP
-
-    rings = sum(
-        (layer.reach + 1) * whole(read) + whole(2 * (layer.reach + 1))
-        for layer, read in zip(arch.layers, arch.inputs, strict=True)
-    )
-    features = arch.filters[-1]
-    pooling = whole(2 * features * (arch.pooled // arch.step)) + 4 * features + whole(features)
-    return 3 * 4 * measured + rings + pooling + 2 * 4 * arch.classes + whole(measured)

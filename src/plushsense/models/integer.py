@@ -93,6 +93,11 @@ class IntegerNetwork:
                 raise BundleError(
                     f"Layer {n} of the integer network has weights {part.weights.shape}; {arch.title} needs {shape}."
                 )
+            if part.weights.dtype != np.int8 or part.bias.dtype.kind != "i":
+                raise BundleError(
+                    f"Layer {n} of the integer network has weights of {part.weights.dtype} and biases of "
+                    f"{part.bias.dtype}: accepted are int8 and whole numbers."
+                )
             most = 255 * (arch.pooled if part is self.dense else 1)
             reach = np.abs(part.weights.astype(np.int64)).reshape(len(part.bias), -1).sum(axis=1) * most
             if part.weights.size and int((np.abs(part.bias) + reach).max()) > _SUM_LIMIT:
@@ -106,9 +111,9 @@ class IntegerNetwork:
         """Logits (N, K) in steps of 1/256 from raw integer windows (N, C, T); the last ``arch.span`` samples are read.
 
         Raises:
-            BadInput: for windows of another shape, or shorter than the span.
+            BadInput: for windows of another shape, shorter than the span, or not of whole numbers.
         """
-        x = np.asarray(x)
+        x = _whole(x)
         check_windows(self.arch, x.shape)
         return np.concatenate([self._logits(x[at : at + 64]) for at in range(0, len(x), 64)] or [self._none()])
 
@@ -124,7 +129,7 @@ class IntegerNetwork:
 
     def activations(self, x: ArrayLike) -> list[Bytes]:
         """What each layer reads and the last one gives, of windows (N, C, T): [(N, T', C')] uint8, to look inside."""
-        seen = [self.inputs.apply(np.asarray(x).transpose(0, 2, 1))]
+        seen = [self.inputs.apply(_whole(x).transpose(0, 2, 1))]
         for layer, part in zip(self.arch.layers, self.layers, strict=True):
             taps = taps_of(seen[-1].astype(np.float64), layer)
             seen.append(np.stack([part.apply(each.reshape(len(each), -1)) for each in taps]).astype(np.uint8))
@@ -133,6 +138,16 @@ class IntegerNetwork:
     def stepper(self) -> IntegerStepper:
         """A reader of one stream, warming."""
         return IntegerStepper(self)
+
+
+def _whole(x: ArrayLike) -> NDArray[Any]:
+    """Raw values: a network in integers does not read scaled ones."""
+    values = np.asarray(x)
+    if values.size and values.dtype.kind not in "iu":
+        raise BadInput(
+            f"A network in integers reads raw whole numbers, not {values.dtype}: give it the samples before scaling."
+        )
+    return values
 
 
 class IntegerStepper:
@@ -159,9 +174,9 @@ class IntegerStepper:
         """Raw integer samples (n, C): the logits (K,), in steps of 1/256, of every decision that falls due.
 
         Raises:
-            BadInput: for samples of another shape.
+            BadInput: for samples of another shape, or not whole numbers.
         """
-        block = np.asarray(samples)
+        block = _whole(samples)
         if block.ndim != 2 or block.shape[1] != self.arch.channels:
             raise BadInput(
                 f"Samples of the shape {block.shape} do not fit: {self.arch.symbol} reads "

@@ -18,6 +18,16 @@
 #define LOGIT_LIMIT 16384
 #define WEIGHT_ZERO 128u    /* weights are stored with this added: some cores cannot load a signed byte */
 
+/* What a model may ask for, so that every sum, size and address below is sure to fit. */
+#define MOST_UNITS (UINT32_C(1) << 22) /* of the clock's gap and period: see part_of() */
+#define MOST_STEP 257u                 /* 257 x 255 is the most that 16 bits hold */
+#define MOST_ROWS 65535u
+#define MOST_FILTERS 4096u
+#define MOST_SHIFT 30u
+#define MOST_INPUT_SHIFT 16u
+#define MOST_MULTIPLIER 32767u
+#define MOST_INPUT_BIAS (INT32_C(1) << 30)
+
 /* ---- Small arithmetic ------------------------------------------------------------------------------------------ */
 
 static uint32_t le16(const uint8_t *p)
@@ -52,7 +62,8 @@ static uint32_t half(uint32_t shift)
     return (UINT32_C(1) << shift) >> 1;
 }
 
-/* floor((distance * into + add) / by) for into <= by < 2^24; the product may need more than 32 bits. */
+/* floor((distance * into + add) / by) for into <= by <= 2 MOST_UNITS and add <= by / 2. The product may need more than
+ * 32 bits: then it is divided by hand, a byte of the distance at a time (`rest` stays below 2^8 by + 2^8 into). */
 static uint32_t part_of(uint32_t distance, uint32_t into, uint32_t by, uint32_t add, uint32_t narrow)
 {
     uint32_t quotient = 0, rest = 0, byte;
@@ -108,7 +119,7 @@ static uint32_t checksum(const uint8_t *bytes, uint32_t n) /* CRC-32, as zip and
 
 static plush_status check(const uint8_t *model, uint32_t bytes)
 {
-    if (bytes < HEAD_BYTES || memcmp(model, "PLSH", 4) != 0)
+    if (model == NULL || bytes < HEAD_BYTES || memcmp(model, "PLSH", 4) != 0)
         return PLUSH_NOT_A_MODEL;
     if (le16(model + 4) != PLUSH_IMAGE_VERSION)
         return PLUSH_OTHER_VERSION;
@@ -123,21 +134,56 @@ static uint32_t fill_up(uint32_t n)
     return (n + GROUP - 1) / GROUP * GROUP;
 }
 
-/* A piece of the memory; only reckoned while there is none. */
-static void *take(uint8_t *memory, uint32_t *used, uint32_t bytes)
-{
-    void *piece = memory == NULL ? NULL : memory + *used;
+/* What is left to read of a model. */
+typedef struct {
+    const uint8_t *at;
+    uint32_t left;
+} source;
 
-    *used += fill_up(bytes);
-    return piece;
+/* The next bytes of a model; NULL when it has not so many. */
+static const uint8_t *next_bytes(source *from, uint32_t bytes)
+{
+    const uint8_t *start = from->at;
+
+    if (bytes > from->left)
+        return NULL;
+    from->at += bytes;
+    from->left -= bytes;
+    return start;
 }
 
-/* Reads a model that check() found good, and hands out the memory. Returns the bytes of it. */
-static uint32_t lay_out(plush_toy *toy, const uint8_t *model, uint8_t *memory)
+/* The next text of a model; NULL when it does not end. */
+static const uint8_t *next_text(source *from)
 {
-    const uint8_t *p = model + HEAD_BYTES;
-    uint32_t used = 0, i;
+    const uint8_t *start = from->at;
 
+    while (from->left > 0) {
+        from->left--;
+        if (*from->at++ == 0)
+            return start;
+    }
+    return NULL;
+}
+
+/* The scales of so many filters or classes. */
+static const uint8_t *next_scales(source *from, uint32_t n)
+{
+    const uint8_t *scales = next_bytes(from, SCALE_BYTES * n), *scale = scales;
+
+    if (scales == NULL)
+        return NULL;
+    for (; n > 0; n--, scale += SCALE_BYTES)
+        if (le16(scale + 4) > MOST_MULTIPLIER || scale[6] > MOST_SHIFT || scale[7] > MOST_SHIFT)
+            return NULL;
+    return scales;
+}
+
+static int read_head(plush_toy *toy, source *from)
+{
+    const uint8_t *p = next_bytes(from, 28);
+
+    if (p == NULL)
+        return 0;
     toy->layers = p[0];
     toy->channels = p[1];
     toy->inputs = p[2];
@@ -149,12 +195,118 @@ static uint32_t lay_out(plush_toy *toy, const uint8_t *model, uint8_t *memory)
     toy->gap = le32(p + 16);
     toy->units_per_ms = le32(p + 20);
     toy->smoothing = (uint16_t)le16(p + 24);
+    toy->ranges = next_bytes(from, 8u * toy->channels);
+    if (toy->layers == 0 || toy->layers > PLUSH_MAX_LAYERS || toy->channels == 0 || toy->inputs == 0 ||
+        toy->classes == 0 || toy->step == 0 || toy->step > MOST_STEP || toy->blocks == 0 || toy->period == 0 ||
+        toy->period > MOST_UNITS || toy->gap == 0 || toy->gap > MOST_UNITS || toy->units_per_ms == 0 ||
+        toy->smoothing == 0 || toy->smoothing > PLUSH_ONE || toy->ranges == NULL)
+        return 0;
     toy->narrow = (UINT32_MAX - toy->gap) / (2 * toy->gap);
-    toy->ranges = p + 28;
-    toy->input_plan = toy->ranges + 8u * toy->channels;
-    p = toy->input_plan;
-    for (i = 0; i < toy->inputs; i++)
-        p += 2 + p[1] + 12;
+    return 1;
+}
+
+static int read_input_plan(plush_toy *toy, source *from)
+{
+    uint32_t i, n;
+
+    toy->input_plan = from->at;
+    for (i = 0; i < toy->inputs; i++) {
+        const uint8_t *head = next_bytes(from, 2);
+        const uint8_t *parts = head == NULL ? NULL : next_bytes(from, head[1]);
+        const uint8_t *scale = parts == NULL ? NULL : next_bytes(from, 12);
+        int32_t bias;
+
+        if (scale == NULL || head[0] > 1 || head[1] == 0 || (head[0] == 0 && head[1] != 1))
+            return 0;
+        for (n = 0; n < head[1]; n++)
+            if (parts[n] >= toy->channels)
+                return 0;
+        bias = as_signed(le32(scale + 4));
+        if (bias < -MOST_INPUT_BIAS || bias >= MOST_INPUT_BIAS || le16(scale + 8) > MOST_MULTIPLIER ||
+            scale[10] > MOST_INPUT_SHIFT || scale[11] > MOST_SHIFT)
+            return 0;
+    }
+    return 1;
+}
+
+/* A layer that reads so many channels. */
+static int read_layer(plush_layer *layer, uint32_t channels, source *from)
+{
+    const uint8_t *p = next_bytes(from, 8);
+    uint32_t row = fill_up(channels), filters, rows;
+
+    if (p == NULL)
+        return 0;
+    filters = le16(p + 6);
+    if (le16(p) == 0 || le16(p + 2) == 0 || le16(p + 4) != channels || filters == 0 || filters > MOST_FILTERS)
+        return 0;
+    layer->kernel = (uint16_t)le16(p);
+    layer->dilation = (uint16_t)(layer->kernel > 1 ? le16(p + 2) : 1u);
+    rows = layer->kernel - 1u;
+    rows = rows * layer->dilation + 1u;
+    layer->scales = next_scales(from, filters);
+    if (rows > MOST_ROWS || layer->scales == NULL || layer->kernel * row > from->left / fill_up(filters))
+        return 0;
+    layer->groups = (uint16_t)(row / GROUP);
+    layer->filters = (uint16_t)filters;
+    layer->rows = (uint16_t)rows;
+    layer->weights = next_bytes(from, layer->kernel * row * fill_up(filters));
+    return 1;
+}
+
+static int read_dense_and_names(plush_toy *toy, source *from)
+{
+    uint32_t i;
+
+    toy->dense = next_scales(from, toy->classes);
+    toy->dense_weights = next_bytes(from, (uint32_t)toy->classes * toy->features);
+    if (toy->dense == NULL || toy->dense_weights == NULL)
+        return 0;
+    toy->names = from->at;
+    for (i = 0; i < toy->classes; i++) {
+        const uint8_t *affect = next_bytes(from, 1);
+
+        if (affect == NULL || *affect > PLUSH_AFFECT_NEGATIVE || next_text(from) == NULL)
+            return 0;
+    }
+    toy->title = next_text(from);
+    return toy->title != NULL;
+}
+
+/* Reads a model that check() found good; says whether all that stands in it holds together. */
+static int read_model(plush_toy *toy, const uint8_t *model)
+{
+    source from;
+    uint32_t span, i;
+
+    from.at = model + HEAD_BYTES;
+    from.left = le32(model + 8) - HEAD_BYTES;
+    if (!read_head(toy, &from) || !read_input_plan(toy, &from))
+        return 0;
+    toy->features = toy->inputs;
+    span = (uint32_t)toy->step * toy->blocks;
+    for (i = 0; i < toy->layers; i++) {
+        if (!read_layer(&toy->layer[i], toy->features, &from))
+            return 0;
+        toy->features = toy->layer[i].filters;
+        span += toy->layer[i].rows - 1u;
+    }
+    return read_dense_and_names(toy, &from) && toy->span == span && from.left == 0;
+}
+
+/* A piece of the memory; only reckoned while there is none. */
+static void *take(uint8_t *memory, uint32_t *used, uint32_t bytes)
+{
+    void *piece = memory == NULL ? NULL : memory + *used;
+
+    *used += fill_up(bytes);
+    return piece;
+}
+
+/* Hands out the memory of a model that was read. Returns the bytes of it. */
+static uint32_t share_out(plush_toy *toy, uint8_t *memory)
+{
+    uint32_t used = 0, i;
 
     toy->held = (int32_t *)take(memory, &used, 4u * toy->channels);
     toy->before = (int32_t *)take(memory, &used, 4u * toy->channels);
@@ -162,30 +314,10 @@ static uint32_t lay_out(plush_toy *toy, const uint8_t *model, uint8_t *memory)
     for (i = 0; i < toy->layers; i++) {
         plush_layer *layer = &toy->layer[i];
 
-        layer->kernel = (uint16_t)le16(p);
-        layer->dilation = (uint16_t)le16(p + 2);
-        layer->groups = (uint16_t)(fill_up(le16(p + 4)) / GROUP);
-        layer->filters = (uint16_t)le16(p + 6);
-        layer->rows = (uint16_t)((layer->kernel - 1u) * layer->dilation + 1u);
-        layer->scales = p + 8;
-        layer->weights = layer->scales + SCALE_BYTES * layer->filters;
-        p = layer->weights + (uint32_t)layer->kernel * layer->groups * GROUP * fill_up(layer->filters);
         layer->ring = (uint8_t *)take(memory, &used, (uint32_t)layer->rows * layer->groups * GROUP);
-        layer->row_sums = (uint16_t *)take(memory, &used, 2u * layer->rows);
-        toy->features = layer->filters;
+        layer->tap_sums = (uint32_t *)take(memory, &used, UINT32_C(4) * layer->dilation);
     }
-    toy->dense = p;
-    toy->dense_weights = p + SCALE_BYTES * toy->classes;
-    toy->names = toy->dense_weights + (uint32_t)toy->classes * toy->features;
-    p = toy->names;
-    for (i = 0; i < toy->classes; i++) {
-        p++;
-        while (*p++ != 0) {
-        }
-    }
-    toy->title = p;
-
-    toy->sums = (uint16_t *)take(memory, &used, 2u * toy->features * toy->blocks);
+    toy->sums = (uint16_t *)take(memory, &used, UINT32_C(2) * toy->features * toy->blocks);
     toy->total = (uint32_t *)take(memory, &used, 4u * toy->features);
     toy->logits = (int32_t *)take(memory, &used, 4u * toy->classes);
     toy->smooth = (int32_t *)take(memory, &used, 4u * toy->classes);
@@ -196,54 +328,92 @@ static uint32_t lay_out(plush_toy *toy, const uint8_t *model, uint8_t *memory)
 
 /* ---- The network ----------------------------------------------------------------------------------------------- */
 
-static uint8_t *newest_row(plush_layer *layer)
+/* The row of the oldest sample that a layer remembers: under its first tap, and the next to be written over. */
+static uint32_t oldest(const plush_layer *layer)
 {
+    return layer->newest + 1u < layer->rows ? layer->newest + 1u : 0u;
+}
+
+/* Room for a new sample. */
+static uint8_t *next_row(plush_layer *layer)
+{
+    layer->newest = (uint16_t)oldest(layer);
     return layer->ring + (uint32_t)layer->newest * layer->groups * GROUP;
 }
 
-static uint8_t *next_row(plush_layer *layer)
+static uint32_t row_sum(const plush_layer *layer, uint32_t row)
 {
-    layer->newest = (uint16_t)(layer->newest + 1u < layer->rows ? layer->newest + 1u : 0u);
-    return newest_row(layer);
+    const uint8_t *x = layer->ring + row * layer->groups * GROUP;
+    uint32_t sum = 0, n;
+
+    for (n = layer->groups * GROUP; n > 0; n--)
+        sum += *x++;
+    return sum;
 }
 
-/* The row that was just written is complete. */
-static void close_row(plush_layer *layer)
+/* What every weight's + 128 adds to the sums of the newest position: 128 times all activations under the taps. Their
+ * sum is that of `dilation` samples ago, less the row that has left, plus the one that has come. */
+static uint32_t surplus(plush_layer *layer)
 {
-    const uint8_t *row = newest_row(layer);
-    uint32_t sum = 0, i;
+    uint32_t *kept = &layer->tap_sums[layer->phase], sum = *kept + row_sum(layer, layer->newest);
 
-    for (i = 0; i < layer->groups * GROUP; i++)
-        sum += row[i];
-    layer->row_sums[layer->newest] = (uint16_t)sum;
+    *kept = sum - row_sum(layer, oldest(layer));
+    layer->phase = (uint16_t)(layer->phase + 1u < layer->dilation ? layer->phase + 1u : 0u);
+    return sum * WEIGHT_ZERO;
 }
 
 /* Four products for each of four filters: `x` 4 activations, `w` 4 filters x 4 channels, weights with 128 added.
- * Three ways to the same sums: two multiplications at once where a core has them; otherwise plain C, in which small
- * cores must keep the written order, or their few registers overflow. */
-#if defined(__GNUC__) && defined(__ARM_FEATURE_DSP) && defined(__ARM_ARCH_ISA_THUMB)
+ * Three ways to the same sums: several multiplications at once where a core has them; otherwise plain C, in which small
+ * cores must keep the written order, or their few registers overflow. PLUSH_PLAIN asks for plain C everywhere. */
+#if defined(__GNUC__) && defined(__ARM_FEATURE_DSP) && defined(__ARM_ARCH_ISA_THUMB) && !defined(PLUSH_PLAIN)
 
 /* Channels 0 and 2, then 1 and 3, each pair as two halves of a register. */
-#define PLUSH_PAIRS(even, odd, four)                    \
+#define PLUSH_PAIRS(even, odd, four) \
     __asm__ volatile("uxtb16 %0, %2\n\tuxtb16 %1, %2, ror #8" : "=&r"(even), "=r"(odd) : "r"(four))
-#define PLUSH_FILTER(s, i)                                                                 \
-    do {                                                                                   \
-        uint32_t four, e, o;                                                               \
-        memcpy(&four, w + 4 * (i), 4);                                                     \
-        PLUSH_PAIRS(e, o, four);                                                           \
-        __asm__ volatile("smlad %0, %1, %2, %0\n\tsmlad %0, %3, %4, %0"                    \
-                         : "+r"(s) : "r"(even), "r"(e), "r"(odd), "r"(o));                 \
-        __asm__ volatile("" ::: "memory");                                                 \
+#define PLUSH_FILTER(s, i)                                              \
+    do {                                                                \
+        uint32_t four, e, o;                                            \
+        memcpy(&four, w + 4 * (i), 4);                                  \
+        PLUSH_PAIRS(e, o, four);                                        \
+        __asm__ volatile("smlad %0, %1, %2, %0\n\tsmlad %0, %3, %4, %0" \
+                         : "+&r"(s)                                     \
+                         : "r"(even), "r"(e), "r"(odd), "r"(o));        \
+        __asm__ volatile("" ::: "memory");                              \
     } while (0)
-#define PLUSH_SIXTEEN              \
-    do {                           \
-        uint32_t both, even, odd;  \
-        memcpy(&both, x, 4);       \
+#define PLUSH_SUMS uint32_t s0 = 0, s1 = 0, s2 = 0, s3 = 0
+#define PLUSH_SIXTEEN                 \
+    do {                              \
+        uint32_t both, even, odd;     \
+        memcpy(&both, x, 4);          \
         PLUSH_PAIRS(even, odd, both); \
-        PLUSH_FILTER(s0, 0);       \
-        PLUSH_FILTER(s1, 1);       \
-        PLUSH_FILTER(s2, 2);       \
-        PLUSH_FILTER(s3, 3);       \
+        PLUSH_FILTER(s0, 0);          \
+        PLUSH_FILTER(s1, 1);          \
+        PLUSH_FILTER(s2, 2);          \
+        PLUSH_FILTER(s3, 3);          \
+    } while (0)
+
+#elif defined(__SSE2__) && !defined(PLUSH_PLAIN)
+
+#include <emmintrin.h>
+
+/* Every product of 8 x 8 bits fits 16; each sum is kept as two halves, of channels 0 and 1 and of 2 and 3. */
+#define PLUSH_SUMS __m128i zero = _mm_setzero_si128(), s01 = zero, s23 = zero
+#define PLUSH_SIXTEEN                                                                    \
+    do {                                                                                 \
+        int32_t four;                                                                    \
+        __m128i a, b = _mm_loadu_si128((const __m128i *)(const void *)w);                \
+        memcpy(&four, x, 4);                                                             \
+        a = _mm_unpacklo_epi8(_mm_shuffle_epi32(_mm_cvtsi32_si128(four), 0), zero);      \
+        s01 = _mm_add_epi32(s01, _mm_madd_epi16(a, _mm_unpacklo_epi8(b, zero)));         \
+        s23 = _mm_add_epi32(s23, _mm_madd_epi16(a, _mm_unpackhi_epi8(b, zero)));         \
+    } while (0)
+#define PLUSH_GIVE                                     \
+    do {                                               \
+        uint32_t halves[8];                            \
+        memcpy(halves, &s01, sizeof s01);              \
+        memcpy(halves + 4, &s23, sizeof s23);          \
+        for (taps = 0; taps < GROUP; taps++)           \
+            sum[taps] = halves[2 * taps] + halves[2 * taps + 1]; \
     } while (0)
 
 #else
@@ -253,41 +423,50 @@ static void close_row(plush_layer *layer)
 #else
 #define PLUSH_IN_ORDER
 #endif
-#define PLUSH_CHANNEL(i)             \
-    do {                             \
-        uint32_t a = x[i];           \
-        s0 += a * w[(i)];            \
-        PLUSH_IN_ORDER;              \
-        s1 += a * w[4 + (i)];        \
-        PLUSH_IN_ORDER;              \
-        s2 += a * w[8 + (i)];        \
-        PLUSH_IN_ORDER;              \
-        s3 += a * w[12 + (i)];       \
-        PLUSH_IN_ORDER;              \
+#define PLUSH_CHANNEL(i)      \
+    do {                      \
+        uint32_t a = x[i];    \
+        s0 += a * w[(i)];     \
+        PLUSH_IN_ORDER;       \
+        s1 += a * w[4 + (i)]; \
+        PLUSH_IN_ORDER;       \
+        s2 += a * w[8 + (i)]; \
+        PLUSH_IN_ORDER;       \
+        s3 += a * w[12 + (i)]; \
+        PLUSH_IN_ORDER;       \
     } while (0)
-#define PLUSH_SIXTEEN      \
-    do {                   \
-        PLUSH_CHANNEL(0);  \
-        PLUSH_CHANNEL(1);  \
-        PLUSH_CHANNEL(2);  \
-        PLUSH_CHANNEL(3);  \
+#define PLUSH_SUMS uint32_t s0 = 0, s1 = 0, s2 = 0, s3 = 0
+#define PLUSH_SIXTEEN     \
+    do {                  \
+        PLUSH_CHANNEL(0); \
+        PLUSH_CHANNEL(1); \
+        PLUSH_CHANNEL(2); \
+        PLUSH_CHANNEL(3); \
     } while (0)
 
 #endif
 
-/* The sums of four filters at one position, of activations times (weight + 128), modulo 2^32. By itself, so that its
- * loop has all registers. */
+#ifndef PLUSH_GIVE
+#define PLUSH_GIVE   \
+    do {             \
+        sum[0] = s0; \
+        sum[1] = s1; \
+        sum[2] = s2; \
+        sum[3] = s3; \
+    } while (0)
+#endif
+
+/* The sums of four filters at the newest position, of activations times (weight + 128), modulo 2^32; returns where the
+ * next filters' weights begin. By itself, so that its loop has all registers. */
 #if defined(__GNUC__)
 __attribute__((noinline))
 #endif
 static const uint8_t *four_sums(const plush_layer *layer, const uint8_t *w, uint32_t sum[GROUP])
 {
     uint32_t row = layer->groups * GROUP, size = layer->rows * row, stride = layer->dilation * row;
-    uint32_t at = layer->newest * row + row, taps = layer->kernel;
-    uint32_t s0 = 0, s1 = 0, s2 = 0, s3 = 0;
+    uint32_t at = oldest(layer) * row, taps = layer->kernel;
+    PLUSH_SUMS;
 
-    if (at == size)
-        at = 0;
     do {
         const uint8_t *x = layer->ring + at, *end = x + row;
 
@@ -300,27 +479,8 @@ static const uint8_t *four_sums(const plush_layer *layer, const uint8_t *w, uint
         if (at >= size)
             at -= size;
     } while (--taps != 0);
-    sum[0] = s0;
-    sum[1] = s1;
-    sum[2] = s2;
-    sum[3] = s3;
+    PLUSH_GIVE;
     return w;
-}
-
-/* What every weight's + 128 added to each of those sums. */
-static uint32_t surplus(const plush_layer *layer)
-{
-    uint32_t at = layer->newest + 1u, sum = 0, taps;
-
-    if (at == layer->rows)
-        at = 0;
-    for (taps = layer->kernel; taps > 0; taps--) {
-        sum += layer->row_sums[at];
-        at += layer->dilation;
-        if (at >= layer->rows)
-            at -= layer->rows;
-    }
-    return sum * WEIGHT_ZERO;
 }
 
 /* ReLU, and a sum to 8 bits. */
@@ -338,7 +498,7 @@ static uint32_t requantize(int32_t sum, const uint8_t *scale)
 }
 
 /* One new position of a layer, (filters) activations. */
-static void advance(const plush_layer *layer, uint8_t *out)
+static void advance(plush_layer *layer, uint8_t *out)
 {
     const uint8_t *weights = layer->weights, *scale = layer->scales;
     uint32_t extra = surplus(layer), sum[GROUP], f, i;
@@ -359,7 +519,6 @@ static void network_sample(plush_toy *toy)
     for (i = 0; i < toy->layers; i++) {
         plush_layer *layer = &toy->layer[i];
 
-        close_row(layer);
         advance(layer, i + 1u < toy->layers ? next_row(layer + 1) : toy->last);
     }
     for (f = 0; f < toy->features; f++) {
@@ -496,7 +655,7 @@ static void read_inputs(plush_toy *toy)
 
             for (n = p[1]; n > 0; n--)
                 sum += square(toy->sample[*part++]);
-            x = (int32_t)square_root(sum << 8); /* with 4 fraction bits */
+            x = as_signed(square_root(sum << 8)); /* with 4 fraction bits */
         }
         p = part;
         offset = as_signed(le32(p));
@@ -568,8 +727,13 @@ uint32_t plush_memory_bytes(const uint8_t *model, uint32_t model_bytes)
 {
     plush_toy toy;
 
-    return check(model, model_bytes) == PLUSH_OK ? lay_out(&toy, model, NULL) : 0;
+    return check(model, model_bytes) == PLUSH_OK && read_model(&toy, model) ? share_out(&toy, NULL) : 0;
 }
+
+struct plush_aligned {
+    uint8_t byte;
+    uint32_t word;
+};
 
 plush_status plush_begin(plush_toy *toy, const uint8_t *model, uint32_t model_bytes, void *memory,
                          uint32_t memory_bytes)
@@ -577,26 +741,37 @@ plush_status plush_begin(plush_toy *toy, const uint8_t *model, uint32_t model_by
     plush_status status = check(model, model_bytes);
 
     memset(toy, 0, sizeof *toy);
-    if (status != PLUSH_OK)
+    if (status == PLUSH_OK && !read_model(toy, model))
+        status = PLUSH_DAMAGED;
+    if (status == PLUSH_OK && (memory == NULL || (uintptr_t)memory % offsetof(struct plush_aligned, word) != 0 ||
+                               share_out(toy, NULL) > memory_bytes))
+        status = PLUSH_MEMORY_TOO_SMALL;
+    if (status != PLUSH_OK) {
+        memset(toy, 0, sizeof *toy);
         return status;
-    if (memory == NULL || lay_out(toy, model, NULL) > memory_bytes)
-        return PLUSH_MEMORY_TOO_SMALL;
+    }
     toy->memory = memory;
-    toy->memory_bytes = lay_out(toy, model, (uint8_t *)memory);
+    toy->memory_bytes = share_out(toy, (uint8_t *)memory);
     plush_restart(toy);
     return PLUSH_OK;
 }
 
 void plush_restart(plush_toy *toy)
 {
-    uint32_t phase = toy->span % toy->step;
+    uint32_t phase;
 
+    if (toy->memory == NULL) /* plush_begin() has not said PLUSH_OK */
+        return;
     memset(toy->memory, 0, toy->memory_bytes);
     toy->heard = toy->running = toy->started = 0;
     toy->block = 0;
     toy->warm = toy->answer.sample = 0;
     toy->answer.state = PLUSH_WARMING;
+    toy->answer.gesture = 0;
+    toy->answer.affect = PLUSH_AFFECT_NONE;
+    toy->answer.confidence = 0;
     /* So that a step ends with the very sample that fills the span. */
+    phase = toy->span % toy->step;
     toy->filled = (uint16_t)(phase == 0 ? 0 : toy->step - phase);
 }
 
@@ -604,6 +779,8 @@ uint32_t plush_push(plush_toy *toy, uint32_t ms, const int32_t *values)
 {
     uint32_t between, due = 0;
 
+    if (toy->memory == NULL) /* plush_begin() has not said PLUSH_OK */
+        return 0;
     if (toy->heard && (ms < toy->seen_ms || ms - toy->seen_ms > toy->gap / toy->units_per_ms)) {
         toy->restarts++;
         plush_restart(toy);
@@ -639,5 +816,5 @@ const char *plush_gesture_name(const plush_toy *toy, uint8_t gesture)
 
 const char *plush_model_title(const plush_toy *toy)
 {
-    return (const char *)toy->title;
+    return toy->memory != NULL ? (const char *)toy->title : "";
 }

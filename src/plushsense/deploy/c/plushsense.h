@@ -36,7 +36,7 @@ typedef enum {
     PLUSH_OK = 0,
     PLUSH_NOT_A_MODEL = 1,     /* the bytes do not begin with PLSH */
     PLUSH_OTHER_VERSION = 2,   /* a model for another version of this library */
-    PLUSH_DAMAGED = 3,         /* cut off, or its checksum does not match */
+    PLUSH_DAMAGED = 3,         /* cut off, its checksum does not match, or what stands in it does not hold together */
     PLUSH_MEMORY_TOO_SMALL = 4 /* give plush_memory_bytes() bytes, aligned for uint32_t */
 } plush_status;
 
@@ -49,7 +49,7 @@ typedef enum {
     PLUSH_AFFECT_NEGATIVE = 3
 } plush_affect;
 
-/* An answer. While warming, only `ms`, `state` and `sample` mean anything. */
+/* An answer. While warming, only `ms`, `state` and `sample` mean anything; the rest is 0. */
 typedef struct {
     uint32_t ms;         /* time of the newest sample that it knows, rounded down */
     uint32_t sample;     /* even samples since the start or the last restart; wraps */
@@ -67,10 +67,11 @@ typedef struct {
     uint16_t rows;          /* samples that it remembers */
     uint16_t dilation;
     uint16_t newest;        /* row of the newest sample */
+    uint16_t phase;         /* the next of tap_sums */
     const uint8_t *scales;  /* of each filter: bias, multiplier, shifts */
     const uint8_t *weights;
     uint8_t *ring;          /* rows x groups x 4 activations */
-    uint16_t *row_sums;     /* of each row, the sum of its activations */
+    uint32_t *tap_sums;     /* for each of the next `dilation` samples: sum of the activations already under its taps */
 } plush_layer;
 
 /* A toy: everything about one stream. Fields from `answer` to `invalid` may be read, no field may be written. */
@@ -80,7 +81,8 @@ typedef struct plush_toy {
     uint32_t restarts;       /* gaps and clock resets */
     uint32_t invalid;        /* values out of their valid range, for which the last valid one stood in */
 
-    /* Called with every answer, also when one frame completes several; may be NULL. Set it after plush_begin(). */
+    /* Called with every answer, also when one frame completes several; may be NULL. Set it after plush_begin(). It may
+     * read the toy, but call no function that changes it (plush_push, plush_restart, plush_begin). */
     void (*on_answer)(const struct plush_toy *toy, void *user);
     void *user;
 
@@ -115,7 +117,10 @@ typedef struct plush_toy {
 /* Bytes of memory that a toy with this model needs; 0 when these bytes are no usable model. */
 uint32_t plush_memory_bytes(const uint8_t *model, uint32_t model_bytes);
 
-/* Makes a toy ready. The model's bytes and the memory must stay where they are. */
+/* Makes a toy ready. The model's bytes and the memory must stay where they are, and only the toy may write to the
+ * memory. Any bytes may be given as a model: they are looked through before anything is believed. Begin again at any
+ * time, with the same model or another. Unless this says PLUSH_OK, the toy is all zeros: it takes readings, and never
+ * has an answer, as a static plush_toy before its beginning. */
 plush_status plush_begin(plush_toy *toy, const uint8_t *model, uint32_t model_bytes, void *memory,
                          uint32_t memory_bytes);
 

@@ -1,0 +1,65 @@
+"""One toy in C, called through ctypes."""
+
+from __future__ import annotations
+
+import ctypes
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import plushsense.deploy
+
+C_FOLDER = Path(plushsense.deploy.__file__).parent / "c"
+TOY_C = Path(__file__).parent / "deploy" / "toy.c"
+
+
+class Seat:
+    """One toy in C."""
+
+    def __init__(self, library: Any, image: bytes, channels: int, classes: int, too_few: int = 0, off: int = 0) -> None:
+        self.library, self.channels, self.classes = library, channels, classes
+        status = ctypes.c_int()
+        self.toy = ctypes.c_void_p(library.seat_new(image, len(image), ctypes.byref(status), too_few, off))
+        self.status = status.value
+
+    def push(self, frames: NDArray[np.int64]) -> NDArray[np.int32]:
+        """The answers (n, 9 + 2 K) that these frames complete."""
+        words = np.ascontiguousarray(frames & 0xFFFFFFFF).astype(np.uint32)
+        # A frame completes one sample, and more after a gap: the rows hold them all.
+        rows = np.empty((40 * len(frames) + 1000, 9 + 2 * self.classes), dtype=np.int32)
+        due = self.library.seat_push(
+            self.toy,
+            ctypes.c_void_p(words.ctypes.data),
+            len(frames),
+            self.channels,
+            ctypes.c_void_p(rows.ctypes.data),
+            len(rows),
+        )
+        assert due <= len(rows)
+        return rows[:due]
+
+    def __del__(self) -> None:
+        self.library.seat_free(self.toy)
+
+
+def compiled(cc: str, folder: Path, *flags: str) -> Any:
+    """The library and ``deploy/toy.c`` as a shared library."""
+    path = folder / "toy.so"
+    subprocess.run(
+        [cc, "-std=c99", "-O2", "-shared", "-fPIC", *flags, f"-I{C_FOLDER}", str(TOY_C), "-o", str(path)], check=True
+    )
+    library = ctypes.CDLL(str(path))
+    library.seat_new.restype = ctypes.c_void_p
+    for name in ("seat_name", "seat_title"):
+        getattr(library, name).restype = ctypes.c_char_p
+    for name in ("seat_push", "seat_answers", "plush_memory_bytes", "try_root", "try_exponential", "try_requantize"):
+        getattr(library, name).restype = ctypes.c_uint32
+    library.try_part_of.restype = ctypes.c_uint32
+    library.try_square.restype = ctypes.c_uint64
+    library.try_root.argtypes = [ctypes.c_uint64]
+    for name in ("try_shift_down", "try_as_signed"):
+        getattr(library, name).restype = ctypes.c_int32
+    return library

@@ -1,0 +1,193 @@
+/* The C library and what tests need beside it: a shared library for ctypes, or, with ALONE, a program that reads one
+ * file of cases, so that sanitizers can watch. The library is included, so that its small functions can be tried. */
+#include "plushsense.c"
+
+#include <stdio.h>
+#include <stdlib.h>
+
+typedef struct {
+    plush_toy toy;
+    uint8_t *model;
+    uint32_t *memory;
+    int32_t *rows;
+    uint32_t frame, made, most;
+} seat;
+
+static void note(const plush_toy *toy, void *user)
+{
+    seat *s = (seat *)user;
+    uint32_t k, told = toy->answer.state == PLUSH_TRACKING;
+    int32_t *row = s->rows + (size_t)s->made * (9u + 2u * toy->classes);
+
+    if (s->made >= s->most)
+        return;
+    s->made++;
+    row[0] = (int32_t)s->frame;
+    row[1] = (int32_t)toy->answer.ms;
+    row[2] = (int32_t)toy->answer.sample;
+    row[3] = (int32_t)toy->answer.state;
+    row[4] = toy->answer.gesture;
+    row[5] = (int32_t)toy->answer.affect;
+    row[6] = toy->answer.confidence;
+    row[7] = (int32_t)toy->restarts;
+    row[8] = (int32_t)toy->invalid;
+    for (k = 0; k < toy->classes; k++) {
+        row[9 + k] = told ? toy->logits[k] : 0;
+        row[9 + toy->classes + k] = told ? toy->smooth[k] : 0;
+    }
+}
+
+/* A toy whose model and memory have exactly the bytes they need, so that one byte too far is noticed. `too_few` bytes
+ * are kept back; the memory begins `off` bytes after an aligned place. */
+void *seat_new(const uint8_t *model, uint32_t bytes, int *status, uint32_t too_few, uint32_t off)
+{
+    seat *s = (seat *)calloc(1, sizeof *s);
+    uint32_t needed;
+
+    s->model = (uint8_t *)malloc(bytes ? bytes : 1);
+    memcpy(s->model, model, bytes);
+    memset(&s->toy, 0xa5, sizeof s->toy);
+    needed = plush_memory_bytes(s->model, bytes);
+    if (needed > (1u << 26)) {
+        *status = -1; /* a giant: not tried */
+        memset(&s->toy, 0, sizeof s->toy);
+        return s;
+    }
+    s->memory = (uint32_t *)malloc(needed + off + 4);
+    memset(s->memory, 0xc3, needed + off + 4);
+    s->memory = (uint32_t *)realloc(s->memory, needed + off ? needed + off : 1);
+    *status = (int)plush_begin(&s->toy, s->model, bytes, (uint8_t *)s->memory + off, needed - too_few);
+    return s;
+}
+
+void seat_free(void *p)
+{
+    seat *s = (seat *)p;
+
+    free(s->model);
+    free(s->memory);
+    free(s);
+}
+
+/* Frames, rows of ms and values, to answers, rows as golden/answers.bin has them; returns how many fell due. */
+uint32_t seat_push(void *p, const int32_t *frames, uint32_t n, uint32_t channels, int32_t *rows, uint32_t most)
+{
+    seat *s = (seat *)p;
+    uint32_t i, due = 0;
+
+    s->rows = rows;
+    s->made = 0;
+    s->most = most;
+    s->toy.on_answer = note;
+    s->toy.user = s;
+    for (i = 0; i < n; i++, s->frame++, frames += 1 + channels)
+        due += plush_push(&s->toy, (uint32_t)frames[0], frames + 1);
+    return due;
+}
+
+void seat_restart(void *p)
+{
+    plush_restart(&((seat *)p)->toy);
+}
+
+/* Every count as it is after nearly 2^32 of what it counts. */
+void seat_age(void *p, uint32_t by)
+{
+    plush_toy *toy = &((seat *)p)->toy;
+
+    toy->answers += by;
+    toy->restarts += by;
+    toy->invalid += by;
+    toy->answer.sample += by;
+}
+
+uint32_t seat_answers(void *p)
+{
+    return ((seat *)p)->toy.answers;
+}
+
+int seat_begin_again(void *p, const uint8_t *model, uint32_t bytes)
+{
+    seat *s = (seat *)p;
+    uint32_t needed = plush_memory_bytes(model, bytes);
+
+    s->model = (uint8_t *)realloc(s->model, bytes);
+    memcpy(s->model, model, bytes);
+    s->memory = (uint32_t *)realloc(s->memory, needed);
+    s->frame = 0;
+    return (int)plush_begin(&s->toy, s->model, bytes, s->memory, needed);
+}
+
+const char *seat_name(void *p, uint8_t gesture)
+{
+    return plush_gesture_name(&((seat *)p)->toy, gesture);
+}
+
+const char *seat_title(void *p)
+{
+    return plush_model_title(&((seat *)p)->toy);
+}
+
+/* The small functions. */
+int32_t try_shift_down(int32_t v, uint32_t n) { return shift_down(v, n); }
+int32_t try_as_signed(uint32_t v) { return as_signed(v); }
+uint32_t try_root(uint64_t v) { return square_root(v); }
+uint64_t try_square(int32_t v) { return square(v); }
+uint32_t try_exponential(int32_t d) { return exponential(d); }
+uint32_t try_requantize(int32_t sum, const uint8_t *scale) { return requantize(sum, scale); }
+uint32_t try_part_of(uint32_t distance, uint32_t into, uint32_t by, uint32_t add, uint32_t narrow)
+{
+    return part_of(distance, into, by, add, narrow);
+}
+
+#ifdef ALONE
+static uint32_t word(FILE *f)
+{
+    uint8_t b[4];
+
+    if (fread(b, 1, 4, f) != 4)
+        exit(0);
+    return le32(b);
+}
+
+/* Cases, one after the other: bytes of the model, the model, frames, columns, the frames. Writes of each: status,
+ * answers, and the answers' rows. */
+int main(int argc, char **argv)
+{
+    FILE *f = argc > 1 ? fopen(argv[1], "rb") : NULL;
+
+    if (f == NULL)
+        return 2;
+    for (;;) {
+        uint32_t bytes = word(f), n, columns, due, fit, width;
+        uint8_t *model = (uint8_t *)malloc(bytes ? bytes : 1);
+        int32_t *frames, *rows;
+        int status;
+        seat *s;
+
+        if (fread(model, 1, bytes, f) != bytes)
+            return 2;
+        n = word(f);
+        columns = word(f);
+        frames = (int32_t *)malloc((size_t)4 * n * columns + 4);
+        if (fread(frames, 4, (size_t)n * columns, f) != (size_t)n * columns)
+            return 2;
+        s = (seat *)seat_new(model, bytes, &status, 0, 0);
+        free(model);
+        width = 9u + 2u * s->toy.classes;
+        rows = (int32_t *)malloc((size_t)4 * width * 4096);
+        /* A damaged model may have more channels than the frames. */
+        fit = s->toy.channels + 1u > columns ? 0 : n;
+        due = seat_push(s, frames, fit, columns - 1, rows, 4096);
+        for (n = 0; n < s->toy.classes; n++)
+            due += (uint32_t)(plush_gesture_name(&s->toy, (uint8_t)n)[0] == 1);
+        due += (uint32_t)(plush_model_title(&s->toy)[0] == 1);
+        fwrite(&status, 4, 1, stdout);
+        fwrite(&s->made, 4, 1, stdout);
+        fwrite(rows, 4, (size_t)width * s->made, stdout);
+        free(frames);
+        free(rows);
+        seat_free(s);
+    }
+}
+#endif
