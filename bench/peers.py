@@ -1,7 +1,7 @@
 """What one decision costs, every 50 ms: our C against the same network in other runtimes, side by side.
 
-    pip install tflite-micro ai-edge-litert ai-edge-quantizer executorch onnxruntime onnx   # in an environment of their own
-    python bench/peers.py --python THAT/bin/python [--onnx2c PATH] [--json]
+    THERE/bin/pip install tflite-micro ai-edge-litert ai-edge-quantizer torch==2.13.0 executorch onnxruntime onnx
+    python bench/peers.py --python THERE/bin/python [--onnx2c PATH] [--json]
 
 The other runtimes are best installed apart from PlushSense (they bring PyTorch and much else); `--python` names their
 interpreter, and without it the one that runs this is asked. What is not installed stands in the table as "not here".
@@ -12,9 +12,9 @@ warm, input already in place: only its own call is timed and counted. They have 
 computes its window again. They may read the window in whichever form takes fewer multiply-accumulates (`--form`):
 `window`, 250 samples with zeros before the first, or `span`, exactly the samples that our streaming decision knows;
 where the two differ, each answer is checked against the float answer of its own form. Our C reads five frames
-(validity, clock, magnitude, scaling), runs the network, smooths and decides. Times are taken in turn, round by round; ratios
-are of the same round. Instructions are callgrind's, of 2N decisions less those of N; callgrind's processor has AVX2 and
-nothing beyond. All frames and (without `--bundle`) all weights are made up: costs depend on neither.
+(validity, clock, magnitude, scaling), runs the network, smooths and decides. Times are taken in turn, round by round;
+ratios are of the same round. Instructions are callgrind's, of 2N decisions less those of N; callgrind's processor has
+AVX2 and nothing beyond. All frames and (without `--bundle`) all weights are made up: costs depend on neither.
 """
 
 from __future__ import annotations
@@ -55,10 +55,12 @@ PEERS: dict[str, tuple[str, str, str]] = {
     "onnxruntime-int8": ("onnxruntime, int8 (QDQ)", "mlas", "onnxruntime onnx"),
 }
 OUR_ROW = "PlushSense C -O2, frames to answer"
-# family, how many times fewer instructions ours shall take, who that is
+PLAIN_ROW = f"{OUR_ROW}, plain C"
+# family, how many times fewer instructions ours shall take, who that is, which of ours: plain C against plain C
 TARGETS = (
-    ("portable C", 20.0, "the best portable C of a peer (onnx2c, TensorFlow Lite Micro)"),
-    ("xnnpack", 5.0, "XNNPACK's hand-vectorised window (LiteRT, ExecuTorch)"),
+    ("portable C", 20.0, "the best portable C of a peer (onnx2c, TensorFlow Lite Micro)", PLAIN_ROW),
+    ("xnnpack", 5.0, "XNNPACK's hand-vectorised window (LiteRT, ExecuTorch)", OUR_ROW),
+    ("xnnpack", 5.0, "XNNPACK's hand-vectorised window, by our plain C", PLAIN_ROW),
 )
 FAITHFUL = 0.8  # share of decisions as the floats', below which a peer is called broken
 
@@ -182,18 +184,21 @@ def compare(rows: list[dict[str, Any]]) -> None:
 def verdicts(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """The targets of this library, on the fewest instructions that any such peer took."""
     told = []
-    for family, least, who in TARGETS:
-        them = [r for r in rows if r["family"] == family and r["times_instructions"] is not None]
-        nearest = min(them, key=lambda r: r["times_instructions"], default=None)
-        ratio = None if nearest is None else nearest["times_instructions"]
+    for family, least, who, ours in TARGETS:
+        mine = next(row for row in rows if row["name"] == ours)["instructions"]
+        them = [row for row in rows if row["family"] == family and row["instructions"] is not None]
+        nearest = min(them, key=lambda row: row["instructions"], default=None)
+        known = nearest is not None and mine is not None
+        ratio = nearest["instructions"] / mine if known else None
         told.append(
             {
                 "who": who,
                 "at_least": least,
                 "ratio": ratio,
-                "against": nearest and nearest["name"],
-                "reached": None if ratio is None else ratio >= least,
-            }  # fmt: skip
+                "ours": ours,
+                "against": nearest["name"] if known else None,
+                "reached": ratio >= least if known else None,
+            }
         )
     return told
 
@@ -243,10 +248,13 @@ def table(report: dict[str, Any]) -> Iterable[str]:
         yield f"{name:<47}  {reason}"
     yield ""
     yield (
-        f"×: times '{OUR_ROW}'. as float: decisions like the float network's, of {case['checked']}; error: of the logits, "
-        "against their spread."
+        f"×: times '{OUR_ROW}'. as float: decisions like the float network's, of {case['checked']}; error: of the "
+        "logits, against their spread."
     )
-    yield "code B of C without a model file holds the weights; a runtime's own library is not counted, nor memory it does not tell."
+    yield (
+        "code B of C without a model file holds the weights; a runtime's own library is not counted, nor memory that "
+        "it does not tell."
+    )
     yield "The others have no streaming state: each of their decisions computes its whole window again."
     for row in report["rows"]:
         if row["check"] is not None and row["check"]["agreement"] < FAITHFUL:

@@ -13,7 +13,6 @@ import importlib.metadata
 import json
 import os
 import re
-import struct
 import sys
 import tempfile
 import time
@@ -66,19 +65,8 @@ def onnx_float(case: Case, path: Path) -> None:
         w, dilation = case[f"w{i}"], int(case[f"dilation{i}"])
         pads = [(w.shape[2] - 1) * dilation if case["padded"] else 0, 0]
         held += [numpy_helper.from_array(case[f"{n}{i}"], f"{n}{i}") for n in ("w", "b")]
-        nodes.append(
-            helper.make_node(
-                "Conv",
-                [z, f"w{i}", f"b{i}"],
-                [f"conv{i}"],
-                name=f"conv{i}",
-                kernel_shape=[w.shape[2]],
-                dilations=[dilation],
-                pads=pads,
-                strides=[1],
-                group=1,
-            )  # fmt: skip
-        )
+        shape = {"kernel_shape": [w.shape[2]], "dilations": [dilation], "pads": pads}
+        nodes.append(helper.make_node("Conv", [z, f"w{i}", f"b{i}"], [f"conv{i}"], name=f"conv{i}", **shape))
         nodes.append(helper.make_node("Relu", [f"conv{i}"], [f"relu{i}"], name=f"relu{i}"))
         z = f"relu{i}"
     held += [numpy_helper.from_array(case[n], n) for n in ("dense_w", "dense_b")]
@@ -355,5 +343,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    assert struct.calcsize("P") == 8
     main()
