@@ -16,12 +16,20 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="the data set that it was trained on: calibrates on its training people's windows (default: what training "
         "kept in the bundle)",
     )
+    parser.add_argument(
+        "--also",
+        default="",
+        metavar="A,B",
+        help="the network for other runtimes as well, each tried there first: onnx, onnx-int8 (extra onnx), tflite, "
+        "tflite-int8 (extra tflite), espdl, espdl-esp32, espdl-esp32p4 (extra espdl)",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
     from plushsense.apps.exporting import export
 
-    done = export(args.bundle, args.out, dataset=args.dataset, warn=lambda what: say(f"warning: {what}"))
+    also = [word.strip() for word in args.also.split(",") if word.strip()]
+    done = export(args.bundle, args.out, dataset=args.dataset, also=also, warn=lambda what: say(f"warning: {what}"))
     facts = done.facts
     simulated = (
         ["  SIMULATION: trained on a virtual toy; it knows no real person's touch"] if facts["simulated"] else []
@@ -35,6 +43,10 @@ def run(args: argparse.Namespace) -> int:
             f"  model             {done.flash_bytes:,} bytes of flash; the code comes on top (plushsense profile)",
             f"  memory            {done.ram_bytes:,} bytes of RAM a toy",
             f"  a step            {facts['step_ms']:g} ms, {facts['macs_per_step']:,} MACs",
+            *(
+                f"  {each['file']:<17} {each['bytes']:,} bytes; logits differ by at most {each['largest_difference']:.2g}"
+                for each in facts.get("conversions", {}).values()
+            ),
             f"  prove it          plushsense verify {args.out}",
         ],
     )
