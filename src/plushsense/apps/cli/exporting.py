@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
             f"  memory            {done.ram_bytes:,} bytes of RAM a toy",
             f"  a step            {facts['step_ms']:g} ms, {facts['macs_per_step']:,} MACs",
             *(
-                f"  {each['file']:<17} {each['bytes']:,} bytes; logits differ by at most {each['largest_difference']:.2g}"
+                f"  {each['file']:<17} {each['bytes']:,} bytes; logits differ by up to {each['largest_difference']:.1g}"
                 for each in facts.get("conversions", {}).values()
             ),
             f"  prove it          plushsense verify {args.out}",
