@@ -400,7 +400,7 @@ def test_square(c_library: Any, v: int) -> None:
     assert c_library.try_square(v) == v * v
 
 
-@settings(max_examples=1000, deadline=None)
+@settings(max_examples=400, deadline=None)
 @given(st.data())
 def test_interpolation_in_32_bits(c_library: Any, data: st.DataObject) -> None:
     """Of any distance and any gap that a model may have; ``add`` is at most half of ``by``."""
@@ -435,8 +435,8 @@ STRICT = ["-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wsign-conversion",
 @pytest.mark.parametrize("plain", [[], ["-DPLUSH_PLAIN"]], ids=["fast", "plain"])
 def test_no_warning(cc: str, plain: list[str], needs: Callable[..., None], tmp_path: Path) -> None:
     needs(cc)
-    for level in ("-O0", "-O2", "-O3", "-Os"):
-        for language in (["-std=c99"], ["-x", "c++", "-std=c++11"]):
+    for language, levels in ((["-std=c99"], ("-O0", "-O2", "-O3")), (["-x", "c++", "-std=c++11"], ("-O2",))):
+        for level in levels:
             subprocess.run(
                 [cc, *language, level, *STRICT, *plain, "-c", C_FOLDER / "plushsense.c", "-o", tmp_path / "o"],
                 check=True,

@@ -10,6 +10,7 @@ from plushsense.apps.preparation import Warn, silent
 from plushsense.dataset.store import Dataset
 from plushsense.deploy.calibration import integer_model
 from plushsense.deploy.emit import Exported, emit
+from plushsense.deploy.package import package
 from plushsense.models.bundle import Bundle
 
 
@@ -20,7 +21,7 @@ def export(
     dataset: Dataset | str | os.PathLike[str] | None = None,
     warn: Warn = silent,
 ) -> Exported:
-    """Write what a toy needs to run a bundle's network: C99, the model as data, golden vectors.
+    """Write what a toy needs to run a bundle's network: C99, the model as data, golden vectors, packages.
 
     Args:
         bundle: with ``stream`` padding and batch normalisation.
@@ -37,4 +38,4 @@ def export(
     given = bundle if isinstance(bundle, Bundle) else Bundle.load(Path(bundle))
     if dataset is not None:
         given = calibrated_on(given, dataset, warn)
-    return emit(integer_model(given), given, Path(out))
+    return emit(integer_model(given), given, Path(out), extras=[package])

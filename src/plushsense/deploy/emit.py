@@ -8,12 +8,13 @@ import shutil
 import uuid
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from plushsense import __version__
 from plushsense.core.errors import BadInput
+from plushsense.core.gestures import NOBODY
 from plushsense.deploy.golden import write_golden
 from plushsense.models.bundle import Bundle
 from plushsense.models.image import HEAD_BYTES, IntegerModel, head, memory_bytes
@@ -155,13 +156,16 @@ def _facts(model: IntegerModel, bundle: Bundle, model_bytes: int) -> dict[str, A
         "memory_bytes": memory_bytes(model),
         "simulated": bool(bundle.provenance.get("simulated", False)),
         "provenance": bundle.provenance,
-        "code_version": __version__,
+        "code_version": version("plushsense"),
     }
 
 
 def without_people(provenance: Mapping[str, Any]) -> dict[str, Any]:
     """A bundle's provenance for strangers: how many people it was trained on, not who."""
-    names = {str(n) for key in _PEOPLE if isinstance(provenance.get(key), list) for n in provenance[key]}
+    people = {
+        key: {str(n) for n in provenance[key]} - {NOBODY} for key in _PEOPLE if isinstance(provenance.get(key), list)
+    }
+    names = set().union(*people.values())
     named = re.compile(
         "|".join(rf"(?<!\w){re.escape(n)}(?!\w)" for n in sorted(names, key=len, reverse=True)) or "(?!)"
     )
@@ -174,7 +178,7 @@ def without_people(provenance: Mapping[str, Any]) -> dict[str, Any]:
         return named.sub("…", value) if isinstance(value, str) else value
 
     kept = {key: plain(value) for key, value in provenance.items() if key not in _PEOPLE}
-    return kept | {key: len(provenance[key]) for key in _PEOPLE if isinstance(provenance.get(key), list)}
+    return kept | {key: len(found) for key, found in people.items()}
 
 
 def c_names(labels: Sequence[str]) -> tuple[str, ...]:

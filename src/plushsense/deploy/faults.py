@@ -192,8 +192,9 @@ def faults_of(image: bytes, source: str) -> list[Fault]:
     for each in TEXTS:
         if source.count(each.text) != 1:
             raise BadInput(
-                f"The fault '{each.name}' cannot be planted: its text stands {source.count(each.text)} times in "
-                f"plushsense.c, and not once ({each.text.strip()!r})."
+                f"The fault '{each.name}' cannot be planted: its text ({each.text.strip()!r}) stands "
+                f"{source.count(each.text)} times in plushsense.c, and not once; export the model again with this "
+                "PlushSense, or undo there what was edited."
             )
         if shows[each.when]:
             found.append(Fault(each.kind, each.name, source=source.replace(each.text, each.wrong)))

@@ -127,7 +127,7 @@ class Export:
             rows += max(samples - have, rows // 4)
         if not len(frames):
             raise ConfigError(f"The data set '{dataset.head.name}' holds nothing to stream: give another one.")
-        return [self.answered(dataset.head.name, part) for part in in_parts(frames)]
+        return [self.answered("recordings", part) for part in in_parts(frames)]
 
 
 @dataclass(frozen=True)

@@ -278,10 +278,9 @@ def _attempt(export: Export, folder: Path, setting: Setting, vector: Vectors, fr
     """One program on one stream; ``first`` is a whole sentence."""
     where = f"On {setting.target} ({setting.compiler} {setting.said}), {vector.name}"
     out.mkdir(parents=True, exist_ok=True)
-    harness = HARNESS
-    if setting.cpp:
-        harness = out / "harness.cpp"
-        shutil.copyfile(HARNESS, harness)
+    # A copy: beside its original stands PlushSense's own plushsense.h, which a compiler would find first.
+    harness = out / ("harness.cpp" if setting.cpp else "harness.c")
+    shutil.copyfile(HARNESS, harness)
     sources = [folder / LIBRARY[1], harness] + ([] if setting.image else [folder / MODEL[1]])
     blobs = {"frames": frames} | ({"image": folder / IMAGE} if setting.image else {})
     defines = {"PLUSH_HARNESS_IMAGE": 1} if setting.image else {}
