@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
 from plushsense.apps.cli.output import emit, say
 
@@ -25,6 +26,12 @@ def add(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _converted(found: dict[str, Any]) -> str:
+    apart = found["largest_difference"]
+    said = "" if apart is None else f"; logits differ by up to {apart:.1g} from those it was made of"
+    return f"  {found['file']:<17} {found['bytes']:,} bytes{said}"
+
+
 def run(args: argparse.Namespace) -> int:
     from plushsense.apps.exporting import export
 
@@ -43,10 +50,7 @@ def run(args: argparse.Namespace) -> int:
             f"  model             {done.flash_bytes:,} bytes of flash; the code comes on top (plushsense profile)",
             f"  memory            {done.ram_bytes:,} bytes of RAM a toy",
             f"  a step            {facts['step_ms']:g} ms, {facts['macs_per_step']:,} MACs",
-            *(
-                f"  {each['file']:<17} {each['bytes']:,} bytes; logits differ by up to {each['largest_difference']:.1g}"
-                for each in facts.get("conversions", {}).values()
-            ),
+            *(_converted(each) for each in facts.get("conversions", {}).values()),
             f"  prove it          plushsense verify {args.out}",
         ],
     )
