@@ -43,7 +43,7 @@ class _Text:
     name: str
     text: str
     wrong: str
-    when: Literal["always", "dilated", "magnitude", "ranged"] = "always"
+    when: Literal["always", "dilated", "magnitude", "ranged", "ties"] = "always"
 
 
 # Every one stays within the toy's memory, so that it is the answers that give it away, and not a crash.
@@ -96,6 +96,13 @@ TEXTS = (
         "a falling channel is interpolated with a half rounded down",
         "part_of(from - to, 2 * into, 2 * between, between - 1, toy->narrow)",
         "part_of(from - to, 2 * into, 2 * between, between, toy->narrow)",
+        "ties",
+    ),
+    _Text(
+        "rounding",
+        "a falling channel is interpolated without rounding",
+        "part_of(from - to, 2 * into, 2 * between, between - 1, toy->narrow)",
+        "part_of(from - to, 2 * into, 2 * between, 0, toy->narrow)",
     ),
     _Text(
         "rounding",
@@ -188,6 +195,8 @@ def faults_of(image: bytes, source: str) -> list[Fault]:
         "dilated": any(layer.dilation > 1 for layer in at.layers),
         "magnitude": at.magnitudes,
         "ranged": bool(ranged),
+        # In fine units of time hardly any value lies just between two whole numbers.
+        "ties": at.units_per_ms <= 10,
     }
     for each in TEXTS:
         if source.count(each.text) != 1:
