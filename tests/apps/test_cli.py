@@ -455,3 +455,18 @@ def test_simulate_makes_a_data_set_in_one_command(cli: Cli, tmp_path: Path) -> N
     refused = cli(*words)
     assert refused.status == 2
     assert "already holds something" in refused.err
+
+
+def test_each_fold_is_deployed_with_ranges_of_its_own_training_windows(dataset: Dataset, cli: Cli) -> None:
+    words = ("evaluate", dataset.path, "--filters", "4,4,4", "--epochs", "3", "--split", "by-subject:2", "--int8")
+    found = cli(*words, "--json").json
+    int8 = found["int8"]
+    assert len(int8["rows"]) == 5 and 0.5 < int8["agreement"] <= 1
+    assert abs(int8["loss"]["macro_f1"]["mean"]) < 0.3
+    assert int8["probability_difference"] > 0, "these are not the floats"
+    shown = cli(*words)
+    assert "deployed in 8 bits" in shown.out and "macro-F1 lost" in shown.out
+    assert "Deployed in 8 bits" in Path(found["report"]).read_text()
+    plain = cli(*words[:-1], "--json").json
+    assert "int8" not in plain and plain["accuracy"] == found["accuracy"]
+    assert cli(*words, "--padding", "mirror").status == 2

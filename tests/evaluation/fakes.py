@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -94,6 +94,19 @@ class Oracle:
         probabilities = np.full((len(test), len(LABELS)), 0.1, dtype=np.float32)
         probabilities[np.arange(len(test)), read] = 0.8
         return FoldOutput(probabilities, history, 0.25, self.epochs)
+
+
+@dataclass(frozen=True)
+class Deploying:
+    """Reads the class off the window; once deployed, one class too far for the people in ``spoilt``."""
+
+    folder: str
+    spoilt: tuple[str, ...] = ()
+
+    def __call__(self, train: WindowSet, validation: WindowSet, test: WindowSet, progress: Any, /) -> FoldOutput:
+        before = Oracle(self.folder)(train, validation, test, progress)
+        after = Oracle(self.folder, self.spoilt)(train, validation, test, progress)
+        return replace(before, deployed=after.probabilities)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from plushsense.reports import tables
+from plushsense.reports.words import DASH
 
 
 def luminance(colour: str) -> float:
@@ -63,3 +64,15 @@ def test_the_card_gives_seconds_beside_samples_and_dashes_for_what_is_missing(st
     assert card["Training people"].startswith("25: P01")
     assert card["Data hash"].startswith("9f2c")
     assert set(dict(tables.model_rows({})).values()) == {"—"}
+
+
+def test_what_deploying_costs_is_shown_where_it_was_asked():
+    row = {"subject": "P01", "accuracy": 0.6, "accuracy_int8": 0.59, "macro_f1": 0.5, "macro_f1_int8": 0.498}
+    means = {"mean": 0.002, "sd": 0.01, "ci95": [-0.001, 0.005]}
+    asked = {"over": "subjects", "rows": [row], "loss": {"macro_f1": means}, "agreement": 0.987}
+    shown = tables.deployed_rows({"int8": asked})
+    assert shown is not None
+    assert shown["rows"] == [{"name": "P01", "cells": ["0.600", "0.590", "0.500", "0.498", DASH, DASH]}]
+    assert (shown["loss"], shown["interval"]) == ("0.002 ± 0.010", "-0.001 to 0.005")
+    assert (shown["unit"], shown["macro_f1"]) == ("Person", DASH)
+    assert tables.deployed_rows({}) is None

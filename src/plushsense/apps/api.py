@@ -21,7 +21,8 @@ from plushsense.apps.reporting import check_place, save_evaluation
 from plushsense.core.gestures import NOBODY
 from plushsense.dataset.importers import import_recordings
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
-from plushsense.deploy.calibration import calibration
+from plushsense.deploy.calibration import calibration, integer_probabilities
+from plushsense.deploy.quantize import QUANTIZE_VERSION, Ranges, quantize, refuse_undeployable
 from plushsense.evaluation.crossval import Evaluation, FoldOutput, FoldProgress
 from plushsense.evaluation.crossval import evaluate as crossvalidate
 from plushsense.evaluation.folds import WindowFold, fold_windows
@@ -43,10 +44,14 @@ EpochProgress = Callable[[int, int, dict[str, Any]], None]
 
 @dataclass(frozen=True)
 class TrainAndPredict:
-    """One training and its predictions: what a cross-validation is given."""
+    """One training and its predictions: what a cross-validation is given.
+
+    ``int8``: the network is also deployed, with ranges of the windows it was trained on, and reads the test windows.
+    """
 
     arch: Arch
     spec: TrainSpec
+    int8: bool = False
 
     def __call__(
         self, train: WindowSet, validation: WindowSet, test: WindowSet, progress: EpochProgress, /
@@ -55,7 +60,12 @@ class TrainAndPredict:
 
         fitted = fit(train, validation, self.arch, self.spec, progress)
         probabilities = predict(self.arch, fitted.weights, fitted.scaler, test, self.spec.device)
-        return FoldOutput(probabilities, fitted.history, fitted.seconds, fitted.best_epoch)
+        deployed = None
+        if self.int8:
+            kept = calibration(self.arch, fitted.weights, fitted.scaler, train.x)
+            network = quantize(self.arch, fitted.weights, fitted.scaler, Ranges.from_dict(kept))
+            deployed = integer_probabilities(network, test.x)
+        return FoldOutput(probabilities, fitted.history, fitted.seconds, fitted.best_epoch, deployed)
 
 
 @dataclass(frozen=True)
@@ -202,6 +212,7 @@ def evaluate(
     out: str | os.PathLike[str] | None = None,
     overwrite: bool = False,
     cluster: str | None = None,
+    int8: bool = False,
     progress: Callable[[FoldProgress], None] | None = None,
     warn: Warn = silent,
     **settings: Any,
@@ -216,6 +227,8 @@ def evaluate(
         out: a folder for ``evaluation.json`` and ``predictions.parquet``; one that holds an evaluation of other
             settings or data is refused unless ``overwrite``.
         cluster: address of a Ray cluster that trains the folds instead of this machine's processes.
+        int8: also deploy each fold's network, with ranges of its own training windows, and score it on the same
+            windows: key ``int8`` of the result. Folds that were kept without it are trained again.
     """
     dataset = opened(dataset)
     config = config or from_settings(arch=arch, filters=filters, **settings)
@@ -226,6 +239,8 @@ def evaluate(
         check_place(Path(out), config, dataset, replace=overwrite)
     gestures = choose_classes(dataset, config.evaluation.classes, warn)
     network = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
+    if int8:
+        refuse_undeployable(network)
     score = windows_for(dataset, network, config.windows, gestures, warn)
     train_context = config.evaluation.train_context
     fit_on = score
@@ -237,9 +252,14 @@ def evaluate(
         fit_on,
         score,
         config.evaluation.split,
-        TrainAndPredict(network, config.training),
+        TrainAndPredict(network, config.training, int8),
         journal=Journal(dataset.path / "cache" / "folds"),
-        key={"arch": network.to_dict(), "training": placed(config.training).key(), "vectors": fit_on.vectors},
+        key={
+            "arch": network.to_dict(),
+            "training": placed(config.training).key(),
+            "vectors": fit_on.vectors,
+            **({"int8": QUANTIZE_VERSION} if int8 else {}),
+        },
         workers=config.evaluation.processes,
         cluster=cluster,
         seed=config.evaluation.seed,

@@ -14,7 +14,7 @@ from plushsense.deploy.quantize import Ranges, calibrate, quantize, refuse_undep
 from plushsense.live.decide import DecideSpec
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
-from plushsense.models.fixed import smoothing_weight
+from plushsense.models.fixed import PROBABILITY_BITS, smoothing_weight, softmax
 from plushsense.models.image import IntegerModel
 from plushsense.models.integer import IntegerNetwork
 from plushsense.models.reference import Network
@@ -78,3 +78,10 @@ def integer_model(bundle: Bundle, decide: DecideSpec | None = None) -> IntegerMo
     spec = decide or DecideSpec.from_dict(bundle.decision)
     weight = smoothing_weight(spec.smoothing_s, bundle.arch.step * bundle.layout.period_us / 1e6)
     return IntegerModel(integer_network(bundle), bundle.layout, bundle.gestures, weight)
+
+
+def integer_probabilities(network: IntegerNetwork, x: NDArray[np.integer[Any]]) -> NDArray[np.float32]:
+    """What a deployed network says of raw windows (N, C, T), not smoothed: probabilities (N, K)."""
+    rows = [softmax(logits) for logits in network.forward(x)]
+    found = np.array(rows, dtype=np.float32).reshape(len(x), network.arch.classes)
+    return found / np.float32(1 << PROBABILITY_BITS)

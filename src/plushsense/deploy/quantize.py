@@ -27,6 +27,9 @@ from plushsense.windows.features import Scaler
 
 Floats = NDArray[np.float64]
 
+# Part of every journalled result: raise it when the same windows and weights would give other whole numbers.
+QUANTIZE_VERSION = 1
+
 _AT_ONCE = 16  # windows: what their layers read is held whole
 
 # The share of what training windows show that may lie outside. Of people who were not met more does, and that costs

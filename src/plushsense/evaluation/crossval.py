@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError
+from plushsense.evaluation.deployed import beside
 from plushsense.evaluation.folds import WindowFold, fold_windows
 from plushsense.evaluation.predictions import Predictions, gather, write_predictions
 from plushsense.evaluation.scores import FoldRecord, scores
@@ -29,12 +30,16 @@ _VERSION = 1
 
 @dataclass(frozen=True)
 class FoldOutput:
-    """What one training leaves: probabilities (N, K) of the test windows, the history's rows, time, best epoch."""
+    """What one training leaves: probabilities (N, K) of the test windows, the history's rows, time, best epoch.
+
+    ``deployed`` (N, K): what the same network says of them once it is deployed; None where nobody asked.
+    """
 
     probabilities: NDArray[np.float32]
     history: list[dict[str, Any]] = field(default_factory=list)
     seconds: float = 0.0
     best_epoch: int = 0
+    deployed: NDArray[np.float32] | None = None
 
 
 EpochProgress = Callable[[int, int, dict[str, Any]], None]
@@ -157,15 +162,19 @@ def evaluate(
         )
         for fold, outcome in zip(folds, outcomes, strict=True)
     ]
-    predictions = gather(
-        score_windows, [(f.name, f.test) for f in folds], [outcome["probabilities"] for outcome in outcomes]
-    )
+    tested = [(fold.name, fold.test) for fold in folds]
+    predictions = gather(score_windows, tested, [outcome["probabilities"] for outcome in outcomes])
+    table = scores(predictions, records, score_windows.affects, asked.apart)
+    if all("deployed" in outcome for outcome in outcomes):
+        deployed = gather(score_windows, tested, [outcome["deployed"] for outcome in outcomes])
+        after = scores(deployed, records, score_windows.affects, asked.apart)
+        table["int8"] = beside(table, after, predictions, deployed)
     return Evaluation(
         split=asked,
         context=context_of(score_windows),
         train_context=context_of(train_windows),
         seeds=[seed],
-        table=scores(predictions, records, score_windows.affects, asked.apart),
+        table=table,
         histories=[list(outcome["history"]) for outcome in outcomes],
         predictions=predictions,
     )
@@ -185,15 +194,19 @@ class _FoldWork:
             report((epoch, epochs))
 
         out = self.fit_predict(train.take(task.train), train.take(task.validation), score.take(task.test), progress)
-        probabilities = np.asarray(out.probabilities, dtype=np.float32)
+        found = {"probabilities": out.probabilities}
+        if out.deployed is not None:
+            found["deployed"] = out.deployed
         wanted = (len(task.test), len(score.labels))
-        if probabilities.shape != wanted:
-            raise ConfigError(
-                f"fit_predict gave probabilities of the shape {probabilities.shape}; {wanted} (windows, classes) is "
-                "expected."
-            )
+        for what, probabilities in found.items():
+            found[what] = probabilities = np.asarray(probabilities, dtype=np.float32)
+            if probabilities.shape != wanted:
+                raise ConfigError(
+                    f"fit_predict gave {what} of the shape {probabilities.shape}; {wanted} (windows, classes) is "
+                    "expected."
+                )
         return {
-            "probabilities": probabilities,
+            **found,
             "history": out.history,
             "seconds": out.seconds,
             "best_epoch": out.best_epoch,

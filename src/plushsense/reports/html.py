@@ -170,6 +170,7 @@ def _evaluation(key: str, evaluation: Mapping[str, Any]) -> dict[str, Any]:
         "spread": words.spread_words(evaluation),
         "metrics": tables.metric_rows(evaluation),
         "contexts": tables.context_rows(evaluation),
+        "deployed": tables.deployed_rows(evaluation),
         "nobody": None
         if not nobody
         else {name: words.count(nobody.get(name)) for name in ("recordings", "windows")}

@@ -271,3 +271,21 @@ def _provenance(value: Any) -> str:
         items = [text(item) for item in value]
         return f"{len(items)}: {', '.join(items)}" if items else DASH
     return text(value)
+
+
+def deployed_rows(evaluation: Mapping[str, Any]) -> dict[str, Any] | None:
+    """What deploying in 8 bits costs: the means, and a row a person (or fold); None where it was not asked."""
+    found = evaluation.get("int8")
+    if not isinstance(found, Mapping):
+        return None
+    unit = "subject" if found.get("over") == "subjects" else "fold"
+    shown = ("accuracy", "accuracy_int8", "macro_f1", "macro_f1_int8", "macro_f1_loss", "agreement")
+    loss = found.get("loss") or {}
+    return {
+        "unit": "Person" if unit == "subject" else "Fold",
+        "rows": [{"name": text(row.get(unit)), "cells": [number(row.get(k)) for k in shown]} for row in found["rows"]],
+        "macro_f1": mean_sd(found.get("macro_f1")),
+        "loss": mean_sd(loss.get("macro_f1")),
+        "interval": interval(loss.get("macro_f1")),
+        "agreement": number(found.get("agreement")),
+    }

@@ -35,6 +35,11 @@ def add(parser: argparse.ArgumentParser) -> None:
         "(default: DATASET/evaluations/, a folder for each settings and data)",
     )
     parser.add_argument("--force", action="store_true", help="replace an evaluation of other settings or data in --out")
+    parser.add_argument(
+        "--int8",
+        action="store_true",
+        help="also deploy each fold's network in 8 bits, and say what that costs, person by person",
+    )
     add_settings(parser)
 
 
@@ -52,6 +57,7 @@ def run(args: argparse.Namespace) -> int:
         out=out,
         overwrite=args.force,
         cluster=args.cluster,
+        int8=args.int8,
         progress=folds_shown("evaluating"),
         warn=warn,
     )
@@ -119,4 +125,21 @@ def lines(e: dict[str, Any]) -> list[str]:
     out.append(f"vote by recording, pooled: accuracy {figure(voted['accuracy'])}, macro-F1 {figure(voted['macro_f1'])}")
     for kind, part in e["by_context"].items():
         out.append(f"  on {kind} windows: accuracy {figure(part['accuracy'])} ({part['windows']} windows)")
-    return out
+    return out + (deployed(e["int8"]) if "int8" in e else [])
+
+
+def deployed(e: dict[str, Any]) -> list[str]:
+    """What deploying costs, as text: a row a person (or fold), then the means."""
+    unit = "subject" if e["over"] == "subjects" else "fold"
+    wanted = ("accuracy", "accuracy_int8", "macro_f1", "macro_f1_int8", "macro_f1_loss", "agreement")
+    rows = [(r[unit], *(figure(r[name]) for name in wanted)) for r in e["rows"]]
+    return [
+        "",
+        "the same networks deployed in 8 bits, on the same windows:\n",
+        table((unit, "accuracy", "int8", "macro-F1", "int8", "lost", "agree"), rows),
+        "",
+        f"macro-F1 in 8 bits  {spread(e['macro_f1'])}",
+        f"macro-F1 lost       {spread(e['loss']['macro_f1'])}",
+        f"accuracy lost       {spread(e['loss']['accuracy'])}",
+        f"both say the same on {100 * (e['agreement'] or 0):.1f} % of the windows",
+    ]
