@@ -7,7 +7,7 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +58,14 @@ def c_compiler() -> str:
 
 
 @pytest.fixture(scope="session")
+def all_compilers(c_compiler: str) -> None:
+    """Every compiler of this machine that the toy's C is tried with."""
+    for tool in ("clang", "g++"):
+        if shutil.which(tool) is None:
+            missing("compilers", f"{tool} is not installed")
+
+
+@pytest.fixture(scope="session")
 def lsl_possible() -> None:
     """The lab streaming layer, and a network on which a stream of this process is found."""
     try:
@@ -101,10 +109,45 @@ def mlflow_here() -> None:
 
 
 @pytest.fixture(scope="session")
+def onnx_here() -> None:
+    """ONNX and the runtime that tries it (extra onnx)."""
+    for module in ("onnx", "onnxruntime"):
+        if importlib.util.find_spec(module) is None:
+            missing("onnx", f"{module} is not installed")
+
+
+@pytest.fixture(scope="session")
+def litert_here() -> None:
+    """LiteRT (extra tflite)."""
+    if importlib.util.find_spec("ai_edge_litert") is None:
+        missing("tflite", "ai-edge-litert is not installed")
+
+
+@pytest.fixture(scope="session")
+def espdl_here() -> None:
+    """Espressif's quantizer (extra espdl), which wants an environment of its own."""
+    if importlib.util.find_spec("esp_ppq") is None:
+        missing("espdl", "esp-ppq is not installed")
+
+
+@pytest.fixture(scope="session")
 def scikit_learn() -> None:
     """Scikit-learn (extra baselines)."""
     if importlib.util.find_spec("sklearn") is None:
         missing("baselines", "sklearn is not installed")
+
+
+@pytest.fixture(scope="session")
+def target_here() -> Callable[[str], str]:
+    """Makes sure that programs can be built for a target of `plushsense.deploy.targets` and run, and hands it back."""
+    from plushsense.deploy.targets import missing_tools
+
+    def here(target: str) -> str:
+        if packages := missing_tools(target):
+            missing("compilers" if target == "host" else "emulators", f"{target} needs {' '.join(packages)}")
+        return target
+
+    return here
 
 
 # Bytes: a small /dev/shm must hold two.

@@ -190,7 +190,6 @@ BAD = [
     (["live", "--device", "virtual://", "--model", "{tmp}/none.plush"], "none.plush"),
     (["live", "--device", "serial:///dev/ttyUSB77", "--model", "{bundle}"], "there is no port"),
     (["live", "--device", "seriel://x", "--model", "{bundle}"], "Did you mean 'serial'?"),
-    (["live", "--device", "virtual://", "--model", "{bundle}", "--engine", "int8"], "not built yet"),
     (["report", "{tmp}/r.html", "--dataset", "{ds}", "--evaluation", "{tmp}/none"], "There is no evaluation"),
     (["toy", "--tcp", "0", "--gestures", "Tail tup 1"], "Did you mean 'Tail tap 1'?"),
 ]

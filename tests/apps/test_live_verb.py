@@ -101,3 +101,25 @@ def test_from_a_real_stream(bundle: Path, real_data: Path) -> None:
 def test_the_default_layout_is_the_bundles(bundle: Path) -> None:
     decisions, _ = live("--device", "virtual://?speed=0", "--model", str(bundle), "--seconds", "4")
     assert abs(len(decisions) - 80) <= 2
+
+
+def test_in_whole_numbers_and_beside_the_floats(bundle: Path, recordings: Path) -> None:
+    stream = recordings / "P1" / "fulldatastream.csv"
+    words = ("--device", f"replay://{stream}?speed=0", "--model", str(bundle), "--seconds", "20")
+    whole, summary = live(*words, "--engine", "int8")
+    assert "agreement" not in summary
+    assert all(list(d) == KEYS for d in whole)
+    known = [d["confidence"] for d in whole if d["state"] == "tracking"]
+    assert len(known) > 200
+    both, summary = live(*words, "--engine", "both")
+    assert both == whole
+    assert summary["agreement"]["gesture"] > 0.8
+    floats, _ = live(*words, "--engine", "float")
+    assert [(d["t_s"], d["state"]) for d in floats] == [(d["t_s"], d["state"]) for d in whole]
+
+
+def test_a_bundle_of_before_says_what_to_do(plush_bundle: Path) -> None:
+    words = ["live", "--device", "virtual://", "--model", str(plush_bundle), "--engine", "int8"]
+    done = subprocess.run([*COMMAND, *words], capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 2
+    assert "no calibration" in done.stderr and "Traceback" not in done.stderr

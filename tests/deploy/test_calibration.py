@@ -11,7 +11,7 @@ from plushsense.core.errors import ArchError, BundleError
 from plushsense.core.gestures import Gesture, GestureSet
 from plushsense.core.signal import load_layout
 from plushsense.deploy.calibration import calibrated, calibration, integer_model, integer_network
-from plushsense.deploy.quantize import Ranges
+from plushsense.deploy.quantize import Ranges, quantize
 from plushsense.live.decide import DecideSpec
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
@@ -46,6 +46,20 @@ def test_the_whole_numbers_answer_as_the_floats_do() -> None:
     found = integer_network(bundle).forward(x) / 256
     assert (wanted.argmax(axis=1) == found.argmax(axis=1)).mean() > 0.95
     assert np.abs(wanted - found).max() < 0.15 * np.abs(wanted).max()
+
+
+def test_the_biases_undo_what_rounding_the_weights_does_to_the_mean() -> None:
+    bundle = calibrated(make(), windows())
+    ranges = Ranges.from_dict(bundle.calibration)
+    # Read as if every mean lay where 8 bits begin, nothing is undone.
+    idle = replace(ranges, means=(ranges.low, *(np.zeros_like(m) for m in ranges.means[1:])))
+    x = windows(seed=1, n=200)
+    wanted = bundle.network().forward(bundle.scaler.apply(x))
+    far = [
+        np.abs((quantize(bundle.arch, bundle.weights, bundle.scaler, r).forward(x) / 256 - wanted).mean(axis=0)).max()
+        for r in (ranges, idle)
+    ]
+    assert far[0] < far[1], far
 
 
 def test_the_smoothing_is_the_bundles_unless_told_otherwise() -> None:
@@ -83,13 +97,16 @@ def test_a_bundle_without_calibration_says_what_to_do() -> None:
 @pytest.mark.parametrize(
     "broken",
     [
-        {"low": [0.0] * 3, "high": [1.0] * 3},
-        {"low": [0.0] * 2, "high": [1.0] * 2, "tops": [[1.0] * 6, [1.0] * 5]},
-        {"low": [0.0] * 3, "high": [1.0] * 3, "tops": [[1.0] * 6]},
-        {"low": [0.0] * 3, "high": [1.0, 2.0, None], "tops": [[1.0] * 6, [1.0] * 5]},
-        {"low": "x", "high": [1.0] * 3, "tops": [[1.0] * 6, [1.0] * 5]},
+        {"means": None},
+        {"low": [0.0] * 2},
+        {"tops": [[1.0] * 6]},
+        {"means": [[0.0] * 3, [1.0] * 6, [1.0] * 4]},
+        {"high": [1.0, 2.0, None]},
+        {"low": "x"},
     ],
 )
 def test_a_calibration_of_another_network_or_of_no_numbers_is_refused(broken: dict[str, object]) -> None:
+    bundle = calibrated(make(), windows())
+    kept = {name: value for name, value in (bundle.calibration | broken).items() if value is not None}
     with pytest.raises(BundleError, match="train again"):
-        integer_model(replace(make(), calibration=broken))
+        integer_model(replace(bundle, calibration=kept))

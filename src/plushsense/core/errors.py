@@ -13,6 +13,9 @@
     ├── DeviceError             a toy that cannot be opened or went away
     ├── TrainingError           a training run that cannot start or go on
     │   └── DivergedError       its loss is no longer a number: the same settings will end so again
+    ├── ToolError               a compiler or emulator that is missing or fails
+    │   ├── BuildError          a compiler or linker that refuses a program
+    │   └── ProgramError        a program that was built and does not end well
     └── MissingExtraError       an optional package that is not installed
 
 Every message is one sentence for the person who reads it: what is wrong, where, what is accepted, what to do.
@@ -75,6 +78,23 @@ class TrainingError(PlushSenseError):
 
 class DivergedError(TrainingError):
     """A training whose loss is no longer a number; the same settings end so on every machine."""
+
+
+class ToolError(PlushSenseError):
+    """A compiler or emulator that is missing or fails."""
+
+    def __init__(self, message: str, said: str = "") -> None:
+        super().__init__(message)
+        self.said = said
+        """All that the tool wrote about it."""
+
+
+class BuildError(ToolError):
+    """A compiler or linker that refuses a program."""
+
+
+class ProgramError(ToolError):
+    """A program that was built and crashes, ends with another status than 0, or does not end."""
 
 
 class MissingExtraError(PlushSenseError):

@@ -8,12 +8,13 @@ import shutil
 import uuid
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from plushsense import __version__
 from plushsense.core.errors import BadInput
+from plushsense.core.gestures import NOBODY
 from plushsense.deploy.golden import write_golden
 from plushsense.models.bundle import Bundle
 from plushsense.models.image import HEAD_BYTES, IntegerModel, head, memory_bytes
@@ -155,13 +156,16 @@ def _facts(model: IntegerModel, bundle: Bundle, model_bytes: int) -> dict[str, A
         "memory_bytes": memory_bytes(model),
         "simulated": bool(bundle.provenance.get("simulated", False)),
         "provenance": bundle.provenance,
-        "code_version": __version__,
+        "code_version": version("plushsense"),
     }
 
 
 def without_people(provenance: Mapping[str, Any]) -> dict[str, Any]:
     """A bundle's provenance for strangers: how many people it was trained on, not who."""
-    names = {str(n) for key in _PEOPLE if isinstance(provenance.get(key), list) for n in provenance[key]}
+    people = {
+        key: {str(n) for n in provenance[key]} - {NOBODY} for key in _PEOPLE if isinstance(provenance.get(key), list)
+    }
+    names = set().union(*people.values())
     named = re.compile(
         "|".join(rf"(?<!\w){re.escape(n)}(?!\w)" for n in sorted(names, key=len, reverse=True)) or "(?!)"
     )
@@ -174,7 +178,7 @@ def without_people(provenance: Mapping[str, Any]) -> dict[str, Any]:
         return named.sub("…", value) if isinstance(value, str) else value
 
     kept = {key: plain(value) for key, value in provenance.items() if key not in _PEOPLE}
-    return kept | {key: len(provenance[key]) for key in _PEOPLE if isinstance(provenance.get(key), list)}
+    return kept | {key: len(found) for key, found in people.items()}
 
 
 def c_names(labels: Sequence[str]) -> tuple[str, ...]:
@@ -190,25 +194,25 @@ def c_names(labels: Sequence[str]) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _comment(text: str) -> str:
-    """Text that may stand in a C comment."""
+def comment(text: str) -> str:
+    """Text as it may stand in a C comment."""
     return text.replace("*/", "* /").replace("/*", "/ *").replace("\\", "/").replace("\n", " ")
 
 
 def _header(facts: dict[str, Any]) -> str:
     gestures = "".join(
-        f"    PLUSH_{g['c_name']} = {i}, /* {_comment(g['label'])}: {g['affect']} */\n"
+        f"    PLUSH_GESTURE_{g['c_name']} = {i}, /* {comment(g['label'])}: {g['affect']} */\n"
         for i, g in enumerate(facts["gestures"])
     )
     channels = "".join(
-        f"    PLUSH_CHANNEL_{name} = {i}, /* {_comment(c['name'])}, {_comment(c['unit'])} */\n"
+        f"    PLUSH_CHANNEL_{name} = {i}, /* {comment(c['name'])}, {comment(c['unit'])} */\n"
         for i, (name, c) in enumerate(
             zip(c_names([c["name"] for c in facts["channels"]]), facts["channels"], strict=True)
         )
     )
     simulated = "\n * Trained on a simulation: it knows no real person's touch." if facts["simulated"] else ""
     return f"""/*
- * The model {_comment(facts["title"])}, as plushsense.c reads it. Made by PlushSense {facts["code_version"]}.
+ * The model {comment(facts["title"])}, as plushsense.c reads it. Made by PlushSense {facts["code_version"]}.
  * A step of {facts["step_ms"]:g} ms; warming for {facts["span"]} samples at {facts["rate_hz"]:g} Hz.{simulated}
  */
 #ifndef PLUSH_MODEL_H
@@ -229,7 +233,7 @@ extern "C" {{
 #define PLUSH_MODEL_STEP {facts["step"]} /* samples from one answer to the next */
 #define PLUSH_MODEL_SPAN {facts["span"]} /* samples until the first answer */
 
-/* The order of the values that plush_push() takes, in the layout '{_comment(facts["layout"])}'. */
+/* The order of the values that plush_push() takes, in the layout '{comment(facts["layout"])}'. */
 enum {{
 {channels}}};
 
@@ -251,7 +255,7 @@ def _source(model: IntegerModel, facts: dict[str, Any]) -> str:
     top = head(b"".join(piece for _, piece in sections))
     lines = [
         "/*",
-        f" * The model {_comment(facts['title'])}: the bytes of {IMAGE}, section by section.",
+        f" * The model {comment(facts['title'])}: the bytes of {IMAGE}, section by section.",
         " * Numbers of more than one byte are little-endian; weights stand with 128 added, for four filters at a time:",
         " * for every tap, for every four channels, 4 weights of each filter. The format is told in PlushSense's",
         " * models/image.",
@@ -262,7 +266,7 @@ def _source(model: IntegerModel, facts: dict[str, Any]) -> str:
     ]
     for what, piece in [(f"head: PLSH, version, bytes, CRC-32 of what follows ({HEAD_BYTES} bytes)", top), *sections]:
         if what:
-            lines.append(f"    /* {_comment(what)} */")
+            lines.append(f"    /* {comment(what)} */")
         for at in range(0, len(piece), _PER_LINE):
             lines.append("    " + " ".join(f"{v}," for v in piece[at : at + _PER_LINE]))
     return "\n".join([*lines, "};", ""])

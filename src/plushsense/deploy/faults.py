@@ -6,10 +6,21 @@ rounding, a clamp), there by exact text that must stand in ``plushsense.c`` once
 
 from __future__ import annotations
 
+import struct
 from dataclasses import dataclass
 from typing import Literal
 
-_HEAD, _FIXED, _SCALE, _INT32 = 16, 28, 8, (1 << 31) - 1
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import BadInput
+from plushsense.models.image import GROUP, head
+from plushsense.models.image import HEAD_BYTES as BODY
+
+_FIXED_BYTES, _SCALE_BYTES = 28, 8
+_GAP_AT, _SMOOTHING_AT = 16, 24
+_INT32 = (1 << 31) - 1
+_MOST_SHIFT = 30
 
 Kind = Literal["weight", "shift", "index", "rounding", "clamp", "rule", "constant"]
 
@@ -32,7 +43,7 @@ class _Text:
     name: str
     text: str
     wrong: str
-    when: Literal["always", "dilated", "magnitude", "gap"] = "always"
+    when: Literal["always", "dilated", "magnitude", "ranged"] = "always"
 
 
 # Every one stays within the toy's memory, so that it is the answers that give it away, and not a crash.
@@ -128,13 +139,13 @@ TEXTS = (
         "values above the valid range are taken",
         "values[i] >= as_signed(le32(range)) && values[i] <= as_signed(le32(range + 4))",
         "values[i] >= as_signed(le32(range))",
-        "gap",
+        "ranged",
     ),
     _Text(
         "rule",
-        "what was remembered survives a gap",
-        "        toy->restarts++;\n        plush_restart(toy);",
-        "        toy->restarts++;",
+        "what was remembered survives a restart",
+        "memset(toy->memory, 0, toy->memory_bytes);",
+        "",
     ),
     _Text(
         "rule",
@@ -149,3 +160,106 @@ TEXTS = (
         "toy->filled = (uint16_t)(phase == 0 ? 1 : 0);",
     ),
 )
+
+
+def faults_of(image: bytes, source: str) -> list[Fault]:
+    """The faults that this model can show, planted in its image or in ``plushsense.c``.
+
+    Raises:
+        BadInput: when a text to replace does not stand in the C exactly once.
+    """
+    at = _Places(image)
+    found = []
+    for n, layer in enumerate([*at.layers, at.dense], 1):
+        what = f"layer {n}" if layer is not at.dense else "the dense layer"
+        weight, filter_ = layer.telling()
+        found.append(_in_image("weight", f"one weight of {what} by one", image, weight, "B"))
+        shift = layer.scales_at + _SCALE_BYTES * filter_ + 7
+        found.append(_in_image("shift", f"one shift of {what} by one", image, shift, "B", _MOST_SHIFT))
+    found.append(_in_image("shift", "one input's shift by one", image, at.inputs[0] + 11, "B", _MOST_SHIFT))
+    found.append(_in_image("constant", "the longest gap by one", image, BODY + _GAP_AT, "I", by=at.units_per_ms))
+    found.append(_in_image("constant", "the smoothing's weight by one", image, BODY + _SMOOTHING_AT, "H"))
+    ranged = [n for n, (_, high) in enumerate(at.ranges) if high < _INT32]
+    for n in ranged[:1]:
+        where = BODY + _FIXED_BYTES + 8 * n + 4
+        found.append(_in_image("constant", f"the valid range of channel {n + 1} by one", image, where, "i"))
+    shows = {
+        "always": True,
+        "dilated": any(layer.dilation > 1 for layer in at.layers),
+        "magnitude": at.magnitudes,
+        "ranged": bool(ranged),
+    }
+    for each in TEXTS:
+        if source.count(each.text) != 1:
+            raise BadInput(
+                f"The fault '{each.name}' cannot be planted: its text ({each.text.strip()!r}) stands "
+                f"{source.count(each.text)} times in plushsense.c, and not once; export the model again with this "
+                "PlushSense, or undo there what was edited."
+            )
+        if shows[each.when]:
+            found.append(Fault(each.kind, each.name, source=source.replace(each.text, each.wrong)))
+    return found
+
+
+def _in_image(kind: Kind, name: str, image: bytes, at: int, form: str, most: int | None = None, by: int = 1) -> Fault:
+    """The image with the number at a place greater by one (smaller, where it is the greatest), and a good checksum."""
+    most = most if most is not None else (1 << (8 * struct.calcsize(form) - form.islower())) - 1
+    (value,) = struct.unpack_from("<" + form, image, at)
+    changed = bytearray(image)
+    struct.pack_into("<" + form, changed, at, value + by if value + by <= most else value - by)
+    body = bytes(changed[BODY:])
+    return Fault(kind, name, image=head(body) + body)
+
+
+@dataclass(frozen=True, eq=False)
+class _Layer:
+    """Where a layer's scales and weights stand; ``weights`` (F, C, K) as numbers, ``index`` their places."""
+
+    dilation: int
+    scales_at: int
+    weights: NDArray[np.int64]
+    index: NDArray[np.int64]
+    after: list[_Layer]
+
+    def telling(self) -> tuple[int, int]:
+        """The place of the weight that speaks loudest, and its filter: a dead filter would hide any fault."""
+        f = np.abs(self.after[0].weights).sum(axis=(0, 2)) if self.after else np.abs(self.weights).sum(axis=(1, 2))
+        filter_ = int(f[: len(self.weights)].argmax())
+        own = int(np.abs(self.weights[filter_]).argmax())
+        return int(self.index[filter_].flat[own]), filter_
+
+
+class _Places:
+    """Where things stand in an image; the format is that of `plushsense.models.image`."""
+
+    def __init__(self, image: bytes) -> None:
+        count, channels, inputs, classes = struct.unpack_from("<BBBB", image, BODY)
+        (self.units_per_ms,) = struct.unpack_from("<I", image, BODY + 20)
+        at = BODY + _FIXED_BYTES
+        self.ranges = [struct.unpack_from("<ii", image, at + 8 * i) for i in range(channels)]
+        at += 8 * channels
+        self.inputs: list[int] = []
+        self.magnitudes = False
+        for _ in range(inputs):
+            self.magnitudes |= image[at] == 1
+            self.inputs.append(at + 2 + image[at + 1])
+            at = self.inputs[-1] + 12
+        self.layers: list[_Layer] = []
+        stored = np.frombuffer(image, dtype=np.uint8).astype(np.int64) - 128
+        filters = 0
+        for _ in range(count):
+            kernel, dilation, read, filters = struct.unpack_from("<HHHH", image, at)
+            scales = at + 8
+            at = scales + _SCALE_BYTES * filters
+            shape = (-(-filters // GROUP), kernel, -(-read // GROUP), GROUP, GROUP)
+            index = at + np.arange(np.prod(shape)).reshape(shape)
+            index = index.transpose(0, 3, 2, 4, 1).reshape(shape[0] * GROUP, shape[2] * GROUP, kernel)
+            index = index[:filters, :read]
+            self.layers.append(_Layer(dilation, scales, stored[index], index, []))
+            at += int(np.prod(shape))
+        scales = at
+        at += _SCALE_BYTES * classes
+        index = at + np.arange(classes * filters).reshape(classes, filters, 1)
+        self.dense = _Layer(1, scales, stored[index], index, [])
+        for one, other in zip(self.layers, [*self.layers[1:], self.dense], strict=True):
+            one.after.append(other)

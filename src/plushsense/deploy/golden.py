@@ -96,7 +96,7 @@ class _Maker:
     def __init__(self, layout: Layout, scaler: Scaler, rng: np.random.Generator) -> None:
         self.layout, self.rng = layout, rng
         self.low, self.high = layout.valid_min_int, layout.valid_max_int
-        self.mean, self.spread = _measured(layout, scaler)
+        self.mean, self.spread = measured(layout, scaler)
         self.rows: list[list[int]] = []
         self.now = 1000
         self._owed = 0.0
@@ -150,7 +150,7 @@ class _Maker:
         return int(self.rng.choice(outside)) if outside else int(self.rng.integers(low, high))
 
 
-def _measured(layout: Layout, scaler: Scaler) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def measured(layout: Layout, scaler: Scaler) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Mean and spread of each measured channel that the scaling of the inputs speaks of."""
     c = len(layout.channels)
     mean, spread = np.zeros(c), np.full(c, 100.0)

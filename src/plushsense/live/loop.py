@@ -11,7 +11,8 @@ import numpy as np
 
 from plushsense.core.errors import ConfigError
 from plushsense.devices.base import Device
-from plushsense.live.stream import Decision, StreamClassifier, check_layout
+from plushsense.live.integer import BothEngines
+from plushsense.live.stream import Decision, StreamReader, check_layout
 
 _KEPT = 72_000  # latencies kept: the last hour at 20 decisions a second
 
@@ -60,7 +61,7 @@ class Summary:
 class Run(Iterator[Decision]):
     """A live run: iterate for decisions; `summary` tells at any time how it went."""
 
-    def __init__(self, device: Device, classifier: StreamClassifier, seconds: float | None) -> None:
+    def __init__(self, device: Device, classifier: StreamReader | BothEngines, seconds: float | None) -> None:
         self.device = device
         self.classifier = classifier
         self._seconds = seconds
@@ -123,7 +124,7 @@ class Run(Iterator[Decision]):
         )
 
 
-def run(device: Device, classifier: StreamClassifier, *, seconds: float | None = None) -> Run:
+def run(device: Device, classifier: StreamReader | BothEngines, *, seconds: float | None = None) -> Run:
     """Run a model on an open device.
 
     Args:

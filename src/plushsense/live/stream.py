@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError
+from plushsense.core.gestures import GestureSet
 from plushsense.core.signal import Layout
 from plushsense.devices.base import Frame
 from plushsense.live.decide import DecideSpec, Smoother
+from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.models.reference import softmax
 from plushsense.windows.clock import Clock
@@ -55,31 +59,20 @@ class Decision:
         }
 
 
-class StreamClassifier:
-    """Reads the frames of one toy through a bundle: clock, derived channels, scaling, network, smoothing.
+class StreamReader(ABC):
+    """Reads the frames of one toy: clock and derived channels here; what answers is the subclass's.
 
     Decisions come every ``step`` even samples, counted so that the first answer falls on the sample that
     fills the span. After a gap beyond the layout's ``gap_ms`` or a reset of the device clock everything
-    restarts. Works with every padding; ``mirror`` and ``causal`` compute the whole window anew at each step.
-
-    Args:
-        bundle: the model.
-        decide: how decisions are made; the bundle's own settings when left out.
+    restarts.
     """
 
-    def __init__(self, bundle: Bundle, decide: DecideSpec | None = None) -> None:
-        self.bundle = bundle
-        self.layout = bundle.layout
-        self.spec = decide or DecideSpec.from_dict(bundle.decision)
-        arch = bundle.arch
-        self.step_s = arch.step * self.layout.period_us / 1e6
+    def __init__(self, arch: Arch, layout: Layout, gestures: GestureSet) -> None:
+        self.arch, self.layout = arch, layout
+        self.step_s = arch.step * layout.period_us / 1e6
         self._step, self._phase = arch.step, arch.span % arch.step
-        self._labels = bundle.gestures.labels
-        self._affects = tuple(bundle.gestures.get(label).affect for label in self._labels)
-        self._inputs = SampleInputs(self.layout)
-        self._stepper = bundle.network().stepper()
-        self._smoother = Smoother(self.spec, self.step_s)
-        self.reset()
+        self._labels, self._affects = gestures.labels, gestures.affects
+        self._inputs = SampleInputs(layout)
 
     @property
     def restarts(self) -> int:
@@ -104,8 +97,7 @@ class StreamClassifier:
         self._restart()
 
     def _restart(self) -> None:
-        self._stepper.reset()
-        self._smoother.reset()
+        self._forget()
         self._samples = 0
         self._block: list[list[int]] = []
 
@@ -132,22 +124,59 @@ class StreamClassifier:
 
     def _decide(self, t_s: float) -> Decision:
         # The samples of a step go through the network together: a fifth of the calls, the same numbers.
-        block = self.bundle.scaler.apply_sample(np.array(self._block, dtype=np.float64))
-        self._block = []
-        logits = self._stepper.push(block)
-        if not logits:
+        block, self._block = self._block, []
+        found = self._answer(block)
+        if found is None:
             return Decision(t_s, None, None, None, "cnn", "warming", None)
-        smooth = self._smoother.update(softmax(logits[-1]))
-        best = int(smooth.argmax())
+        best, confidence, probabilities = found
         return Decision(
             t_s,
             self._labels[best],
             self._affects[best],
-            float(smooth[best]),
+            confidence,
             "cnn",
             "tracking",
-            tuple(smooth.tolist()),
+            tuple(probabilities.tolist()),
         )
+
+    @abstractmethod
+    def _forget(self) -> None:
+        """Forget the past of network and smoothing."""
+
+    @abstractmethod
+    def _answer(self, block: list[list[int]]) -> tuple[int, float, NDArray[np.float64]] | None:
+        """Take the inputs of a step's samples in: class, confidence, smoothed probabilities; None while warming."""
+
+
+class StreamClassifier(StreamReader):
+    """Reads the frames of one toy through a bundle: clock, derived channels, scaling, network, smoothing.
+
+    Works with every padding; ``mirror`` and ``causal`` compute the whole window anew at each step.
+
+    Args:
+        bundle: the model.
+        decide: how decisions are made; the bundle's own settings when left out.
+    """
+
+    def __init__(self, bundle: Bundle, decide: DecideSpec | None = None) -> None:
+        super().__init__(bundle.arch, bundle.layout, bundle.gestures)
+        self.bundle = bundle
+        self.spec = decide or DecideSpec.from_dict(bundle.decision)
+        self._stepper = bundle.network().stepper()
+        self._smoother = Smoother(self.spec, self.step_s)
+        self.reset()
+
+    def _forget(self) -> None:
+        self._stepper.reset()
+        self._smoother.reset()
+
+    def _answer(self, block: list[list[int]]) -> tuple[int, float, NDArray[np.float64]] | None:
+        logits = self._stepper.push(self.bundle.scaler.apply_sample(np.array(block, dtype=np.float64)))
+        if not logits:
+            return None
+        smooth = self._smoother.update(softmax(logits[-1]))
+        best = int(smooth.argmax())
+        return best, float(smooth[best]), smooth
 
 
 def check_layout(sent: Layout, read: Layout) -> None:

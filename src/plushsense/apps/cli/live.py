@@ -5,9 +5,15 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from typing import TYPE_CHECKING
 
 from plushsense.apps.cli.output import say
-from plushsense.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from plushsense.live.decide import DecideSpec
+    from plushsense.live.integer import BothEngines
+    from plushsense.live.stream import StreamReader
+    from plushsense.models.bundle import Bundle
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -20,7 +26,11 @@ def add(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--model", required=True, metavar="BUNDLE", help="a .plush bundle")
     parser.add_argument(
-        "--engine", default="float", choices=("float", "int8"), help="float (default; int8 is not built yet)"
+        "--engine",
+        default="float",
+        choices=("float", "int8", "both"),
+        help="float (default); int8: whole numbers, bit for bit what the toy's C answers; both: decides as int8, and "
+        "the summary says how often float agreed",
     )
     parser.add_argument(
         "--seconds",
@@ -42,15 +52,12 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from plushsense.devices.opening import open_device
     from plushsense.live.decide import DecideSpec
+    from plushsense.live.integer import BothEngines
     from plushsense.live.loop import run as run_loop
-    from plushsense.live.stream import StreamClassifier
     from plushsense.models.bundle import Bundle
 
-    if args.engine == "int8":
-        raise ConfigError("The int8 engine is not built yet: use --engine float.")
     bundle = Bundle.load(args.model)
-    decide = DecideSpec(args.smoothing) if args.smoothing is not None else None
-    classifier = StreamClassifier(bundle, decide)
+    classifier = classifier_of(bundle, DecideSpec(args.smoothing) if args.smoothing is not None else None, args.engine)
     with open_device(args.device, bundle.layout, reconnect=args.reconnect) as device:
         say(
             f"reading {args.device}; {bundle.arch.symbol}, a decision every "
@@ -64,5 +71,18 @@ def run(args: argparse.Namespace) -> int:
         except KeyboardInterrupt:
             pass
         finally:
-            say(json.dumps(live.summary().to_dict()))
+            both = {"agreement": classifier.agreement()} if isinstance(classifier, BothEngines) else {}
+            say(json.dumps(live.summary().to_dict() | both))
     return 0
+
+
+def classifier_of(bundle: Bundle, decide: DecideSpec | None, engine: str) -> StreamReader | BothEngines:
+    """What reads the stream; ``engine`` is "float", "int8" or "both"."""
+    from plushsense.deploy.calibration import integer_model
+    from plushsense.live.integer import BothEngines, IntegerClassifier
+    from plushsense.live.stream import StreamClassifier
+
+    if engine == "float":
+        return StreamClassifier(bundle, decide)
+    integer = IntegerClassifier(integer_model(bundle, decide))
+    return integer if engine == "int8" else BothEngines(integer, StreamClassifier(bundle, decide))

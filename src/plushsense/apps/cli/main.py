@@ -39,6 +39,8 @@ VERBS: dict[str, tuple[str, str]] = {
     "search": ("search", "the best network within limits of size, for a share of what a whole sweep costs"),
     "report": ("report", "one HTML page from evaluations and bundles, or of a sweep"),
     "export": ("exporting", "C for the toy that gives the same answers, bit for bit"),
+    "verify": ("verify", "prove that the C of an export gives the same answers, here and on emulated chips"),
+    "profile": ("profiling", "what an export costs on a chip: instructions, bytes, stack, and an estimate of the time"),
     "live": ("live", "read a toy and say what it feels, 20 times a second"),
     "toy": ("toy", "a virtual toy that speaks the wire format over a pty or TCP"),
     "simulate": ("simulate", "recordings of virtual people, as the authors' recorder would leave them"),
@@ -62,6 +64,7 @@ STOPPED = {
     "train": "no bundle was written",
     "report": "no page was written",
     "export": "nothing was written",
+    "verify": "nothing was changed",
 }
 
 

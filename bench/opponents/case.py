@@ -1,0 +1,190 @@
+"""What all opponents are given: one network with its normalisation folded, and the windows they are checked on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import ArchError
+from plushsense.core.gestures import GestureSet, load_gestures
+from plushsense.core.signal import Layout, load_layout
+from plushsense.deploy.quantize import calibrate, quantize, refuse_undeployable
+from plushsense.models import fixed
+from plushsense.models.arch import NORM_EPSILON, Arch
+from plushsense.models.bundle import Bundle
+from plushsense.models.image import IntegerModel
+from plushsense.models.reference import Network, random_weights
+from plushsense.windows.features import Scaler, inputs
+
+Floats = NDArray[np.float64]
+CHECKED, CALIBRATED, APART = 200, 200, 8  # windows to check on, windows to calibrate with, decisions between them
+FORMS = ("cheapest", "window", "span")
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """One network, and the numbers that go through it.
+
+    ``frames`` (n, 1 + C) int32 are what the toy measures: ms and raw values. Ours reads them as a stream. The others
+    read ``windows`` (N, F, T) float32, which end where a decision of the stream falls; ``ours`` (N,) says which one.
+    ``stream_logits`` and ``window_logits`` (N, K) are the float answers to each.
+    """
+
+    arch: Arch
+    model: IntegerModel
+    form: str
+    weights: dict[str, NDArray[np.float32]]
+    frames: NDArray[np.int32]
+    calibration: NDArray[np.float32]
+    windows: NDArray[np.float32]
+    ours: NDArray[np.int64]
+    stream_logits: Floats
+    window_logits: Floats
+
+    @property
+    def length(self) -> int:
+        """Samples that an opponent reads for one decision."""
+        return int(self.windows.shape[2])
+
+    @property
+    def macs(self) -> int:
+        """Multiply-accumulates of an opponent's decision."""
+        return macs_of(self.arch, self.form)
+
+    def save(self, folder: Path) -> None:
+        """Everything an opponent needs, without PlushSense."""
+        facts = {f"dilation{i}": np.int64(layer.dilation) for i, layer in enumerate(self.arch.layers)}
+        np.savez(
+            folder / "case.npz",
+            **self.weights,
+            **facts,
+            layers=np.int64(len(self.arch.layers)),
+            padded=np.int64(self.form == "window"),
+            calibration=self.calibration,
+            windows=self.windows,
+        )
+        (folder / "windows.bin").write_bytes(self.windows.tobytes())
+        (folder / "frames.bin").write_bytes(self.frames.tobytes())
+
+
+def macs_of(arch: Arch, form: str) -> int:
+    """Multiply-accumulates of one decision that computes everything again, without the dense layer."""
+    positions = (arch.window,) * len(arch.layers) if form == "window" else arch.positions
+    each = zip(arch.layers, arch.inputs, positions, strict=True)
+    return sum(layer.kernel * read * layer.filters * n for layer, read, n in each)
+
+
+def make_case(
+    symbol: str,
+    filters: str,
+    *,
+    layout: str = "plush-15",
+    gestures: str = "plush-18",
+    window: int = 250,
+    form: str = "cheapest",
+    bundle: str | None = None,
+    seed: int = 1,
+) -> Case:
+    """A network with random weights, or that of a bundle, and made-up frames for it."""
+    laid, named = load_layout(layout), load_gestures(gestures)
+    if bundle is None:
+        arch = Arch.parse(symbol, filters, channels=laid.n_inputs, classes=len(named), window=window)
+        refuse_undeployable(arch)
+        weights, scaler, smoothing = random_weights(arch, seed), None, fixed.smoothing_weight(0.3, 0.05)
+    else:
+        found = Bundle.load(bundle)
+        arch, weights, laid, named, scaler = found.arch, dict(found.weights), found.layout, found.gestures, found.scaler
+        refuse_undeployable(arch)
+        smoothing = fixed.smoothing_weight(0.3, arch.step / laid.rate_hz)
+    if form == "cheapest":
+        form = min(("window", "span"), key=lambda f: macs_of(arch, f))
+    return _filled(arch, weights, laid, named, scaler, smoothing, form, seed)
+
+
+def _filled(
+    arch: Arch,
+    weights: dict[str, NDArray[np.float32]],
+    layout: Layout,
+    gestures: GestureSet,
+    scaler: Scaler | None,
+    smoothing: int,
+    form: str,
+    seed: int,
+) -> Case:
+    length = arch.window if form == "window" else arch.span
+    first = -(-max(length - arch.span, 0) // arch.step)  # the first decision that has a whole window behind it
+    decisions = first + APART * (CALIBRATED + CHECKED)
+    frames = made_up_frames(layout, scaler, arch.span + arch.step * decisions, seed)
+    x = inputs(frames[:, 1:].astype(np.int64), layout)
+    at = first + APART * np.arange(CALIBRATED + CHECKED)
+    ends = arch.span + arch.step * at
+    spans = np.stack([x[end - arch.span : end].T for end in ends])
+    scaler = scaler or Scaler.fit(spans[:CALIBRATED])
+    ranges = calibrate(Network(arch, weights), scaler.apply(spans[:CALIBRATED]))
+    model = IntegerModel(quantize(arch, weights, scaler, ranges), layout, gestures, smoothing)
+    windows = scaler.apply(np.stack([x[end - length : end].T for end in ends]))
+    stream = Network(arch, weights).forward(scaler.apply(spans[CALIBRATED:]))
+    folded = fold(arch, weights)
+    apart = np.abs(forward(arch, folded, scaler.apply(spans[CALIBRATED:][:4]), padded=False) - stream[:4]).max()
+    if apart > 1e-3 * np.abs(stream).max():
+        raise ArchError(f"Folding the normalisation of {arch.title} changed its answers by {apart:.2g}: a fault here.")
+    answers = forward(arch, folded, windows[CALIBRATED:], padded=form == "window")
+    return Case(
+        arch, model, form, folded, frames, windows[:CALIBRATED], windows[CALIBRATED:], at[CALIBRATED:], stream, answers
+    )  # fmt: skip
+
+
+def made_up_frames(layout: Layout, scaler: Scaler | None, n: int, seed: int) -> NDArray[np.int32]:
+    """Frames (n, 1 + C) every 10 ms: levels and liveliness of all channels change every few seconds."""
+    rng = np.random.default_rng(seed)
+    channels = len(layout.channels)
+    level, size = np.empty((n, channels)), np.empty((n, channels))
+    at = 0
+    while at < n:
+        until = at + int(rng.integers(150, 600))
+        level[at:until], size[at:until] = rng.uniform(-1.7, 1.7, channels), rng.uniform(0.05, 0.5, channels)
+        at = until
+    noise = rng.normal(size=(n, channels))
+    for t in range(1, n):
+        noise[t] += 0.8 * noise[t - 1]
+        level[t] = 0.95 * level[t - 1] + 0.05 * level[t]
+    offset, spread = np.full(channels, 1000.0), np.full(channels, 300.0)
+    if scaler is not None:
+        for i, name in enumerate(layout.inputs):
+            if all(name != d.name for d in layout.derived):
+                offset[layout.index(name)], spread[layout.index(name)] = scaler.offset[i], 1 / scaler.scale[i]
+    values = np.rint(offset + spread * (level + size * noise))
+    values = np.clip(values, layout.valid_min_int, layout.valid_max_int)
+    return np.column_stack([10 * np.arange(n), values]).astype(np.int32)
+
+
+def fold(arch: Arch, weights: dict[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float32]]:
+    """The network without normalisation: each one moved into the layer that reads it. ``w0 (F, C, K)``, ``b0`` …"""
+    gain, shift = np.ones(arch.channels), np.zeros(arch.channels)
+    folded: dict[str, Any] = {}
+    for i in range(len(arch.layers)):
+        w = weights[f"conv{i}.weight"].astype(np.float64)
+        folded[f"w{i}"] = w * gain[:, None]
+        folded[f"b{i}"] = weights[f"conv{i}.bias"] + np.einsum("fck,c->f", w, shift)
+        gain = weights[f"norm{i}.gain"] / np.sqrt(weights[f"norm{i}.var"].astype(np.float64) + NORM_EPSILON)
+        shift = weights[f"norm{i}.shift"] - weights[f"norm{i}.mean"] * gain
+    w = weights["dense.weight"].astype(np.float64)
+    folded["dense_w"], folded["dense_b"] = w * gain, weights["dense.bias"] + w @ shift
+    return {name: np.ascontiguousarray(values, dtype=np.float32) for name, values in folded.items()}
+
+
+def forward(arch: Arch, folded: dict[str, NDArray[np.float32]], x: NDArray[np.float32], *, padded: bool) -> Floats:
+    """The float answer (N, K) to windows (N, C, T); ``padded`` puts zeros before each layer's first sample."""
+    z = x.astype(np.float64)
+    for i, layer in enumerate(arch.layers):
+        if padded:
+            z = np.pad(z, ((0, 0), (0, 0), (layer.reach, 0)))
+        length = z.shape[2] - layer.reach
+        taps = [z[:, :, k * layer.dilation : k * layer.dilation + length] for k in range(layer.kernel)]
+        z = sum(np.einsum("fc,nct->nft", folded[f"w{i}"][:, :, k], tap) for k, tap in enumerate(taps))
+        z = np.maximum(z + folded[f"b{i}"][:, None], 0.0)
+    return z.mean(axis=2) @ folded["dense_w"].T + folded["dense_b"]

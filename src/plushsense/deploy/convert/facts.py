@@ -1,0 +1,177 @@
+"""What every converter says, and how its result is tried: facts to write into the file, windows, the comparison."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import BundleError
+from plushsense.models.bundle import Bundle
+from plushsense.models.fixed import LOGIT_LIMIT
+from plushsense.models.integer import IntegerNetwork
+from plushsense.models.reference import check_windows
+from plushsense.windows.features import Scaler
+
+Floats = NDArray[np.float32]
+Windows = NDArray[np.int64]
+
+RAW = "raw"
+LOGITS = "logits"
+PROBABILITIES = "probabilities"
+LIMIT = LOGIT_LIMIT / 256  # of logits in the network in whole numbers
+# Logits in float32 against the reference in float64, relative to the largest logit; above it nothing is written.
+TOLERANCE = 1e-4
+NOT_EXACT = (
+    "Compared with the network in whole numbers, which the C in the toy equals bit for bit; this file only comes "
+    "close: a code may differ by 1 where this runtime rounds the other way."
+)
+
+
+@dataclass(frozen=True)
+class Converted:
+    """A file for another runtime.
+
+    ``largest_difference`` is between its logits and those of the network it came from (`Network.forward`, or
+    `IntegerNetwork.forward` / 256 for the int8 formats) on the windows tried; None where the runtime that could tell
+    is not installed. ``notes`` are sentences for the person who uses the file.
+    """
+
+    path: Path
+    bytes: int
+    largest_difference: float | None
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Made:
+    """What a converter gives: the file's bytes, and as in `Converted`."""
+
+    data: bytes
+    largest_difference: float | None
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a converter is given: the bundle, and raw windows (N, C, T) to try and to calibrate with: ``given`` ones
+    first, then made-up ones."""
+
+    bundle: Bundle
+    windows: Windows
+    given: int
+
+    @classmethod
+    def of(cls, bundle: Bundle, windows: NDArray[Any] | None) -> Job:
+        """With made-up windows beside the given ones.
+
+        Raises:
+            BadInput: for windows of another shape.
+        """
+        tried = made_up_windows(bundle)
+        if windows is not None:
+            check_windows(bundle.arch, windows.shape)
+            given = windows[:, :, windows.shape[2] - bundle.arch.span :].astype(np.int64)
+            tried = np.concatenate([given, tried])
+        return cls(bundle, tried, 0 if windows is None else len(windows))
+
+    def thinned(self, most: int) -> Job:
+        """At most ``most`` of the given windows, evenly taken, and the made-up ones."""
+        given = self.windows[: self.given][:: max(1, -(-self.given // most))]
+        return replace(self, windows=np.concatenate([given, self.windows[self.given :]]), given=len(given))
+
+    @property
+    def tried(self) -> str:
+        """The windows, in words."""
+        made = len(self.windows) - self.given
+        return f"{made} made-up windows" if not self.given else f"{self.given} given and {made} made-up windows"
+
+    def reference(self) -> NDArray[np.float64]:
+        """Logits (N, K) of the float network."""
+        return self.bundle.network().forward(self.bundle.scaler.apply(self.windows))
+
+
+def made_up_windows(bundle: Bundle, n: int = 24) -> Windows:
+    """Raw windows (n, C, span) that nobody recorded: walks and noise about the middle of each channel."""
+    rng = np.random.default_rng(20)
+    shape = (n, bundle.arch.channels, bundle.arch.span)
+    walk = np.cumsum(rng.normal(size=shape), axis=2) / np.sqrt(shape[2] / 4) + rng.normal(size=(*shape[:2], 1))
+    scaled = (
+        np.where(np.arange(n)[:, None, None] % 3 == 0, rng.normal(size=shape), walk)
+        * rng.choice([0.5, 1, 3], n)[:, None, None]
+    )
+    scaler = bundle.scaler
+    unit = 1 / np.where(scaler.scale == 0, 1.0, scaler.scale)
+    raw: Windows = np.rint(scaler.offset[:, None] + scaled * unit[:, None]).astype(np.int64)
+    return raw
+
+
+def scaling(scaler: Scaler) -> tuple[Floats, Floats, Floats]:
+    """(whole, scale, rest), each (C,): ``(raw - whole) * scale + rest`` in float32 is the scaler without its losing
+    the last digits of a large offset."""
+    whole = np.rint(scaler.offset)
+    rest = (whole - scaler.offset) * scaler.scale
+    return whole.astype(np.float32), scaler.scale.astype(np.float32), rest.astype(np.float32)
+
+
+def input_codes(network: IntegerNetwork) -> tuple[Floats, Floats, Floats]:
+    """(offset, gain, start), each (C,): ``(raw - offset) * gain + start``, rounded and held in 0 to 255, is what the
+    first layer reads; it may differ from `InputScale` by 1 where that rounds the other way."""
+    scale = network.inputs
+    unit = np.ldexp(1.0, -scale.after)
+    gain = scale.multiplier * unit * np.ldexp(1.0, -scale.before)
+    return scale.offset.astype(np.float32), gain.astype(np.float32), (scale.bias * unit - 0.5).astype(np.float32)
+
+
+def sum_scales(multiplier: NDArray[Any], before: NDArray[Any], after: NDArray[Any]) -> NDArray[np.float64]:
+    """What a sum is multiplied by; never 0, which runtimes refuse: 2^-32 of any sum is less than half."""
+    return np.asarray(np.maximum(multiplier * np.ldexp(1.0, -(before + after)), 2.0**-32))
+
+
+def describe(bundle: Bundle) -> dict[str, str]:
+    """What a file must say of itself, as texts: `metadata_props` of ONNX, the metadata of a .tflite."""
+    arch, layout = bundle.arch, bundle.layout
+    provenance = bundle.provenance
+    facts: dict[str, Any] = {
+        "title": arch.title,
+        "padding": arch.padding,
+        "norm": arch.norm,
+        "layout": layout.name,
+        "channels": list(layout.inputs),
+        "gestures": list(bundle.gestures.labels),
+        "affect": [g.affect for g in bundle.gestures.gestures],
+        "span": arch.span,
+        "step": arch.step,
+        "rate_hz": layout.rate_hz,
+        "input": (
+            f"'{RAW}': integers as the toy measures them, at {layout.rate_hz:g} Hz after the clock rule, derived "
+            "channels included, not scaled; the newest sample is the last"
+        ),
+        "simulated": bool(provenance.get("simulated", False)),
+        "code_version": str(provenance.get("code_version", "")),
+    }
+    return {k: v if isinstance(v, str) else json.dumps(v, ensure_ascii=False) for k, v in facts.items()}
+
+
+def compare(
+    found: NDArray[Any], job: Job, title: str, expected: NDArray[np.float64] | None = None, exact: bool = True
+) -> tuple[float, str]:
+    """(largest difference, a sentence) between logits (N, K); ``exact`` refuses what is no rounding.
+
+    Raises:
+        BundleError: when a float file does not give the network's answers.
+    """
+    expected = job.reference() if expected is None else expected
+    largest = float(np.abs(found - expected).max())
+    same = int((found.argmax(axis=1) == expected.argmax(axis=1)).sum())
+    if exact and not largest <= TOLERANCE * max(1.0, float(np.abs(expected).max())):
+        raise BundleError(
+            f"The {title} file answers otherwise than the bundle (logits differ by up to {largest:.3g}) and is not "
+            "written: please report this with the bundle."
+        )
+    said = f"On {job.tried}: logits differ by at most {largest:.2g}, the same gesture in {same} of {len(expected)}."
+    return largest, said

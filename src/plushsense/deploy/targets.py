@@ -1,0 +1,306 @@
+"""Machines that a C program can be built for and run on here: this one, and chips that QEMU plays.
+
+The emulators run on a clock of their own (``-icount``), so that counts are the same in every run. They count
+instructions, not cycles, and nothing here is a real chip. A microcontroller is a line of `TARGETS`, its start-up and
+linker script are in ``c/runtime``. Recipes: Debian 12's packages.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+from plushsense.core.errors import BuildError, ConfigError, ProgramError, ToolError, nearest
+
+C_FOLDER = Path(__file__).parent / "c"
+RUNTIME = C_FOLDER / "runtime"
+
+
+@dataclass(frozen=True)
+class Target:
+    """One machine: how to compile for it and how to run there.
+
+    ``packages`` names Debian's package of each tool that must be on the path. ``libraries`` are files that the
+    compiler must find (``-print-file-name``), with their package. ``runtime`` and ``script`` are files of `RUNTIME`;
+    ``run`` is the emulator's command, to which the program's path is added.
+    """
+
+    name: str
+    title: str
+    compiler: str
+    packages: Mapping[str, str]
+    runtime: tuple[str, ...]
+    flags: tuple[str, ...] = ()
+    link: tuple[str, ...] = ()
+    run: tuple[str, ...] = ()
+    libraries: Mapping[str, str] | None = None
+    counts: bool = True
+
+
+_BARE = ("-nostdlib", "-nostartfiles", "-ffunction-sections", "-fdata-sections")
+_QUIET = ("-nographic", "-monitor", "none", "-serial", "none")
+_NATIVE = ("-semihosting-config", "enable=on,target=native")
+_MPS2 = ("qemu-system-arm", "-M", "mps2-an386", *_QUIET, *_NATIVE, "-icount", "shift=6,sleep=off", "-kernel")
+
+TARGETS: dict[str, Target] = {
+    "host": Target(
+        name="host",
+        title="this computer",
+        compiler="gcc",
+        packages={"gcc": "gcc"},
+        runtime=("host.c",),
+        counts=False,
+    ),
+    "xtensa": Target(
+        name="xtensa",
+        title="Xtensa lx106 (the ESP32's family) on QEMU",
+        compiler="xtensa-lx106-elf-gcc",
+        packages={"xtensa-lx106-elf-gcc": "gcc-xtensa-lx106", "qemu-system-xtensa": "qemu-system-misc"},
+        runtime=("xtensa_start.S", "xtensa.c", "xtensa_libc.c", "bare.c"),
+        flags=("-mlongcalls", "-ffreestanding", "-fno-builtin", "-I", str(RUNTIME / "xtensa_libc"), *_BARE),
+        link=("-T", str(RUNTIME / "xtensa.ld"), "-lgcc"),
+        run=(
+            *("qemu-system-xtensa", "-M", "sim", "-cpu", "lx106", *_QUIET),
+            *("-semihosting", "-icount", "shift=5,sleep=off", "-kernel"),
+        ),
+    ),
+    "cortex-m4": Target(
+        name="cortex-m4",
+        title="Arm Cortex-M4 on QEMU",
+        compiler="arm-none-eabi-gcc",
+        packages={"arm-none-eabi-gcc": "gcc-arm-none-eabi", "qemu-system-arm": "qemu-system-arm"},
+        libraries={"libc.a": "libnewlib-arm-none-eabi"},
+        runtime=("cortex-m4.c", "bare.c"),
+        flags=("-mcpu=cortex-m4", "-mthumb", *_BARE),
+        link=("-T", str(RUNTIME / "cortex-m4.ld"), "-lc", "-lgcc"),
+        run=_MPS2,
+    ),
+    "cortex-m0": Target(
+        name="cortex-m0",
+        title="Arm Cortex-M0+ code (the RP2040's) on QEMU's Cortex-M4",
+        compiler="arm-none-eabi-gcc",
+        packages={"arm-none-eabi-gcc": "gcc-arm-none-eabi", "qemu-system-arm": "qemu-system-arm"},
+        libraries={"libc.a": "libnewlib-arm-none-eabi"},
+        runtime=("cortex-m4.c", "bare.c"),
+        flags=("-mcpu=cortex-m0plus", "-mthumb", *_BARE),
+        link=("-T", str(RUNTIME / "cortex-m4.ld"), "-lc", "-lgcc"),
+        run=_MPS2,
+    ),
+    "riscv32": Target(
+        name="riscv32",
+        title="RISC-V RV32IMC (the ESP32-C3's family) on QEMU",
+        compiler="riscv64-unknown-elf-gcc",
+        packages={"riscv64-unknown-elf-gcc": "gcc-riscv64-unknown-elf", "qemu-system-riscv32": "qemu-system-misc"},
+        libraries={"picolibc.specs": "picolibc-riscv64-unknown-elf"},
+        runtime=("riscv32_start.S", "riscv32.c", "bare.c"),
+        flags=("--specs=picolibc.specs", "-march=rv32imc_zicsr", "-mabi=ilp32", "-msmall-data-limit=0", *_BARE),
+        # Without _zicsr, or the compiler does not find its libraries for 32 bits.
+        link=("-march=rv32imc", "-T", str(RUNTIME / "riscv32.ld"), "-lc", "-lgcc"),
+        run=(
+            *("qemu-system-riscv32", "-M", "virt", "-bios", "none", *_QUIET),
+            *(*_NATIVE, "-icount", "shift=0,sleep=off", "-kernel"),
+        ),
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Program:
+    """A program that was built: its ``file``, and the object file of each of its sources, in their order."""
+
+    target: Target
+    file: Path
+    objects: tuple[Path, ...]
+
+    def run(self, *, timeout_s: float = 120.0) -> bytes:
+        """What the program writes to standard output.
+
+        Raises:
+            ProgramError: when it ends with another status than 0, crashes (98 on an emulator), or takes too long.
+        """
+        command = [*self.target.run, str(self.file)]
+        where = f"The test program on {self.target.name}"
+        try:
+            done = subprocess.run(
+                command, cwd=self.file.parent, stdin=subprocess.DEVNULL, capture_output=True, timeout=timeout_s
+            )
+        except subprocess.TimeoutExpired:
+            raise ProgramError(f"{where} did not end within {timeout_s:g} s: it was stopped.", "") from None
+        except OSError as cause:
+            raise ToolError(f"{where} cannot be started with {command[0]}: {cause.strerror or cause}.") from None
+        if done.returncode != 0:
+            said = done.stderr.decode(errors="replace").strip()
+            last = f" It said: {_shortened(said)}" if said else ""
+            raise ProgramError(f"{where} ended with status {done.returncode} instead of 0.{last}", said)
+        return done.stdout
+
+
+def target_named(name: str) -> Target:
+    """The target of this name; ConfigError for an unknown one."""
+    if name not in TARGETS:
+        raise ConfigError(f"Unknown target '{name}': accepted are {', '.join(TARGETS)}.{nearest(name, TARGETS)}")
+    return TARGETS[name]
+
+
+def missing_tools(target: str, *, cc: str | None = None) -> list[str]:
+    """Debian packages that must be installed before programs can be built for this target and run: none when all is
+    here. ``cc`` is another compiler than the target's own."""
+    machine = target_named(target)
+    tools = dict(machine.packages)
+    if cc is not None:
+        tools = {cc: Path(cc).name} | {t: p for t, p in tools.items() if t != machine.compiler}
+    missing = [package for tool, package in tools.items() if shutil.which(tool) is None]
+    for file, package in (machine.libraries or {}).items():
+        if shutil.which(machine.compiler) is None or not _finds(machine.compiler, file):
+            missing.append(package)
+    return list(dict.fromkeys(missing))
+
+
+def available() -> list[str]:
+    """The targets for which everything is installed here."""
+    return [name for name in TARGETS if not missing_tools(name)]
+
+
+def require(target: str, *, cc: str | None = None) -> None:
+    """ToolError, with what to install, when something for this target is missing."""
+    if missing := missing_tools(target, cc=cc):
+        packages = " ".join(missing)
+        raise ToolError(
+            f"The target {target} ({target_named(target).title}) needs compilers or emulators that are not installed "
+            f"here: install Debian's {packages} (apt-get install {packages}), or leave this target out."
+        )
+
+
+def build(
+    target: str,
+    sources: Sequence[Path],
+    out_dir: Path,
+    *,
+    include: Iterable[Path] = (),
+    defines: Mapping[str, object] | None = None,
+    optimise: str = "-O2",
+    blobs: Mapping[str, Path] | None = None,
+    cc: str | None = None,
+    flags: Sequence[str] = (),
+) -> Program:
+    """A program from C (or assembly) sources, one of which has ``main``; made in ``out_dir``, nothing else is touched.
+
+    ``target.h`` is on the include path. Each file of ``blobs`` becomes bytes from the symbol NAME to NAME_end
+    (``extern const uint8_t NAME[], NAME_end[]``), at a multiple of 16. ``flags`` are for the sources, not for the
+    runtime, and for linking.
+
+    Raises:
+        ToolError: when a compiler or emulator is missing.
+        BuildError: when the compiler or linker refuses; ``said`` is all of what it said.
+    """
+    machine = target_named(target)
+    require(target, cc=cc)
+    compiler = cc or machine.compiler
+    out_dir = Path(out_dir).resolve()
+    out_dir.mkdir(parents=True, exist_ok=True)
+    own = [optimise, *flags, *(f"-I{Path(p).resolve()}" for p in include)]
+    own += [f"-D{name}={value}" for name, value in (defines or {}).items()]
+    with tempfile.TemporaryDirectory(prefix="plushsense-", dir=out_dir) as work:
+        objects = []
+        for n, source in enumerate(sources):
+            objects.append(out_dir / f"{n}-{Path(source).stem}.o")
+            command = [compiler, *machine.flags, f"-I{RUNTIME}", *own, "-c", str(Path(source).resolve())]
+            _compile([*command, "-o", str(objects[-1])], Path(work), Path(source).name)
+        around = [str(RUNTIME / name) for name in machine.runtime]
+        if blobs:
+            (Path(work) / "blobs.S").write_text(_blobs(blobs))
+            around.append("blobs.S")
+        # A loop of the runtime must not become a call of the very function that it implements.
+        runtime = ["-O2", "-fno-tree-loop-distribute-patterns"] if machine.run else ["-O2"]
+        command = [compiler, *machine.flags, f"-I{RUNTIME}", *runtime, "-c", *around]
+        _compile(command, Path(work), "the runtime")
+        file = out_dir / f"program-{target}{'.exe' if sys.platform == 'win32' and not machine.run else ''}"
+        linked = [*map(str, objects), *sorted(p.name for p in Path(work).glob("*.o"))]
+        trim = ["-Wl,--gc-sections"] if machine.run else []
+        command = [compiler, *machine.flags, optimise, *flags, *trim, *linked, "-o", str(file), *machine.link]
+        _compile(command, Path(work), "the program")
+    return Program(machine, file, tuple(objects))
+
+
+def compile_object(target: str, source: Path, file: Path, flags: Sequence[str]) -> Path:
+    """One source as an object file, with these flags; for what needs no program."""
+    machine = target_named(target)
+    file = Path(file).resolve()
+    command = [machine.compiler, *machine.flags, *flags, "-c", str(Path(source).resolve()), "-o", str(file)]
+    _compile(command, file.parent, Path(source).name)
+    return file
+
+
+def tool(target: str, name: str) -> str:
+    """A tool that comes with the target's compiler, as ``nm`` or ``size``; ToolError when it is not there."""
+    compiler = target_named(target).compiler
+    found = compiler.removesuffix("gcc") + name
+    if shutil.which(found) is None:
+        raise ToolError(f"{found}, which comes with {compiler}, is not installed here: install Debian's binutils.")
+    return found
+
+
+def said_by(command: Sequence[str]) -> str:
+    """Standard output of a tool; ToolError when it fails."""
+    done = subprocess.run(command, capture_output=True, stdin=subprocess.DEVNULL)
+    if done.returncode != 0:
+        said = done.stderr.decode(errors="replace").strip()
+        raise ToolError(f"{command[0]} failed: {_shortened(said)}")
+    return done.stdout.decode(errors="replace")
+
+
+def _compile(command: Sequence[str], cwd: Path, what: str) -> None:
+    try:
+        # The compiler's own words, whatever the person's language: tests and people look for them.
+        env = os.environ | {"LC_ALL": "C"}
+        done = subprocess.run(command, cwd=cwd, stdin=subprocess.DEVNULL, capture_output=True, env=env)
+    except OSError as cause:
+        raise ToolError(f"{command[0]} cannot be started: {cause.strerror or cause}.") from None
+    if done.returncode != 0:
+        said = done.stderr.decode(errors="replace").strip()
+        raise BuildError(f"{command[0]} refused {what}: {_shortened(said)}", said)
+
+
+def _shortened(said: str) -> str:
+    """The first line of a tool's words that names an error, else the last line."""
+    lines = [line.strip() for line in said.splitlines() if line.strip()]
+    words = (" error:", "undefined reference", "multiple definition", "overflowed", "ERROR:")
+    telling = [line for line in lines if any(w in line for w in words) and not line.startswith("collect2")]
+    return (telling or lines[-1:] or ["it said nothing"])[0]
+
+
+@cache
+def _finds(compiler: str, file: str) -> bool:
+    return Path(said_by([compiler, f"-print-file-name={file}"]).strip()).is_absolute()
+
+
+def _blobs(blobs: Mapping[str, Path]) -> str:
+    """Assembly that takes files in as they are."""
+    lines = [
+        "#define JOIN(a, b) a##b",
+        "#define JOINED(a, b) JOIN(a, b)",
+        "#define SYMBOL(name) JOINED(__USER_LABEL_PREFIX__, name)",
+        "#if defined(__APPLE__)",
+        "    .const",
+        "#elif defined(_WIN32)",
+        '    .section .rdata, "dr"',
+        "#else",
+        '    .section .blob, "a"',
+        "#endif",
+    ]
+    for name, path in blobs.items():
+        quoted = str(Path(path).resolve()).replace("\\", "\\\\").replace('"', '\\"')
+        lines += [
+            f"    .balign 16\n    .globl SYMBOL({name})\nSYMBOL({name}):",
+            f'    .incbin "{quoted}"',
+            f"    .globl SYMBOL({name}_end)\nSYMBOL({name}_end):\n    .byte 0",
+        ]
+    lines += ["#if defined(__ELF__) && defined(__linux__)", '    .section .note.GNU-stack, "", %progbits', "#endif"]
+    return "\n".join(lines) + "\n"

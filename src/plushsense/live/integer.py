@@ -1,0 +1,100 @@
+"""The deployed model reads a live stream: every decision is, bit for bit, the answer that the toy's C gives."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.devices.base import Frame
+from plushsense.live.stream import Decision, StreamReader
+from plushsense.models import fixed
+from plushsense.models.image import IntegerModel
+
+_CONFIDENCE = float(1 << fixed.PROBABILITY_BITS)
+_SMOOTH = float(1 << (fixed.PROBABILITY_BITS + fixed.SMOOTH_EXTRA_BITS))
+
+
+class IntegerClassifier(StreamReader):
+    """Reads the frames of one toy through a deployed model: clock, derived channels, then whole numbers only.
+
+    ``confidence`` of a decision is a multiple of 2^-15, as in the toy, its ``probabilities`` of 2^-27;
+    ``t_s`` in microseconds, counted from the stream's first frame, is the time of the toy's answer.
+    """
+
+    def __init__(self, model: IntegerModel) -> None:
+        super().__init__(model.network.arch, model.layout, model.gestures)
+        self.model = model
+        self._stepper = model.network.stepper()
+        self._mean: fixed.Ints | None = None
+        self.reset()
+
+    def _forget(self) -> None:
+        self._stepper.reset()
+        self._mean = None
+
+    def _answer(self, block: list[list[int]]) -> tuple[int, float, NDArray[np.float64]] | None:
+        logits = self._stepper.push(np.array(block, dtype=np.int64))
+        if not logits:
+            return None
+        self._mean = mean = fixed.smooth(self._mean, fixed.softmax(logits[-1]), self.model.smoothing)
+        best = int(mean.argmax())
+        return best, (int(mean[best]) >> fixed.SMOOTH_EXTRA_BITS) / _CONFIDENCE, mean / _SMOOTH
+
+
+class BothEngines:
+    """The deployed model and its float original on the same frames: decides as the first, counts where they differ."""
+
+    def __init__(self, integer: IntegerClassifier, original: StreamReader) -> None:
+        self.integer, self.original = integer, original
+        self.layout, self.step_s = integer.layout, integer.step_s
+        self.reset()
+
+    @property
+    def restarts(self) -> int:
+        """As of the deployed model."""
+        return self.integer.restarts
+
+    @property
+    def invalid(self) -> int:
+        """As of the deployed model."""
+        return self.integer.invalid
+
+    @property
+    def time_s(self) -> float:
+        """As of the deployed model."""
+        return self.integer.time_s
+
+    def reset(self) -> None:
+        """Begin a new stream, with every count at 0."""
+        self.integer.reset()
+        self.original.reset()
+        self._compared = self._gesture = self._affect = 0
+        self._far = 0.0
+
+    def push(self, frame: Frame) -> list[Decision]:
+        """The deployed model's decisions that this frame completes."""
+        decisions = self.integer.push(frame)
+        for one, other in zip(decisions, self.original.push(frame), strict=True):
+            if one.probabilities is None or other.probabilities is None:
+                continue
+            self._compared += 1
+            self._gesture += one.gesture == other.gesture
+            self._affect += one.affect == other.affect
+            apart = max(abs(a - b) for a, b in zip(one.probabilities, other.probabilities, strict=True))
+            self._far = max(self._far, apart)
+        return decisions
+
+    def agreement(self) -> dict[str, Any]:
+        """How often both said the same, of the ``decisions`` with an answer; None where there was none.
+
+        ``gesture`` and ``affect`` are shares, ``largest_difference`` that of any smoothed probability.
+        """
+        n = self._compared
+        return {
+            "decisions": n,
+            "gesture": self._gesture / n if n else None,
+            "affect": self._affect / n if n else None,
+            "largest_difference": self._far if n else None,
+        }

@@ -1,0 +1,224 @@
+"""Files for other runtimes give the network's answers, in the runtimes they are for."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from plushsense.core.errors import ArchError, BadInput, BundleError, ConfigError, MissingExtraError
+from plushsense.core.gestures import load_gestures
+from plushsense.core.recfile import read_stream
+from plushsense.core.signal import load_layout
+from plushsense.deploy.calibration import calibrated, deployable, integer_network
+from plushsense.deploy.convert import as_onnx, as_tflite, convert
+from plushsense.deploy.convert.facts import Job, compare, made_up_windows
+from plushsense.models.arch import Arch
+from plushsense.models.bundle import Bundle
+from plushsense.models.reference import random_weights
+from plushsense.windows.features import Scaler, inputs
+
+# symbol, filters, layout, settings: every padding and normalisation, one layer to four, one reflection and several.
+NETS: list[tuple[str, tuple[int, ...], str, dict[str, Any]]] = [
+    ("14d1_39d2_41d4", (8, 12, 16), "plush-15", {}),
+    ("5", (3,), "accel-3", {"window": 40}),
+    ("4d1_3d2_3d2_2d8", (4, 6, 8, 8), "phone-6", {"window": 60}),
+    ("9d1_5d3", (5, 7), "accel-3", {"window": 60, "norm": "layer"}),
+    ("9d1_5d3", (5, 7), "phone-6", {"window": 60, "padding": "mirror"}),
+    ("1d1_26d2", (5, 6), "accel-3", {"window": 40, "padding": "mirror", "norm": "layer"}),
+    ("1d1_26d4", (5, 6), "accel-3", {"window": 40, "padding": "mirror"}),
+    ("9d1_5d3", (5, 7), "accel-3", {"window": 60, "padding": "causal", "norm": "layer"}),
+    ("9d1_5d3", (5, 7), "plush-15", {"window": 60, "padding": "causal"}),
+]
+DEPLOYABLE = [net for net in NETS if not {"norm", "padding"} & net[3].keys()]
+
+
+def made(net: tuple[str, tuple[int, ...], str, dict[str, Any]], seed: int = 1, **parts: Any) -> Bundle:
+    symbol, filters, layout_name, settings = net
+    layout, gestures = load_layout(layout_name), load_gestures("plush-18")
+    arch = Arch.parse(symbol, filters, channels=layout.n_inputs, classes=7, **settings)
+    rng = np.random.default_rng(seed)
+    # Offsets of thousands and fractions, as real z-scores have.
+    scaler = Scaler(rng.normal(size=arch.channels) * 5000, np.exp(-rng.uniform(1, 8, arch.channels)))
+    parts = {"provenance": {"simulated": True}} | parts
+    bundle = Bundle(arch, random_weights(arch, seed), layout, scaler, gestures.subset(gestures.labels[:7]), **parts)
+    return calibrated(bundle, made_up_windows(bundle, 64)) if deployable(arch) else bundle
+
+
+def others(bundle: Bundle, n: int = 20, seed: int = 5) -> np.ndarray[Any, np.dtype[np.int64]]:
+    """Windows that the converter did not try itself; the last is far outside anything seen."""
+    rng = np.random.default_rng(seed)
+    x = np.cumsum(rng.normal(size=(n, bundle.arch.channels, bundle.arch.span)), axis=2) / 4
+    raw = np.rint(bundle.scaler.offset[:, None] + x / bundle.scaler.scale[:, None]).astype(np.int64)
+    raw[-1] = np.where(rng.random(raw[-1].shape) < 0.5, -30000, 30000)
+    return raw
+
+
+def assert_floats(found: Any, bundle: Bundle, raw: Any) -> None:
+    expected = bundle.network().forward(bundle.scaler.apply(raw))
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5 * max(1.0, np.abs(expected).max()))
+    assert np.abs(expected).max() > 0.1, "this network says nothing, so that anything would agree with it"
+
+
+@pytest.mark.parametrize("net", NETS, ids=str)
+def test_onnx_answers_as_the_network(net: Any, tmp_path: Path, onnx_here: None) -> None:
+    bundle = made(net)
+    done = convert(bundle, tmp_path / "new" / "model.onnx", "onnx")
+    assert done.bytes == done.path.stat().st_size and done.path.name == "model.onnx"
+    assert done.largest_difference is not None and done.largest_difference < 1e-3
+    raw = others(bundle)
+    assert_floats(as_onnx.answers(done.path.read_bytes(), raw), bundle, raw)
+    assert [p.name for p in done.path.parent.iterdir()] == ["model.onnx"], "something was left behind"
+
+
+@pytest.mark.parametrize("net", NETS, ids=str)
+def test_litert_answers_as_the_network(net: Any, tmp_path: Path, litert_here: None) -> None:
+    bundle = made(net)
+    done = convert(bundle, tmp_path / "model.tflite", "tflite")
+    assert done.largest_difference is not None and done.largest_difference < 1e-3
+    raw = others(bundle)
+    assert_floats(as_tflite.answers(done.path.read_bytes(), raw), bundle, raw)
+
+
+@pytest.mark.parametrize("net", DEPLOYABLE, ids=str)
+@pytest.mark.parametrize("name", ["onnx-int8", "tflite-int8"])
+def test_int8_comes_close_to_the_integers(name: str, net: Any, tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    request.getfixturevalue("onnx_here" if name == "onnx-int8" else "litert_here")
+    bundle = made(net)
+    integer = integer_network(bundle)
+    done = convert(bundle, tmp_path / "m", name)
+    raw = others(bundle, 60)
+    room = as_onnx if name == "onnx-int8" else as_tflite
+    found, expected = room.answers(done.path.read_bytes(), raw), integer.forward(raw) / 256
+    assert found is not None
+    # A code that rounds the other way moves a logit by little; a wrong scale or shift by much.
+    assert np.abs(found - expected).max() < 0.01 * max(1.0, np.abs(expected).max())
+    assert (found.argmax(axis=1) == expected.argmax(axis=1)).mean() >= 0.95
+    float_ones = bundle.network().forward(bundle.scaler.apply(raw))
+    assert np.abs(found - expected).mean() < 0.2 * np.abs(float_ones - expected).mean(), "as far off as the floats are"
+    assert done.bytes < len(bundle.to_bytes()) + 6000
+
+
+def test_real_windows(real_data: Path, onnx_here: None, litert_here: None) -> None:
+    bundle = made(("14d1_19d2_19d4", (8, 12, 16), "accel-3", {}))
+    stream = real_data / "makeability-gestures" / "P07" / "fulldatastream.csv"
+    values = inputs(read_stream(stream, bundle.layout).frames.values, bundle.layout)
+    raw = np.stack([values[at : at + bundle.arch.span].T for at in range(0, len(values) - bundle.arch.span, 400)])
+    assert len(raw) > 10
+    fitted = Bundle(bundle.arch, bundle.weights, bundle.layout, Scaler.fit(raw), bundle.gestures)
+    assert_floats(as_onnx.answers(as_onnx.float_model(fitted), raw), fitted, raw)
+    assert_floats(as_tflite.answers(as_tflite.float_model(fitted), raw), fitted, raw)
+
+
+def test_onnx_says_what_it_is(tmp_path: Path, onnx_here: None) -> None:
+    import onnx
+
+    bundle = made(NETS[0])
+    model = onnx.load(convert(bundle, tmp_path / "m.onnx", "onnx").path)
+    said = {entry.key: entry.value for entry in model.metadata_props}
+    assert json.loads(said["channels"]) == list(bundle.layout.inputs)
+    assert json.loads(said["gestures"]) == list(bundle.gestures.labels)
+    assert said["layout"] == "plush-15" and said["title"] == bundle.arch.title
+    assert json.loads(said["span"]) == bundle.arch.span and json.loads(said["simulated"]) is True
+    shape = model.graph.input[0].type.tensor_type.shape.dim
+    assert model.graph.input[0].name == "raw"
+    assert [d.dim_param or d.dim_value for d in shape] == ["N", 11, bundle.arch.span]
+
+
+def test_probabilities_are_the_softmax(onnx_here: None) -> None:
+    import onnxruntime
+
+    bundle = made(NETS[1])
+    session = onnxruntime.InferenceSession(as_onnx.float_model(bundle), providers=["CPUExecutionProvider"])
+    raw = others(bundle)
+    found = session.run(["probabilities"], {"raw": raw.astype(np.float32)})[0]
+    np.testing.assert_allclose(found, bundle.network().probabilities(bundle.scaler.apply(raw)), atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["onnx", "tflite"])
+def test_the_same_bundle_gives_the_same_bytes(name: str, tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    request.getfixturevalue("onnx_here" if name == "onnx" else "litert_here")
+    one, two = (convert(made(NETS[2]), tmp_path / n, name).path.read_bytes() for n in "ab")
+    assert one == two
+
+
+def test_a_file_that_answers_otherwise_is_refused(tmp_path: Path, onnx_here: None) -> None:
+    bundle = made(NETS[1])
+    changed = dict(bundle.weights)
+    changed["conv0.weight"] = changed["conv0.weight"].copy()
+    changed["conv0.weight"][0, 0, 0] += 0.05
+    other = Bundle(bundle.arch, changed, bundle.layout, bundle.scaler, bundle.gestures)
+    job = Job.of(bundle, None)
+    with pytest.raises(BundleError, match="answers otherwise"):
+        compare(as_onnx.answers(as_onnx.float_model(other), job.windows), job, "ONNX")
+
+
+def test_given_windows_are_tried_too(tmp_path: Path, onnx_here: None) -> None:
+    bundle = made(NETS[1])
+    given = others(bundle, 6)
+    longer = np.concatenate([given[:, :, :3], given], axis=2)
+    done = convert(bundle, tmp_path / "m", "onnx", windows=longer)
+    assert "6 given and 24 made-up windows" in done.notes[0]
+    with pytest.raises(BadInput, match="do not fit"):
+        convert(bundle, tmp_path / "n", "onnx", windows=given[:, :2])
+
+
+def test_neither_pytorch_nor_tensorflow_is_loaded(tmp_path: Path, onnx_here: None, litert_here: None) -> None:
+    path = made(NETS[1]).save(tmp_path / "m.plush")
+    code = (
+        "import sys; from plushsense.models.bundle import Bundle; from plushsense.deploy.convert import convert\n"
+        f"b = Bundle.load({str(path)!r}); convert(b, {str(tmp_path / 'o')!r}, 'onnx')\n"
+        f"convert(b, {str(tmp_path / 't')!r}, 'tflite')\n"
+        "print([m for m in ('torch', 'tensorflow') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_an_unknown_format_names_the_known_ones(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"Unknown format 'tflit'.*Did you mean 'tflite'\?"):
+        convert(made(NETS[1]), tmp_path / "m", "tflit")
+
+
+@pytest.mark.parametrize(
+    ("name", "module"), [("onnx", "onnx"), ("tflite", "ai_edge_litert.schema_py_generated"), ("espdl", "onnx")]
+)
+def test_a_missing_package_says_how_to_install_it(
+    name: str, module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(MissingExtraError, match=rf"pip install 'plushsense\[{name}\]'"):
+        convert(made(NETS[1]), tmp_path / "m", name)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["onnx-int8", "tflite-int8"])
+def test_int8_refuses_what_has_no_whole_numbers(name: str, tmp_path: Path) -> None:
+    with pytest.raises(BundleError, match="holds no calibration"):
+        convert(replace(made(NETS[1]), calibration={}), tmp_path / "m", name)
+    with pytest.raises(ArchError, match="padding 'mirror'"):
+        convert(made(NETS[4]), tmp_path / "m", name)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("net", [NETS[3], NETS[4]], ids=str)
+def test_espdl_refuses_what_cannot_be_folded(net: Any, tmp_path: Path) -> None:
+    with pytest.raises(ArchError, match="train 9d1_5d3 with"):
+        convert(made(net), tmp_path / "m", "espdl")
+
+
+def test_espdl_in_its_own_simulation(tmp_path: Path, espdl_here: None, capfd: pytest.CaptureFixture[str]) -> None:
+    bundle = made(NETS[2])
+    for name in ("espdl", "espdl-esp32", "espdl-esp32p4"):
+        done = convert(bundle, tmp_path / name, name, windows=others(bundle, 32)[:-1])
+        assert done.path.read_bytes()[:4] == b"EDL2"
+        expected = bundle.network().forward(bundle.scaler.apply(others(bundle, 32)))
+        assert done.largest_difference is not None
+        assert done.largest_difference < 0.25 * np.abs(expected).max()
+        assert capfd.readouterr().out == "", "standard output belongs to --json"

@@ -1,0 +1,182 @@
+"""What an export costs: counted twice alike, adding up, within the limits, and each claim able to fail."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from plushsense.core.errors import BadInput, ProgramError, ToolError
+from plushsense.core.gestures import load_gestures
+from plushsense.core.signal import load_layout
+from plushsense.deploy.cores import CORES, estimate
+from plushsense.deploy.counting import count
+from plushsense.deploy.emit import TOY_BYTES, emit, read_facts
+from plushsense.deploy.profile import profile
+from plushsense.deploy.quantize import calibrate, quantize
+from plushsense.deploy.targets import TARGETS
+from plushsense.models.arch import Arch
+from plushsense.models.bundle import Bundle
+from plushsense.models.image import IntegerModel
+from plushsense.models.reference import Network, random_weights
+from plushsense.windows.features import Scaler
+
+COUNTING = [name for name, target in TARGETS.items() if target.counts]
+Here = Callable[[str], str]
+
+
+def exported(folder: Path, symbol: str, filters: str, layout: str = "accel-3", window: int = 60) -> Path:
+    read, gestures = load_layout(layout), load_gestures("plush-18")
+    arch = Arch.parse(symbol, filters, channels=read.n_inputs, classes=len(gestures), window=window)
+    weights = random_weights(arch, 3)
+    noise = np.random.default_rng(1).normal(size=(12, arch.channels, arch.span + 40))
+    windows = np.rint(np.cumsum(noise, axis=2) * 60 + 900).astype(np.int64)
+    scaler = Scaler.fit(windows)
+    network = quantize(arch, weights, scaler, calibrate(Network(arch, weights), scaler.apply(windows)))
+    emit(IntegerModel(network, read, gestures, 9000), Bundle(arch, weights, read, scaler, gestures), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return exported(tmp_path_factory.mktemp("exports") / "small", "9d1_5d2", "4,6")
+
+
+@pytest.fixture()
+def edited(small: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(small, tmp_path / "edited"))
+
+
+@pytest.mark.parametrize("target", COUNTING)
+def test_counts(target: str, small: Path, target_here: Here) -> None:
+    facts = read_facts(small)
+    before = {p: p.read_bytes() for p in small.rglob("*") if p.is_file()}
+    cost = count(small, target_here(target), facts)
+    assert count(small, target, facts) == cost
+    assert {p: p.read_bytes() for p in small.rglob("*") if p.is_file()} == before
+    assert cost.step is not None and cost.even is not None and cost.step_most is not None and cost.gap is not None
+    assert sum(cost.stages.values()) == cost.step
+    assert all(part > 0 for part in cost.stages.values())
+    # Jitter costs interpolation; a step of it may hold one sample more; a gap of 100 ms makes up for two steps.
+    assert cost.even < cost.step < cost.step_most < 1.3 * cost.step
+    assert 1.8 * cost.step < cost.gap < 2.2 * cost.step
+    assert cost.sections["plush_model"]["rodata"] == facts["model_bytes"]
+    assert cost.flash_bytes > facts["model_bytes"] + 2000
+    assert abs(cost.toy_bytes - TOY_BYTES) <= 8 and cost.memory_bytes == facts["memory_bytes"]
+    assert cost.ram_bytes == cost.toy_bytes + cost.memory_bytes
+    assert cost.stack_push is not None
+    assert cost.stack_functions["plush_push"] < cost.stack_push < sum(cost.stack_functions.values()) + 64
+    assert cost.stack_memory_bytes is not None
+    assert cost.stack_functions["plush_memory_bytes"] <= cost.stack_memory_bytes < 600
+    assert "memset" in cost.needs and not cost.heap and not cost.floats
+
+
+def test_a_larger_network_costs_more_only_where_it_is_larger(small: Path, tmp_path: Path, target_here: Here) -> None:
+    target = target_here("riscv32")
+    large = exported(tmp_path / "large", "9d1_5d2", "4,12")
+    one, two = (count(folder, target, read_facts(folder)).stages for folder in (small, large))
+    assert abs(one["inputs"] - two["inputs"]) < 20
+    assert one["network"] * 1.2 < two["network"] < one["network"] * 2
+    assert one["dense"] * 1.5 < two["dense"] < one["dense"] * 2.5
+
+
+@pytest.mark.parametrize(
+    ("symbol", "limits"),
+    [
+        ("14d1_39d2_41d4", {"xtensa": 400_000, "cortex-m4": 150_000}),
+        ("14d1_19d2_19d4", {"xtensa": 200_000, "cortex-m4": 80_000}),
+    ],
+)
+def test_the_networks_of_the_issue_stay_within_their_limits(
+    symbol: str, limits: dict[str, int], tmp_path: Path, target_here: Here
+) -> None:
+    folder = exported(tmp_path / "out", symbol, "8,12,16", "plush-15", 250)
+    found = profile(folder, [target_here(name) for name in limits])
+    for name, limit in limits.items():
+        cost = found.costs[name]
+        assert cost.stages["network"] <= limit
+        assert cost.flash_bytes <= 24 * 1024
+        assert cost.ram_bytes + (cost.stack_push or 0) <= 6 * 1024
+    assert all(e.fits == "yes" for e in found.estimates.values())
+
+
+def test_a_heap_and_floating_point_are_found(edited: Path, target_here: Here) -> None:
+    target = target_here("xtensa")
+    source = edited / "plushsense.c"
+    source.write_text(
+        source.read_text()
+        + "\nvoid *malloc(size_t n);\nvoid *plush_more(void);\nvoid *plush_more(void) { return malloc(8); }\n"
+        "float plush_float(float a, float b);\nfloat plush_float(float a, float b) { return a * b; }\n"
+    )
+    cost = count(edited, target, read_facts(edited))
+    assert cost.heap == ("malloc",)
+    assert cost.floats == ("__mulsf3",)
+
+
+def test_what_is_counted_is_what_stands_in_the_folder(edited: Path, small: Path, target_here: Here) -> None:
+    target = target_here("riscv32")
+    source = edited / "plushsense.c"
+    text = source.read_text()
+    slower = text.replace("static void dense(plush_toy *toy)\n{", "static void dense(plush_toy *toy)\n{\n    SLOWER")
+    assert slower != text
+    wait = "#define SLOWER { volatile int i; for (i = 0; i < 1000; i++) { } }\n"
+    source.write_text(wait + slower)
+    one, two = (count(folder, target, read_facts(folder)) for folder in (small, edited))
+    assert two.stages["dense"] - one.stages["dense"] > 3000
+    assert two.stages["network"] == one.stages["network"]
+
+
+def test_a_folder_that_does_not_work_is_refused(edited: Path, target_here: Here) -> None:
+    target = target_here("riscv32")
+    model = edited / "plush_model.c"
+    text = model.read_text()
+    cut = text.rindex("128,")
+    model.write_text(text[:cut] + "129," + text[cut + 4 :])
+    with pytest.raises(ProgramError, match="refuses its own model on riscv32: export the model again"):
+        profile(edited, [target])
+    (edited / "golden" / "frames.bin").unlink()
+    with pytest.raises(BadInput, match=r"frames\.bin"):
+        profile(edited, [target])
+    model.unlink()
+    with pytest.raises(BadInput, match=r"lacks plush_model\.c: export the model again"):
+        profile(edited, [target])
+
+
+def test_sizes_on_the_host_without_counts(small: Path, target_here: Here) -> None:
+    found = profile(small, [target_here("host")])
+    told = found.to_dict()
+    assert told["instructions_per_step"] == {} and told["estimated_ms"] == {}
+    assert found.costs["host"].flash_bytes > 0 and found.costs["host"].step is None
+
+
+def test_nothing_to_count_on(small: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(ToolError, match="No emulator to count on is installed here: install Debian's gcc-xtensa-lx106"):
+        profile(small)
+    with pytest.raises(ToolError, match="cortex-m4 .* install Debian's gcc-arm-none-eabi"):
+        profile(small, ["cortex-m4"])
+
+
+def test_estimates_are_a_band_and_a_verdict() -> None:
+    core = replace(CORES["esp32"], mhz=100, cycles_low=1.0, cycles_high=2.0, flash_mb_s=None)
+    found = estimate(core, 1_000_000, 20_000, 5, 50.0)
+    assert (found.low_ms, found.high_ms, found.fits) == (10.0, 20.0, "yes")
+    assert found.verdict == "fits 20 Hz: yes, uses about 20 to 40 % of the core, 30 ms left a step"
+    # 20 000 bytes five times at 10 MB/s are 10 ms more.
+    slow = estimate(replace(core, flash_mb_s=10.0), 1_000_000, 20_000, 5, 50.0)
+    assert (slow.low_ms, slow.high_ms) == (10.0, 30.0)
+    assert "at 10 MB/s" in slow.core.reasons
+    assert estimate(core, 4_000_000, 0, 5, 50.0).verdict.startswith(
+        "fits 20 Hz: not sure, it would use about 80 to 160"
+    )
+    assert estimate(core, 6_000_000, 0, 5, 50.0).verdict == "fits 20 Hz: no, it would use 120 % of the core or more"
+
+
+def test_every_core_stands_on_a_target_that_counts() -> None:
+    for name, core in CORES.items():
+        assert core.name == name and TARGETS[core.target].counts
+        assert 1.0 <= core.cycles_low < core.cycles_high and core.why

@@ -1,0 +1,414 @@
+"""The proof of the C: it holds for real exports, and it notices what is wrong with bad ones."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from plushsense.apps.cli.main import main
+from plushsense.core.errors import BadInput, ConfigError, ToolError
+from plushsense.core.gestures import GestureSet, load_gestures
+from plushsense.core.signal import Layout, load_layout
+from plushsense.dataset.importers import import_recordings
+from plushsense.dataset.index import open_dataset
+from plushsense.deploy.calibration import calibrated, integer_model
+from plushsense.deploy.emit import emit
+from plushsense.deploy.faults import TEXTS, faults_of
+from plushsense.deploy.golden import COLUMNS
+from plushsense.deploy.streams import frames_of
+from plushsense.deploy.targets import C_FOLDER, TARGETS
+from plushsense.deploy.vectors import Export, compare
+from plushsense.deploy.verify import Setting, verify
+from plushsense.models.arch import Arch
+from plushsense.models.bundle import Bundle
+from plushsense.models.reference import random_weights
+from plushsense.windows.clock import Clock
+from plushsense.windows.features import Scaler
+
+EMULATED = [name for name in TARGETS if name != "host"]
+GESTURES = load_gestures("plush-18")
+
+
+def eight() -> Layout:
+    """Eight channels of which nobody told the range, at a rate whose period is no whole number of milliseconds."""
+    names = [f"c{i}" for i in range(8)]
+    return Layout.from_dict(
+        {
+            "name": "eight",
+            "rate_hz": 90.0,
+            "channels": [{"name": n, "unit": "count", "kind": "capacitive"} for n in names],
+            "wire": ["device_ms", *names],
+        }
+    )
+
+
+def bundle_of(symbol: str, filters: str, layout: Layout, gestures: GestureSet = GESTURES, seed: int = 3) -> Bundle:
+    """Random weights: the numbers are what counts here, not what they mean."""
+    arch = Arch.parse(symbol, filters, channels=layout.n_inputs, classes=len(gestures))
+    rng = np.random.default_rng(seed)
+    x = np.rint(np.cumsum(rng.normal(size=(16, arch.channels, arch.span + 60)), axis=2) * 50 + 1000).astype(np.int64)
+    return calibrated(Bundle(arch, random_weights(arch, seed), layout, Scaler.fit(x), gestures), x)
+
+
+def exported(out: Path, bundle: Bundle) -> Path:
+    emit(integer_model(bundle), bundle, out)
+    return out
+
+
+@pytest.fixture(scope="session")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small export, not to be changed."""
+    return exported(tmp_path_factory.mktemp("small") / "out", bundle_of("9d1_5d2", "4,6", load_layout("plush-15")))
+
+
+@pytest.fixture
+def own(small: Path, tmp_path: Path) -> Path:
+    """A copy to spoil."""
+    return Path(shutil.copytree(small, tmp_path / "out"))
+
+
+@pytest.fixture(scope="session")
+def emulators(target_here: Callable[[str], str]) -> None:
+    """Compilers and emulators of every target."""
+    for name in TARGETS:
+        target_here(name)
+
+
+def plainly(setting: Setting) -> bool:
+    return setting.optimise == "-O2" and setting.cc in (None, "gcc") and not setting.image and not setting.cpp
+
+
+def run(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, dict[str, Any], str]:
+    code = main(["verify", *words, "--json"])
+    said = capsys.readouterr()
+    return code, json.loads(said.out) if said.out else {}, said.err
+
+
+def edit(path: Path, old: str, new: str) -> None:
+    text = path.read_text(encoding="utf-8")
+    assert text.count(old) == 1
+    path.write_text(text.replace(old, new), encoding="utf-8")
+
+
+# ---- It holds ------------------------------------------------------------------------------------------------------
+
+
+def test_every_way_to_compile_on_the_host(all_compilers: None, small: Path) -> None:
+    done = verify(Export(small), ["host"])
+    assert done.passed and done.mismatches == 0 and done.first is None
+    made = {(r.compiler, r.flags) for r in done.runs}
+    assert {(cc, o) for cc in ("gcc", "clang") for o in ("-O0", "-O2", "-O3")} <= made
+    assert {("gcc", "-O1 sanitizers"), ("gcc", "-O2 called from C++"), ("gcc", "-O2 plush_model.bin")} <= made
+    assert all("sanitizers" in what for what, _ in done.not_run), "clang's are a package of their own"
+    answers = len(Export(small).golden.answers)
+    assert answers > 500 and {r.vectors for r in done.runs} == {answers}
+
+
+MAIN = {
+    "paper-11": ("14d1_39d2_41d4", "8,12,16", "plush-15"),
+    "default-11": ("14d1_19d2_19d4", "8,12,16", "plush-15"),
+    "paper-3": ("14d1_39d2_41d4", "8,12,16", "accel-3"),
+    "default-3": ("14d1_19d2_19d4", "8,12,16", "accel-3"),
+    "four-layers-6": ("19d1_19d2_19d4_17d8", "4,6,8,8", "phone-6"),
+    "one-layer-8": ("250", "5", "eight"),
+    "two-layers-3": ("100_151", "3,5", "accel-3"),
+}
+
+
+@pytest.mark.parametrize("name", MAIN)
+def test_the_same_on_every_chip(emulators: None, tmp_path: Path, name: str) -> None:
+    symbol, filters, layout = MAIN[name]
+    read = eight() if layout == "eight" else load_layout(layout)
+    export = Export(exported(tmp_path / "out", bundle_of(symbol, filters, read)))
+    more = export.made_up(5000 - export.golden.samples) if export.golden.samples < 5000 else []
+    done = verify(export, ["host", *EMULATED], more, only=plainly)
+    assert done.first is None and done.passed
+    assert [r.target for r in done.runs] == ["host", *EMULATED]
+    assert sum(c.samples for c in done.counts) >= 5000
+    tracking = export.golden.answers[:, COLUMNS.index("state")]
+    assert tracking.sum() > 100 and (tracking == 0).sum() > 100
+    assert {r.vectors for r in done.runs} == {sum(c.answers for c in done.counts)}
+
+
+# ---- It notices ----------------------------------------------------------------------------------------------------
+
+
+def test_every_fault_is_caught_on_the_host(c_compiler: str, small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    export = Export(small)
+    done = verify(export, ["host"], only=plainly, plant=lambda fault: True)
+    assert [f.fault for f in done.faults if not f.caught] == [] and done.passed
+    assert {f.kind for f in done.faults} == {"weight", "shift", "index", "rounding", "clamp", "rule", "constant"}
+    assert len(done.faults) == len(TEXTS) + 10
+    # By an answer, not because the toy would not begin or crashed.
+    assert all("should be" in (f.first or "") and "plush_begin" not in (f.first or "") for f in done.faults)
+
+
+def test_a_weight_a_shift_an_index_and_a_rounding_are_caught_on_every_chip(emulators: None, small: Path) -> None:
+    chosen = {"one weight of layer 1 by one", "one shift of layer 2 by one", TEXTS[1].name, TEXTS[4].name}
+    done = verify(Export(small), EMULATED, only=plainly, plant=lambda fault: fault.name in chosen)
+    assert sorted((f.kind, f.target, f.caught) for f in done.faults) == sorted(
+        (kind, name, True) for kind in ("weight", "shift", "index", "rounding") for name in EMULATED
+    )
+    assert done.passed
+
+
+def test_golden_vectors_that_are_too_weak_let_a_fault_through(
+    c_compiler: str, own: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    golden = Export(own).golden
+    few = golden.answers[golden.answers[:, 0] < 40]
+    assert len(few)
+    (own / "golden" / "frames.bin").write_bytes(golden.frames[:40].astype("<u4").tobytes())
+    (own / "golden" / "answers.bin").write_bytes(few.astype("<i4").tobytes())
+    done = verify(Export(own), ["host"], only=plainly, plant=lambda fault: fault.kind in ("weight", "constant"))
+    assert done.mismatches == 0 and not done.passed
+    assert not any(f.caught for f in done.faults if f.kind == "weight")
+
+
+def test_the_texts_of_the_faults_stand_in_our_c(small: Path) -> None:
+    source = (C_FOLDER / "plushsense.c").read_text(encoding="utf-8")
+    found = faults_of((small / "plush_model.bin").read_bytes(), source)
+    assert len({f.name for f in found}) == len(found) == len(TEXTS) + 10
+    for fault in found:
+        assert (fault.image is None) != (fault.source is None)
+        assert fault.source != source
+    image = np.frombuffer((small / "plush_model.bin").read_bytes(), dtype=np.uint8)
+    for fault in found:
+        if fault.image is not None:
+            # The checksum and one number.
+            changed = np.flatnonzero(np.frombuffer(fault.image, dtype=np.uint8) != image)
+            assert 1 <= (changed >= 16).sum() <= 2 and ((changed >= 12) & (changed < 16)).any()
+    with pytest.raises(BadInput, match="stands 0 times"):
+        faults_of((small / "plush_model.bin").read_bytes(), source.replace("+ 16384u", "+ 16385u"))
+
+
+def test_a_file_edited_by_hand_is_what_is_tested(
+    c_compiler: str, own: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    edit(own / "plushsense.c", "int32_t now = (int32_t)(((e << 15)", "int32_t now = (int32_t)(((e << 14)")
+    code, said, _ = run(capsys, str(own), "--target", "host")
+    assert code == 1 and not said["passed"]
+    assert said["mismatches"] == sum(r["mismatches"] for r in said["runs"]) > 0
+    assert said["max_abs_diff"] >= 1
+    assert said["first"].startswith("On host (gcc -O0), golden: answer ")
+    assert "'confidence' should be " in said["first"] and said["first"].count(".") == 1
+
+
+def test_the_folders_own_header_is_what_the_caller_reads(c_compiler: str, own: Path) -> None:
+    edit(own / "plushsense.h", "typedef struct plush_toy {", "typedef struct plush_toy {\n    uint32_t mine[5];")
+    assert verify(Export(own), ["host"], only=lambda s: s.optimise == "-O2" and s.cc == "gcc").passed
+
+
+def test_an_image_that_was_edited(c_compiler: str, own: Path) -> None:
+    image = bytearray((own / "plush_model.bin").read_bytes())
+    image[200] ^= 1
+    (own / "plush_model.bin").write_bytes(bytes(image))
+    done = verify(Export(own), ["host"], only=lambda s: (s.cc, s.optimise) == ("gcc", "-O2"))
+    assert len(done.runs) == 3
+    bad = [r for r in done.runs if r.mismatches]
+    assert [r.flags for r in bad] == ["-O2 plush_model.bin"]
+    assert bad[0].mismatches == bad[0].vectors and "PLUSH_DAMAGED" in (bad[0].first or "")
+    with pytest.raises(BadInput, match="is not what this PlushSense makes of model.plush"):
+        verify(Export(own), ["host"], plant=lambda fault: True)
+    with pytest.raises(BadInput, match="is not what this PlushSense makes of model.plush"):
+        Export(own).made_up(10)
+
+
+def test_c_that_warns_or_writes_past_its_memory(c_compiler: str, own: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    edit(own / "plushsense.c", "toy->heard = 1;", "toy->heard = 1; int unused;")
+    done = verify(Export(own), ["host"], only=plainly)
+    assert done.mismatches == sum(r.vectors for r in done.runs) and "unused" in (done.first or "")
+    edit(own / "plushsense.c", "toy->heard = 1; int unused;", "((uint32_t *)toy->memory)[-1] = 0; toy->heard = 1;")
+    done = verify(Export(own), ["host"], only=plainly)
+    assert "before the toy's memory" in (done.first or "") and done.mismatches == 1
+
+
+# ---- Comparing -----------------------------------------------------------------------------------------------------
+
+
+def test_comparing_names_the_first_number_that_differs() -> None:
+    labels = ("a", "b")
+    expected = np.arange(39, dtype=np.int32).reshape(3, 13)
+
+    def seen(rows: np.ndarray, words: bytes = b"") -> tuple[int, int, str | None]:
+        found = compare(expected, rows.astype("<i4").tobytes() + words, labels)
+        assert found.vectors == 3
+        return found.mismatches, found.max_abs_diff, found.first
+
+    assert seen(expected) == (0, 0, None)
+    one = expected.copy()
+    one[1, 12] += 5
+    one[2, 4] -= 9
+    assert seen(one) == (2, 9, "answer 1 (frame 13): the smoothed probability of 'b' should be 25 and is 30")
+    logit = expected.copy()
+    logit[0, 9] = -1
+    assert seen(logit) == (1, 10, "answer 0 (frame 0): the logit of 'a' should be 9 and is -1")
+    field = expected.copy()
+    field[0, 1] = 7
+    assert seen(field) == (1, 6, "answer 0 (frame 0): 'ms' should be 1 and is 7")
+    assert seen(expected[:2]) == (1, 0, "answer 2 (frame 26) never came")
+    assert seen(np.concatenate([expected, expected[:1]])) == (1, 0, "answer 3 (frame 0) is one too many")
+    assert seen(expected, b"Something.") == (1, 0, "Something")
+    assert seen(expected[:0], b"Nothing.") == (3, 0, "Nothing; answer 0 (frame 0) never came")
+    far = expected.copy()
+    far[0, 9], high = -(1 << 31), (1 << 31) - 1
+    assert compare(np.full_like(far, high), far.astype("<i4").tobytes(), labels).max_abs_diff == 2**32 - 1
+
+
+# ---- Recordings ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="session")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two people: one with a session stream whose clock starts again, one with two recordings only."""
+    raw = tmp_path_factory.mktemp("raw")
+    rng = np.random.default_rng(0)
+
+    def rows(n: int, first: int, ms: int) -> list[str]:
+        walk = np.rint(np.cumsum(rng.normal(size=(n, 3)), axis=0) * 100).astype(int)
+        return [f"{first + 10 * i}, {ms + 10 * i}, {x}, {y}, {z}" for i, (x, y, z) in enumerate(walk.tolist())]
+
+    (raw / "A").mkdir()
+    (raw / "B").mkdir()
+    header = "Processing Timestamp (ms), Arduino Timestamp (ms), X, Y, Z"
+    stream = [*rows(300, 1_600_000_000_000, 5000), *rows(300, 1_600_000_010_000, 40)]
+    (raw / "A" / "fulldatastream.csv").write_text("\n".join(stream) + "\n")
+    (raw / "A" / "Tap_1600000000100_80.csv").write_text("\n".join([header, *stream[10:90]]) + "\n")
+    for n, label in ((120, "Tap"), (60, "Hit")):
+        lines = [header, *rows(n, 1_600_000_100_000 + n, 4_294_967_000 if n == 60 else 70)]
+        (raw / "B" / f"{label}_{1_600_000_100_000 + n}_{n}.csv").write_text("\n".join(lines) + "\n")
+    out = tmp_path_factory.mktemp("recorded") / "ds"
+    import_recordings(raw, out, layout="accel-3")
+    return out
+
+
+def test_frames_of_recordings(recorded: Path) -> None:
+    dataset, layout = open_dataset(recorded), load_layout("accel-3")
+    frames = frames_of(dataset, layout, rows=10_000)
+    assert len(frames) == 600 + 120 + 60 and frames[:, 0].min() >= 0 and frames[:, 0].max() < 1 << 32
+    clock = Clock(layout)
+    restarts = []
+    for at, (ms, *values) in enumerate(frames.tolist()):
+        clock.push(ms, values)
+        if clock.restarted:
+            restarts.append(at)
+    assert restarts in ([300, 600, 720], [300, 600, 660]), "the stream's own, and before each recording"
+    share = frames_of(dataset, layout, rows=240)
+    assert len(share) == 240 and (np.diff(share[:, 0]) > 100).sum() == 2, "some of each"
+    assert len(frames_of(dataset, layout, subjects=["B"], rows=10_000)) == 180
+    with pytest.raises(ConfigError, match="has nobody 'C': accepted are A, B"):
+        frames_of(dataset, layout, subjects=["C"], rows=1)
+    with pytest.raises(ConfigError, match="holds layout 'accel-3'"):
+        frames_of(dataset, load_layout("plush-15"), rows=1)
+
+
+def test_recordings_go_through_the_c(
+    c_compiler: str, recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = exported(tmp_path / "out", bundle_of("5d1_4d3", "3,5", load_layout("accel-3")))
+    code, said, err = run(capsys, str(out), "--target", "host", "--dataset", str(recorded), "--samples", "5000")
+    assert code == 0 and said["mismatches"] == 0
+    assert [s["name"] for s in said["streams"]] == ["golden", "recordings"]
+    assert said["streams"][1]["frames"] == 780 and "these recordings make" in err
+    assert all(r["vectors"] == sum(s["answers"] for s in said["streams"]) for r in said["runs"])
+    assert sorted(p.name for p in out.iterdir()) == sorted(
+        p.name for p in exported(tmp_path / "b", Export(out).bundle).iterdir()
+    )
+
+
+def test_real_recordings_go_through_the_c(c_compiler: str, real_data: Path, tmp_path: Path) -> None:
+    some = tmp_path / "raw"
+    for person in ("P01", "P10"):
+        shutil.copytree(real_data / "makeability-gestures" / person, some / person)
+    import_recordings(some, tmp_path / "ds", layout="accel-3")
+    export = Export(exported(tmp_path / "out", bundle_of("14d1_19d2_19d4", "8,12,16", load_layout("accel-3"))))
+    vectors = export.recorded(open_dataset(tmp_path / "ds"), [], 6000)
+    assert sum(v.samples for v in vectors) >= 6000
+    done = verify(export, ["host"], vectors, only=plainly)
+    assert done.passed and done.runs[0].vectors >= 6000 // 5
+
+
+def test_long_streams_are_cut_where_an_emulator_has_no_more_room(
+    c_compiler: str, small: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("plushsense.deploy.vectors.MOST_FRAME_BYTES", 56 * 2000)
+    export = Export(small)
+    vectors = export.made_up(5000)
+    assert len(vectors) >= 3 and {len(v.frames) for v in vectors[:-1]} == {2000}
+    done = verify(export, ["host"], vectors, only=plainly)
+    assert done.passed and [c.name for c in done.counts] == ["golden", "made up"]
+    assert done.counts[1].samples >= 4900 and done.runs[0].vectors == sum(c.answers for c in done.counts)
+
+
+# ---- What cannot be used -------------------------------------------------------------------------------------------
+
+
+BAD = [
+    (lambda o: (o / "plushsense.c").unlink(), "lacks plushsense.c"),
+    (lambda o: (o / "plush_model.bin").unlink(), "lacks plush_model.bin"),
+    (lambda o: (o / "model.plush").unlink(), "lacks model.plush"),
+    (lambda o: (o / "export.json").unlink(), "is no export"),
+    (lambda o: (o / "export.json").write_text("{"), "cannot be read"),
+    (lambda o: (o / "golden" / "frames.bin").unlink(), "cannot be read"),
+    (lambda o: (o / "golden" / "frames.bin").write_bytes(b"abc"), "no whole rows of 14 numbers"),
+    (lambda o: (o / "golden" / "answers.bin").write_bytes(bytes(4)), "no whole rows of 45 numbers"),
+    (lambda o: (o / "model.plush").write_bytes(b"abc"), "model.plush"),
+]
+
+
+@pytest.mark.parametrize(("how", "words"), BAD, ids=[words for _, words in BAD])
+def test_an_export_that_is_none(
+    own: Path, capsys: pytest.CaptureFixture[str], how: Callable[[Path], object], words: str
+) -> None:
+    how(own)
+    code, said, err = run(capsys, str(own))
+    assert code == 2 and said == {} and words in err and err.count("\n") == 1
+
+
+def test_golden_vectors_of_another_model_or_damaged(
+    own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = exported(tmp_path / "other", bundle_of("9d1_5d2", "4,6", load_layout("plush-15"), seed=4))
+    shutil.copyfile(other / "golden" / "answers.bin", own / "golden" / "answers.bin")
+    code, _, err = run(capsys, str(own))
+    assert code == 2 and "are not those of model.plush" in err and err.count("\n") == 1
+    shutil.rmtree(own / "golden")
+    shutil.copytree(other / "golden", own / "golden")
+    frames = bytearray((other / "golden" / "frames.bin").read_bytes())
+    frames[9000] ^= 16
+    (other / "golden" / "frames.bin").write_bytes(bytes(frames))
+    for folder in (own, other):
+        code, _, err = run(capsys, str(folder))
+        assert code == 2 and "they are damaged, or of another model (answer " in err and err.count("\n") == 1
+
+
+def test_what_is_asked_for_must_be_there(
+    c_compiler: str, own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, _, err = run(capsys, str(own), "--target", "xtesna")
+    assert code == 2 and "Did you mean 'xtensa'?" in err
+    code, _, err = run(capsys, str(own), "--subject", "A")
+    assert code == 2 and "--dataset" in err
+    code, _, err = run(capsys, str(own), "--samples", "0")
+    assert code == 2 and "--samples is 0" in err
+    tools = tmp_path / "bin"
+    tools.mkdir()
+    for tool in ("gcc", "as", "ld"):
+        (tools / tool).symlink_to(shutil.which(tool) or "")
+    monkeypatch.setenv("PATH", str(tools))
+    code, _, err = run(capsys, str(own), "--target", "xtensa")
+    assert code == 2 and "gcc-xtensa-lx106" in err and "qemu-system-misc" in err and err.count("\n") == 1
+    code, said, _ = run(capsys, str(own))
+    assert code == 0 and {r["target"] for r in said["runs"]} == {"host"}
+    why = {n["what"]: n["why"] for n in said["not_run"]}
+    assert "gcc-xtensa-lx106" in why["xtensa"] and set(EMULATED) <= set(why)
+    assert "clang" in why["host, clang -O2"]
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(ToolError, match="Nothing can be checked here"):
+        verify(Export(own))

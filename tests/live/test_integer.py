@@ -1,0 +1,203 @@
+"""``live --engine int8`` is the toy: every answer is that of the C library, bit for bit, whatever the stream does."""
+
+from __future__ import annotations
+
+import ctypes
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import plushsense.deploy
+from plushsense.core.gestures import load_gestures
+from plushsense.core.recfile import Frames
+from plushsense.core.signal import load_layout
+from plushsense.deploy.calibration import calibrated, integer_model
+from plushsense.devices.base import Frame
+from plushsense.devices.opening import open_device
+from plushsense.live.decide import DecideSpec
+from plushsense.live.integer import BothEngines, IntegerClassifier
+from plushsense.live.loop import run
+from plushsense.live.stream import StreamClassifier
+from plushsense.models.arch import Arch
+from plushsense.models.bundle import Bundle
+from plushsense.models.image import AFFECT_CODES, IntegerModel
+from plushsense.models.reference import random_weights
+from plushsense.windows.clock import resample
+from plushsense.windows.features import Scaler, inputs
+
+LIBRARY = Path(plushsense.deploy.__file__).parent / "c"
+COLUMNS = 9  # of an answer: row, ms, sample, state, gesture, affect, confidence, restarts, invalid
+
+# Feeds frames to one toy, and writes down every answer.
+FEEDER = """
+#include "plushsense.c"
+static int32_t *out; static long count, row;
+static void note(const plush_toy *toy, void *user) {
+    int32_t *a = out + 9 * count++;
+    (void)user;
+    a[0] = (int32_t)row; a[1] = (int32_t)toy->answer.ms; a[2] = (int32_t)toy->answer.sample;
+    a[3] = (int32_t)toy->answer.state; a[4] = toy->answer.gesture; a[5] = (int32_t)toy->answer.affect;
+    a[6] = toy->answer.confidence; a[7] = (int32_t)toy->restarts; a[8] = (int32_t)toy->invalid;
+}
+long feed(const uint8_t *model, uint32_t bytes, const uint32_t *ms, const int32_t *values, long rows, int32_t *answers)
+{
+    static uint32_t memory[1 << 16];
+    plush_toy toy;
+    out = answers; count = 0;
+    if (plush_begin(&toy, model, bytes, memory, sizeof memory) != PLUSH_OK) return -1;
+    toy.on_answer = note;
+    for (row = 0; row < rows; row++) plush_push(&toy, ms[row], values + row * toy.channels);
+    return count;
+}
+"""
+
+
+@pytest.fixture(scope="session")
+def library(c_compiler: str, tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
+    folder = tmp_path_factory.mktemp("c")
+    (folder / "feeder.c").write_text(FEEDER)
+    made = folder / "feeder.so"
+    command = [c_compiler, "-std=c99", "-O2", "-shared", "-fPIC", f"-I{LIBRARY}", "feeder.c", "-o", str(made)]
+    subprocess.run(command, check=True, cwd=folder)
+    loaded = ctypes.CDLL(str(made))
+    loaded.feed.restype = ctypes.c_long
+    return loaded
+
+
+def of_the_c(library: ctypes.CDLL, model: IntegerModel, frames: list[Frame]) -> np.ndarray:
+    """The C's answers, (m, COLUMNS)."""
+    image = model.to_bytes()
+    ms = np.array([f.device_ms for f in frames], dtype=np.int64).astype(np.uint32)
+    values = np.array([f.values for f in frames], dtype=np.int32)
+    out = np.zeros((3 * len(frames), COLUMNS), dtype=np.int32)
+    pointers = [a.ctypes.data_as(ctypes.c_void_p) for a in (ms, values)]
+    n = library.feed(image, len(image), *pointers, ctypes.c_long(len(frames)), out.ctypes.data_as(ctypes.c_void_p))
+    assert n >= 0
+    return out[:n]
+
+
+def of_live(model: IntegerModel, frames: list[Frame]) -> np.ndarray:
+    """The live engine's decisions in the C's terms, with every decimal that they have."""
+    classifier = IntegerClassifier(model)
+    rows = []
+    zero = frames[0].device_ms
+    for row, frame in enumerate(frames):
+        # Over a clock reset a decision's time goes on where it was; the toy's own clock does not.
+        if row and frame.device_ms < frames[row - 1].device_ms:
+            zero += (frame.device_ms - frames[row - 1].device_ms) - model.layout.period_us / 1000
+        for d in classifier.push(frame):
+            at_ms = d.t_s * 1000 + zero
+            assert abs(at_ms * 1000 - round(at_ms * 1000)) < 1e-3, "times are whole microseconds"
+            known = d.state == "tracking"
+            confidence = (d.confidence or 0.0) * 2**15
+            assert confidence == int(confidence), "confidence comes in steps of 2^-15"
+            rows.append(
+                [
+                    row,
+                    (round(at_ms * 1000) // 1000) % 2**32,
+                    int(known),
+                    model.gestures.labels.index(d.gesture) if d.gesture is not None else 0,
+                    AFFECT_CODES[d.affect] if d.affect is not None else 0,
+                    int(confidence),
+                    classifier.restarts,
+                    classifier.invalid,
+                ]
+            )
+    return np.array(rows)
+
+
+def equal(library: ctypes.CDLL, model: IntegerModel, frames: list[Frame]) -> np.ndarray:
+    """Assert that both say the same; the live engine's answers."""
+    found, wanted = of_live(model, frames), of_the_c(library, model, frames)
+    wanted = np.delete(wanted, 2, axis=1).astype(np.int64)
+    wanted[:, 1] %= 2**32  # the toy's clock is a uint32_t, and a garbled line may hold any time
+    wanted[wanted[:, 2] == 0, 3:6] = 0  # while warming these mean nothing
+    np.testing.assert_array_equal(found, wanted)
+    return found
+
+
+def virtual(query: str, layout: str = "plush-15") -> list[Frame]:
+    """Everything that a virtual toy sends."""
+    frames: list[Frame] = []
+    with open_device(f"virtual://?{query}&speed=0", load_layout(layout)) as device:
+        while not device.closed and (some := device.read()) is not None:
+            frames.extend(some)
+    return frames
+
+
+def model_for(layout: str, symbol: str = "14d1_19d2_19d4", filters: tuple[int, ...] = (8, 12, 16)) -> Bundle:
+    """A network of random weights, its numbers scaled and calibrated on a virtual person."""
+    chosen, gestures = load_layout(layout), load_gestures("plush-18")
+    arch = Arch.parse(symbol, filters, channels=chosen.n_inputs, classes=len(gestures))
+    quiet = virtual("person=3&seed=5&seconds=40", layout)
+    values = np.array([f.values for f in quiet], dtype=np.int64)
+    times = np.array([f.device_ms for f in quiet], dtype=np.int64)
+    longest = max(resample(Frames(values, times, times), chosen), key=len)
+    x = inputs(longest.data, chosen).T
+    windows = np.stack([x[:, at : at + arch.span] for at in range(0, x.shape[1] - arch.span, 60)]).astype(np.int32)
+    return calibrated(Bundle(arch, random_weights(arch, 3), chosen, Scaler.fit(windows), gestures), windows)
+
+
+@pytest.mark.parametrize("layout", ["plush-15", "accel-3"])
+def test_decisions_are_the_c_librarys_with_lost_frames_garbage_and_restarts(library: ctypes.CDLL, layout: str) -> None:
+    frames = virtual("person=7&seed=2&lost=0.45&garbled=0.02&glitch=0.02&seconds=150", layout)
+    back = len(frames) * 2 // 3
+    reset = frames[back].device_ms - 3
+    frames = frames[:back] + [Frame(f.host_ms, f.device_ms - reset, f.values) for f in frames[back:]]
+    model = integer_model(model_for(layout))
+    found = equal(library, model, frames)
+    tracking = found[found[:, 2] == 1]
+    assert found[-1, 6] >= 2, "there were restarts"
+    assert len(tracking) > 500 and len(set(tracking[:, 3])) > 1 and len(set(tracking[:, 5])) > 100
+    if layout == "plush-15":
+        assert found[-1, 7] > 10, "there was garbage"
+
+
+@pytest.mark.parametrize(("symbol", "filters"), [("9", (5,)), ("28d1_32d2", (4, 6)), ("3d1_3d2_3d4_3d8", (4, 6, 8, 8))])
+def test_other_networks_too(library: ctypes.CDLL, symbol: str, filters: tuple[int, ...]) -> None:
+    model = integer_model(model_for("accel-3", symbol, filters), DecideSpec(0.0))
+    assert len(equal(library, model, virtual("person=2&seed=4&lost=0.1&seconds=20", "accel-3"))) > 300
+
+
+def test_a_real_session(library: ctypes.CDLL, real_data: Path) -> None:
+    stream = real_data / "makeability-gestures" / "P01" / "fulldatastream.csv"
+    layout = load_layout("accel-3")
+    frames: list[Frame] = []
+    with open_device(f"replay://{stream}?speed=0", layout) as device:
+        while not device.closed and len(frames) < 20_000 and (some := device.read()) is not None:
+            frames.extend(some)
+    found = equal(library, integer_model(model_for("accel-3")), frames)
+    assert (found[:, 2] == 1).sum() > 1000
+
+
+def test_both_engines_are_counted_against_each_other() -> None:
+    bundle = model_for("accel-3")
+    both = BothEngines(IntegerClassifier(integer_model(bundle)), StreamClassifier(bundle))
+    with open_device("virtual://?person=4&seed=3&lost=0.01&speed=0", bundle.layout) as device:
+        live = run(device, both, seconds=60)
+        decided = list(live)
+    alone = IntegerClassifier(integer_model(bundle))
+    with open_device("virtual://?person=4&seed=3&lost=0.01&speed=0", bundle.layout) as device:
+        assert decided == list(run(device, alone, seconds=60)), "what is decided is the deployed model's"
+    found = both.agreement()
+    # The frame at which the time is up is read, but its decision is not given out.
+    assert found["decisions"] - sum(d.state == "tracking" for d in decided) in (0, 1)
+    assert found["decisions"] > 500
+    assert 0.8 < found["gesture"] <= found["affect"] <= 1
+    assert 0 < found["largest_difference"] < 0.5
+    assert (live.summary().restarts, live.summary().invalid) == (alone.restarts, alone.invalid)
+    both.reset()
+    assert both.agreement() == {"decisions": 0, "gesture": None, "affect": None, "largest_difference": None}
+
+
+def test_a_decision_of_another_model_counts_as_one_that_differs() -> None:
+    bundle = model_for("accel-3")
+    stranger = Bundle(
+        bundle.arch, random_weights(bundle.arch, 8), bundle.layout, bundle.scaler, bundle.gestures, decision={}
+    )
+    both = BothEngines(IntegerClassifier(integer_model(bundle)), StreamClassifier(stranger))
+    with open_device("virtual://?person=4&seed=3&speed=0", bundle.layout) as device:
+        list(run(device, both, seconds=30))
+    assert both.agreement()["gesture"] < 0.6
