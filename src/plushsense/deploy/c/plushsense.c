@@ -799,7 +799,7 @@ uint32_t plush_push(plush_toy *toy, uint32_t ms, const int32_t *values)
         return push_sample(toy, ms);
     }
     between = (ms - toy->last_ms) * toy->units_per_ms;
-    while (between != 0 && toy->due <= between) {
+    while (toy->due <= between) { /* never for an equal stamp: a sample at the last frame's time is already made */
         interpolate(toy, toy->due, between);
         due += push_sample(toy, toy->last_ms + toy->due / toy->units_per_ms);
         toy->due += toy->period;
