@@ -66,28 +66,6 @@ def all_compilers(c_compiler: str) -> None:
 
 
 @pytest.fixture(scope="session")
-def emulators(c_compiler: str) -> None:
-    """Compilers and emulators of every chip."""
-    from plushsense.deploy.targets import TARGETS, missing_tools
-
-    for name in TARGETS:
-        if lacks := missing_tools(name):
-            missing("emulators", f"{name} lacks {' '.join(lacks)}")
-
-
-@pytest.fixture(scope="session")
-def installed() -> Callable[..., None]:
-    """Asks for compilers by the names of their programs."""
-
-    def ask(*programs: str) -> None:
-        for program in programs:
-            if shutil.which(program) is None:
-                missing("compilers", f"{program} is not installed")
-
-    return ask
-
-
-@pytest.fixture(scope="session")
 def lsl_possible() -> None:
     """The lab streaming layer, and a network on which a stream of this process is found."""
     try:

@@ -128,7 +128,7 @@ def any_frames(model: IntegerModel, seed: int, n: int | None = None, start: int 
     unruly, garbage = float(rng.choice([0, 0.5, 3])) / n, float(rng.choice([0, 0.01, 0.1]))
     wander = (low + high) / 2
     rows = []
-    for _ in range(n):
+    for row in range(n):
         kind = rng.random()
         if kind < unruly:
             now += float(rng.choice([layout.gap_ms, layout.gap_ms + 1, -30, -now, 10_000]))
@@ -141,7 +141,7 @@ def any_frames(model: IntegerModel, seed: int, n: int | None = None, start: int 
         ends = rng.random(len(low))
         values[ends < 0.02] = low[ends < 0.02]
         values[ends > 0.98] = high[ends > 0.98]
-        for i in np.flatnonzero(rng.random(len(low)) < garbage):
+        for i in np.flatnonzero(rng.random(len(low)) < (0.5 if garbage and row < 4 else garbage)):
             values[i] = int(rng.choice([INT32[0], INT32[1], max(low[i] - 1, INT32[0]), min(high[i] + 1, INT32[1]), 0]))
         now = max(now, 0.0)
         rows.append([int(now) & 0xFFFFFFFF, *values.tolist()])
@@ -165,3 +165,58 @@ def plain_model(seed: int = 1, **changes: Any) -> IntegerModel:
     arch = Arch((ConvLayer(5, 2, 6), ConvLayer(4, 3, 5)), **settings)
     gestures = GestureSet("plain", tuple(Gesture(f"gesture {i}", AFFECTS[i % 4]) for i in range(arch.classes)))
     return IntegerModel(any_network(arch, layout, np.random.default_rng(seed)), layout, gestures, 5000)
+
+
+def edged_model() -> IntegerModel:
+    """A toy of two tiny channels in which every clamp and every rounding shows, and two classes always tie."""
+    layout = Layout(
+        name="edged",
+        title="At every edge",
+        rate_hz=100.0,
+        channels=(
+            Channel("small", "raw", "touch", valid_min=-3, valid_max=3),
+            Channel("wide", "raw", "touch", valid_min=-40_000),
+        ),
+        wire=("device_ms", "small", "wide"),
+        derived=(Derived("size", "magnitude", ("small", "small")),),
+        inputs=("small", "wide", "size"),
+        csv=CsvFormat(("device_ms",), ("device_ms",), ","),
+    )
+    arch = Arch((ConvLayer(1, 7, 9), ConvLayer(2, 3, 4)), channels=3, classes=9, step=1, pool=2)
+    inputs = InputScale(
+        offset=np.array([0, INT32[0], 24]),
+        before=np.array([0, 16, 0]),
+        multiplier=np.array([160, 32767, 32767]),
+        bias=np.array([512, (1 << 30) - 1, -(1 << 30)]),
+        after=np.array([2, 22, 11]),
+    )
+    weights = np.zeros((9, 3, 1), dtype=np.int8)
+    weights[:4, 0, 0] = 1, 127, -128, 5
+    weights[4:, 1:, 0] = [[1, 2], [127, 127], [-128, -128], [3, -3], [-2, 1]]
+    bias = np.array([0, 3_000_000, 40_000, -700, 5, 60_000_000, -1, 300, 100])
+    # Among them sums beyond 16 bits, halves that round up, no scaling at all, and the widest shifts.
+    first = Requantize(
+        before=np.array([0, 0, 0, 1, 0, 0, 30, 0, 2]),
+        multiplier=np.array([1, 32767, 32767, 3, 16384, 7, 32767, 12345, 32767]),
+        after=np.array([0, 30, 28, 2, 15, 10, 30, 13, 15]),
+    )
+    rng = np.random.default_rng(4)
+    second = IntegerLayer(
+        rng.integers(-128, 128, (4, 9, 2)).astype(np.int8),
+        np.array([0, 20_000, -20_000, 4_000]),
+        Requantize(np.array([0, 2, 1, 5]), np.array([300, 20_000, 9_999, 32_767]), np.array([16, 20, 19, 15])),
+    )
+    rows = rng.integers(-128, 128, (9, 4)).astype(np.int8)
+    rows[1], rows[8] = rows[0], 0
+    dense = IntegerDense(
+        rows,
+        np.array([9, 9, 0, 5_000_000, -5_000_000, 70_000, -70_000, 1, -3]),
+        LogitScale(
+            before=np.array([0, 0, 3, 0, 0, 0, 0, 30, 0]),
+            multiplier=np.array([6000, 6000, 9000, 3000, 3000, 32767, 32767, 5, 3]),
+            after=np.array([15, 15, 12, 15, 15, 15, 15, 0, 1]),
+        ),
+    )
+    network = IntegerNetwork(arch, inputs, (IntegerLayer(weights, bias, first), second), dense)
+    gestures = GestureSet("edged", tuple(Gesture(f"gesture {i}", AFFECTS[i % 4]) for i in range(9)))
+    return IntegerModel(network, layout, gestures, 20_000)

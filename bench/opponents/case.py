@@ -146,7 +146,7 @@ def made_up_frames(layout: Layout, scaler: Scaler | None, n: int, seed: int) -> 
     at = 0
     while at < n:
         until = at + int(rng.integers(150, 600))
-        level[at:until], size[at:until] = rng.normal(size=channels), np.exp(rng.normal(size=channels) - 1)
+        level[at:until], size[at:until] = rng.uniform(-1.7, 1.7, channels), rng.uniform(0.05, 0.5, channels)
         at = until
     noise = rng.normal(size=(n, channels))
     for t in range(1, n):

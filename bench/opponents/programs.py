@@ -87,25 +87,24 @@ class Workshop:
 
 
 def ours(case: Case, shop: Workshop) -> list[Entry]:
-    """PlushSense's C, with -O2 and -O3, frames in and network only."""
+    """PlushSense's C as it is and held to plain C (PLUSH_PLAIN), frames in; as it is also the network alone."""
     (shop.folder / "model.bin").write_bytes(case.model.to_bytes())
     model = (shop.folder / "model.bin").stat().st_size
     entries = []
     with as_file(files("plushsense.deploy") / "c") as sources:
+        memory = int(_call(_asking(shop, sources), shop.folder))
         include = f"-I{sources}"
         for level in ("-O2", "-O3"):
-            library = shop.compiled(sources / "plushsense.c", f"library{level}", "-std=c99", level)
             for what, reads, extra in (
                 ("frames to answer", "frames", ()),
                 ("network only", "stream", ("-DNETWORK_ONLY",)),
+                ("frames to answer, plain C", "frames", ("-DPLUSH_PLAIN",)),
             ):
-                unit = f"ours{level}-{reads}"
+                unit = f"ours{len(entries)}"
+                library = shop.compiled(sources / "plushsense.c", f"library-{unit}", "-std=c99", level, *extra)
                 built = shop.compiled(HERE / "ours.c", unit, "-std=gnu99", level, include, *extra)
-                memory = int(_call([*_asking(shop, sources)], shop.folder))
-                command = shop.program(f"run-{unit}", [built])
-                entries.append(
-                    Entry(f"PlushSense C {level}, {what}", "ours", reads, command, model, _sizes(library)[0], memory)
-                )
+                command, code = shop.program(f"run-{unit}", [built]), _sizes(library)[0]
+                entries.append(Entry(f"PlushSense C {level}, {what}", "ours", reads, command, model, code, memory))
     return entries
 
 
@@ -178,5 +177,5 @@ def onnx2c(case: Case, shop: Workshop, tool: str, model: Path) -> list[Entry]:
         caller = shop.compiled(HERE / "window.c", f"call-onnx2c{level}", level, "-DONNX2C")
         flash, memory = _sizes(network)
         command = shop.program(f"run-onnx2c{level}", [network, caller])
-        entries.append(Entry(f"onnx2c float C {level}", "onnx2c", "window", command, None, flash, memory))
+        entries.append(Entry(f"onnx2c float C {level}", "portable C", "window", command, None, flash, memory))
     return entries

@@ -73,3 +73,15 @@ def test_without_calibration(tmp_path: Path, bundle: Bundle, capsys: pytest.Capt
     replace(bundle, calibration={}).save(tmp_path / "m.plush")
     assert main(["export", str(tmp_path / "m.plush"), str(tmp_path / "out")]) == 2
     assert "--dataset" in capsys.readouterr().err
+
+
+def test_other_formats(tmp_path: Path, bundle: Bundle, onnx_here: None, capsys: pytest.CaptureFixture[str]) -> None:
+    bundle.save(tmp_path / "m.plush")
+    assert main(["export", str(tmp_path / "m.plush"), str(tmp_path / "out"), "--also", "onnx, onnx-int8"]) == 0
+    assert "model.onnx" in capsys.readouterr().out
+    facts = json.loads((tmp_path / "out" / "export.json").read_text())
+    assert facts["conversions"]["onnx"]["largest_difference"] < 1e-3
+    assert {"model.onnx", "model.int8.onnx"} <= set(facts["files"])
+    assert main(["export", str(tmp_path / "m.plush"), str(tmp_path / "two"), "--also", "onx"]) == 2
+    assert "Did you mean 'onnx'" in capsys.readouterr().err
+    assert not (tmp_path / "two").exists()

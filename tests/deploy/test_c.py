@@ -22,7 +22,7 @@ TESTS = Path(__file__).parents[1]
 sys.path.insert(0, str(TESTS))
 
 from c_toy import C_FOLDER, Seat  # noqa: E402
-from integers import INT32, any_frames, models, plain_model  # noqa: E402
+from integers import INT32, any_frames, edged_model, models, plain_model  # noqa: E402
 from plushsense.deploy.emit import TOY_BYTES  # noqa: E402
 from plushsense.deploy.golden import answers_of  # noqa: E402
 from plushsense.models.fixed import exponentials  # noqa: E402
@@ -61,6 +61,20 @@ def test_most_random_streams_are_answered(c_library: Any) -> None:
         gestures |= set(answers[answers[:, 3] == 1, 4].tolist())
     assert tracked > 500
     assert len(gestures) == 3
+
+
+def test_every_edge(c_library: Any, plain_c_library: Any) -> None:
+    model = edged_model()
+    for seed in range(4):
+        frames = any_frames(model, seed, 700)
+        wanted = answers_of(model, frames)
+        for library in (c_library, plain_c_library):
+            assert np.array_equal(seat(library, model).push(frames), wanted)
+        logits, best = wanted[wanted[:, 3] == 1][:, 9:18], wanted[wanted[:, 3] == 1][:, 4]
+        # Held within their limits; a tie goes to the first.
+        assert (logits.min(), logits.max()) == (-16384, 16384)
+        assert np.array_equal(logits[:, 0], logits[:, 1])
+        assert 1 not in best
 
 
 @settings(max_examples=30, deadline=None)
@@ -400,7 +414,7 @@ def test_square(c_library: Any, v: int) -> None:
     assert c_library.try_square(v) == v * v
 
 
-@settings(max_examples=1000, deadline=None)
+@settings(max_examples=400, deadline=None)
 @given(st.data())
 def test_interpolation_in_32_bits(c_library: Any, data: st.DataObject) -> None:
     """Of any distance and any gap that a model may have; ``add`` is at most half of ``by``."""
@@ -435,8 +449,8 @@ STRICT = ["-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wsign-conversion",
 @pytest.mark.parametrize("plain", [[], ["-DPLUSH_PLAIN"]], ids=["fast", "plain"])
 def test_no_warning(cc: str, plain: list[str], needs: Callable[..., None], tmp_path: Path) -> None:
     needs(cc)
-    for level in ("-O0", "-O2", "-O3", "-Os"):
-        for language in (["-std=c99"], ["-x", "c++", "-std=c++11"]):
+    for language, levels in ((["-std=c99"], ("-O0", "-O2", "-O3")), (["-x", "c++", "-std=c++11"], ("-O2",))):
+        for level in levels:
             subprocess.run(
                 [cc, *language, level, *STRICT, *plain, "-c", C_FOLDER / "plushsense.c", "-o", tmp_path / "o"],
                 check=True,

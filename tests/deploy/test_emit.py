@@ -119,7 +119,8 @@ def test_the_model_as_c(tmp_path: Path, c_compiler: str) -> None:
         '#include <stdio.h>\n#include "plush_model.h"\n#include "plushsense.h"\n'
         "static uint32_t memory[PLUSH_MODEL_MEMORY_WORDS];\nstatic plush_toy toy;\n"
         "int main(void) { fwrite(plush_model, 1, PLUSH_MODEL_BYTES, stdout);\n"
-        "return (int)plush_begin(&toy, plush_model, PLUSH_MODEL_BYTES, memory, sizeof memory) + PLUSH_AT_REST; }\n"
+        "return (int)plush_begin(&toy, plush_model, PLUSH_MODEL_BYTES, memory, sizeof memory)\n"
+        "       + PLUSH_GESTURE_AT_REST; }\n"
     )
     out = tmp_path / "out"
     words = [c_compiler, "-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror", f"-I{out}"]

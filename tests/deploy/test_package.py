@@ -333,7 +333,7 @@ SCORES = {"split": "validation-subjects", "leaky": False, "windows": 321, "accur
 
 
 def test_the_readme_tells_this_model(tmp_path: Path) -> None:
-    people = ["Anna", "P02"]
+    people = ["Anna", "P02", "none"]  # at rest there is nobody
     text = with_provenance(tmp_path, dataset="gestures | of 2", scores=SCORES, subjects=people, simulated=False)
     facts = read_facts(tmp_path / "out")
     for figure in ("parameters", "macs_per_step", "model_bytes", "memory_bytes", "span"):

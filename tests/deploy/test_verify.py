@@ -73,6 +73,13 @@ def own(small: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(small, tmp_path / "out"))
 
 
+@pytest.fixture(scope="session")
+def emulators(target_here: Callable[[str], str]) -> None:
+    """Compilers and emulators of every target."""
+    for name in TARGETS:
+        target_here(name)
+
+
 def plainly(setting: Setting) -> bool:
     return setting.optimise == "-O2" and setting.cc in (None, "gcc") and not setting.image and not setting.cpp
 
@@ -184,20 +191,26 @@ def test_the_texts_of_the_faults_stand_in_our_c(small: Path) -> None:
 def test_a_file_edited_by_hand_is_what_is_tested(
     c_compiler: str, own: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    edit(own / "plushsense.c", "+ 16384u", "+ 16385u")
+    edit(own / "plushsense.c", "int32_t now = (int32_t)(((e << 15)", "int32_t now = (int32_t)(((e << 14)")
     code, said, _ = run(capsys, str(own), "--target", "host")
     assert code == 1 and not said["passed"]
     assert said["mismatches"] == sum(r["mismatches"] for r in said["runs"]) > 0
     assert said["max_abs_diff"] >= 1
     assert said["first"].startswith("On host (gcc -O0), golden: answer ")
-    assert "the smoothed probability of '" in said["first"] and said["first"].count(".") == 1
+    assert "'confidence' should be " in said["first"] and said["first"].count(".") == 1
+
+
+def test_the_folders_own_header_is_what_the_caller_reads(c_compiler: str, own: Path) -> None:
+    edit(own / "plushsense.h", "typedef struct plush_toy {", "typedef struct plush_toy {\n    uint32_t mine[5];")
+    assert verify(Export(own), ["host"], only=lambda s: s.optimise == "-O2" and s.cc == "gcc").passed
 
 
 def test_an_image_that_was_edited(c_compiler: str, own: Path) -> None:
     image = bytearray((own / "plush_model.bin").read_bytes())
     image[200] ^= 1
     (own / "plush_model.bin").write_bytes(bytes(image))
-    done = verify(Export(own), ["host"])
+    done = verify(Export(own), ["host"], only=lambda s: (s.cc, s.optimise) == ("gcc", "-O2"))
+    assert len(done.runs) == 3
     bad = [r for r in done.runs if r.mismatches]
     assert [r.flags for r in bad] == ["-O2 plush_model.bin"]
     assert bad[0].mismatches == bad[0].vectors and "PLUSH_DAMAGED" in (bad[0].first or "")
@@ -271,7 +284,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
         lines = [header, *rows(n, 1_600_000_100_000 + n, 4_294_967_000 if n == 60 else 70)]
         (raw / "B" / f"{label}_{1_600_000_100_000 + n}_{n}.csv").write_text("\n".join(lines) + "\n")
     out = tmp_path_factory.mktemp("recorded") / "ds"
-    import_recordings(raw, out, "accel-3")
+    import_recordings(raw, out, layout="accel-3")
     return out
 
 
@@ -301,7 +314,7 @@ def test_recordings_go_through_the_c(
     out = exported(tmp_path / "out", bundle_of("5d1_4d3", "3,5", load_layout("accel-3")))
     code, said, err = run(capsys, str(out), "--target", "host", "--dataset", str(recorded), "--samples", "5000")
     assert code == 0 and said["mismatches"] == 0
-    assert [s["name"] for s in said["streams"]] == ["golden", "raw"]
+    assert [s["name"] for s in said["streams"]] == ["golden", "recordings"]
     assert said["streams"][1]["frames"] == 780 and "these recordings make" in err
     assert all(r["vectors"] == sum(s["answers"] for s in said["streams"]) for r in said["runs"])
     assert sorted(p.name for p in out.iterdir()) == sorted(
@@ -313,7 +326,7 @@ def test_real_recordings_go_through_the_c(c_compiler: str, real_data: Path, tmp_
     some = tmp_path / "raw"
     for person in ("P01", "P10"):
         shutil.copytree(real_data / "makeability-gestures" / person, some / person)
-    import_recordings(some, tmp_path / "ds", "accel-3")
+    import_recordings(some, tmp_path / "ds", layout="accel-3")
     export = Export(exported(tmp_path / "out", bundle_of("14d1_19d2_19d4", "8,12,16", load_layout("accel-3"))))
     vectors = export.recorded(open_dataset(tmp_path / "ds"), [], 6000)
     assert sum(v.samples for v in vectors) >= 6000

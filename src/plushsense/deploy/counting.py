@@ -31,10 +31,11 @@ Ints = NDArray[np.int64]
 class Cost:
     """What one target says. Instructions, bytes; None where the target counts nothing (the host).
 
-    ``step`` is the mean over `STEPS` decisions with the jitter of a real toy, ``even`` with even stamps,
-    ``step_most`` the dearest of them; ``gap`` is the dearest single call, which bridges the longest gap; ``stages``
-    add up to ``step``, ``clock`` (with the check of values) being what the others leave of it. ``stack_functions`` is
-    what the compiler says of each function.
+    ``step`` is the mean over `STEPS` decisions with frames up to a fifth of a period early or late, ``even`` with
+    even stamps, ``step_most`` the dearest step; ``gap`` is the dearest single call, which bridges the longest gap;
+    ``stages`` add up to ``step``, ``clock`` (with the check of values) being what the others leave of it.
+    ``stack_push``, ``stack_begin`` and ``stack_memory_bytes`` are how deep the stack went below the caller of these
+    functions, without a callback; ``stack_functions`` is the frame that the compiler gives to each function.
     """
 
     target: str
@@ -49,6 +50,7 @@ class Cost:
     memory_bytes: int
     stack_push: int | None
     stack_begin: int | None
+    stack_memory_bytes: int | None
     stack_functions: Mapping[str, int]
     needs: tuple[str, ...]
 
@@ -90,6 +92,7 @@ class Cost:
             "memory_bytes": self.memory_bytes,
             "stack_push_bytes": self.stack_push,
             "stack_begin_bytes": self.stack_begin,
+            "stack_memory_bytes_call": self.stack_memory_bytes,
             "stack_functions": dict(self.stack_functions),
             "needs": list(self.needs),
             "heap": list(self.heap),
@@ -144,8 +147,9 @@ def count(folder: Path, target: str, facts: Mapping[str, Any], optimise: str = "
             sections={name: _sections(target, file) for name, file in objects.items()},
             toy_bytes=head[0],
             memory_bytes=head[1],
-            stack_push=head[4] if counts else None,
-            stack_begin=head[3] if counts else None,
+            stack_push=head[5] if counts else None,
+            stack_begin=head[4] if counts else None,
+            stack_memory_bytes=head[3] if counts else None,
             stack_functions=_stack_usage(objects["plushsense"].with_suffix(".su")),
             needs=_needs(target, objects["plushsense"]),
         )
@@ -183,14 +187,14 @@ def _written(frames: Ints, file: Path) -> Path:
 
 
 def _whole(program: Program, step: int) -> tuple[list[int], Ints, Ints]:
-    """Five numbers about the toy; then the rows (`STEPS`, 3) after the first decision of the even stream, and those of
+    """Six numbers about the toy; then the rows (`STEPS`, 3) after the first decision of the even stream, and those of
     the jittered one with the gap's as one more."""
     numbers = np.frombuffer(program.run(), dtype="<u4").astype(np.int64)
     if not len(numbers):
         raise ProgramError(
             f"The C in the export refuses its own model on {program.target.name}: export the model again."
         )
-    table = numbers[5:].reshape(-1, 3)
+    table = numbers[6:].reshape(-1, 3)
     first = int(np.flatnonzero(table[:, 2] == 2)[0])
     even, jittered = (part[part[:, 2] == 1][1:] for part in (table[:first], table[first + 1 : -1]))
     if (len(even), len(jittered)) != (STEPS, STEPS + 1):
@@ -198,7 +202,7 @@ def _whole(program: Program, step: int) -> tuple[list[int], Ints, Ints]:
             f"The C in the export gave {len(even)} answers on {program.target.name} where {STEPS} steps of {step} "
             "samples should: plushsense verify says where it goes wrong."
         )
-    return numbers[:5].tolist(), even, jittered
+    return numbers[:6].tolist(), even, jittered
 
 
 def _stages(program: Program) -> dict[str, int]:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.core.errors import BadInput
+from plushsense.core.gestures import NOBODY
 from plushsense.deploy.golden import write_golden
 from plushsense.models.bundle import Bundle
 from plushsense.models.image import HEAD_BYTES, IntegerModel, head, memory_bytes
@@ -161,7 +162,10 @@ def _facts(model: IntegerModel, bundle: Bundle, model_bytes: int) -> dict[str, A
 
 def without_people(provenance: Mapping[str, Any]) -> dict[str, Any]:
     """A bundle's provenance for strangers: how many people it was trained on, not who."""
-    names = {str(n) for key in _PEOPLE if isinstance(provenance.get(key), list) for n in provenance[key]}
+    people = {
+        key: {str(n) for n in provenance[key]} - {NOBODY} for key in _PEOPLE if isinstance(provenance.get(key), list)
+    }
+    names = set().union(*people.values())
     named = re.compile(
         "|".join(rf"(?<!\w){re.escape(n)}(?!\w)" for n in sorted(names, key=len, reverse=True)) or "(?!)"
     )
@@ -174,7 +178,7 @@ def without_people(provenance: Mapping[str, Any]) -> dict[str, Any]:
         return named.sub("…", value) if isinstance(value, str) else value
 
     kept = {key: plain(value) for key, value in provenance.items() if key not in _PEOPLE}
-    return kept | {key: len(provenance[key]) for key in _PEOPLE if isinstance(provenance.get(key), list)}
+    return kept | {key: len(found) for key, found in people.items()}
 
 
 def c_names(labels: Sequence[str]) -> tuple[str, ...]:

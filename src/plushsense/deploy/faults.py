@@ -43,7 +43,7 @@ class _Text:
     name: str
     text: str
     wrong: str
-    when: Literal["always", "dilated", "magnitude", "ranged"] = "always"
+    when: Literal["always", "dilated", "magnitude", "ranged", "ties"] = "always"
 
 
 # Every one stays within the toy's memory, so that it is the answers that give it away, and not a crash.
@@ -96,6 +96,13 @@ TEXTS = (
         "a falling channel is interpolated with a half rounded down",
         "part_of(from - to, 2 * into, 2 * between, between - 1, toy->narrow)",
         "part_of(from - to, 2 * into, 2 * between, between, toy->narrow)",
+        "ties",
+    ),
+    _Text(
+        "rounding",
+        "a falling channel is interpolated without rounding",
+        "part_of(from - to, 2 * into, 2 * between, between - 1, toy->narrow)",
+        "part_of(from - to, 2 * into, 2 * between, 0, toy->narrow)",
     ),
     _Text(
         "rounding",
@@ -188,12 +195,15 @@ def faults_of(image: bytes, source: str) -> list[Fault]:
         "dilated": any(layer.dilation > 1 for layer in at.layers),
         "magnitude": at.magnitudes,
         "ranged": bool(ranged),
+        # In fine units of time hardly any value lies just between two whole numbers.
+        "ties": at.units_per_ms <= 10,
     }
     for each in TEXTS:
         if source.count(each.text) != 1:
             raise BadInput(
-                f"The fault '{each.name}' cannot be planted: its text stands {source.count(each.text)} times in "
-                f"plushsense.c, and not once ({each.text.strip()!r})."
+                f"The fault '{each.name}' cannot be planted: its text ({each.text.strip()!r}) stands "
+                f"{source.count(each.text)} times in plushsense.c, and not once; export the model again with this "
+                "PlushSense, or undo there what was edited."
             )
         if shows[each.when]:
             found.append(Fault(each.kind, each.name, source=source.replace(each.text, each.wrong)))

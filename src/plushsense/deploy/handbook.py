@@ -72,8 +72,8 @@ def handbook(bundle: Bundle, facts: Mapping[str, Any]) -> str:
             ),
             "",
             "A value outside its range is no reading: the last valid one stands in, and `toy.invalid` counts it. There",
-            "are no answers before every channel has had a valid value. The sensors must be those of the recordings: same",
-            "sign, scale and order. `plush_fake.c` of the example shows where the values lay in training.",
+            "are no answers before every channel has had a valid value. The sensors must be those of the recordings:",
+            "same sign, scale, order. `plush_fake.c` of the example shows where the values lay in training.",
             "",
             "## What comes out",
             "",
@@ -154,15 +154,16 @@ One task or interrupt uses a toy at a time. Several toys may share a model, each
 **When plush_begin() fails** it says why (`plush_status`); a toy that has not begun must not be pushed. Show it, and
 go on sending frames: the example blinks the status.
 
-**Missed ticks.** Only the time that comes with a frame counts. Who comes late reads once, with the true time, and does
-not make up for ticks that went by. Up to {gap} ms are bridged by interpolation, and every answer that fell due is given;
-after a longer gap, or when the clock runs backwards, the toy is warming again (`toy.restarts` counts it).
+**Missed ticks.** Only the time that comes with a frame counts. Who comes late reads once, with the true time, and
+does not make up for ticks that went by. Up to {gap} ms are bridged by interpolation, and every answer that fell due is
+given; after a longer gap, or when the clock runs backwards, the toy is warming again (`toy.restarts` counts it).
 
 ## Prove it, measure it
 
 `plushsense verify .` compiles the library and the model that stand here and compares every answer with those in
-`golden`, bit for bit; `--target xtensa`, `cortex-m4`, `riscv32` do it on emulated chips. The packages below hold copies of these
-files: whoever edits one edits it here, and copies. `plushsense profile .` counts instructions, flash, RAM and stack.
+`golden`, bit for bit; `--target xtensa`, `cortex-m4`, `riscv32` do it on emulated chips. The packages hold copies of
+these files: whoever edits one edits it here, and copies. `plushsense profile .` counts instructions, flash, RAM and
+stack.
 
 ## Another model without compiling
 

@@ -127,7 +127,8 @@ class Export:
             rows += max(samples - have, rows // 4)
         if not len(frames):
             raise ConfigError(f"The data set '{dataset.head.name}' holds nothing to stream: give another one.")
-        return [self.answered(dataset.head.name, part) for part in in_parts(frames)]
+        name = "simulated recordings" if dataset.head.simulated else "recordings"
+        return [self.answered(name, part) for part in in_parts(frames)]
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
 from plushsense.apps.cli.output import emit, say
 
@@ -16,12 +17,26 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="the data set that it was trained on: calibrates on its training people's windows (default: what training "
         "kept in the bundle)",
     )
+    parser.add_argument(
+        "--also",
+        default="",
+        metavar="A,B",
+        help="the network for other runtimes as well, each tried there first: onnx, onnx-int8 (extra onnx), tflite, "
+        "tflite-int8 (extra tflite), espdl, espdl-esp32, espdl-esp32p4 (extra espdl)",
+    )
+
+
+def _converted(found: dict[str, Any]) -> str:
+    apart = found["largest_difference"]
+    said = "" if apart is None else f"; logits differ by up to {apart:.1g} from those it was made of"
+    return f"  {found['file']:<17} {found['bytes']:,} bytes{said}"
 
 
 def run(args: argparse.Namespace) -> int:
     from plushsense.apps.exporting import export
 
-    done = export(args.bundle, args.out, dataset=args.dataset, warn=lambda what: say(f"warning: {what}"))
+    also = [word.strip() for word in args.also.split(",") if word.strip()]
+    done = export(args.bundle, args.out, dataset=args.dataset, also=also, warn=lambda what: say(f"warning: {what}"))
     facts = done.facts
     simulated = (
         ["  SIMULATION: trained on a virtual toy; it knows no real person's touch"] if facts["simulated"] else []
@@ -35,6 +50,7 @@ def run(args: argparse.Namespace) -> int:
             f"  model             {done.flash_bytes:,} bytes of flash; the code comes on top (plushsense profile)",
             f"  memory            {done.ram_bytes:,} bytes of RAM a toy",
             f"  a step            {facts['step_ms']:g} ms, {facts['macs_per_step']:,} MACs",
+            *(_converted(each) for each in facts.get("conversions", {}).values()),
             f"  prove it          plushsense verify {args.out}",
         ],
     )

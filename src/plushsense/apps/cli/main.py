@@ -64,6 +64,7 @@ STOPPED = {
     "train": "no bundle was written",
     "report": "no page was written",
     "export": "nothing was written",
+    "verify": "nothing was changed",
 }
 
 

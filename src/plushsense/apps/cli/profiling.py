@@ -84,7 +84,7 @@ def _counts(found: Profile) -> list[str]:
     )
     return [
         "",
-        f"Instructions, counted (mean of {STEPS} steps with a real toy's jitter)",
+        f"Instructions, counted (mean of {STEPS} steps; frames come up to a fifth of a period early or late)",
         table(["", *(c.target for c in costs)], rows),
         *textwrap.wrap(again, 118),
     ]
@@ -107,6 +107,7 @@ def _bytes(costs: list[Cost]) -> list[str]:
         ["RAM, all", *(f"{c.ram_bytes:,}" for c in costs)],
         ["stack: plush_push", *(known(c.stack_push) for c in costs)],
         ["stack: plush_begin", *(known(c.stack_begin) for c in costs)],
+        ["stack: plush_memory_bytes", *(known(c.stack_memory_bytes) for c in costs)],
     ]
     needs = "; ".join(f"{c.target}: {', '.join(c.needs) or 'nothing'}" for c in costs)
     heap = sorted({s for c in costs for s in c.heap})
@@ -115,6 +116,12 @@ def _bytes(costs: list[Cost]) -> list[str]:
         f"Heap: {', '.join(heap) or 'none'}. Floating point: {', '.join(floats) or 'none'}. All that plushsense.o "
         f"needs from outside, on {needs}."
     )
+    frames = "; ".join(
+        f"{c.target}: " + ", ".join(f"{f} {n}" for f, n in list(c.stack_functions.items())[:4])
+        for c in costs
+        if c.stack_functions
+    )
+    proof += f" Largest frames, as the compiler says: {frames}." if frames else ""
     return ["Bytes", table(["", *(c.target for c in costs)], rows), *textwrap.wrap(proof, 118)]
 
 

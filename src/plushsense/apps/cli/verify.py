@@ -15,14 +15,16 @@ _SAMPLES = 100_000
 
 
 def add(parser: argparse.ArgumentParser) -> None:
+    from plushsense.deploy.targets import TARGETS
+
     parser.add_argument("export", metavar="OUT", help="export folder, as plushsense export leaves it")
     parser.add_argument(
         "--target",
         metavar="NAME",
         action="append",
         default=[],
-        help="host, xtensa, cortex-m4 or riscv32; several with commas (default: all whose compilers and emulators "
-        "are installed here)",
+        help=f"{', '.join(TARGETS)}; several with commas (default: all whose compilers and emulators are installed "
+        "here)",
     )
     parser.add_argument(
         "--dataset", metavar="DS", help="also stream these recordings through the C; nothing of them is kept"

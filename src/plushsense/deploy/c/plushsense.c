@@ -66,12 +66,12 @@ static uint32_t half(uint32_t shift)
  * 32 bits: then it is divided by hand, a byte of the distance at a time (`rest` stays below 2^8 by + 2^8 into). */
 static uint32_t part_of(uint32_t distance, uint32_t into, uint32_t by, uint32_t add, uint32_t narrow)
 {
-    uint32_t quotient = 0, rest = 0, byte;
+    uint32_t quotient = 0, rest = 0, place;
 
     if (distance <= narrow)
         return (distance * into + add) / by;
-    for (byte = 4; byte-- > 0;) {
-        rest = (rest << 8) + ((distance >> (8 * byte)) & 0xffu) * into;
+    for (place = 4; place > 0; place--, distance <<= 8) {
+        rest = (rest << 8) + (distance >> 24) * into;
         quotient = (quotient << 8) + rest / by;
         rest %= by;
     }
@@ -109,7 +109,7 @@ static uint32_t checksum(const uint8_t *bytes, uint32_t n) /* CRC-32, as zip and
 {
     uint32_t sum = UINT32_MAX, bit;
 
-    while (n-- > 0) {
+    for (; n > 0; n--) {
         sum ^= *bytes++;
         for (bit = 0; bit < 8; bit++)
             sum = (sum >> 1) ^ ((sum & 1u) != 0 ? UINT32_C(0xedb88320) : 0u);
@@ -799,7 +799,7 @@ uint32_t plush_push(plush_toy *toy, uint32_t ms, const int32_t *values)
         return push_sample(toy, ms);
     }
     between = (ms - toy->last_ms) * toy->units_per_ms;
-    while (between != 0 && toy->due <= between) {
+    while (toy->due <= between) { /* never for an equal stamp: a sample at the last frame's time is already made */
         interpolate(toy, toy->due, between);
         due += push_sample(toy, toy->last_ms + toy->due / toy->units_per_ms);
         toy->due += toy->period;

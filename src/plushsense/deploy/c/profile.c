@@ -5,7 +5,7 @@
  *     PLUSH_STAGES  takes plushsense.c in, so that each stage can be called by itself
  *
  * EVEN and JITTERED hold rows of 32-bit numbers, milliseconds and the measured channels: the same readings at even
- * times, and with the jitter of a real toy and a long gap at the end. What is written are rows of 32-bit numbers.
+ * times, and somewhat early or late with a long gap at the end. What is written are rows of 32-bit numbers.
  */
 /* In angle brackets: those of the export, not the ones beside this file. */
 #ifdef PLUSH_STAGES
@@ -83,6 +83,13 @@ static void count_steps(const int32_t *row, const int32_t *end)
     put(END_OF_ROWS);
 }
 
+static uint32_t stack_of_asking(void)
+{
+    target_stack_paint();
+    plush_memory_bytes(plush_model, PLUSH_MODEL_BYTES);
+    return target_stack_used();
+}
+
 static uint32_t stack_of_beginning(void)
 {
     target_stack_paint();
@@ -110,6 +117,7 @@ int main(void)
     put(sizeof toy);
     put(plush_memory_bytes(plush_model, PLUSH_MODEL_BYTES));
     put(took);
+    put(stack_of_asking());
     put(stack_of_beginning());
     put(stack_of_pushing(rows(JITTERED), rows(JITTERED_end)));
     begin();

@@ -23,7 +23,7 @@ from plushsense.deploy.convert.as_tflite import to_integer_tflite, to_tflite
 from plushsense.deploy.convert.facts import Converted, Job, Made
 from plushsense.models.bundle import Bundle
 
-__all__ = ["CONVERTERS", "Converted", "Format", "convert"]
+__all__ = ["CONVERTERS", "Converted", "Format", "check_format", "convert"]
 
 
 @dataclass(frozen=True)
@@ -48,6 +48,12 @@ CONVERTERS: dict[str, Format] = {
 }
 
 
+def check_format(name: str) -> None:
+    """Refuse a format that there is not: ConfigError with those that there are."""
+    if name not in CONVERTERS:
+        raise ConfigError(f"Unknown format '{name}': accepted are {', '.join(CONVERTERS)}.{nearest(name, CONVERTERS)}")
+
+
 def convert(
     bundle: Bundle,
     path: str | Path,
@@ -66,10 +72,7 @@ def convert(
         ArchError, BadInput: for a network that the format cannot hold.
         BundleError: when the result does not give the network's answers; for int8, a bundle without calibration.
     """
-    if format_name not in CONVERTERS:
-        raise ConfigError(
-            f"Unknown format '{format_name}': accepted are {', '.join(CONVERTERS)}.{nearest(format_name, CONVERTERS)}"
-        )
+    check_format(format_name)
     made = CONVERTERS[format_name].write(Job.of(bundle, windows))
     path = Path(path)
     part = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.part")

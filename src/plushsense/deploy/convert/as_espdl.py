@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from plushsense.core.errors import BundleError
 from plushsense.core.extras import need
 from plushsense.deploy.convert.facts import LOGITS, Floats, Job, Made, compare, describe
-from plushsense.deploy.quantize import Ranges, calibrate, refuse_undeployable
+from plushsense.deploy.quantize import Ranges, refuse_undeployable
 from plushsense.models.arch import NORM_EPSILON
 from plushsense.models.bundle import Bundle
 
@@ -31,30 +31,31 @@ HEAD_BYTES = 16
 _MOST = 128  # windows: esp-ppq simulates a few dozen a second
 
 
-def folded(bundle: Bundle, tops: tuple[NDArray[np.float64], ...]) -> list[tuple[Floats, Floats]]:
-    """(weights, bias) of each convolution and of the dense layer, normalisation folded away, each filter made to
-    reach about 1 at its top (F,): one scale then serves all filters of a layer."""
+def folded(bundle: Bundle) -> list[tuple[Floats, Floats]]:
+    """(weights, bias) of each convolution and of the dense layer, normalisation folded into the layer after it.
+
+    Filters keep their own sizes: made even by their ranges they agreed less with the floats on the S3.
+    """
     w = {n: v.astype(np.float64) for n, v in bundle.weights.items()}
     parts = []
     unit, start = np.ones(bundle.arch.channels), np.zeros(bundle.arch.channels)
-    for i, top in enumerate(tops):
-        top = np.maximum(top, 1e-6)
+    for i in range(len(bundle.arch.layers)):
         bias = w[f"conv{i}.bias"] + np.einsum("fck,c->f", w[f"conv{i}.weight"], start)
-        weight = w[f"conv{i}.weight"] * unit[:, None] / top[:, None, None]
-        parts.append((weight.astype(np.float32), (bias / top).astype(np.float32)))
+        weight = w[f"conv{i}.weight"] * unit[:, None]
+        parts.append((weight.astype(np.float32), bias.astype(np.float32)))
         gain = w[f"norm{i}.gain"] / np.sqrt(w[f"norm{i}.var"] + NORM_EPSILON)
-        unit, start = gain * top, w[f"norm{i}.shift"] - w[f"norm{i}.mean"] * gain
+        unit, start = gain, w[f"norm{i}.shift"] - w[f"norm{i}.mean"] * gain
     dense = w["dense.weight"]
     parts.append(((dense * unit).astype(np.float32), (w["dense.bias"] + dense @ start).astype(np.float32)))
     return parts
 
 
-def plain_model(bundle: Bundle, tops: tuple[NDArray[np.float64], ...]) -> Any:
+def plain_model(bundle: Bundle) -> Any:
     """The folded network as an ONNX model for esp-ppq: only Conv, Relu, GlobalAveragePool, Flatten and Gemm."""
     onnx, arch = need("onnx", "espdl"), bundle.arch
     make, real = onnx.helper.make_node, onnx.TensorProto.FLOAT
     nodes, constants, z = [], [], SCALED
-    *convolutions, dense = folded(bundle, tops)
+    *convolutions, dense = folded(bundle)
     for i, (layer, (w, b)) in enumerate(zip(arch.layers, convolutions, strict=True)):
         constants += [onnx.numpy_helper.from_array(w, f"w{i}"), onnx.numpy_helper.from_array(b, f"b{i}")]
         nodes += [
@@ -100,10 +101,10 @@ def to_espdl(job: Job, target: str = "esp32s3") -> Made:
     job = job.thinned(_MOST)
     scaled = bundle.scaler.apply(job.windows)
     some = scaled[: job.given or None]
-    ranges = Ranges.from_dict(bundle.calibration) if bundle.calibration else calibrate(bundle.network(), some)
-    if not job.given:
+    if not job.given and bundle.calibration:
+        ranges = Ranges.from_dict(bundle.calibration)
         some = np.clip(some, ranges.low[:, None], ranges.high[:, None]).astype(np.float32)
-    model = plain_model(bundle, ranges.tops)
+    model = plain_model(bundle)
     facts = describe(bundle) | {"input": f"'{SCALED}': (value - offset) * scale a channel, (1, C, span)"}
     facts |= {k: json.dumps(v) for k, v in bundle.scaler.to_dict().items()}
     data, found = _quantized(bundle, model, some, scaled, target, facts)

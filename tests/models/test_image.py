@@ -1,0 +1,167 @@
+"""The image that the toy reads: its bytes, read back by hand, and what a toy could not hold."""
+
+from __future__ import annotations
+
+import dataclasses
+import struct
+import sys
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from integers import any_network, models, plain_model
+from plushsense.core.errors import BundleError
+from plushsense.core.gestures import Gesture, GestureSet
+from plushsense.core.signal import Channel, CsvFormat, Derived, Layout
+from plushsense.models.arch import Arch, ConvLayer
+from plushsense.models.image import AFFECT_CODES, IntegerModel, grouped, memory_bytes
+
+
+class Reader:
+    """Bytes one after the other."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data, self.at = data, 0
+
+    def take(self, form: str) -> tuple[Any, ...]:
+        found = struct.unpack_from("<" + form, self.data, self.at)
+        self.at += struct.calcsize("<" + form)
+        return found
+
+    def text(self) -> str:
+        end = self.data.index(0, self.at)
+        found, self.at = self.data[self.at : end].decode(), end + 1
+        return found
+
+
+@settings(max_examples=40, deadline=None)
+@given(models(longest=300))
+def test_read_back(model: IntegerModel) -> None:
+    """By the table of the module's docstring, and by nothing else."""
+    image = model.to_bytes()
+    network, layout, arch = model.network, model.layout, model.network.arch
+    magic, version, zero, length, crc = struct.unpack_from("<4sHHII", image)
+    assert (magic, version, zero, length, crc) == (b"PLSH", 1, 0, len(image), zlib.crc32(image[16:]))
+    r = Reader(image[16:])
+    head = r.take("BBBBHHIIIIHH")
+    assert head[:4] == (len(arch.layers), len(layout.channels), arch.channels, arch.classes)
+    assert head[4:7] == (arch.step, arch.pooled // arch.step, arch.span)
+    period, gap, units, smoothing, zero = head[7:]
+    assert period * 1000 == layout.period_us * units
+    assert gap == layout.gap_ms * units
+    assert (smoothing, zero) == (model.smoothing, 0)
+    for channel in layout.channels:
+        assert r.take("ii") == (channel.valid_min, channel.valid_max)
+    derived = {d.name: d.of for d in layout.derived}
+    for i, name in enumerate(layout.inputs):
+        kind, n = r.take("BB")
+        parts = r.take(f"{n}B")
+        assert kind == (name in derived)
+        assert [layout.channels[p].name for p in parts] == list(derived.get(name, (name,)))
+        scale = network.inputs
+        assert r.take("iiHBB") == tuple(
+            int(column[i]) for column in (scale.offset, scale.bias, scale.multiplier, scale.before, scale.after)
+        )
+    for layer, read, part in zip(arch.layers, arch.inputs, network.layers, strict=True):
+        assert r.take("HHHH") == (layer.kernel, layer.dilation, read, layer.filters)
+        for f in range(layer.filters):
+            s = part.scale
+            assert r.take("iHBB") == tuple(int(c[f]) for c in (part.bias, s.multiplier, s.before, s.after))
+        for group in range(0, layer.filters, 4):
+            for tap in range(layer.kernel):
+                for channel in range(0, read, 4):
+                    for f in range(group, group + 4):
+                        for c in range(channel, channel + 4):
+                            inside = f < layer.filters and c < read
+                            assert r.take("B")[0] - 128 == (part.weights[f, c, tap] if inside else 0)
+    for k in range(arch.classes):
+        s = network.dense.scale
+        assert r.take("iHBB") == tuple(int(c[k]) for c in (network.dense.bias, s.multiplier, s.before, s.after))
+    for row in network.dense.weights:
+        assert [v - 128 for v in r.take(f"{len(row)}B")] == row.tolist()
+    for gesture in model.gestures.gestures:
+        assert r.take("B") == (AFFECT_CODES[gesture.affect],)
+        assert r.text() == gesture.label
+    assert r.text() == arch.title
+    assert r.at == len(r.data)
+
+
+def test_weights_of_every_size_fit_a_byte() -> None:
+    weights = np.arange(-128, 128, dtype=np.int8).reshape(4, 4, 16)
+    assert sorted(grouped(weights).ravel().tolist()) == list(range(256))
+
+
+def test_memory_of_the_papers_network() -> None:
+    """Issue 5 allows 6 KB, with the 304 bytes of a plush_toy."""
+    axes = tuple(Channel(a, "raw", "motion", valid_min=-40_000, valid_max=40_000) for a in "xyz")
+    touch = tuple(Channel(f"c{i}", "raw", "touch") for i in range(10))
+    names = tuple(c.name for c in (*touch, *axes))
+    layout = Layout(
+        "plush",
+        "Plush",
+        100.0,
+        (*touch, *axes),
+        ("device_ms", *names),
+        (Derived("m", "magnitude", ("x", "y", "z")),),
+        (*names[:10], "m"),
+        CsvFormat(("device_ms",), ("device_ms",), ","),
+    )
+    arch = Arch.parse("14d1_39d2_41d4", (8, 12, 16))
+    gestures = GestureSet("18", tuple(Gesture(f"g{i}") for i in range(18)))
+    model = IntegerModel(any_network(arch, layout, np.random.default_rng(1)), layout, gestures, 5000)
+    assert memory_bytes(model) == 4740
+    rings = 14 * 12 + 77 * 8 + 161 * 12
+    assert memory_bytes(model) > rings + 2 * 16 * 50
+    assert arch.state_bytes_int8 < memory_bytes(model)
+
+
+def other(model: IntegerModel, **changes: Any) -> IntegerModel:
+    return dataclasses.replace(model, **changes)
+
+
+def test_what_a_toy_cannot_hold() -> None:
+    model = plain_model()
+    layout, gestures = model.layout, model.gestures.gestures
+    for gap_ms in (0, -5, (1 << 22) + 1):
+        with pytest.raises(BundleError, match="accepts 1 to 4194304 ms"):
+            other(model, layout=dataclasses.replace(layout, gap_ms=gap_ms))
+    odd = dataclasses.replace(layout, rate_hz=104.0)  # a period of 9615 us: 200 units a ms
+    other(model, layout=dataclasses.replace(odd, gap_ms=20971)).to_bytes()
+    with pytest.raises(BundleError, match="at 104 Hz the toy accepts 1 to 20971 ms"):
+        other(model, layout=dataclasses.replace(odd, gap_ms=20972))
+    for smoothing in (0, -1, 32769):
+        with pytest.raises(BundleError, match="accepted are 1 to 32768"):
+            other(model, smoothing=smoothing)
+    for label in ("a\0b", "half of \ud800"):
+        wrong = GestureSet("wrong", (Gesture(label), *gestures[1:]))
+        with pytest.raises(BundleError, match="rename it"):
+            other(model, gestures=wrong)
+    with pytest.raises(BundleError, match="2 gestures"):
+        other(model, gestures=GestureSet("few", gestures[:2]))
+
+
+def made(layers: tuple[ConvLayer, ...], **settings_: Any) -> IntegerModel:
+    plain = plain_model()
+    arch = Arch(layers, channels=2, **({"classes": 3, "step": 1, "pool": 1} | settings_))
+    gestures = GestureSet("many", tuple(Gesture(f"g{i}") for i in range(arch.classes)))
+    return IntegerModel(any_network(arch, plain.layout, np.random.default_rng(1)), plain.layout, gestures, 1)
+
+
+def test_counts_that_do_not_fit_their_bits() -> None:
+    made((ConvLayer(17, 4095, 1),)).to_bytes()  # 65521 samples
+    with pytest.raises(BundleError, match="Layer 1 of 17d4096 1 remembers 65537 samples"):
+        made((ConvLayer(17, 4096, 1),))
+    made((ConvLayer(2, 1, 1),), pool=65535).to_bytes()
+    with pytest.raises(BundleError, match="pools 65536 steps"):
+        made((ConvLayer(2, 1, 1),), pool=65536)
+    made((ConvLayer(2, 1, 1),), classes=255).to_bytes()
+    with pytest.raises(BundleError, match="256 gestures: in the toy"):
+        made((ConvLayer(2, 1, 1),), classes=256)
+    # As many filters as an architecture may have.
+    made((ConvLayer(1, 1, 4096), ConvLayer(1, 1, 1))).to_bytes()
