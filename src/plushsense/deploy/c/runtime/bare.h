@@ -10,6 +10,9 @@ void machine_exit(int status);
 void machine_begin(void);                          /* starts whatever counts */
 uint32_t machine_ticks(void);                      /* of that */
 
+/* Of a machine that leaves the first two to semihosting.c: */
+uint32_t semihosting(uint32_t operation, const void *block);
+
 /* Every TICKS_PER ticks are INSTRUCTIONS_PER instructions: the emulator runs on a clock of its own (-icount). */
 #if defined(__XTENSA__)
 #define TICKS_PER 32u       /* 25 ns each, an instruction takes 32 ns */
