@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +11,9 @@ from numpy.typing import NDArray
 from plushsense.core.errors import ArchError
 from plushsense.core.gestures import GestureSet, load_gestures
 from plushsense.core.signal import Layout, load_layout
-from plushsense.deploy.quantize import calibrate, quantize, refuse_undeployable
+from plushsense.deploy.quantize import calibrate, folded, quantize, refuse_undeployable
 from plushsense.models import fixed
-from plushsense.models.arch import NORM_EPSILON, Arch
+from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.models.image import IntegerModel
 from plushsense.models.reference import Network, random_weights
@@ -128,13 +127,13 @@ def _filled(
     model = IntegerModel(quantize(arch, weights, scaler, ranges), layout, gestures, smoothing)
     windows = scaler.apply(np.stack([x[end - length : end].T for end in ends]))
     stream = Network(arch, weights).forward(scaler.apply(spans[CALIBRATED:]))
-    folded = fold(arch, weights)
-    apart = np.abs(forward(arch, folded, scaler.apply(spans[CALIBRATED:][:4]), padded=False) - stream[:4]).max()
+    plain = fold(arch, weights)
+    apart = np.abs(forward(arch, plain, scaler.apply(spans[CALIBRATED:][:4]), padded=False) - stream[:4]).max()
     if apart > 1e-3 * np.abs(stream).max():
         raise ArchError(f"Folding the normalisation of {arch.title} changed its answers by {apart:.2g}: a fault here.")
-    answers = forward(arch, folded, windows[CALIBRATED:], padded=form == "window")
+    answers = forward(arch, plain, windows[CALIBRATED:], padded=form == "window")
     return Case(
-        arch, model, form, folded, frames, windows[:CALIBRATED], windows[CALIBRATED:], at[CALIBRATED:], stream, answers
+        arch, model, form, plain, frames, windows[:CALIBRATED], windows[CALIBRATED:], at[CALIBRATED:], stream, answers
     )  # fmt: skip
 
 
@@ -163,21 +162,15 @@ def made_up_frames(layout: Layout, scaler: Scaler | None, n: int, seed: int) -> 
 
 
 def fold(arch: Arch, weights: dict[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float32]]:
-    """The network without normalisation: each one moved into the layer that reads it. ``w0 (F, C, K)``, ``b0`` …"""
-    gain, shift = np.ones(arch.channels), np.zeros(arch.channels)
-    folded: dict[str, Any] = {}
-    for i in range(len(arch.layers)):
-        w = weights[f"conv{i}.weight"].astype(np.float64)
-        folded[f"w{i}"] = w * gain[:, None]
-        folded[f"b{i}"] = weights[f"conv{i}.bias"] + np.einsum("fck,c->f", w, shift)
-        gain = weights[f"norm{i}.gain"] / np.sqrt(weights[f"norm{i}.var"].astype(np.float64) + NORM_EPSILON)
-        shift = weights[f"norm{i}.shift"] - weights[f"norm{i}.mean"] * gain
-    w = weights["dense.weight"].astype(np.float64)
-    folded["dense_w"], folded["dense_b"] = w * gain, weights["dense.bias"] + w @ shift
-    return {name: np.ascontiguousarray(values, dtype=np.float32) for name, values in folded.items()}
+    """The network without normalisation: ``w0 (F, C, K)``, ``b0`` … ``dense_w``, ``dense_b``."""
+    *layers, (dense_w, dense_b) = folded(arch, weights)
+    found = {"dense_w": dense_w, "dense_b": dense_b}
+    for i, (w, b) in enumerate(layers):
+        found |= {f"w{i}": w, f"b{i}": b}
+    return {name: np.ascontiguousarray(values, dtype=np.float32) for name, values in found.items()}
 
 
-def forward(arch: Arch, folded: dict[str, NDArray[np.float32]], x: NDArray[np.float32], *, padded: bool) -> Floats:
+def forward(arch: Arch, plain: dict[str, NDArray[np.float32]], x: NDArray[np.float32], *, padded: bool) -> Floats:
     """The float answer (N, K) to windows (N, C, T); ``padded`` puts zeros before each layer's first sample."""
     z = x.astype(np.float64)
     for i, layer in enumerate(arch.layers):
@@ -185,6 +178,6 @@ def forward(arch: Arch, folded: dict[str, NDArray[np.float32]], x: NDArray[np.fl
             z = np.pad(z, ((0, 0), (0, 0), (layer.reach, 0)))
         length = z.shape[2] - layer.reach
         taps = [z[:, :, k * layer.dilation : k * layer.dilation + length] for k in range(layer.kernel)]
-        z = sum(np.einsum("fc,nct->nft", folded[f"w{i}"][:, :, k], tap) for k, tap in enumerate(taps))
-        z = np.maximum(z + folded[f"b{i}"][:, None], 0.0)
-    return z.mean(axis=2) @ folded["dense_w"].T + folded["dense_b"]
+        z = sum(np.einsum("fc,nct->nft", plain[f"w{i}"][:, :, k], tap) for k, tap in enumerate(taps))
+        z = np.maximum(z + plain[f"b{i}"][:, None], 0.0)
+    return z.mean(axis=2) @ plain["dense_w"].T + plain["dense_b"]

@@ -104,6 +104,22 @@ def refuse_undeployable(arch: Arch) -> None:
         )
 
 
+def folded(arch: Arch, weights: Mapping[str, NDArray[Any]]) -> list[tuple[Floats, Floats]]:
+    """The float network without normalisation: weights (F, C, K) and biases (F,) of each layer, then of the dense one.
+
+    Each normalisation is moved into the layer that reads it; exact for networks that can be deployed.
+    """
+    gain, shift = np.ones(arch.channels), np.zeros(arch.channels)
+    parts = []
+    for i in range(len(arch.layers)):
+        w = weights[f"conv{i}.weight"].astype(np.float64)
+        parts.append((w * gain[:, None], weights[f"conv{i}.bias"] + w.sum(axis=2) @ shift))
+        gain = weights[f"norm{i}.gain"] / np.sqrt(weights[f"norm{i}.var"].astype(np.float64) + NORM_EPSILON)
+        shift = weights[f"norm{i}.shift"] - weights[f"norm{i}.mean"] * gain
+    w = weights["dense.weight"].astype(np.float64)
+    return [*parts, (w * gain, weights["dense.bias"] + w @ shift)]
+
+
 def quantize(arch: Arch, weights: Mapping[str, NDArray[Any]], scaler: Scaler, ranges: Ranges) -> IntegerNetwork:
     """The network in whole numbers.
 

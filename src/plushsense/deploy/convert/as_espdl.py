@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from plushsense.core.errors import BundleError
 from plushsense.core.extras import need
 from plushsense.deploy.convert.facts import LOGITS, Floats, Job, Made, compare, describe
-from plushsense.deploy.quantize import Ranges, refuse_undeployable
-from plushsense.models.arch import NORM_EPSILON
+from plushsense.deploy.quantize import Ranges, folded, refuse_undeployable
 from plushsense.models.bundle import Bundle
 
 SCALED = "scaled"
@@ -31,31 +30,13 @@ HEAD_BYTES = 16
 _MOST = 128  # windows: esp-ppq simulates a few dozen a second
 
 
-def folded(bundle: Bundle) -> list[tuple[Floats, Floats]]:
-    """(weights, bias) of each convolution and of the dense layer, normalisation folded into the layer after it.
-
-    Filters keep their own sizes: made even by their ranges they agreed less with the floats on the S3.
-    """
-    w = {n: v.astype(np.float64) for n, v in bundle.weights.items()}
-    parts = []
-    unit, start = np.ones(bundle.arch.channels), np.zeros(bundle.arch.channels)
-    for i in range(len(bundle.arch.layers)):
-        bias = w[f"conv{i}.bias"] + np.einsum("fck,c->f", w[f"conv{i}.weight"], start)
-        weight = w[f"conv{i}.weight"] * unit[:, None]
-        parts.append((weight.astype(np.float32), bias.astype(np.float32)))
-        gain = w[f"norm{i}.gain"] / np.sqrt(w[f"norm{i}.var"] + NORM_EPSILON)
-        unit, start = gain, w[f"norm{i}.shift"] - w[f"norm{i}.mean"] * gain
-    dense = w["dense.weight"]
-    parts.append(((dense * unit).astype(np.float32), (w["dense.bias"] + dense @ start).astype(np.float32)))
-    return parts
-
-
 def plain_model(bundle: Bundle) -> Any:
     """The folded network as an ONNX model for esp-ppq: only Conv, Relu, GlobalAveragePool, Flatten and Gemm."""
     onnx, arch = need("onnx", "espdl"), bundle.arch
     make, real = onnx.helper.make_node, onnx.TensorProto.FLOAT
     nodes, constants, z = [], [], SCALED
-    *convolutions, dense = folded(bundle)
+    # Filters keep their own sizes: made even by their ranges they agreed less with the floats on the S3.
+    *convolutions, dense = [tuple(v.astype(np.float32) for v in part) for part in folded(arch, bundle.weights)]
     for i, (layer, (w, b)) in enumerate(zip(arch.layers, convolutions, strict=True)):
         constants += [onnx.numpy_helper.from_array(w, f"w{i}"), onnx.numpy_helper.from_array(b, f"b{i}")]
         nodes += [
