@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import plushsense.deploy
+from plushsense.models.image import IntegerModel
 
 C_FOLDER = Path(plushsense.deploy.__file__).parent / "c"
 TOY_C = Path(__file__).parent / "deploy" / "toy.c"
@@ -43,6 +44,11 @@ class Seat:
 
     def __del__(self) -> None:
         self.library.seat_free(self.toy)
+
+
+def seat(library: Any, model: IntegerModel, **how: int) -> Seat:
+    """A toy with this model."""
+    return Seat(library, model.to_bytes(), len(model.layout.channels), model.network.arch.classes, **how)
 
 
 def compiled(cc: str, folder: Path, *flags: str) -> Any:

@@ -30,7 +30,7 @@ def export(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_json_and_text(export: Path, capsys: pytest.CaptureFixture[str], target_here: Callable[[str], str]) -> None:
-    wanted = ["--target", target_here("xtensa"), "--target", target_here("cortex-m4")]
+    wanted = ["--target", f"{target_here('xtensa')}, {target_here('cortex-m4')}"]
     assert main(["profile", str(export), *wanted, "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert {"instructions_per_step", "macs_per_step", "flash_bytes", "ram_bytes", "estimated_ms"} <= set(told)
@@ -42,7 +42,7 @@ def test_json_and_text(export: Path, capsys: pytest.CaptureFixture[str], target_
     assert esp32["verdict"].startswith("fits 20 Hz: yes")
     assert "nothing ran on a real chip" in told["said"]
 
-    assert main(["profile", str(export), *wanted]) == 0
+    assert main(["profile", str(export), "--target", "xtensa"]) == 0
     text = capsys.readouterr().out
     count = told["instructions_per_step"]["xtensa"]
     assert f"{count:,}" in text

@@ -1,4 +1,4 @@
-"""The C library as tests drive it: compiled once a session."""
+"""The C library as tests drive it, compiled once a session; an export, and recordings for it."""
 
 from __future__ import annotations
 
@@ -9,12 +9,21 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from c_toy import C_FOLDER, TOY_C, compiled
 from conftest import missing
+from exports import LAYOUTS, bundle_of, exported
+from plushsense.dataset.importers import import_recordings
+from plushsense.deploy.calibration import integer_model
+from plushsense.deploy.emit import emit
+from plushsense.deploy.package import package
+from plushsense.models.image import IntegerModel
+
+Packages = dict[str, tuple[Path, IntegerModel]]
 
 
 @pytest.fixture(scope="session")
@@ -83,3 +92,53 @@ def sanitized(c_compiler: str, tmp_path_factory: pytest.TempPathFactory) -> list
         )
         programs.append(out)
     return programs
+
+
+@pytest.fixture(scope="session")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small export, not to be changed."""
+    return exported(tmp_path_factory.mktemp("small") / "out", bundle_of("plush-15"))
+
+
+@pytest.fixture
+def own(small: Path, tmp_path: Path) -> Path:
+    """A copy to spoil."""
+    return Path(shutil.copytree(small, tmp_path / "out"))
+
+
+@pytest.fixture(scope="session")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two people: one with a session stream whose clock starts again, one with two recordings only."""
+    raw = tmp_path_factory.mktemp("raw")
+    rng = np.random.default_rng(0)
+
+    def rows(n: int, first: int, ms: int) -> list[str]:
+        walk = np.rint(np.cumsum(rng.normal(size=(n, 3)), axis=0) * 100).astype(int)
+        return [f"{first + 10 * i}, {ms + 10 * i}, {x}, {y}, {z}" for i, (x, y, z) in enumerate(walk.tolist())]
+
+    (raw / "A").mkdir()
+    (raw / "B").mkdir()
+    header = "Processing Timestamp (ms), Arduino Timestamp (ms), X, Y, Z"
+    stream = [*rows(300, 1_600_000_000_000, 5000), *rows(300, 1_600_000_010_000, 40)]
+    (raw / "A" / "fulldatastream.csv").write_text("\n".join(stream) + "\n")
+    (raw / "A" / "Tap_1600000000100_80.csv").write_text("\n".join([header, *stream[10:90]]) + "\n")
+    for n, label in ((120, "Tap"), (60, "Hit")):
+        lines = [header, *rows(n, 1_600_000_100_000 + n, 4_294_967_000 if n == 60 else 70)]
+        (raw / "B" / f"{label}_{1_600_000_100_000 + n}_{n}.csv").write_text("\n".join(lines) + "\n")
+    out = tmp_path_factory.mktemp("recorded") / "ds"
+    import_recordings(raw, out, layout="accel-3")
+    return out
+
+
+@pytest.fixture(scope="session")
+def packages(tmp_path_factory: pytest.TempPathFactory, needs: Callable[..., None]) -> Packages:
+    """An export with packages for each built-in layout, and its model; what builds them is here."""
+    needs("gcc", "g++", "clang", "clang++")
+    found = {}
+    for layout in LAYOUTS:
+        bundle = bundle_of(layout, window=60)
+        model = integer_model(bundle)
+        out = tmp_path_factory.mktemp("packages") / layout
+        emit(model, bundle, out, extras=[package])
+        found[layout] = out, model
+    return found

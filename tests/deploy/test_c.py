@@ -4,35 +4,26 @@ from __future__ import annotations
 
 import ctypes
 import math
-import re
 import struct
-import subprocess
 import sys
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 TESTS = Path(__file__).parents[1]
 sys.path.insert(0, str(TESTS))
 
-from c_toy import C_FOLDER, Seat  # noqa: E402
+from c_toy import seat  # noqa: E402
 from integers import INT32, any_frames, edged_model, models, plain_model  # noqa: E402
-from plushsense.deploy.emit import TOY_BYTES  # noqa: E402
 from plushsense.deploy.golden import answers_of  # noqa: E402
 from plushsense.models.fixed import exponentials  # noqa: E402
-from plushsense.models.image import IntegerModel, head, memory_bytes  # noqa: E402
+from plushsense.models.image import IntegerModel, memory_bytes  # noqa: E402
 
-OK, NOT_A_MODEL, OTHER_VERSION, DAMAGED, TOO_SMALL = range(5)
-
-
-def seat(library: Any, model: IntegerModel, **how: int) -> Any:
-    return Seat(library, model.to_bytes(), len(model.layout.channels), model.network.arch.classes, **how)
+OK, TOO_SMALL = 0, 4
 
 
 # ---- The same answers ------------------------------------------------------------------------------------------------
@@ -205,187 +196,6 @@ def test_the_clocks_wrap_is_a_restart(c_library: Any) -> None:
     assert warming[-1] == 1
 
 
-# ---- Bytes that are no model -----------------------------------------------------------------------------------------
-
-
-def test_what_plush_begin_says(c_library: Any) -> None:
-    image = plain_model().to_bytes()
-
-    def status(bytes_: bytes) -> int:
-        said = Seat(c_library, bytes_, 4, 3).status
-        assert (c_library.plush_memory_bytes(bytes_, len(bytes_)) == 0) == (said != OK)
-        return int(said)
-
-    assert status(image) == OK
-    assert status(image + b"what stands behind it in flash") == OK
-    assert status(b"") == status(image[:15]) == status(b"PLSX" + image[4:]) == NOT_A_MODEL
-    assert status(image[:4] + b"\2" + image[5:]) == OTHER_VERSION
-    for cut in (16, 17, len(image) // 2, len(image) - 1):
-        assert status(image[:cut]) == DAMAGED
-    for at in range(16, len(image), 7):
-        flipped = bytearray(image)
-        flipped[at] ^= 1 << at % 8
-        assert status(bytes(flipped)) == DAMAGED
-    assert c_library.plush_memory_bytes(None, 100) == 0
-
-
-def sealed(body: bytes) -> bytes:
-    """With a good checksum, as somebody who writes an image by hand would have it."""
-    return head(body) + body
-
-
-def test_a_good_checksum_makes_no_model(c_library: Any) -> None:
-    """Every count that could lead a reader astray is refused, one at a time."""
-    body = plain_model().to_bytes()[16:]
-    layer = 28 + 4 * 8 + (2 + 1 + 12) + (2 + 3 + 12)
-    assert struct.unpack_from("<HHHH", body, layer) == (5, 2, 2, 6)
-    changes = {
-        "no layers": (0, b"\0"),
-        "five layers": (0, b"\5"),
-        "no channels": (1, b"\0"),
-        "more channels than follow": (1, b"\xff"),
-        "no inputs": (2, b"\0"),
-        "other inputs than the first layer reads": (2, b"\1"),
-        "no classes": (3, b"\0"),
-        "more classes than follow": (3, b"\xff"),
-        "step 0": (4, struct.pack("<H", 0)),
-        "step 258": (4, struct.pack("<H", 258)),
-        "no blocks": (6, struct.pack("<H", 0)),
-        "another span": (8, struct.pack("<I", 38)),
-        "period 0": (12, struct.pack("<I", 0)),
-        "a giant period": (12, struct.pack("<I", 1 << 31)),
-        "gap 0": (16, struct.pack("<I", 0)),
-        "a gap beyond 32 bits of interpolation": (16, struct.pack("<I", (1 << 22) + 1)),
-        "no units a ms": (20, struct.pack("<I", 0)),
-        "no smoothing": (24, struct.pack("<H", 0)),
-        "smoothing above 1": (24, struct.pack("<H", 32769)),
-        "an unknown input": (60, b"\2"),
-        "a channel of two parts": (60, b"\0\2"),
-        "an input of no part": (61, b"\0"),
-        "a part that is no channel": (62, b"\4"),
-        "bias": (67, struct.pack("<i", 1 << 30)),
-        "input multiplier": (71, struct.pack("<H", 32768)),
-        "input shift before": (73, b"\x11"),
-        "input shift after": (74, b"\x1f"),
-        "kernel 0": (layer, struct.pack("<H", 0)),
-        "kernel beyond the end": (layer, struct.pack("<H", 65535)),
-        "dilation 0": (layer + 2, struct.pack("<H", 0)),
-        "more rows than 16 bits": (layer + 2, struct.pack("<H", 65535)),
-        "reads other channels": (layer + 4, struct.pack("<H", 3)),
-        "no filters": (layer + 6, struct.pack("<H", 0)),
-        "more filters than follow": (layer + 6, struct.pack("<H", 65535)),
-        "multiplier": (layer + 12, struct.pack("<H", 32768)),
-        "shift before": (layer + 14, b"\x1f"),
-        "shift after": (layer + 15, b"\xff"),
-        "an unknown affect": (body.index(b"gesture 1") - 1, b"\4"),
-        "a label without end": (body.index(b"gesture 2") + 9, b"x"),
-        "a title without end": (len(body) - 1, b"x"),
-    }
-    for what, (at, change) in changes.items():
-        wrong = sealed(body[:at] + change + body[at + len(change) :])
-        assert Seat(c_library, wrong, 4, 3).status == DAMAGED, what
-    assert Seat(c_library, sealed(body + b"\0"), 4, 3).status == DAMAGED
-    assert Seat(c_library, sealed(body), 4, 3).status == OK
-
-
-def test_a_toy_that_never_began_is_quiet(c_library: Any) -> None:
-    frames = any_frames(plain_model(), 1, 50)
-    for toy in (seat(c_library, plain_model(), too_few=1), Seat(c_library, b"no model at all.....", 4, 3)):
-        assert toy.status != OK
-        assert len(toy.push(frames)) == 0
-        c_library.seat_restart(toy.toy)
-        assert len(toy.push(frames)) == 0
-        assert c_library.seat_name(toy.toy, 0) == c_library.seat_title(toy.toy) == b""
-    never = (ctypes.c_uint64 * 128)()
-    assert c_library.plush_push(never, 5, (ctypes.c_int32 * 255)()) == 0
-
-
-def cases(*all_cases: tuple[bytes, np.ndarray]) -> bytes:
-    return b"".join(
-        struct.pack("<I", len(image))
-        + image
-        + struct.pack("<II", *frames.shape)
-        + (frames & 0xFFFFFFFF).astype("<u4").tobytes()
-        for image, frames in all_cases
-    )
-
-
-def run(program: Path, file: Path) -> bytes:
-    done = subprocess.run([program, file], capture_output=True, timeout=300)
-    assert done.returncode == 0, done.stderr.decode()[-3000:]
-    return done.stdout
-
-
-def test_sanitizers_find_nothing_in_good_models(sanitized: list[Path], tmp_path: Path) -> None:
-    """Extremes on purpose: full ranges, garbage, gaps, saturated scales."""
-    found = []
-
-    @settings(max_examples=25, deadline=None, database=None)
-    @given(models(longest=200), st.integers(0, 1 << 30))
-    def collect(model: IntegerModel, seed: int) -> None:
-        frames = any_frames(model, seed, 450)
-        wanted = answers_of(model, frames)
-        found.append((model.to_bytes(), frames, struct.pack("<iI", 0, len(wanted)) + wanted.astype("<i4").tobytes()))
-
-    collect()
-    (tmp_path / "cases").write_bytes(cases(*((image, frames) for image, frames, _ in found)))
-    for program in sanitized:
-        assert run(program, tmp_path / "cases") == b"".join(wanted for *_, wanted in found)
-
-
-def test_sanitizers_find_nothing_in_any_bytes(sanitized: list[Path], tmp_path: Path) -> None:
-    """Thousands of damaged images, most with a good checksum: refused or used, never read or written out of bounds."""
-    rng = np.random.default_rng(5)
-    frames = any_frames(plain_model(), 3, 60)
-    wide = np.zeros((60, 40), dtype=np.int64)
-    wide[:, : frames.shape[1]] = frames
-    base = plain_model().to_bytes()[16:]
-    layers = [m.start() for m in re.finditer(re.escape(struct.pack("<HHHH", 4, 3, 6, 5)), base)] + [92]
-    spots = [
-        *range(28),
-        *range(60, 92),
-        *(at + i for at in layers for i in range(24)),
-        *range(len(base) - 60, len(base)),
-    ]
-    edges = [0, 1, 2, 3, 4, 5, 127, 128, 254, 255]
-    images = []
-    for _ in range(4000):
-        body = bytearray(base)
-        for _ in range(int(rng.integers(1, 4))):
-            at = int(rng.choice(spots)) if rng.random() < 0.8 else int(rng.integers(len(body)))
-            body[at] = int(rng.choice(edges)) if rng.random() < 0.6 else int(rng.integers(256))
-        kind = rng.random()
-        if kind < 0.1:
-            body = body[: int(rng.integers(len(body)))]
-        elif kind < 0.15:
-            body += bytes(rng.integers(0, 256, 40, dtype=np.uint8))
-        # A span that fits the changed layers lets more of them through.
-        if kind > 0.4 and len(body) > 130:
-            rows = 0
-            at = 92
-            kernel, dilation = struct.unpack_from("<HH", body, at)
-            rows += (kernel - 1) * dilation
-            rows += sum((struct.unpack_from("<H", base, at)[0] - 1) * 3 for at in layers[:1])
-            step, blocks = struct.unpack_from("<HH", body, 4)
-            struct.pack_into("<I", body, 8, (rows + step * blocks) & 0xFFFFFFFF)
-        image = sealed(bytes(body))
-        if rng.random() < 0.05:
-            image = bytes(rng.integers(0, 256, int(rng.integers(0, 60)), dtype=np.uint8))
-        images.append((image, wide))
-    (tmp_path / "cases").write_bytes(cases(*images))
-    said = {run(program, tmp_path / "cases") for program in sanitized}
-    assert len(said) == 1
-    out, at, statuses = said.pop(), 0, []
-    for image, _ in images:
-        status, made = struct.unpack_from("<iI", out, at)
-        statuses.append(status)
-        classes = image[16 + 3] if status == OK else 0
-        at += 8 + 4 * made * (9 + 2 * classes)
-    assert at == len(out)
-    assert statuses.count(OK) > 200
-    assert statuses.count(DAMAGED) > 1000
-
-
 # ---- The small functions ---------------------------------------------------------------------------------------------
 
 int32s = st.integers(*INT32) | st.sampled_from((*INT32, 0, -1, 1))
@@ -438,138 +248,3 @@ def test_exponentials(c_library: Any) -> None:
 def test_the_checksum_is_the_one_of_zip(c_library: Any) -> None:
     image = plain_model().to_bytes()
     assert struct.unpack_from("<I", image, 12)[0] == zlib.crc32(image[16:])
-
-
-# ---- The source ------------------------------------------------------------------------------------------------------
-
-STRICT = ["-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wsign-conversion", "-Wshadow", "-Werror"]
-
-
-@pytest.mark.parametrize("cc", ["gcc", "clang"])
-@pytest.mark.parametrize("plain", [[], ["-DPLUSH_PLAIN"]], ids=["fast", "plain"])
-def test_no_warning(cc: str, plain: list[str], needs: Callable[..., None], tmp_path: Path) -> None:
-    needs(cc)
-    for language, levels in ((["-std=c99"], ("-O0", "-O2", "-O3")), (["-x", "c++", "-std=c++11"], ("-O2",))):
-        for level in levels:
-            subprocess.run(
-                [cc, *language, level, *STRICT, *plain, "-c", C_FOLDER / "plushsense.c", "-o", tmp_path / "o"],
-                check=True,
-            )
-
-
-@pytest.mark.parametrize("cc", ["gcc", "clang"])
-def test_it_needs_three_functions_of_the_c_library(cc: str, needs: Callable[..., None], tmp_path: Path) -> None:
-    """No floats, no heap; on a core of 32 bits no 64-bit division either."""
-    needs(cc, "nm")
-    allowed = {"memcpy", "memset", "memcmp"}
-    for flags in (["-O2"], ["-O0"], ["-O2", "-DPLUSH_PLAIN"]):
-        subprocess.run(
-            [cc, "-std=c99", *flags, "-fno-pic", "-fno-stack-protector", "-c", C_FOLDER / "plushsense.c"],
-            check=True,
-            cwd=tmp_path,
-        )
-        listed = subprocess.run(["nm", "-u", "plushsense.o"], check=True, cwd=tmp_path, capture_output=True, text=True)
-        assert set(re.findall(r"U (\w+)", listed.stdout)) <= allowed
-
-
-@pytest.mark.parametrize(
-    ("cc", "flags", "also"),
-    [
-        ("arm-none-eabi-gcc", ["-mcpu=cortex-m4", "-mthumb"], set()),
-        ("arm-none-eabi-gcc", ["-mcpu=cortex-m0", "-mthumb"], {"__aeabi_uidiv", "__aeabi_uidivmod", "__aeabi_llsl"}),
-        ("xtensa-lx106-elf-gcc", ["-mlongcalls"], {"__udivsi3", "__umodsi3"}),
-    ],
-    ids=["cortex-m4", "cortex-m0", "lx106"],
-)
-def test_small_cores_need_no_long_division(
-    cc: str, flags: list[str], also: set[str], needs: Callable[..., None], tmp_path: Path
-) -> None:
-    needs(cc)
-    (tmp_path / "string.h").write_text(
-        "#include <stddef.h>\nvoid *memcpy(void *, const void *, size_t);\nvoid *memset(void *, int, size_t);\n"
-        "int memcmp(const void *, const void *, size_t);\n"
-    )
-    common = [cc, *flags, "-std=c99", "-ffreestanding", f"-I{tmp_path}", f"-I{C_FOLDER}"]
-    for level in ("-O2", "-Os"):
-        subprocess.run(
-            [*common, level, *STRICT, "-c", C_FOLDER / "plushsense.c", "-o", "plushsense.o"], check=True, cwd=tmp_path
-        )
-        listed = subprocess.run(
-            [cc.replace("gcc", "nm"), "-u", "plushsense.o"], check=True, cwd=tmp_path, capture_output=True, text=True
-        )
-        assert set(re.findall(r"U (\w+)", listed.stdout)) <= {"memcpy", "memset", "memcmp"} | also
-    # No data that would have to be set up, and the size of a toy that exports speak of.
-    sizes = subprocess.run(
-        [cc.replace("gcc", "size"), "plushsense.o"], check=True, cwd=tmp_path, capture_output=True, text=True
-    )
-    assert sizes.stdout.splitlines()[1].split()[1:3] == ["0", "0"]
-    (tmp_path / "size.c").write_text(
-        f'#include "plushsense.h"\nchar fits[sizeof(plush_toy) <= {TOY_BYTES} ? 1 : -1];\n'
-    )
-    subprocess.run([*common, "-c", "size.c"], check=True, cwd=tmp_path)
-
-
-def test_cppcheck(needs: Callable[..., None]) -> None:
-    needs("cppcheck")
-    for define in ("-UPLUSH_PLAIN", "-DPLUSH_PLAIN"):
-        done = subprocess.run(
-            [
-                "cppcheck",
-                "--enable=all",
-                "--inconclusive",
-                "--std=c99",
-                "--error-exitcode=1",
-                "--quiet",
-                define,
-                # What a library is: its functions are called by others; its headers are the system's.
-                "--suppress=unusedFunction",
-                "--suppress=missingIncludeSystem",
-                "--suppress=unusedStructMember",
-                C_FOLDER / "plushsense.c",
-            ],
-            capture_output=True,
-            text=True,
-        )
-        assert (done.returncode, done.stderr) == (0, "")
-
-
-def test_clang_tidy(needs: Callable[..., None]) -> None:
-    needs("clang-tidy")
-    checks = [
-        "-*",
-        "bugprone-*",
-        "cert-*",
-        "clang-analyzer-*",
-        "misc-*",
-        "performance-*",
-        "portability-*",
-        "readability-*",
-        # Short names of arithmetic, the numbers of a format, braces of one-line bodies: a matter of taste.
-        "-readability-identifier-length",
-        "-readability-magic-numbers",
-        "-readability-braces-around-statements",
-        "-readability-isolate-declaration",
-        "-readability-function-cognitive-complexity",
-        "-readability-uppercase-literal-suffix",
-        "-bugprone-easily-swappable-parameters",
-        # Every size and offset fits 32 bits: read_model() sees to that.
-        "-bugprone-implicit-widening-of-multiplication-result",
-        # Asks for memcpy_s, which nobody has.
-        "-clang-analyzer-security.insecureAPI.DeprecatedOrUnsafeBufferHandling",
-    ]
-    for define in ("-UPLUSH_PLAIN", "-DPLUSH_PLAIN"):
-        done = subprocess.run(
-            [
-                "clang-tidy",
-                "--quiet",
-                "--warnings-as-errors=*",
-                f"--checks={','.join(checks)}",
-                C_FOLDER / "plushsense.c",
-                "--",
-                "-std=c99",
-                define,
-            ],
-            capture_output=True,
-            text=True,
-        )
-        assert done.returncode == 0, done.stdout[-4000:]

@@ -4,39 +4,30 @@ from __future__ import annotations
 
 import json
 import subprocess
+import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from exports import bundle_of
 from plushsense.core.errors import BadInput
-from plushsense.core.gestures import GestureSet, load_gestures
-from plushsense.core.signal import load_layout
+from plushsense.core.gestures import GestureSet
+from plushsense.deploy.calibration import integer_model
 from plushsense.deploy.emit import TOY_BYTES, c_names, emit, read_facts, without_people
 from plushsense.deploy.golden import answers_of, golden_frames, read_golden
-from plushsense.deploy.quantize import calibrate, quantize
-from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.models.image import IntegerModel, memory_bytes
-from plushsense.models.reference import Network, random_weights
-from plushsense.windows.features import Scaler
 
 PEOPLE = {"subjects": ["Anna", "P02"], "validation_subjects": ["Bo"], "scores": {"said": "people: Bo, P02", "f1": 0.5}}
 
 
-def made(layout: str = "accel-3", symbol: str = "9d1_5d2", filters: str = "4,6") -> tuple[IntegerModel, Bundle]:
-    read = load_layout(layout)
-    gestures = load_gestures("plush-18")
-    arch = Arch.parse(symbol, filters, channels=read.n_inputs, classes=len(gestures), window=60)
-    weights = random_weights(arch, 3)
-    rng = np.random.default_rng(1)
-    windows = np.rint(np.cumsum(rng.normal(size=(12, arch.channels, arch.span + 40)), axis=2) * 60 + 900).astype(
-        np.int64
-    )
-    scaler = Scaler.fit(windows)
-    network = quantize(arch, weights, scaler, calibrate(Network(arch, weights), scaler.apply(windows)))
-    bundle = Bundle(arch, weights, read, scaler, gestures, provenance=dict(PEOPLE))
-    return IntegerModel(network, read, gestures, 5000), bundle
+def made(layout: str = "accel-3") -> tuple[IntegerModel, Bundle]:
+    bundle = replace(bundle_of(layout, window=60), provenance=dict(PEOPLE))
+    return integer_model(bundle), bundle
 
 
 def test_the_folder(tmp_path: Path) -> None:

@@ -1,0 +1,149 @@
+"""The C as a text: no warning, no finding, nothing needed but three functions."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+TESTS = Path(__file__).parents[1]
+sys.path.insert(0, str(TESTS))
+
+from c_toy import C_FOLDER  # noqa: E402
+from plushsense.deploy.emit import TOY_BYTES  # noqa: E402
+
+STRICT = ["-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wsign-conversion", "-Wshadow", "-Werror"]
+
+
+@pytest.mark.parametrize("cc", ["gcc", "clang"])
+@pytest.mark.parametrize("plain", [[], ["-DPLUSH_PLAIN"]], ids=["fast", "plain"])
+def test_no_warning(cc: str, plain: list[str], needs: Callable[..., None], tmp_path: Path) -> None:
+    needs(cc)
+    for language, levels in ((["-std=c99"], ("-O0", "-O2", "-O3")), (["-x", "c++", "-std=c++11"], ("-O2",))):
+        for level in levels:
+            subprocess.run(
+                [cc, *language, level, *STRICT, *plain, "-c", C_FOLDER / "plushsense.c", "-o", tmp_path / "o"],
+                check=True,
+            )
+
+
+@pytest.mark.parametrize("cc", ["gcc", "clang"])
+def test_it_needs_three_functions_of_the_c_library(cc: str, needs: Callable[..., None], tmp_path: Path) -> None:
+    """No floats, no heap; on a core of 32 bits no 64-bit division either."""
+    needs(cc, "nm")
+    allowed = {"memcpy", "memset", "memcmp"}
+    for flags in (["-O2"], ["-O0"], ["-O2", "-DPLUSH_PLAIN"]):
+        subprocess.run(
+            [cc, "-std=c99", *flags, "-fno-pic", "-fno-stack-protector", "-c", C_FOLDER / "plushsense.c"],
+            check=True,
+            cwd=tmp_path,
+        )
+        listed = subprocess.run(["nm", "-u", "plushsense.o"], check=True, cwd=tmp_path, capture_output=True, text=True)
+        assert set(re.findall(r"U (\w+)", listed.stdout)) <= allowed
+
+
+@pytest.mark.parametrize(
+    ("cc", "flags", "also"),
+    [
+        ("arm-none-eabi-gcc", ["-mcpu=cortex-m4", "-mthumb"], set()),
+        ("arm-none-eabi-gcc", ["-mcpu=cortex-m0", "-mthumb"], {"__aeabi_uidiv", "__aeabi_uidivmod", "__aeabi_llsl"}),
+        ("xtensa-lx106-elf-gcc", ["-mlongcalls"], {"__udivsi3", "__umodsi3"}),
+    ],
+    ids=["cortex-m4", "cortex-m0", "lx106"],
+)
+def test_small_cores_need_no_long_division(
+    cc: str, flags: list[str], also: set[str], needs: Callable[..., None], tmp_path: Path
+) -> None:
+    needs(cc)
+    (tmp_path / "string.h").write_text(
+        "#include <stddef.h>\nvoid *memcpy(void *, const void *, size_t);\nvoid *memset(void *, int, size_t);\n"
+        "int memcmp(const void *, const void *, size_t);\n"
+    )
+    common = [cc, *flags, "-std=c99", "-ffreestanding", f"-I{tmp_path}", f"-I{C_FOLDER}"]
+    for level in ("-O2", "-Os"):
+        subprocess.run(
+            [*common, level, *STRICT, "-c", C_FOLDER / "plushsense.c", "-o", "plushsense.o"], check=True, cwd=tmp_path
+        )
+        listed = subprocess.run(
+            [cc.replace("gcc", "nm"), "-u", "plushsense.o"], check=True, cwd=tmp_path, capture_output=True, text=True
+        )
+        assert set(re.findall(r"U (\w+)", listed.stdout)) <= {"memcpy", "memset", "memcmp"} | also
+    # No data that would have to be set up, and the size of a toy that exports speak of.
+    sizes = subprocess.run(
+        [cc.replace("gcc", "size"), "plushsense.o"], check=True, cwd=tmp_path, capture_output=True, text=True
+    )
+    assert sizes.stdout.splitlines()[1].split()[1:3] == ["0", "0"]
+    (tmp_path / "size.c").write_text(
+        f'#include "plushsense.h"\nchar fits[sizeof(plush_toy) <= {TOY_BYTES} ? 1 : -1];\n'
+    )
+    subprocess.run([*common, "-c", "size.c"], check=True, cwd=tmp_path)
+
+
+def test_cppcheck(needs: Callable[..., None]) -> None:
+    needs("cppcheck")
+    for define in ("-UPLUSH_PLAIN", "-DPLUSH_PLAIN"):
+        done = subprocess.run(
+            [
+                "cppcheck",
+                "--enable=all",
+                "--inconclusive",
+                "--std=c99",
+                "--error-exitcode=1",
+                "--quiet",
+                define,
+                # What a library is: its functions are called by others; its headers are the system's.
+                "--suppress=unusedFunction",
+                "--suppress=missingIncludeSystem",
+                "--suppress=unusedStructMember",
+                C_FOLDER / "plushsense.c",
+            ],
+            capture_output=True,
+            text=True,
+        )
+        assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_clang_tidy(needs: Callable[..., None]) -> None:
+    needs("clang-tidy")
+    checks = [
+        "-*",
+        "bugprone-*",
+        "cert-*",
+        "clang-analyzer-*",
+        "misc-*",
+        "performance-*",
+        "portability-*",
+        "readability-*",
+        # Short names of arithmetic, the numbers of a format, braces of one-line bodies: a matter of taste.
+        "-readability-identifier-length",
+        "-readability-magic-numbers",
+        "-readability-braces-around-statements",
+        "-readability-isolate-declaration",
+        "-readability-function-cognitive-complexity",
+        "-readability-uppercase-literal-suffix",
+        "-bugprone-easily-swappable-parameters",
+        # Every size and offset fits 32 bits: read_model() sees to that.
+        "-bugprone-implicit-widening-of-multiplication-result",
+        # Asks for memcpy_s, which nobody has.
+        "-clang-analyzer-security.insecureAPI.DeprecatedOrUnsafeBufferHandling",
+    ]
+    for define in ("-UPLUSH_PLAIN", "-DPLUSH_PLAIN"):
+        done = subprocess.run(
+            [
+                "clang-tidy",
+                "--quiet",
+                "--warnings-as-errors=*",
+                f"--checks={','.join(checks)}",
+                C_FOLDER / "plushsense.c",
+                "--",
+                "-std=c99",
+                define,
+            ],
+            capture_output=True,
+            text=True,
+        )
+        assert done.returncode == 0, done.stdout[-4000:]

@@ -1,0 +1,235 @@
+"""The example firmware: it compiles without a warning, and feels on a made-up board what the computer reads of it."""
+
+from __future__ import annotations
+
+import ctypes
+import re
+import shutil
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from exports import LAYOUTS, bundle_of
+from plushsense.core.errors import LayoutError
+from plushsense.core.gestures import Gesture, GestureSet
+from plushsense.core.signal import Channel, load_layout
+from plushsense.deploy.calibration import integer_model
+from plushsense.deploy.emit import emit
+from plushsense.deploy.firmware import TEMPLATES, firmware
+from plushsense.deploy.golden import answers_of, read_golden
+from plushsense.deploy.package import ARDUINO, SKETCH, changed_copies, copies, package
+from plushsense.devices.wire import LineParser, format_line
+from plushsense.models.image import IntegerModel
+from plushsense.windows.features import Scaler
+from virtual_boards import BUILDS, SECONDS, WARNINGS, arduino, frames_of, idf, play, run, told
+
+Packages = dict[str, tuple[Path, IntegerModel]]
+
+
+@pytest.mark.parametrize("board", BUILDS)
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_the_example_feels_what_the_computer_reads_of_its_lines(
+    packages: Packages, tmp_path: Path, board: str, layout: str
+) -> None:
+    """Two runs on the same clock: one sends its frames, one its answers; PlushSense answers the frames alike."""
+    out, model = packages[layout]
+    sent, pins = play(BUILDS[board](out, tmp_path))
+    frames = frames_of(model.layout, sent)
+    between = np.diff(frames[:, 0])
+    assert len(frames) == pytest.approx(100 * SECONDS, rel=0.05)
+    # It held the tick on average, was late twice, and made up for nothing.
+    assert np.median(between) == 10
+    assert abs((frames[400, 0] - frames[0, 0]) - 4000) <= 2
+    assert sorted(between)[-2] == pytest.approx(40, abs=12) and sorted(between)[-1] == pytest.approx(255, abs=12)
+    answers = answers_of(model, frames)
+    assert set(answers[:, 3]) == {0, 1}
+    assert answers[-1, 7] == 1  # the restart of the long gap
+    assert answers[-1, 8] == 0  # made-up readings are within the valid ranges
+    lines = play(BUILDS[board](out, tmp_path, "TELL_ANSWERS=1"))[0].decode().splitlines()
+    # A wire without a clock tells the time since its first frame.
+    since = int(lines[0].split()[0]) - int(answers[0, 1]) if layout == "plush-14" else 0
+    assert lines == told(answers, model, -since)
+    assert len({pin for _, pin, _ in pins}) >= 3  # the eyes moved
+
+
+@pytest.mark.parametrize("board", BUILDS)
+@pytest.mark.parametrize("layout", ["accel-3", "plush-15", "phone-6"])
+def test_lines_that_come_in_are_felt_like_golden_frames(
+    packages: Packages, tmp_path: Path, board: str, layout: str
+) -> None:
+    out, model = packages[layout]
+    frames, answers = read_golden(out / "golden", model.layout.n_channels, len(model.gestures))
+    frames, answers = frames[:900], answers[answers[:, 0] < 900]
+    before = np.concatenate([[0], np.maximum(0, np.diff(frames[:, 0]))])
+    lines = [format_line(model.layout, row[1:], row[0], d) for row, d in zip(frames.tolist(), before, strict=True)]
+    (tmp_path / "lines").write_bytes(b"7 8 half a line\n" + b"".join(lines))
+    sent, _ = play(BUILDS[board](out, tmp_path, "SENSORS=2"), tmp_path / "lines", seconds=40)
+    assert sent.decode().splitlines() == told(answers, model)
+
+
+@pytest.mark.parametrize("board", BUILDS)
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_wired_sensors_arrive_in_their_channels(packages: Packages, tmp_path: Path, board: str, layout: str) -> None:
+    out, model = packages[layout]
+    frame = frames_of(model.layout, play(BUILDS[board](out, tmp_path, "SENSORS=1"), seconds=1)[0])[-1, 1:].tolist()
+    # The made-up sensor's bytes are its registers' numbers: acceleration from 0x3B, rotation from 0x43.
+    axes = [(0x3B + 2 * i) * 256 + 0x3C + 2 * i for i in (0, 1, 2, 4, 5, 6)]
+    if layout.startswith("plush"):
+        gpio = {"arduino": [400, 1500, 1300, 1400, 2700, 3300, 3200, 200, 1200]}
+        pads = gpio.get(board, [1000, 1030, 1040, 1060, 1070, 1080, 1090, 1020, 1050])
+        assert frame == [sum(pads), *pads, *axes[:3]]
+    elif layout == "accel-3":
+        assert frame == axes[:3]
+    else:
+        g, degree = 9.80665e3 / 16384, np.pi / 180 * 1000 / 131
+        assert frame == pytest.approx([a * g for a in axes[:3]] + [a * degree for a in axes[3:]], rel=1e-3)
+    silent = play(BUILDS[board](out, tmp_path, "SENSORS=1", "NO_MOTION"), seconds=1)[0]
+    parser = LineParser(model.layout)
+    assert all(f.garbage for f in parser.feed(silent)) and parser.counters.garbage > 50
+
+
+@pytest.mark.parametrize("board", BUILDS)
+def test_a_damaged_model_blinks_and_the_lines_go_on(packages: Packages, tmp_path: Path, board: str) -> None:
+    out, model = packages["accel-3"]
+    shutil.copytree(out, tmp_path / "out")
+    for copy in (c for c, original in copies().items() if original == "plush_model.c"):
+        text = (tmp_path / "out" / copy).read_text(encoding="utf-8")
+        at = text.rindex("128,")
+        (tmp_path / "out" / copy).write_text(text[:at] + "129," + text[at + 4 :], encoding="utf-8")
+    assert len(changed_copies(tmp_path / "out")) == 2
+    sent, pins = play(BUILDS[board](tmp_path / "out", tmp_path), seconds=3)
+    assert len(frames_of(model.layout, sent)) > 280
+    red = [value for _, pin, value in pins if value == 255]
+    assert len(red) == 3  # PLUSH_DAMAGED is 3; the pattern lasts 10 × 0.3 s
+    assert len({pin for _, pin, value in pins if value}) == 1
+
+
+def test_clang_agrees(packages: Packages, tmp_path: Path) -> None:
+    for layout in LAYOUTS:
+        (tmp_path / layout).mkdir()
+        for sensors in (0, 1, 2):
+            arduino(packages[layout][0], tmp_path / layout, f"SENSORS={sensors}", compiler=("clang", "clang++"))
+            idf(packages[layout][0], tmp_path, f"SENSORS={sensors}", compiler="clang")
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        ("xtensa-lx106-elf-gcc", "-mlongcalls", "-ffreestanding"),
+        ("arm-none-eabi-gcc", "-mcpu=cortex-m4", "-mthumb"),
+    ],
+)
+def test_the_sources_compile_for_the_chip(
+    packages: Packages, needs: Callable[..., None], tmp_path: Path, target: tuple[str, ...]
+) -> None:
+    needs(target[0])
+    # Debian's lx106 compiler comes without a C library: what the sources use of it.
+    (tmp_path / "string.h").write_text(
+        "#include <stddef.h>\nvoid *memcpy(void *, const void *, size_t);\nvoid *memset(void *, int, size_t);\n"
+        "int memcmp(const void *, const void *, size_t);\n"
+    )
+    own = [f"-I{tmp_path}"] if "xtensa" in target[0] else []
+    for layout in LAYOUTS:
+        out = packages[layout][0]
+        for source in [*(out / ARDUINO / "src").glob("*.c"), *(out / SKETCH).glob("*.c")]:
+            words = ["-std=c99", "-Wpedantic", "-Wconversion", *WARNINGS, "-O2", f"-I{out / ARDUINO / 'src'}"]
+            run(*target, *own, *words, "-c", source, "-o", tmp_path / "x.o")
+
+
+def test_noise_is_read_as_the_computer_reads_it(packages: Packages, tmp_path: Path, c_compiler: str) -> None:
+    """Frames broken at random: the toy's reader and the computer's find the same ones."""
+    for layout in ("accel-3", "plush-14"):
+        out, model = packages[layout]
+        source, library = out / ARDUINO / "src" / "plush_wire.c", tmp_path / f"{layout}.so"
+        run(c_compiler, "-shared", "-fPIC", source, "-o", library)
+        wire = ctypes.CDLL(str(library))
+        channels = model.layout.n_channels
+        state, ms, values = ctypes.create_string_buffer(4096), ctypes.c_uint32(), (ctypes.c_int32 * channels)()
+        rng = np.random.default_rng(5)
+        lines = []
+        for k in range(600):
+            row = rng.integers(-3000, 3000, channels)
+            line = bytearray(format_line(model.layout, row.tolist(), 10 * k, int(rng.integers(0, 30))))
+            for _ in range(rng.integers(0, 3)):
+                line[rng.integers(len(line))] = int(rng.choice(list(b" -+.;,\t\r\nx0123456789\xff")))
+            lines.append(bytes(line))
+        noise = b"".join(lines)
+        parser = LineParser(model.layout, joining=True)
+        expected = [(f.device_ms, *f.values) for f in parser.feed(noise)]
+        found = [
+            (ms.value, *values)
+            for c in noise
+            if wire.plush_wire_read(state, ctypes.c_char(c), ctypes.byref(ms), values)
+        ]
+        assert found == expected
+        assert 100 < len(found) < 590
+
+
+def test_a_line_is_as_long_as_promised(packages: Packages, tmp_path: Path, c_compiler: str) -> None:
+    """The longest line fills its room exactly, and is the one that the computer would write."""
+    for layout in LAYOUTS:
+        out, model = packages[layout]
+        src, library = out / ARDUINO / "src", tmp_path / f"{layout}.so"
+        run(c_compiler, "-shared", "-fPIC", src / "plush_wire.c", "-o", library)
+        wire = ctypes.CDLL(str(library))
+        room = int(re.findall(r"PLUSH_WIRE_BYTES (\d+)", (src / "plush_wire.h").read_text())[0])
+        line = ctypes.create_string_buffer(4096)
+        most = 2**32 - 1
+        for values, ms in (([-(2**31)] * model.layout.n_channels, most), ([-7] * model.layout.n_channels, 0)):
+            n = wire.plush_wire_write(line, ms, ms, (ctypes.c_int32 * len(values))(*values))
+            expected = format_line(model.layout, values, ms, ms)
+            assert [float(w) for w in line.value.split()] == [float(w) for w in expected.split()]
+            assert n == len(line.value) <= room - 1
+            if ms:
+                assert n == room - 1
+
+
+def test_names_of_any_kind_become_legal(tmp_path: Path) -> None:
+    """Umlauts, digits first, marks of comments, words of the library itself, and names that clean to the same."""
+    plain = load_layout("accel-3")
+    odd = ("1st Käfer", "x*/y", "X Y \\")
+    channels = tuple(replace(c, name=n) for c, n in zip(plain.channels, odd, strict=True))
+    wire = ("device_ms", *odd)
+    csv = replace(plain.csv, columns=wire, header=wire)
+    layout = replace(plain, name="ö*/ö", channels=channels, wire=wire, inputs=odd, vectors=(odd,), csv=csv)
+    labels = ["OK", "One", "Tracking", "2 hands", "Ä", "Ö", "a-b", "a b.", "A_B 2", "*/ int x;", 'say "hi" ??/']
+    gestures = GestureSet("odd ones", tuple(Gesture(label) for label in labels))
+    bundle = bundle_of(layout, gestures=gestures, window=60)
+    out = emit(integer_model(bundle), bundle, tmp_path / "out", extras=[package]).folder
+    sent, pins = play(arduino(out, tmp_path, "TELL_ANSWERS=1"), seconds=4)
+    assert sent.decode().splitlines()[-1].split(" ", 3)[3] in labels
+    # Nobody told an affect: the eyes have a gesture's own colour, and there is no sound.
+    assert {pin for _, pin, value in pins if value} & {18, 19} and not any(pin == 5 for _, pin, value in pins if value)
+    play(idf(out, tmp_path), seconds=1)
+    assert "Nobody told an affect for 11 of 11" in (out / "README.md").read_text(encoding="utf-8")
+
+
+def test_channels_that_no_pad_measures_are_marked() -> None:
+    plain = load_layout("accel-3")
+    for kinds, said in (
+        ([("capacitive", "count")] * 12, "NO PAD IS LEFT"),
+        ([("heat", "K"), ("acceleration", "count")], "see read_other()"),
+    ):
+        names = tuple(f"c{i}" for i in range(len(kinds)))
+        channels = tuple(Channel(n, unit, kind) for n, (kind, unit) in zip(names, kinds, strict=True))
+        wire = ("device_ms", *names)
+        csv = replace(plain.csv, columns=wire, header=wire)
+        layout = replace(plain, channels=channels, wire=wire, inputs=names, vectors=(), csv=csv)
+        facts = {"title": "t", "classes": 2, "span": 10}
+        files = firmware(layout, Scaler(np.zeros(len(names)), np.ones(len(names))), facts)
+        assert set(files) == set(TEMPLATES)
+        assert said in files["PlushToy.ino"] and said in files["main.c"]
+
+
+def test_a_step_that_no_line_carries_is_refused() -> None:
+    plain = load_layout("accel-3")
+    fine = replace(plain.channels[0], step=1e-12, valid_min=0.0, valid_max=1e-9)
+    layout = replace(plain, channels=(fine, *plain.channels[1:]))
+    with pytest.raises(LayoutError, match="another step"):
+        firmware(layout, Scaler(np.zeros(3), np.ones(3)), {"title": "t", "classes": 2, "span": 10})

@@ -1,0 +1,77 @@
+"""The README of an export: this model's figures, loud about simulations and leaks, its programs compile."""
+
+from __future__ import annotations
+
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from exports import bundle_of
+from plushsense.deploy.calibration import integer_model
+from plushsense.deploy.emit import emit, read_facts
+from plushsense.deploy.package import ARDUINO, package
+from plushsense.models.image import IntegerModel
+from virtual_boards import WARNINGS, run
+
+Packages = dict[str, tuple[Path, IntegerModel]]
+
+
+def test_the_programs_in_the_readme_compile(packages: Packages, tmp_path: Path, c_compiler: str) -> None:
+    out = packages["plush-15"][0]
+    programs = re.findall(r"```c\n(.*?)```", (out / "README.md").read_text(encoding="utf-8"), re.S)
+    assert len(programs) == 2
+    for text in programs:
+        (tmp_path / "x.c").write_text(text)
+        run(c_compiler, "-std=c99", *WARNINGS, f"-I{out}", "-c", tmp_path / "x.c", "-o", tmp_path / "x.o")
+
+
+def with_provenance(tmp_path: Path, **provenance: object) -> str:
+    bundle = replace(bundle_of(window=60), provenance=provenance)
+    emit(integer_model(bundle), bundle, tmp_path / "out", extras=[package])
+    return (tmp_path / "out" / "README.md").read_text(encoding="utf-8")
+
+
+SCORES = {"split": "validation-subjects", "leaky": False, "windows": 321, "accuracy": 0.6789, "macro_f1": 0.5432}
+
+
+def test_the_readme_tells_this_model(tmp_path: Path) -> None:
+    people = ["Anna", "P02", "none"]  # at rest there is nobody
+    text = with_provenance(tmp_path, dataset="gestures | of 2", scores=SCORES, subjects=people, simulated=False)
+    facts = read_facts(tmp_path / "out")
+    for figure in ("parameters", "macs_per_step", "model_bytes", "memory_bytes", "span"):
+        assert f"{facts[figure]:,}" in text
+    for said in (
+        facts["symbol"],
+        "50 ms",
+        "0.56 s",
+        "0.679",
+        "0.543",
+        "321 windows",
+        "`validation-subjects`",
+        "2 people",
+    ):
+        assert said in text
+    assert "gestures \\| of 2" in text
+    for word in ("SIMULATION", "LEAKY", "Anna", "P02"):
+        assert word not in text
+    order = [text.index(f"| {i} | {c} | `PLUSH_CHANNEL_{c.upper()}` |") for i, c in enumerate("xyz")]
+    assert order == sorted(order)
+    assert "Nobody told an affect" not in text
+
+
+def test_the_figures_of_the_toy_itself_stand_beside_the_floats(tmp_path: Path) -> None:
+    int8 = {"accuracy": 0.6712, "macro_f1": 0.5389, "agreement": 0.98}
+    text = with_provenance(tmp_path, scores=SCORES | {"int8": int8})
+    rows = [row for row in text.splitlines() if row.startswith(("| accuracy", "| macro-F1"))]
+    assert [row.split(" | ")[-1] for row in rows] == ["0.679 |", "0.543 |", "0.671 |", "0.539 |"]
+    assert all("whole numbers" in row for row in rows[2:])
+
+
+def test_simulation_and_leaks_are_told_loudly(tmp_path: Path) -> None:
+    text = with_provenance(tmp_path, dataset="virtual toy", simulated=True, scores=SCORES | {"leaky": True})
+    assert text.splitlines()[2].startswith("> **SIMULATION.**")
+    assert "virtual toy (SIMULATION)" in text and "**LEAKY**" in text
+    assert "SIMULATION" in (tmp_path / "out" / ARDUINO / "library.properties").read_text(encoding="utf-8")
