@@ -9,7 +9,8 @@ answers, not the labels anew, so that a few epochs on the training windows canno
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -54,8 +55,8 @@ def fine_tune(
 ) -> Tuned:
     """Fine-tune trained weights for the ranges of ``calibration``, which stay those of the deployed network.
 
-    Batch, turning, seed and device are those of ``spec``, the rate is the last of its schedule. The same seed gives
-    the same weights.
+    Batch, turning, seed and threads are those of ``spec``, the rate is the last of its schedule; it runs on the CPU.
+    The same seed gives the same weights.
 
     Raises:
         TrainingError: for a network that cannot be deployed, no calibration, or fewer epochs than 1.
@@ -70,7 +71,7 @@ def fine_tune(
     x = torch.from_numpy(scaler.apply(train.x[:, :, train.x.shape[2] - arch.span :]))
     rate = spec.learning_rate_at(spec.epochs)
     history: list[dict[str, Any]] = []
-    with torch.random.fork_rng(devices=[]):
+    with torch.random.fork_rng(devices=[]), _threads(spec.threads):
         teacher = Net(arch)
         teacher.import_weights(weights)
         teacher.eval()
@@ -93,6 +94,16 @@ def fine_tune(
             if progress is not None:
                 progress(epoch, epochs, history[-1] | {"validation_accuracy": None})
     return Tuned(network.export_weights(), history)
+
+
+@contextmanager
+def _threads(wanted: int) -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(wanted)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 class Rounded:
