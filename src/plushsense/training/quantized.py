@@ -55,8 +55,8 @@ def fine_tune(
 ) -> Tuned:
     """Fine-tune trained weights for the ranges of ``calibration``, which stay those of the deployed network.
 
-    Batch, turning, seed and threads are those of ``spec``, the rate is the last of its schedule; it runs on the CPU.
-    The same seed gives the same weights.
+    Batch, turning, seed and threads are those of ``spec``, the rate falls evenly from the last of its schedule to
+    nothing; it runs on the CPU. The same seed gives the same weights.
 
     Raises:
         TrainingError: for a network that cannot be deployed, no calibration, or fewer epochs than 1.
@@ -69,7 +69,7 @@ def fine_tune(
     if epochs < 1:
         raise TrainingError(f"{epochs} epochs of fine-tuning are asked for: accepted are 1 and more.")
     x = torch.from_numpy(scaler.apply(train.x[:, :, train.x.shape[2] - arch.span :]))
-    rate = spec.learning_rate_at(spec.epochs)
+    highest = spec.learning_rate_at(spec.epochs)
     history: list[dict[str, Any]] = []
     with torch.random.fork_rng(devices=[]), _threads(spec.threads):
         teacher = Net(arch)
@@ -78,8 +78,11 @@ def fine_tune(
         network = Rounded(arch, weights, calibration)
         turn = Turn(train.vectors, scaler, spec.turn_deg, torch.device("cpu"))
         random = torch.Generator().manual_seed(spec.seed)
-        adam = torch.optim.Adam(network.parameters, lr=rate)
+        adam = torch.optim.Adam(network.parameters, lr=highest)
         for epoch in range(1, epochs + 1):
+            rate = highest * (1.0 - (epoch - 1) / epochs)
+            for group in adam.param_groups:
+                group["lr"] = rate
             order, total = torch.randperm(len(x), generator=random), 0.0
             for at in slices(len(x), spec.batch):
                 batch = turn(x[order[at]], random)
