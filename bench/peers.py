@@ -14,7 +14,7 @@ computes its window again. They may read the window in whichever form takes fewe
 where the two differ, each answer is checked against the float answer of its own form. Our C reads five frames
 (validity, clock, magnitude, scaling), runs the network, smooths and decides. Times are taken in turn, round by round;
 ratios are of the same round. Instructions are callgrind's, of 2N decisions less those of N; callgrind's processor has
-AVX2 and nothing beyond. All frames and (without `--bundle`) all weights are made up: costs depend on neither.
+AVX2 and nothing beyond. All frames and (without `--bundle`) all weights are made up: costs hardly depend on them.
 """
 
 from __future__ import annotations
@@ -83,6 +83,8 @@ def python_entry(peer: str, python: str, shop: Workshop) -> Entry:
             raise CannotBuild(f"not here: pip install {packages}")
         raise CannotBuild(f"could not be built: {last[:200]}")
     facts = json.loads(made.stdout)
+    if facts.get("outside_xnnpack"):
+        title += f", {len(facts['outside_xnnpack'])} operators outside"
     return Entry(
         title, family, "window", [*command, "run", peer, str(shop.folder)], facts["model_bytes"],
         memory_bytes=facts.get("memory_bytes"), versions=facts["versions"],
@@ -314,7 +316,7 @@ def main() -> int:
     parser.add_argument("--python", default=sys.executable, help="interpreter that has the other runtimes")
     parser.add_argument("--onnx2c", default="onnx2c", help="the program onnx2c")
     parser.add_argument("--cc", default="gcc")
-    parser.add_argument("--only", help=f"of {','.join(PEERS)},onnx2c,plain; none: ours alone")
+    parser.add_argument("--only", help=f"of {','.join(PEERS)},onnx2c,plain; 'none': ours alone")
     parser.add_argument("--rounds", type=int, default=60)
     parser.add_argument("--slice-ms", type=float, default=10.0, help="how long each runs in a round")
     parser.add_argument("--decisions", type=int, default=20, help="to count instructions of; 0: do not count")
@@ -322,9 +324,12 @@ def main() -> int:
     args = parser.parse_args()
     if args.rounds < 1 or args.decisions < 0 or args.slice_ms <= 0:
         parser.error("--rounds is at least 1, --decisions at least 0, --slice-ms above 0")
+    for name in (args.only or "none").split(","):
+        if name not in (*PEERS, "onnx2c", "plain", "none"):
+            parser.error(f"--only names '{name}': known are {', '.join(PEERS)}, onnx2c, plain and none")
     try:
         report = bench(args)
-    except (PlushSenseError, CannotBuild) as refusal:
+    except (PlushSenseError, CannotBuild, Died) as refusal:
         say(f"bench/peers.py: {refusal}")
         return 2
     print(json.dumps(report) if args.json else "\n".join(table(report)))

@@ -99,6 +99,8 @@ def instructions(command: list[str], folder: Path, decisions: int) -> float:
 
 
 def _total(path: Path) -> int:
+    if not path.exists():
+        raise Died("callgrind saw no marks: valgrind's headers (valgrind/callgrind.h) are missing")
     found = re.search(r"^(?:totals|summary): (\d+)", path.read_text(errors="replace"), re.MULTILINE)
     if found is None:
         raise Died(f"callgrind wrote no total into {path.name}")
