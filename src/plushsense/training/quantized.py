@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import TrainingError
 from plushsense.models.arch import NORM_EPSILON, Arch
+from plushsense.models.integer import deployable
 from plushsense.models.net import Net
 from plushsense.training.engine import slices
 from plushsense.training.spec import TrainSpec
@@ -62,7 +63,7 @@ def fine_tune(
     Raises:
         TrainingError: for a network that cannot be deployed, no calibration, or fewer epochs than 1.
     """
-    if arch.padding != "stream" or arch.norm != "batch" or not calibration:
+    if not deployable(arch) or not calibration:
         raise TrainingError(
             f"{arch.title} cannot be deployed, so there is nothing to fine-tune it for: train it with --padding stream "
             "and --norm batch."
