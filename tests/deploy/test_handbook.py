@@ -62,14 +62,6 @@ def test_the_readme_tells_this_model(tmp_path: Path) -> None:
     assert "Nobody told an affect" not in text
 
 
-def test_the_figures_of_the_toy_itself_stand_beside_the_floats(tmp_path: Path) -> None:
-    int8 = {"accuracy": 0.6712, "macro_f1": 0.5389, "agreement": 0.98}
-    text = with_provenance(tmp_path, scores=SCORES | {"int8": int8})
-    rows = [row for row in text.splitlines() if row.startswith(("| accuracy", "| macro-F1"))]
-    assert [row.split(" | ")[-1] for row in rows] == ["0.679 |", "0.543 |", "0.671 |", "0.539 |"]
-    assert all("whole numbers" in row for row in rows[2:])
-
-
 def test_simulation_and_leaks_are_told_loudly(tmp_path: Path) -> None:
     text = with_provenance(tmp_path, dataset="virtual toy", simulated=True, scores=SCORES | {"leaky": True})
     assert text.splitlines()[2].startswith("> **SIMULATION.**")

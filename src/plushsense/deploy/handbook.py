@@ -211,9 +211,6 @@ def _affect_said(facts: Mapping[str, Any]) -> list[str]:
     ]
 
 
-_FIGURES = (("accuracy", "accuracy"), ("macro-F1", "macro_f1"))
-
-
 def _scores(provenance: Mapping[str, Any], simulated: bool) -> list[str]:
     scores = provenance.get("scores")
     if not isinstance(scores, Mapping) or "accuracy" not in scores:
@@ -225,11 +222,8 @@ def _scores(provenance: Mapping[str, Any], simulated: bool) -> list[str]:
         ("data set", _cell(f"{provenance.get('dataset', 'not told')}{' (SIMULATION)' if simulated else ''}")),
         *([("trained on", f"{trained} people")] if trained is not None else []),
         ("scored on", f"{scores.get('windows', 'an unknown number of')} windows, split `{scores.get('split', '?')}`"),
-        *((name, f"{scores[key]:.3f}") for name, key in _FIGURES),
+        *((name, f"{scores[key]:.3f}") for name, key in (("accuracy", "accuracy"), ("macro-F1", "macro_f1"))),
     ]
-    int8 = scores.get("int8")
-    if isinstance(int8, Mapping):
-        rows += [(f"{name}, in whole numbers as in the toy", f"{int8[key]:.3f}") for name, key in _FIGURES]
     said = [*_table(("", ""), rows), ""]
     if leaky:
         said += [
@@ -241,6 +235,6 @@ def _scores(provenance: Mapping[str, Any], simulated: bool) -> list[str]:
         said += ["**SIMULATION**: of the virtual toy; no result.", ""]
     return [
         *said,
-        "One split of one training, in floating point where nothing else is said. For figures over everybody ask",
-        "`plushsense evaluate --int8`.",
+        "One split of one training, in floating point: whole numbers may differ in single answers. For figures over",
+        "everybody ask `plushsense evaluate`.",
     ]
