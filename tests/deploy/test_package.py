@@ -51,9 +51,9 @@ def made(layout: Layout | str = "accel-3", gestures: GestureSet | None = None) -
 
 
 @pytest.fixture(scope="module")
-def exports(tmp_path_factory: pytest.TempPathFactory, installed: Callable[..., None]) -> Exports:
+def exports(tmp_path_factory: pytest.TempPathFactory, needs: Callable[..., None]) -> Exports:
     """An export with packages for each built-in layout; what builds them is here."""
-    installed("gcc", "g++", "clang", "clang++")
+    needs("gcc", "g++", "clang", "clang++")
     found = {}
     for layout in LAYOUTS:
         model, bundle = made(layout)
@@ -217,9 +217,9 @@ def test_clang_agrees(exports: Exports, tmp_path: Path) -> None:
     ],
 )
 def test_the_sources_compile_for_the_chip(
-    exports: Exports, installed: Callable[..., None], tmp_path: Path, target: tuple[str, ...]
+    exports: Exports, needs: Callable[..., None], tmp_path: Path, target: tuple[str, ...]
 ) -> None:
-    installed(target[0])
+    needs(target[0])
     # Debian's lx106 compiler comes without a C library: what the sources use of it.
     (tmp_path / "string.h").write_text(
         "#include <stddef.h>\nvoid *memcpy(void *, const void *, size_t);\nvoid *memset(void *, int, size_t);\n"
@@ -330,6 +330,12 @@ def with_provenance(tmp_path: Path, **provenance: object) -> str:
 
 
 SCORES = {"split": "validation-subjects", "leaky": False, "windows": 321, "accuracy": 0.6789, "macro_f1": 0.5432}
+
+
+def test_the_readme_tells_what_8_bits_cost(tmp_path: Path) -> None:
+    int8 = {"accuracy": 0.671, "macro_f1": 0.541, "agreement": 0.985}
+    text = with_provenance(tmp_path, dataset="gestures", scores=SCORES | {"int8": int8})
+    assert "| accuracy, macro-F1 in 8 bits | 0.671, 0.541 |" in text and "98.5 % of the windows" in text
 
 
 def test_the_readme_tells_this_model(tmp_path: Path) -> None:
