@@ -371,6 +371,15 @@ def test_an_export_that_is_none(
     assert code == 2 and said == {} and words in err and err.count("\n") == 1
 
 
+def test_a_model_of_another_layout_among_the_files_is_named(own: Path, tmp_path: Path) -> None:
+    other = exported(tmp_path / "other", bundle_of("9d1_5d2", "4,6", load_layout("accel-3")))
+    for name in ("plush_model.h", "plush_model.c"):
+        shutil.copyfile(other / name, own / name)
+    done = verify(Export(own), ["host"], only=plainly)
+    assert not done.passed
+    assert "other channels or classes than model.plush" in str(done.first)
+
+
 def test_golden_vectors_of_another_model_or_damaged(
     own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -6,7 +6,7 @@ import argparse
 import textwrap
 from typing import TYPE_CHECKING
 
-from plushsense.apps.cli.output import bar, emit, say, table
+from plushsense.apps.cli.output import bar, emit, listed, say, table
 
 if TYPE_CHECKING:
     from plushsense.deploy.counting import Cost
@@ -29,7 +29,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME",
-        help="xtensa, cortex-m4, cortex-m0, riscv32, or host for sizes only; may be given again (default: every "
+        help="xtensa, cortex-m4, cortex-m0, riscv32, or host for sizes only; several with commas (default: every "
         "emulator that is installed here)",
     )
     parser.add_argument(
@@ -40,7 +40,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from plushsense.deploy.profile import profile
 
-    found = profile(args.out, args.target, optimise=f"-{args.optimise}", progress=bar("targets"))
+    found = profile(args.out, listed(args.target), optimise=f"-{args.optimise}", progress=bar("targets"))
     for name, packages in found.missing.items():
         say(f"left out: {name}, which needs Debian's {' '.join(packages)}")
     emit(args, found.to_dict(), shown(found))
@@ -147,7 +147,10 @@ def _times(found: Profile) -> list[str]:
     return [
         "",
         *textwrap.wrap(f"Time of a step, ESTIMATED. {SAID}", 118),
-        table(["chip", "MHz", "counted on", "cycles each", "ms a step", f"fits {1000 / found.step_ms:g} Hz"], rows),
+        table(
+            ["chip", "MHz", "counted on", "cycles an instruction", "ms a step", f"fits {1000 / found.step_ms:g} Hz"],
+            rows,
+        ),
         "Where the bounds come from:",
         *(line for words, names in why.items() for line in _wrapped(f"{', '.join(names)}: {words}.")),
     ]
