@@ -262,6 +262,52 @@ def test_noise_is_read_as_the_computer_reads_it(exports: Exports, tmp_path: Path
         assert 100 < len(found) < 590
 
 
+def test_decimals_of_any_length_are_read_as_the_computer_reads_them(
+    exports: Exports, tmp_path: Path, c_compiler: str
+) -> None:
+    """A phone writes what its floats hold: 16 places, at times a power of ten, and the time since 1970."""
+    out, model = exports["phone-6"]
+    library = tmp_path / "phone-6.so"
+    run(c_compiler, "-shared", "-fPIC", out / ARDUINO / "src" / "plush_wire.c", "-o", library)
+    wire = ctypes.CDLL(str(library))
+    channels = model.layout.n_channels
+    rng = np.random.default_rng(6)
+    lines = [b""]
+    for k in range(400):
+        values = rng.normal(size=channels) * 10.0 ** rng.integers(-7, 3, channels)
+        words = [f"{v:.{rng.integers(5, 19)}f}" if rng.random() < 0.7 else f"{v:.7E}" for v in values]
+        lines.append(" ".join([*words, str(1657533977813 + 10 * k)]).encode())
+    odd = (
+        "1e",
+        "e1",
+        "1e+",
+        "1e123",
+        "1e1.5",
+        "1.5.5",
+        "1e-99",
+        "5e17",
+        "-1E1",
+        "1.e1",
+        ".5e-1",
+        "9e9",
+        "1e1e1",
+        "0e99",
+    )
+    lines += [f"{word} 0 0 0 0 0 {k}".encode() for k, word in enumerate(odd)]
+    lines += [f"0 0 0 0 0 0 {ms}".encode() for ms in ("7.0", "7e0", 2**32 - 1, 2**32, 2**53, 2**53 + 1, "9" * 30)]
+    talk = b"\n".join([*lines, b""])
+    state, ms, values = ctypes.create_string_buffer(4096), ctypes.c_uint32(), (ctypes.c_int32 * channels)()
+    expected = [
+        (f.device_ms % 2**32, *(max(-(2**31), min(v, 2**31 - 1)) for v in f.values))
+        for f in LineParser(model.layout, joining=True).feed(talk)
+    ]
+    found = [
+        (ms.value, *values) for c in talk if wire.plush_wire_read(state, ctypes.c_char(c), ctypes.byref(ms), values)
+    ]
+    assert found == expected
+    assert len(found) > 400
+
+
 def test_a_line_is_as_long_as_promised(exports: Exports, tmp_path: Path, c_compiler: str) -> None:
     """The longest line fills its room exactly, and is the one that the computer would write."""
     for layout in LAYOUTS:

@@ -82,7 +82,6 @@ def firmware(layout: Layout, scaler: Scaler, facts: Mapping[str, Any]) -> dict[s
         "line_bytes": str(_line_bytes(layout, written)),
         "n_fields": str(len(layout.wire)),
         "number": "uint64_t" if decimal else "uint32_t",
-        "most": "UINT64_C(1000000000000000000)" if decimal else "UINT32_MAX",
         "order": "\n".join(f"    {names.get(field, field.upper())}," for field in layout.wire),
         "written": _rows(layout, [f"{times}, {decimals}" for times, decimals in written]),
         "usual": _rows(layout, [f"{usual}, {spread}" for usual, spread in _usual(layout, scaler)]),

@@ -45,11 +45,6 @@ def utf8() -> None:
             stream.reconfigure(encoding="utf-8", errors=errors)
 
 
-def listed(given: Iterable[str]) -> list[str]:
-    """The words of an option that may be given again, and takes several with commas."""
-    return [word.strip() for each in given for word in each.split(",") if word.strip()]
-
-
 def say(text: str) -> None:
     """A message for the person, on standard error; a terminal that was closed is no failure."""
     with contextlib.suppress(OSError):

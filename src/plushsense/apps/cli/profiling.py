@@ -6,7 +6,8 @@ import argparse
 import textwrap
 from typing import TYPE_CHECKING
 
-from plushsense.apps.cli.output import bar, emit, listed, say, table
+from plushsense.apps.cli.output import bar, emit, say, table
+from plushsense.apps.cli.settings import listed
 
 if TYPE_CHECKING:
     from plushsense.deploy.counting import Cost
@@ -40,7 +41,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from plushsense.deploy.profile import profile
 
-    found = profile(args.out, listed(args.target), optimise=f"-{args.optimise}", progress=bar("targets"))
+    found = profile(args.out, listed(*args.target), optimise=f"-{args.optimise}", progress=bar("targets"))
     for name, packages in found.missing.items():
         say(f"left out: {name}, which needs Debian's {' '.join(packages)}")
     emit(args, found.to_dict(), shown(found))

@@ -3,7 +3,11 @@
  *
 @fields_shown@
  *
- * device_ms is the toy's clock in ms, delay_ms the time since the frame before.
+ * device_ms is the sender's clock in ms (here it wraps at 2^32), delay_ms the time since the frame before.
+@if decimal@
+ * Numbers may have any decimals and a power of ten, and are rounded to the channel's steps; one that lies just in the
+ * middle between two steps may come out one step away from the computer's, which divides floating-point numbers.
+@end@
  */
 #ifndef PLUSH_WIRE_H
 #define PLUSH_WIRE_H
@@ -24,10 +28,14 @@ typedef struct {
     uint8_t digits;    /* it has a digit */
 @if decimal@
     uint8_t decimals;  /* 0: no point yet; else 1 + its places */
+    uint8_t rest;      /* places that are not kept were not all 0 */
+    uint8_t power;     /* of the power of ten: how far it was read */
+    uint8_t exponent;
+    uint8_t down;      /* it is negative */
 @end@
     char sign;
     uint16_t field;    /* of the line, from 0 */
-    @number@ number;
+    uint64_t number;
 @if delay_only@
     uint8_t heard;     /* a frame has come: `clock` runs */
     uint32_t clock;    /* the delays, added up: these lines carry no clock */
