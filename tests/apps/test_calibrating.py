@@ -14,6 +14,7 @@ from plushsense.apps.preparation import choose_classes, windows_for
 from plushsense.core.errors import ArchError, BundleError, ConfigError
 from plushsense.dataset.store import Dataset
 from plushsense.deploy.calibration import calibration, integer_model
+from plushsense.deploy.emit import without_people
 from plushsense.models.bundle import Bundle
 from plushsense.windows.cut import WindowSpec
 
@@ -44,6 +45,8 @@ def test_data_of_other_content_is_used_with_a_word_and_of_other_people_refused(d
     assert any("content" in line for line in said) and any("P99" in line for line in said)
     with pytest.raises(BundleError, match="holds no window of the 1 people"):
         calibrated_on(replace(bundle, provenance=origin | {"subjects": ["P99"]}), dataset)
+    with pytest.raises(BundleError, match="belongs to an export.*plushsense train wrote"):
+        calibrated_on(replace(bundle, provenance=without_people(origin)), dataset)
     with pytest.raises(BundleError, match="held-back ones could slip in"):
         calibrated_on(replace(bundle, provenance=origin | {"split": "windows:holdout"}), dataset)
 

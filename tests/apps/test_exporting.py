@@ -69,6 +69,19 @@ def test_what_cannot_be_deployed(
     assert not (tmp_path / "out").exists()
 
 
+def test_a_folder_is_no_bundle(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["export", str(tmp_path), str(tmp_path / "out")]) == 2
+    assert "is a folder: give a *.plush file" in capsys.readouterr().err
+
+
+def test_an_export_says_of_how_many_people(tmp_path: Path, bundle: Bundle) -> None:
+    origin = {"subjects": ["Anna", "Bo"], "validation_subjects": ["Cleo"], "scores": {"accuracy": 0.5, "macro_f1": 0.4}}
+    done = ps.export(replace(bundle, provenance=origin), tmp_path / "out")
+    assert (done.facts["provenance"]["subjects"], done.facts["provenance"]["validation_subjects"]) == (2, 1)
+    said = (tmp_path / "out" / "README.md").read_text(encoding="utf-8")
+    assert "| trained on | 2 people |" in said and "of 1 other people" in said and "Anna" not in said
+
+
 def test_without_calibration(tmp_path: Path, bundle: Bundle, capsys: pytest.CaptureFixture[str]) -> None:
     replace(bundle, calibration={}).save(tmp_path / "m.plush")
     assert main(["export", str(tmp_path / "m.plush"), str(tmp_path / "out")]) == 2
@@ -82,6 +95,8 @@ def test_other_formats(tmp_path: Path, bundle: Bundle, onnx_here: None, capsys: 
     facts = json.loads((tmp_path / "out" / "export.json").read_text())
     assert facts["conversions"]["onnx"]["largest_difference"] < 1e-3
     assert {"model.onnx", "model.int8.onnx"} <= set(facts["files"])
+    said = (tmp_path / "out" / "README.md").read_text(encoding="utf-8")
+    assert "`model.onnx`" in said and "`--also onnx-int8`" in said
     assert main(["export", str(tmp_path / "m.plush"), str(tmp_path / "two"), "--also", "onx"]) == 2
     assert "Did you mean 'onnx'" in capsys.readouterr().err
     assert not (tmp_path / "two").exists()

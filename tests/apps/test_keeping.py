@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 
 import plushsense as ps
 from plushsense.dataset.store import Dataset
+from plushsense.deploy.emit import without_people
 
 Cli = Callable[..., Any]
 
@@ -51,11 +53,14 @@ def test_forget_asks_first_and_names_the_models(cli: Cli, dataset: Dataset, bund
     models = tmp_path / "models"
     models.mkdir()
     shutil.copy(bundle, models / "m.plush")
+    given = ps.load(bundle)
+    replace(given, provenance=without_people(given.provenance)).save(models / "given.plush")
     (models / "torn.plush").write_bytes(bundle.read_bytes()[:100])
     before = {p: p.read_bytes() for p in dataset.path.rglob("*") if p.is_file()}
     ran = cli("forget", dataset.path, "P1", "--bundles", models, "--json")
     assert (ran.status, ran.json["done"], ran.json["raw"]) == (1, False, 7)
     assert {p: p.read_bytes() for p in dataset.path.rglob("*") if p.is_file()} == before
+    assert "does not say who" in {Path(b["bundle"]).name: b for b in ran.json["bundles"]}["given.plush"]["message"]
     named = {Path(b["bundle"]).name: b for b in ran.json["bundles"]}
     assert named["m.plush"]["certain"]
     assert "train it again" in named["m.plush"]["message"]

@@ -71,11 +71,14 @@ def test_how_it_is_compiled_matters(
 def test_refusals(
     export: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert main(["profile", str(export), "--target", "xtens"]) == 2
+    assert main(["profile", str(export), "--target", "host, xtens"]) == 2
     assert "Did you mean 'xtensa'?" in capsys.readouterr().err
     assert main(["profile", str(tmp_path), "--json"]) == 2
     told = capsys.readouterr()
     assert told.out == "" and "is no export: make one with plushsense export BUNDLE OUT" in told.err
+    for none, words in ((tmp_path / "nowhere", "There is no export"), (export / "README.md", "is no export")):
+        assert main(["profile", str(none)]) == 2
+        assert words in capsys.readouterr().err
     monkeypatch.setenv("PATH", str(tmp_path))
     assert main(["profile", str(export), "--target", "cortex-m4"]) == 2
     assert "install Debian's gcc-arm-none-eabi qemu-system-arm libnewlib-arm-none-eabi" in capsys.readouterr().err

@@ -17,7 +17,7 @@ from exports import bundle_of
 from plushsense.core.errors import BadInput
 from plushsense.core.gestures import GestureSet
 from plushsense.deploy.calibration import integer_model
-from plushsense.deploy.emit import TOY_BYTES, c_names, emit, read_facts, without_people
+from plushsense.deploy.emit import TOY_BYTES, c_names, comment, emit, read_facts, without_people
 from plushsense.deploy.golden import answers_of, golden_frames, read_golden
 from plushsense.models.bundle import Bundle
 from plushsense.models.image import IntegerModel, memory_bytes
@@ -82,6 +82,13 @@ def test_nobody_is_named(tmp_path: Path) -> None:
         "validation_subjects": 1,
         "scores": {"said": "people: …, …", "f1": 0.5},
     }
+    assert without_people(without_people(PEOPLE)) == without_people(PEOPLE), "export does it before emit does"
+
+
+@pytest.mark.parametrize("label", ["*\\", "*/*", "/*/", "\u202eRTL", "a\rb\n", "\u2066x"])
+def test_no_label_ends_a_comment_or_turns_it_round(label: str) -> None:
+    said = comment(label)
+    assert "*/" not in said and "/*" not in said and "\\" not in said and said.isprintable()
 
 
 @pytest.mark.parametrize("layout", ["plush-15", "phone-6"])

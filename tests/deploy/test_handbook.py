@@ -37,6 +37,12 @@ def with_provenance(tmp_path: Path, **provenance: object) -> str:
 SCORES = {"split": "validation-subjects", "leaky": False, "windows": 321, "accuracy": 0.6789, "macro_f1": 0.5432}
 
 
+def test_the_readme_tells_what_8_bits_cost(tmp_path: Path) -> None:
+    int8 = {"accuracy": 0.671, "macro_f1": 0.541, "agreement": 0.985}
+    text = with_provenance(tmp_path, dataset="gestures", scores=SCORES | {"int8": int8})
+    assert "| accuracy, macro-F1 in 8 bits | 0.671, 0.541 |" in text and "98.5 % of the windows" in text
+
+
 def test_the_readme_tells_this_model(tmp_path: Path) -> None:
     people = ["Anna", "P02", "none"]  # at rest there is nobody
     text = with_provenance(tmp_path, dataset="gestures | of 2", scores=SCORES, subjects=people, simulated=False)

@@ -242,6 +242,15 @@ def test_long_streams_are_cut_where_an_emulator_has_no_more_room(
     assert done.counts[1].samples >= 4900 and done.runs[0].vectors == sum(c.answers for c in done.counts)
 
 
+def test_a_model_of_another_layout_among_the_files_is_named(c_compiler: str, own: Path, tmp_path: Path) -> None:
+    other = exported(tmp_path / "other", bundle_of("accel-3", "9d1_5d2", "4,6"))
+    for name in ("plush_model.h", "plush_model.c"):
+        shutil.copyfile(other / name, own / name)
+    done = verify(Export(own), ["host"], only=plainly)
+    assert not done.passed
+    assert "other channels or classes than model.plush" in str(done.first)
+
+
 def test_what_is_asked_for_must_be_there(
     c_compiler: str, own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

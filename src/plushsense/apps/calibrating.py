@@ -39,6 +39,11 @@ def calibrated_on(bundle: Bundle, dataset: Dataset | str | os.PathLike[str], war
         warn("the bundle was fine-tuned for the calibration that it holds, so that it keeps it")
         return bundle
     # Nobody's windows stand in every fold, held-back ones too.
+    if isinstance(origin.get("subjects"), int):
+        raise BundleError(
+            "The bundle belongs to an export and does not say who it was trained on, so that people held back could "
+            "slip in: give the bundle that plushsense train wrote."
+        )
     people = {str(s) for s in origin.get("subjects", ())} - {NOBODY}
     if origin.get("split") != _BY_PERSON or not people:
         raise BundleError(

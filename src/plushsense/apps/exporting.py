@@ -60,4 +60,4 @@ def export(
 
     for name in also:
         check_format(name)
-    return emit(model, given, Path(out), extras=[package, converted])
+    return emit(model, given, Path(out), extras=[converted, package])

@@ -88,10 +88,16 @@ def trained_on(folder: Path, subject: str, places: Iterable[Path]) -> list[Train
         except BundleError as cause:
             out.append(TrainedOn(str(path), False, f"cannot be read, so nobody knows: {cause}"))
             continue
-        people = [*provenance.get("subjects", ()), *provenance.get("validation_subjects", ())]
-        if subject not in people:
-            continue
         theirs = provenance.get("dataset_hash"), provenance.get("dataset")
+        people = [provenance.get(key, ()) for key in ("subjects", "validation_subjects")]
+        if any(isinstance(each, int) for each in people):
+            # An export tells strangers how many, not who.
+            if theirs[0] == content or theirs[1] == name:
+                said = "belongs to an export of this data set and does not say who: the bundle that it was made of does"
+                out.append(TrainedOn(str(path), False, said))
+            continue
+        if subject not in {who for each in people for who in each}:
+            continue
         if certain := theirs[0] == content:
             said = "trained on this person: train it again without them, and remove it"
         elif theirs[1] == name:

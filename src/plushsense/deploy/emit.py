@@ -101,8 +101,9 @@ def read_facts(folder: str | Path) -> dict[str, Any]:
     try:
         facts = json.loads(path.read_text(encoding="utf-8"))
         needed = {"title", "channels", "classes", "memory_bytes", "model_bytes"} - set(facts)
-    except FileNotFoundError:
-        raise BadInput(f"'{folder}' is no export: make one with plushsense export BUNDLE OUT.") from None
+    except (FileNotFoundError, NotADirectoryError):
+        what = f"'{folder}' is no export" if Path(folder).exists() else f"There is no export '{folder}'"
+        raise BadInput(f"{what}: make one with plushsense export BUNDLE OUT.") from None
     except (OSError, ValueError, TypeError) as cause:
         raise BadInput(f"'{path}' cannot be read ({cause}): export the model again.") from None
     if needed:
@@ -161,7 +162,7 @@ def _facts(model: IntegerModel, bundle: Bundle, model_bytes: int) -> dict[str, A
 
 
 def without_people(provenance: Mapping[str, Any]) -> dict[str, Any]:
-    """A bundle's provenance for strangers: how many people it was trained on, not who."""
+    """A bundle's provenance for strangers: how many people it was trained on, not who. Once more changes nothing."""
     people = {
         key: {str(n) for n in provenance[key]} - {NOBODY} for key in _PEOPLE if isinstance(provenance.get(key), list)
     }
@@ -177,8 +178,9 @@ def without_people(provenance: Mapping[str, Any]) -> dict[str, Any]:
             return [plain(each) for each in value]
         return named.sub("…", value) if isinstance(value, str) else value
 
+    counted = {key: provenance[key] for key in _PEOPLE if isinstance(provenance.get(key), int)}
     kept = {key: plain(value) for key, value in provenance.items() if key not in _PEOPLE}
-    return kept | {key: len(found) for key, found in people.items()}
+    return kept | counted | {key: len(found) for key, found in people.items()}
 
 
 def c_names(labels: Sequence[str]) -> tuple[str, ...]:
@@ -195,8 +197,9 @@ def c_names(labels: Sequence[str]) -> tuple[str, ...]:
 
 
 def comment(text: str) -> str:
-    """Text as it may stand in a C comment."""
-    return text.replace("*/", "* /").replace("/*", "/ *").replace("\\", "/").replace("\n", " ")
+    """Text as it may stand in a C comment; compilers refuse marks that would show the code in another order."""
+    plain = "".join(c if c.isprintable() else " " for c in text)
+    return plain.replace("\\", "/").replace("*/", "* /").replace("/*", "/ *")
 
 
 def _header(facts: dict[str, Any]) -> str:

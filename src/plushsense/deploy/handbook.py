@@ -93,7 +93,7 @@ def handbook(bundle: Bundle, facts: Mapping[str, Any]) -> str:
             _USE.format(image=IMAGE, gap=facts["gap_ms"], channels=len(facts["channels"])),
             "## What this folder holds",
             "",
-            *_table(("", ""), [(f"`{name}`", what) for name, what in _HOLDS.items()]),
+            *_table(("", ""), [(f"`{name}`", what) for name, what in (_HOLDS | _converted(facts)).items()]),
             "",
             f"No recording is in it: the golden frames are made up. `{BUNDLE}` and `{FACTS}` say",
             "how many people the model was trained on, not who. A network was made from people's recordings all the",
@@ -151,8 +151,8 @@ void frame(uint32_t ms, const int32_t *values, void (*react)(plush_affect, const
 
 One task or interrupt uses a toy at a time. Several toys may share a model, each with its own `plush_toy` and memory.
 
-**When plush_begin() fails** it says why (`plush_status`); a toy that has not begun must not be pushed. Show it, and
-go on sending frames: the example blinks the status.
+**When plush_begin() fails** it says why (`plush_status`), and the toy takes frames without ever having an answer. Show
+it, and go on sending frames: the example blinks the status.
 
 **Missed ticks.** Only the time that comes with a frame counts. Who comes late reads once, with the true time, and
 does not make up for ticks that went by. Up to {gap} ms are bridged by interpolation, and every answer that fell due is
@@ -161,9 +161,9 @@ given; after a longer gap, or when the clock runs backwards, the toy is warming 
 ## Prove it, measure it
 
 `plushsense verify .` compiles the library and the model that stand here and compares every answer with those in
-`golden`, bit for bit; `--target xtensa`, `cortex-m4`, `riscv32` do it on emulated chips. The packages hold copies of
-these files: whoever edits one edits it here, and copies. `plushsense profile .` counts instructions, flash, RAM and
-stack.
+`golden`, bit for bit, on this computer and on the emulated chips that are installed (`--target` chooses). The packages
+hold copies of these files: whoever edits one edits it here, and copies. `plushsense profile .` counts instructions,
+flash, RAM and stack.
 
 ## Another model without compiling
 
@@ -171,6 +171,8 @@ Put `{image}` of another export into flash and begin on its bytes, which must st
 partition and `esp_partition_mmap()`). They need no alignment. The checksum is looked at first.
 
 ```c
+#include <stddef.h>
+
 #include "plushsense.h"
 
 static uint32_t pool[2048]; /* as much as the largest model needs */
@@ -180,11 +182,25 @@ plush_status swap(const uint8_t *model, uint32_t bytes, uint8_t channels)
 {{
     plush_status status = plush_begin(&toy, model, bytes, pool, sizeof pool);
 
-    /* A model for other sensors would read beyond a frame of yours. */
-    return status == PLUSH_OK && toy.channels != channels ? PLUSH_NOT_A_MODEL : status;
+    /* A model for other sensors would read beyond a frame of yours: begun on nothing, the toy is silent. */
+    if (status == PLUSH_OK && toy.channels != channels)
+        status = plush_begin(&toy, NULL, 0, NULL, 0); /* PLUSH_NOT_A_MODEL */
+    return status;
 }}
 ```
+
+That the number of channels is right does not say that they are: the layout of both exports must be the same.
 """
+
+
+def _converted(facts: Mapping[str, Any]) -> dict[str, str]:
+    """The files for other runtimes, with how far from the network they are."""
+    found = {}
+    for name, each in facts.get("conversions", {}).items():
+        apart = each["largest_difference"]
+        far = "" if apart is None else f"; logits differ by up to {apart:.1g} from those it was made of"
+        found[str(each["file"])] = f"the network alone for another runtime (`--also {name}`){far}"
+    return found
 
 
 def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> list[str]:
@@ -206,9 +222,13 @@ def _affect_said(facts: Mapping[str, Any]) -> list[str]:
     return [
         f"Nobody told an affect for {len(untold)} of {facts['classes']} gestures: the library then says",
         "`PLUSH_AFFECT_NONE`, and the example gives each such gesture a colour of its own. Affect is told in the",
-        "gesture set (`plushsense train --gestures FILE`).",
+        "gesture set (`plushsense import RECORDINGS DS --gestures FILE`).",
         "",
     ]
+
+
+def _people(found: object) -> int | None:
+    return found if isinstance(found, int) else len(found) if isinstance(found, list) else None
 
 
 def _scores(provenance: Mapping[str, Any], simulated: bool) -> list[str]:
@@ -216,14 +236,20 @@ def _scores(provenance: Mapping[str, Any], simulated: bool) -> list[str]:
     if not isinstance(scores, Mapping) or "accuracy" not in scores:
         return [f"`{BUNDLE}` carries no scores: ask `plushsense evaluate` for some."]
     leaky = bool(scores.get("leaky", False))
-    people = provenance.get("subjects")
-    trained = people if isinstance(people, int) else len(people) if isinstance(people, list) else None
+    trained, others = (_people(provenance.get(key)) for key in ("subjects", "validation_subjects"))
+    windows = f"{scores.get('windows', 'an unknown number of')} windows"
     rows = [
         ("data set", _cell(f"{provenance.get('dataset', 'not told')}{' (SIMULATION)' if simulated else ''}")),
         *([("trained on", f"{trained} people")] if trained is not None else []),
-        ("scored on", f"{scores.get('windows', 'an unknown number of')} windows, split `{scores.get('split', '?')}`"),
+        ("scored on", f"{windows}{f' of {others} other people' if others else ''}, split `{scores.get('split', '?')}`"),
         *((name, f"{scores[key]:.3f}") for name, key in (("accuracy", "accuracy"), ("macro-F1", "macro_f1"))),
     ]
+    int8 = scores.get("int8")
+    if isinstance(int8, Mapping):
+        rows += [
+            ("accuracy, macro-F1 in 8 bits", f"{int8['accuracy']:.3f}, {int8['macro_f1']:.3f}"),
+            ("the same answer in 8 bits", f"{100 * int8['agreement']:.1f} % of the windows"),
+        ]
     said = [*_table(("", ""), rows), ""]
     if leaky:
         said += [
@@ -235,6 +261,6 @@ def _scores(provenance: Mapping[str, Any], simulated: bool) -> list[str]:
         said += ["**SIMULATION**: of the virtual toy; no result.", ""]
     return [
         *said,
-        "One split of one training, in floating point: whole numbers may differ in single answers. For figures over",
-        "everybody ask `plushsense evaluate`.",
+        "One split of one training, in floating point where nothing else is said: whole numbers may differ in single",
+        "answers. For figures over everybody ask `plushsense evaluate --int8`.",
     ]

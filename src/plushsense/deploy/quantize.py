@@ -65,7 +65,10 @@ class Ranges:
             tops, means = (tuple(np.asarray(t, dtype=np.float64) for t in table[name]) for name in ("tops", "means"))
             return cls(low, high, tops, means)
         except KeyError as missing:
-            raise BundleError(f"The calibration in the bundle lacks {missing}: train again.") from None
+            raise BundleError(
+                f"The calibration in the bundle lacks {missing} (it was made by an earlier PlushSense): train it "
+                "again, or give the data set that it was trained on, with plushsense export BUNDLE OUT --dataset DS."
+            ) from None
         except (TypeError, ValueError) as cause:
             raise BundleError(f"The calibration in the bundle cannot be read ({cause}): train again.") from None
 

@@ -283,7 +283,9 @@ def _attempt(export: Export, folder: Path, setting: Setting, vector: Vectors, fr
     shutil.copyfile(HARNESS, harness)
     sources = [folder / LIBRARY[1], harness] + ([] if setting.image else [folder / MODEL[1]])
     blobs = {"frames": frames} | ({"image": folder / IMAGE} if setting.image else {})
-    defines = {"PLUSH_HARNESS_IMAGE": 1} if setting.image else {}
+    classes = len(export.labels)
+    defines = {"PLUSH_HARNESS_CHANNELS": vector.frames.shape[1] - 1, "PLUSH_HARNESS_CLASSES": classes}
+    defines |= {"PLUSH_HARNESS_IMAGE": 1} if setting.image else {}
     program = build(
         setting.target,
         sources,

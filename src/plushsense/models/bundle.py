@@ -120,6 +120,8 @@ class Bundle:
                 f"There is no bundle '{path}': check the path, or make one with plushsense train."
             ) from None
         except OSError as cause:
+            if path.is_dir():
+                raise BundleError(f"'{path}' is a folder: give a *.plush file made by plushsense train.") from None
             raise BundleError(f"The bundle '{path}' cannot be read ({cause}).") from None
         return cls.from_bytes(data, path)
 

@@ -84,7 +84,7 @@ def name_of(config: RunConfig, dataset: Dataset) -> str:
 
 def figure(value: float | None) -> str:
     """Three digits; a dash for what could not be computed."""
-    return "-" if value is None else f"{value:.3f}"
+    return "-" if value is None else f"{value:z.3f}"
 
 
 def spread(score: dict[str, Any]) -> str:
@@ -92,8 +92,8 @@ def spread(score: dict[str, Any]) -> str:
     mean, sd, ci = score["mean"], score["sd"], score["ci95"]
     if mean is None:
         return "-"
-    text = f"{mean:.3f}"
-    return text if sd is None else f"{text} ± {sd:.3f} (95 % {ci[0]:.3f} to {ci[1]:.3f})"
+    text = f"{mean:z.3f}"
+    return text if sd is None else f"{text} ± {sd:.3f} (95 % {ci[0]:z.3f} to {ci[1]:z.3f})"
 
 
 def lines(e: dict[str, Any]) -> list[str]:
@@ -135,7 +135,7 @@ def deployed(e: dict[str, Any]) -> list[str]:
     rows = [(r[unit], *(figure(r[name]) for name in wanted)) for r in e["rows"]]
     return [
         "",
-        "the same networks deployed in 8 bits, on the same windows:\n",
+        "the same networks deployed in 8 bits, on the same windows (lost: macro-F1 less in 8 bits; below 0: more):\n",
         table((unit, "accuracy", "int8", "macro-F1", "int8", "lost", "agree"), rows),
         "",
         f"macro-F1 in 8 bits  {spread(e['macro_f1'])}",

@@ -148,7 +148,10 @@ def _times(found: Profile) -> list[str]:
     return [
         "",
         *textwrap.wrap(f"Time of a step, ESTIMATED. {SAID}", 118),
-        table(["chip", "MHz", "counted on", "cycles each", "ms a step", f"fits {1000 / found.step_ms:g} Hz"], rows),
+        table(
+            ["chip", "MHz", "counted on", "cycles an instruction", "ms a step", f"fits {1000 / found.step_ms:g} Hz"],
+            rows,
+        ),
         "Where the bounds come from:",
         *(line for words, names in why.items() for line in _wrapped(f"{', '.join(names)}: {words}.")),
     ]

@@ -9,6 +9,7 @@
  * where from gesture to smooth all is 0 while warming. When something is wrong that no row can show, one more row is
  * written, not whole: words that say it.
  *
+ * PLUSH_HARNESS_CHANNELS and PLUSH_HARNESS_CLASSES say of how many the frames and the expected rows are.
  * With PLUSH_HARNESS_IMAGE the model is not the one compiled in (plush_model.c) but the bytes of plush_model.bin, as
  * when a model is swapped without compiling the code again.
  */
@@ -128,6 +129,8 @@ int main(void)
     }
     if (toy.channels != PLUSH_MODEL_CHANNELS || toy.classes != PLUSH_MODEL_CLASSES)
         return wrong("PLUSH_MODEL_CHANNELS or PLUSH_MODEL_CLASSES is not that of the model.");
+    if (toy.channels != PLUSH_HARNESS_CHANNELS || toy.classes != PLUSH_HARNESS_CLASSES)
+        return wrong("The model has other channels or classes than model.plush: put the files of one export together.");
     toy.on_answer = on_answer;
     toy.user = &frame;
     for (p = frames; p < frames_end; p += 4u * (1u + toy.channels), frame++) {
