@@ -14,7 +14,7 @@ computes its window again. They may read the window in whichever form takes fewe
 where the two differ, each answer is checked against the float answer of its own form. Our C reads five frames
 (validity, clock, magnitude, scaling), runs the network, smooths and decides. Times are taken in turn, round by round;
 ratios are of the same round. Instructions are callgrind's, of 2N decisions less those of N; callgrind's processor has
-AVX2 and nothing beyond. All frames and (without `--bundle`) all weights are made up: costs depend on neither.
+AVX2 and nothing beyond. All frames and (without `--bundle`) all weights are made up: costs hardly depend on them.
 """
 
 from __future__ import annotations

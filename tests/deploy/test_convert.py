@@ -16,11 +16,12 @@ from plushsense.core.errors import ArchError, BadInput, BundleError, ConfigError
 from plushsense.core.gestures import load_gestures
 from plushsense.core.recfile import read_stream
 from plushsense.core.signal import load_layout
-from plushsense.deploy.calibration import calibrated, deployable, integer_network
+from plushsense.deploy.calibration import calibrated, integer_network
 from plushsense.deploy.convert import as_onnx, as_tflite, convert
 from plushsense.deploy.convert.facts import Job, compare, made_up_windows
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
+from plushsense.models.integer import deployable
 from plushsense.models.reference import random_weights
 from plushsense.windows.features import Scaler, inputs
 

@@ -277,7 +277,7 @@ def test_decimals_of_any_length_are_read_as_the_computer_reads_them(
         values = rng.normal(size=channels) * 10.0 ** rng.integers(-7, 3, channels)
         words = [f"{v:.{rng.integers(5, 19)}f}" if rng.random() < 0.7 else f"{v:.7E}" for v in values]
         lines.append(" ".join([*words, str(1657533977813 + 10 * k)]).encode())
-    odd = [
+    odd = (
         "1e",
         "e1",
         "1e+",
@@ -292,7 +292,7 @@ def test_decimals_of_any_length_are_read_as_the_computer_reads_them(
         "9e9",
         "1e1e1",
         "0e99",
-    ]
+    )
     lines += [f"{word} 0 0 0 0 0 {k}".encode() for k, word in enumerate(odd)]
     lines += [f"0 0 0 0 0 0 {ms}".encode() for ms in ("7.0", "7e0", 2**32 - 1, 2**32, 2**53, 2**53 + 1, "9" * 30)]
     talk = b"\n".join([*lines, b""])

@@ -22,7 +22,7 @@ from plushsense.windows.features import Scaler
 
 Make = Callable[..., WindowSet]
 Weights = dict[str, np.ndarray]
-SPEC = TrainSpec(epochs=10, batch=16, patience=None, halve_every=None, device="cpu")
+SPEC = TrainSpec(epochs=10, batch=16, learning_rate=0.015, patience=None, halve_every=None, device="cpu")
 
 
 def arch(**changes: Any) -> Arch:

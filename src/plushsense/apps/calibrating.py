@@ -23,6 +23,8 @@ _BY_PERSON = "validation-subjects"
 def calibrated_on(bundle: Bundle, dataset: Dataset | str | os.PathLike[str], warn: Warn = silent) -> Bundle:
     """The bundle with the ranges of its training people's windows, cut as its own were.
 
+    One that was fine-tuned for the ranges that it holds keeps them.
+
     Args:
         dataset: the one that it was trained on; warned of when its content is another by now.
 
@@ -33,6 +35,9 @@ def calibrated_on(bundle: Bundle, dataset: Dataset | str | os.PathLike[str], war
     refuse_undeployable(bundle.arch)
     dataset = opened(dataset)
     origin = bundle.provenance
+    if bundle.calibration and origin.get("quantize_aware"):
+        warn("the bundle was fine-tuned for the calibration that it holds, so that it keeps it")
+        return bundle
     # Nobody's windows stand in every fold, held-back ones too.
     people = {str(s) for s in origin.get("subjects", ())} - {NOBODY}
     if origin.get("split") != _BY_PERSON or not people:

@@ -16,16 +16,11 @@ from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.models.fixed import PROBABILITY_BITS, smoothing_weight, softmax
 from plushsense.models.image import IntegerModel
-from plushsense.models.integer import IntegerNetwork
+from plushsense.models.integer import IntegerNetwork, deployable
 from plushsense.models.reference import Network
 from plushsense.windows.features import Scaler
 
 _MOST = 1024  # windows
-
-
-def deployable(arch: Arch) -> bool:
-    """Whether a network has a meaning in the toy; `refuse_undeployable` says why it has none."""
-    return arch.padding == "stream" and arch.norm == "batch"
 
 
 def calibration(

@@ -80,7 +80,7 @@ def emit(model: IntegerModel, bundle: Bundle, out: str | Path, extras: Sequence[
             extra(part, facts)
         found = sorted(p.relative_to(part).as_posix() for p in part.rglob("*") if p.is_file())
         facts["files"] = sorted({*found, FACTS})
-        (part / FACTS).write_text(json.dumps(facts, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        (part / FACTS).write_text(json.dumps(facts, indent=1, ensure_ascii=False) + "\n", "utf-8", newline="\n")
         if out.exists():
             out.rmdir()
         part.rename(out)
@@ -118,8 +118,8 @@ def _write(model: IntegerModel, bundle: Bundle, folder: Path) -> dict[str, Any]:
     image = model.to_bytes()
     facts = _facts(model, bundle, len(image))
     (folder / IMAGE).write_bytes(image)
-    (folder / MODEL[0]).write_text(_header(facts), encoding="utf-8")
-    (folder / MODEL[1]).write_text(_source(model, facts), encoding="utf-8")
+    (folder / MODEL[0]).write_text(_header(facts), encoding="utf-8", newline="\n")
+    (folder / MODEL[1]).write_text(_source(model, facts), encoding="utf-8", newline="\n")
     bundle.save(folder / BUNDLE)
     write_golden(model, bundle.scaler, folder / GOLDEN)
     return facts

@@ -186,6 +186,7 @@ export and compares every number.
   warming.
 """,
         encoding="utf-8",
+        newline="\n",
     )
     return [folder / FRAMES, folder / ANSWERS, folder / "README.md"]
 

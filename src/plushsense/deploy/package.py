@@ -59,13 +59,13 @@ def package(out: Path, facts: Mapping[str, Any] | None = None) -> list[Path]:
         texts |= {f"{ARDUINO}/src/{name}": made[name], f"{IDF}/{_place(name)}": made[name]}
     for name in _EXAMPLE:
         texts |= {f"{SKETCH}/{name}": made[name], f"{IDF_EXAMPLE}/main/{name}": made[name]}
-    for copy, original in copies().items():
-        texts[copy] = (out / original).read_text(encoding="utf-8")
+    contents = {name: text.encode() for name, text in texts.items()}
+    contents |= {copy: (out / original).read_bytes() for copy, original in copies().items()}
     written = []
-    for name, text in texts.items():
+    for name, content in contents.items():
         path = out / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8", newline="\n")
+        path.write_bytes(content)
         written.append(path)
     return written
 

@@ -163,11 +163,6 @@ def missing_tools(target: str, *, cc: str | None = None) -> list[str]:
     return list(dict.fromkeys(missing))
 
 
-def available() -> list[str]:
-    """The targets for which everything is installed here."""
-    return [name for name in TARGETS if not missing_tools(name)]
-
-
 def require(target: str, *, cc: str | None = None) -> None:
     """ToolError, with what to install, when something for this target is missing."""
     if missing := missing_tools(target, cc=cc):
@@ -227,15 +222,6 @@ def build(
         command = [compiler, *machine.flags, optimise, *flags, *trim, *linked, "-o", str(file), *machine.link]
         _compile(command, Path(work), "the program")
     return Program(machine, file, tuple(objects))
-
-
-def compile_object(target: str, source: Path, file: Path, flags: Sequence[str]) -> Path:
-    """One source as an object file, with these flags; for what needs no program."""
-    machine = target_named(target)
-    file = Path(file).resolve()
-    command = [machine.compiler, *machine.flags, *flags, "-c", str(Path(source).resolve()), "-o", str(file)]
-    _compile(command, file.parent, Path(source).name)
-    return file
 
 
 def tool(target: str, name: str) -> str:

@@ -18,7 +18,6 @@ from plushsense.core.errors import BundleError
 Ints = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
 
-LOGIT_FRACTION_BITS = 8
 LOGIT_LIMIT = 1 << 14  # logits are held within ±64 in steps of 1/256
 PROBABILITY_BITS = 15
 SMOOTH_EXTRA_BITS = 12

@@ -23,6 +23,11 @@ from plushsense.models.state import CHUNK, Floats, Pool, Ring
 _SUM_LIMIT = (1 << 31) - 1
 
 
+def deployable(arch: Arch) -> bool:
+    """Whether a network has a meaning in whole numbers; `plushsense.deploy.quantize` says why another has none."""
+    return arch.padding == "stream" and arch.norm == "batch"
+
+
 @dataclass(frozen=True, eq=False)
 class IntegerLayer:
     """One layer: ``weights`` (F, C, K) int8, ``bias`` (F,) int32, and how its sums become 8-bit activations."""
@@ -75,7 +80,7 @@ class IntegerNetwork:
 
     def __post_init__(self) -> None:
         arch = self.arch
-        if arch.padding != "stream" or arch.norm != "batch":
+        if not deployable(arch):
             raise BundleError(
                 f"{arch.title} has padding '{arch.padding}' and {arch.norm} normalisation: a network in "
                 "integers needs 'stream' and batch normalisation."

@@ -9,7 +9,8 @@ answers, not the labels anew, so that a few epochs on the training windows canno
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,8 +19,8 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import TrainingError
 from plushsense.models.arch import NORM_EPSILON, Arch
+from plushsense.models.integer import deployable
 from plushsense.models.net import Net
-from plushsense.training.augment import Turn
 from plushsense.training.engine import slices
 from plushsense.training.spec import TrainSpec
 from plushsense.windows.cut import WindowSet
@@ -31,6 +32,7 @@ from torch.nn import functional as F
 
 Weights = dict[str, NDArray[np.float32]]
 _READ = 256
+_SLOWER = 5
 
 
 @dataclass(frozen=True)
@@ -54,13 +56,14 @@ def fine_tune(
 ) -> Tuned:
     """Fine-tune trained weights for the ranges of ``calibration``, which stay those of the deployed network.
 
-    Batch, turning, seed and device are those of ``spec``, the rate is the last of its schedule. The same seed gives
-    the same weights.
+    Batch, seed and threads are those of ``spec``, the rate falls evenly from a fifth of the last of its schedule to
+    nothing. Windows are not turned: on turned ones, which lie outside the ranges, it would learn to live with being
+    cut off. It runs on the CPU. The same seed gives the same weights.
 
     Raises:
         TrainingError: for a network that cannot be deployed, no calibration, or fewer epochs than 1.
     """
-    if arch.padding != "stream" or arch.norm != "batch" or not calibration:
+    if not deployable(arch) or not calibration:
         raise TrainingError(
             f"{arch.title} cannot be deployed, so there is nothing to fine-tune it for: train it with --padding stream "
             "and --norm batch."
@@ -68,20 +71,22 @@ def fine_tune(
     if epochs < 1:
         raise TrainingError(f"{epochs} epochs of fine-tuning are asked for: accepted are 1 and more.")
     x = torch.from_numpy(scaler.apply(train.x[:, :, train.x.shape[2] - arch.span :]))
-    rate = spec.learning_rate_at(spec.epochs)
+    highest = spec.learning_rate_at(spec.epochs) / _SLOWER
     history: list[dict[str, Any]] = []
-    with torch.random.fork_rng(devices=[]):
+    with torch.random.fork_rng(devices=[]), _threads(spec.threads):
         teacher = Net(arch)
         teacher.import_weights(weights)
         teacher.eval()
         network = Rounded(arch, weights, calibration)
-        turn = Turn(train.vectors, scaler, spec.turn_deg, torch.device("cpu"))
         random = torch.Generator().manual_seed(spec.seed)
-        adam = torch.optim.Adam(network.parameters, lr=rate)
+        adam = torch.optim.Adam(network.parameters, lr=highest)
         for epoch in range(1, epochs + 1):
+            rate = highest * (1.0 - (epoch - 1) / epochs)
+            for group in adam.param_groups:
+                group["lr"] = rate
             order, total = torch.randperm(len(x), generator=random), 0.0
             for at in slices(len(x), spec.batch):
-                batch = turn(x[order[at]], random)
+                batch = x[order[at]]
                 with torch.no_grad():
                     wanted = F.log_softmax(teacher(batch), dim=1)
                 loss = F.kl_div(F.log_softmax(network(batch), dim=1), wanted, reduction="batchmean", log_target=True)
@@ -93,6 +98,16 @@ def fine_tune(
             if progress is not None:
                 progress(epoch, epochs, history[-1] | {"validation_accuracy": None})
     return Tuned(network.export_weights(), history)
+
+
+@contextmanager
+def _threads(wanted: int) -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(wanted)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 class Rounded:

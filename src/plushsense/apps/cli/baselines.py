@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.apps.cli.output import emit, say, table
-from plushsense.apps.cli.settings import add_settings, add_work, settings, warn
+from plushsense.apps.cli.settings import add_settings, add_work, listed, settings, warn
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -50,8 +50,8 @@ def run(args: argparse.Namespace) -> int:
 
     config = settings(args, workers=args.workers)
     dataset = open_dataset(args.dataset)
-    asked: dict[str, Any] = {"splits": _words(args.split), "models": _words(args.models)}
-    asked |= {"features": _words(args.features), "pca": args.pca}
+    asked: dict[str, Any] = {"splits": listed(args.split), "models": listed(args.models)}
+    asked |= {"features": listed(args.features), "pca": args.pca}
     name = f"baselines_{comparison_id(dataset, config, **asked)[:8]}"
     out = Path(args.out) if args.out else dataset.path / "evaluations" / name
     result = baselines(
@@ -61,10 +61,6 @@ def run(args: argparse.Namespace) -> int:
     say(f"written: {out}")
     emit(args, result, lines(result))
     return 0
-
-
-def _words(text: str) -> list[str]:
-    return [word.strip() for word in text.split(",") if word.strip()]
 
 
 def lines(result: dict[str, Any]) -> list[str]:

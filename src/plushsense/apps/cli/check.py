@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from plushsense.apps.cli.output import bar, emit, say
+from plushsense.apps.cli.settings import listed
 from plushsense.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     from plushsense.apps.checking import decide
     from plushsense.dataset.quality.checking import known_checks
 
-    only = [name.strip() for name in args.only.split(",") if name.strip()]
+    only = listed(args.only)
     known_checks(only)
     if args.report:
         from plushsense.reports.html import check_place

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from plushsense.apps.cli.output import emit, say
+from plushsense.apps.cli.output import emit
+from plushsense.apps.cli.settings import listed, warn
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -35,8 +36,8 @@ def _converted(found: dict[str, Any]) -> str:
 def run(args: argparse.Namespace) -> int:
     from plushsense.apps.exporting import export
 
-    also = [word.strip() for word in args.also.split(",") if word.strip()]
-    done = export(args.bundle, args.out, dataset=args.dataset, also=also, warn=lambda what: say(f"warning: {what}"))
+    also = listed(args.also)
+    done = export(args.bundle, args.out, dataset=args.dataset, also=also, warn=warn)
     facts = done.facts
     simulated = (
         ["  SIMULATION: trained on a virtual toy; it knows no real person's touch"] if facts["simulated"] else []

@@ -7,6 +7,7 @@ import textwrap
 from typing import TYPE_CHECKING
 
 from plushsense.apps.cli.output import bar, emit, say, table
+from plushsense.apps.cli.settings import listed
 
 if TYPE_CHECKING:
     from plushsense.deploy.counting import Cost
@@ -29,7 +30,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME",
-        help="xtensa, cortex-m4, cortex-m0, riscv32, or host for sizes only; may be given again (default: every "
+        help="xtensa, cortex-m4, cortex-m0, riscv32, or host for sizes only; several with commas (default: every "
         "emulator that is installed here)",
     )
     parser.add_argument(
@@ -40,7 +41,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from plushsense.deploy.profile import profile
 
-    found = profile(args.out, args.target, optimise=f"-{args.optimise}", progress=bar("targets"))
+    found = profile(args.out, listed(*args.target), optimise=f"-{args.optimise}", progress=bar("targets"))
     for name, packages in found.missing.items():
         say(f"left out: {name}, which needs Debian's {' '.join(packages)}")
     emit(args, found.to_dict(), shown(found))

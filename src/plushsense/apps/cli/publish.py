@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from plushsense.apps.cli.output import Progress, bar, emit, say
+from plushsense.apps.cli.settings import listed
 from plushsense.core.errors import ConfigError
 
 SHOWN_PROBLEMS = 20
@@ -80,7 +81,7 @@ def _publish(args: argparse.Namespace) -> int:
         save=args.save,
         streams=not args.no_streams,
         excluded=args.allow_excluded,
-        columns=tuple(c.strip() for c in args.allow_columns.split(",") if c.strip()),
+        columns=tuple(listed(args.allow_columns)),
         key=args.key,
         bids=args.bids,
         reidentification=not args.no_reidentification,

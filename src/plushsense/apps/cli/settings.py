@@ -13,6 +13,11 @@ if TYPE_CHECKING:
     from plushsense.apps.config import RunConfig
 
 
+def listed(*given: str) -> list[str]:
+    """What an option lists, with commas or by being given again: ``A,B``."""
+    return [word.strip() for each in given for word in each.split(",") if word.strip()]
+
+
 def add_settings(parser: argparse.ArgumentParser) -> None:
     """Network, training and windows. Nothing given: the preset's, or the configuration file's."""
     parser.add_argument(

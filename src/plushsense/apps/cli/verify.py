@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from plushsense.apps.cli.output import bar, emit, say, table
+from plushsense.apps.cli.output import bar, emit, table
+from plushsense.apps.cli.settings import listed, warn
 from plushsense.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -45,6 +46,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from plushsense.dataset.index import open_dataset
+    from plushsense.deploy.package import changed_copies
     from plushsense.deploy.vectors import Export
     from plushsense.deploy.verify import verify
 
@@ -53,20 +55,18 @@ def run(args: argparse.Namespace) -> int:
     if args.samples is not None and args.samples < 1:
         raise ConfigError(f"--samples is {args.samples}: give 1 or more.")
     export = Export(args.export)
+    if changed := changed_copies(export.folder):
+        warn(f"only the originals are proved, and these copies of them were changed: {', '.join(changed)}")
     if args.dataset:
-        vectors = export.recorded(open_dataset(args.dataset), _listed(args.subject), args.samples or _SAMPLES)
+        vectors = export.recorded(open_dataset(args.dataset), listed(*args.subject), args.samples or _SAMPLES)
         if args.samples and sum(v.samples for v in vectors) < args.samples:
-            say(f"plushsense: these recordings make {sum(v.samples for v in vectors):,} samples, not {args.samples:,}.")
+            warn(f"these recordings make {sum(v.samples for v in vectors):,} samples, not {args.samples:,}")
     else:
         vectors = export.made_up(args.samples or 0)
     plant = (lambda fault: True) if args.faults else None
-    done = verify(export, _listed(args.target), vectors, plant=plant, progress=bar("verify"))
+    done = verify(export, listed(*args.target), vectors, plant=plant, progress=bar("verify"))
     emit(args, {"export": args.export, **done.to_dict()}, _text(done))
     return 0 if done.passed else 1
-
-
-def _listed(given: list[str]) -> list[str]:
-    return [word.strip() for each in given for word in each.split(",") if word.strip()]
 
 
 def _text(done: Verified) -> list[str]:
