@@ -91,6 +91,7 @@ def test_nobody_is_named(tmp_path: Path) -> None:
         "validation_subjects": 1,
         "scores": {"said": "people: …, …", "f1": 0.5},
     }
+    assert without_people(without_people(PEOPLE)) == without_people(PEOPLE)
 
 
 @pytest.mark.parametrize("layout", ["plush-15", "phone-6"])

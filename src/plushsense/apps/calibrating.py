@@ -39,7 +39,8 @@ def calibrated_on(bundle: Bundle, dataset: Dataset | str | os.PathLike[str], war
         warn("the bundle was fine-tuned for the calibration that it holds, so that it keeps it")
         return bundle
     # Nobody's windows stand in every fold, held-back ones too.
-    people = {str(s) for s in origin.get("subjects", ())} - {NOBODY}
+    told = origin.get("subjects", ())
+    people = {str(s) for s in told} - {NOBODY} if isinstance(told, list | tuple) else set()
     if origin.get("split") != _BY_PERSON or not people:
         raise BundleError(
             "The bundle does not say which people its training windows came from "

@@ -20,7 +20,8 @@ SUFFIX = ".plush"
 
 @dataclass(frozen=True)
 class TrainedOn:
-    """A bundle that names the person's code; ``certain`` where its data set had the content that this one has."""
+    """A bundle that names the person's code, or may be of them; ``certain`` where its data set had the content that
+    this one has."""
 
     bundle: str
     certain: bool
@@ -73,7 +74,7 @@ def forget(
 def trained_on(folder: Path, subject: str, places: Iterable[Path]) -> list[TrainedOn]:
     """Bundles below ``places`` that name the person among those they were trained or validated on.
 
-    A bundle that cannot be read is named too: nobody knows.
+    A bundle that cannot be read is named too, and so is one of this data set that was exported: nobody knows.
     """
     name = DatasetHead.read(folder).name
     try:
@@ -88,10 +89,15 @@ def trained_on(folder: Path, subject: str, places: Iterable[Path]) -> list[Train
         except BundleError as cause:
             out.append(TrainedOn(str(path), False, f"cannot be read, so nobody knows: {cause}"))
             continue
-        people = [*provenance.get("subjects", ()), *provenance.get("validation_subjects", ())]
-        if subject not in people:
-            continue
         theirs = provenance.get("dataset_hash"), provenance.get("dataset")
+        told = [provenance.get(key, ()) for key in ("subjects", "validation_subjects")]
+        if any(isinstance(part, int) for part in told):
+            if content == theirs[0] or name == theirs[1]:
+                said = "exported from a model of this data set, it does not say of whom: look what it was exported from"
+                out.append(TrainedOn(str(path), False, said))
+            continue
+        if subject not in [person for part in told for person in part]:
+            continue
         if certain := theirs[0] == content:
             said = "trained on this person: train it again without them, and remove it"
         elif theirs[1] == name:

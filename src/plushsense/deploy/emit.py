@@ -161,7 +161,7 @@ def _facts(model: IntegerModel, bundle: Bundle, model_bytes: int) -> dict[str, A
 
 
 def without_people(provenance: Mapping[str, Any]) -> dict[str, Any]:
-    """A bundle's provenance for strangers: how many people it was trained on, not who."""
+    """A bundle's provenance for strangers: how many people it was trained on, not who. Once more changes nothing."""
     people = {
         key: {str(n) for n in provenance[key]} - {NOBODY} for key in _PEOPLE if isinstance(provenance.get(key), list)
     }
@@ -177,7 +177,7 @@ def without_people(provenance: Mapping[str, Any]) -> dict[str, Any]:
             return [plain(each) for each in value]
         return named.sub("…", value) if isinstance(value, str) else value
 
-    kept = {key: plain(value) for key, value in provenance.items() if key not in _PEOPLE}
+    kept = {key: plain(value) for key, value in provenance.items() if key not in _PEOPLE or isinstance(value, int)}
     return kept | {key: len(found) for key, found in people.items()}
 
 
