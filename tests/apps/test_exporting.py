@@ -44,6 +44,16 @@ def test_the_verb(tmp_path: Path, bundle: Bundle, capsys: pytest.CaptureFixture[
     assert "plushsense verify" in capsys.readouterr().out
 
 
+def test_it_tells_how_many_people_also_when_it_is_exported_again(tmp_path: Path, bundle: Bundle) -> None:
+    who = {"subjects": ["Anna", "P02"], "validation_subjects": ["Bo"], "split": "validation-subjects"}
+    ps.export(replace(bundle, provenance=who), tmp_path / "one")
+    ps.export(tmp_path / "one" / "model.plush", tmp_path / "two")
+    for name in ("one", "two"):
+        facts = json.loads((tmp_path / name / "export.json").read_text(encoding="utf-8"))
+        for told in (facts["provenance"], ps.load(tmp_path / name / "model.plush").provenance):
+            assert (told["subjects"], told["validation_subjects"]) == (2, 1)
+
+
 def test_the_same_bundle_gives_the_same_files(tmp_path: Path, bundle: Bundle) -> None:
     one, two = ps.export(bundle, tmp_path / "one"), ps.export(bundle, tmp_path / "two")
     assert one.files == two.files

@@ -75,6 +75,16 @@ def test_forget_asks_first_and_names_the_models(cli: Cli, dataset: Dataset, bund
     assert cli("forget", dataset.path, "P2", "--bundles", tmp_path / "nowhere").status == 2
 
 
+def test_an_exported_model_of_the_data_set_is_a_question_too(dataset: Dataset, bundle: Path, tmp_path: Path) -> None:
+    """It does not say of whom it is."""
+    ours = replace(ps.load(bundle), provenance={"dataset": dataset.head.name, "subjects": 3, "validation_subjects": 1})
+    ours.save(tmp_path / "ours.plush")
+    replace(ours, provenance=ours.provenance | {"dataset": "another"}).save(tmp_path / "other.plush")
+    found = ps.forget(dataset.path, "P1", bundles=[tmp_path]).bundles
+    assert [(Path(b.bundle).name, b.certain) for b in found] == [("ours.plush", False)]
+    assert "does not say who" in found[0].message
+
+
 def test_a_bundle_of_another_data_set_is_only_a_question(dataset: Dataset, bundle: Path, tmp_path: Path) -> None:
     head = dataset.path / "dataset.toml"
     text = head.read_text()

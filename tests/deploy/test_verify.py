@@ -6,6 +6,7 @@ import json
 import shutil
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from plushsense.deploy.package import ARDUINO, package
 from plushsense.deploy.targets import TARGETS
 from plushsense.deploy.vectors import Export
 from plushsense.deploy.verify import Setting, verify
+from plushsense.models.image import HEAD_BYTES, head
 
 EMULATED = [name for name in TARGETS if name != "host"]
 
@@ -145,6 +147,7 @@ def test_golden_vectors_that_are_too_weak_let_a_fault_through(
     (own / "golden" / "answers.bin").write_bytes(few.astype("<i4").tobytes())
     done = verify(Export(own), ["host"], only=plainly, plant=lambda fault: fault.kind in ("weight", "constant"))
     assert done.mismatches == 0 and not done.passed
+    assert done.decisions == 0 and not verify(Export(own), ["host"], only=plainly).passed, "the toy only warmed"
     assert not any(f.caught for f in done.faults if f.kind == "weight")
 
 
@@ -190,6 +193,34 @@ def test_an_image_that_was_edited(c_compiler: str, own: Path) -> None:
         verify(Export(own), ["host"], plant=lambda fault: True)
     with pytest.raises(BadInput, match="is not what this PlushSense makes of model.plush"):
         Export(own).made_up(10)
+
+
+def test_without_smoothing_no_fault_is_planted_that_cannot_show(c_compiler: str, tmp_path: Path) -> None:
+    """Nor one that the toy would only refuse."""
+    bundle = replace(bundle_of("plush-15", "9d1_5d2", "4,6"), decision={"smoothing_s": 0})
+    done = verify(Export(exported(tmp_path / "out", bundle)), ["host"], only=plainly, plant=lambda fault: True)
+    assert done.passed and len(done.faults) == len(TEXTS) + 9
+    assert all("should be" in (f.first or "") and "plush_begin" not in (f.first or "") for f in done.faults)
+
+
+def test_an_edited_model_that_agrees_with_its_golden_vectors_is_not_vouched_for(
+    c_compiler: str, own: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The title, which no answer shows; in plush_model.c it is the old one."""
+    whole = (own / "plush_model.bin").read_bytes()
+    body = bytearray(whole[HEAD_BYTES:])
+    body[-3] ^= 1
+    (own / "plush_model.bin").write_bytes(head(bytes(body)) + body)
+    done = verify(Export(own), ["host"], only=lambda s: s.image)
+    assert not done.passed and "plush_model.c does not hold the bytes of plush_model.bin" in (done.first or "")
+    assert not verify(Export(own), ["host"], only=plainly).own
+    (own / "plush_model.bin").write_bytes(whole)
+    edit(own / "export.json", '"smoothing": ', '"smoothing": 1')
+    assert main(["verify", str(own), "--target", "host"]) == 0
+    assert "nobody vouches for those" in capsys.readouterr().out
+    edit(own / "export.json", '"smoothing": ', '"smoothing": true, "was": ')
+    assert main(["verify", str(own), "--target", "host"]) == 2
+    assert "has the smoothing True" in capsys.readouterr().err
 
 
 def test_c_that_warns_or_writes_past_its_memory(c_compiler: str, own: Path, capsys: pytest.CaptureFixture[str]) -> None:

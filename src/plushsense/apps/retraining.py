@@ -20,7 +20,8 @@ SUFFIX = ".plush"
 
 @dataclass(frozen=True)
 class TrainedOn:
-    """A bundle that names the person's code; ``certain`` where its data set had the content that this one has."""
+    """A bundle that names the person's code, or may be of them; ``certain`` where its data set had the content that
+    this one has."""
 
     bundle: str
     certain: bool
@@ -73,7 +74,7 @@ def forget(
 def trained_on(folder: Path, subject: str, places: Iterable[Path]) -> list[TrainedOn]:
     """Bundles below ``places`` that name the person among those they were trained or validated on.
 
-    A bundle that cannot be read is named too: nobody knows.
+    A bundle that cannot be read is named too, and so is one of this data set that was exported: nobody knows.
     """
     name = DatasetHead.read(folder).name
     try:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import BadInput
+from plushsense.models.fixed import PROBABILITY_BITS
 from plushsense.models.image import GROUP, head
 from plushsense.models.image import HEAD_BYTES as BODY
 
@@ -43,7 +44,7 @@ class _Text:
     name: str
     text: str
     wrong: str
-    when: Literal["always", "dilated", "magnitude", "ranged", "ties"] = "always"
+    when: Literal["always", "dilated", "magnitude", "ranged", "smoothed", "ties"] = "always"
 
 
 # Every one stays within the toy's memory, so that it is the answers that give it away, and not a crash.
@@ -115,6 +116,7 @@ TEXTS = (
         "the smoothing is cut off, not rounded",
         "((low * toy->smoothing + 16384u) >> 15)",
         "((low * toy->smoothing) >> 15)",
+        "smoothed",
     ),
     _Text(
         "rounding",
@@ -185,7 +187,8 @@ def faults_of(image: bytes, source: str) -> list[Fault]:
         found.append(_in_image("shift", f"one shift of {what} by one", image, shift, "B", _MOST_SHIFT))
     found.append(_in_image("shift", "one input's shift by one", image, at.inputs[0] + 11, "B", _MOST_SHIFT))
     found.append(_in_image("constant", "the longest gap by one", image, BODY + _GAP_AT, "I", by=at.units_per_ms))
-    found.append(_in_image("constant", "the smoothing's weight by one", image, BODY + _SMOOTHING_AT, "H"))
+    where = BODY + _SMOOTHING_AT
+    found.append(_in_image("constant", "the smoothing's weight by one", image, where, "H", 1 << PROBABILITY_BITS))
     ranged = [n for n, (_, high) in enumerate(at.ranges) if high < _INT32]
     for n in ranged[:1]:
         where = BODY + _FIXED_BYTES + 8 * n + 4
@@ -195,6 +198,8 @@ def faults_of(image: bytes, source: str) -> list[Fault]:
         "dilated": any(layer.dilation > 1 for layer in at.layers),
         "magnitude": at.magnitudes,
         "ranged": bool(ranged),
+        # With the whole weight on the new step nothing is left to round.
+        "smoothed": at.smoothing < 1 << PROBABILITY_BITS,
         # In fine units of time hardly any value lies just between two whole numbers.
         "ties": at.units_per_ms <= 10,
     }
@@ -244,6 +249,7 @@ class _Places:
     def __init__(self, image: bytes) -> None:
         count, channels, inputs, classes = struct.unpack_from("<BBBB", image, BODY)
         (self.units_per_ms,) = struct.unpack_from("<I", image, BODY + 20)
+        (self.smoothing,) = struct.unpack_from("<H", image, BODY + _SMOOTHING_AT)
         at = BODY + _FIXED_BYTES
         self.ranges = [struct.unpack_from("<ii", image, at + 8 * i) for i in range(channels)]
         at += 8 * channels

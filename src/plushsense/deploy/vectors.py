@@ -13,7 +13,7 @@ from plushsense.core.errors import BadInput, ConfigError
 from plushsense.core.recfile import Frames
 from plushsense.dataset.store import Dataset
 from plushsense.deploy.calibration import integer_model
-from plushsense.deploy.emit import BUNDLE, GOLDEN, IMAGE, LIBRARY, MODEL, read_facts
+from plushsense.deploy.emit import BUNDLE, FACTS, GOLDEN, IMAGE, LIBRARY, MODEL, read_facts
 from plushsense.deploy.golden import COLUMNS, answers_of, golden_frames, read_golden
 from plushsense.deploy.streams import frames_of
 from plushsense.models.bundle import Bundle
@@ -69,7 +69,10 @@ class Export:
         self.title = str(facts["title"])
         self.bundle = Bundle.load(self.folder / BUNDLE)
         model = integer_model(self.bundle)
-        self.model: IntegerModel = replace(model, smoothing=int(facts.get("smoothing", model.smoothing)))
+        smoothing = facts.get("smoothing", model.smoothing)
+        if isinstance(smoothing, bool) or not isinstance(smoothing, int):
+            raise BadInput(f"'{self.folder / FACTS}' has the smoothing {smoothing!r}: export the model again.")
+        self.model: IntegerModel = replace(model, smoothing=smoothing)
         self.image = (self.folder / IMAGE).read_bytes()
         arch = self.model.network.arch
         frames, answers = read_golden(self.folder / GOLDEN, len(self.model.layout.channels), arch.classes)

@@ -19,6 +19,7 @@ from typing import Any
 from plushsense.core.errors import BuildError, ProgramError, ToolError
 from plushsense.deploy.emit import IMAGE, LIBRARY, MODEL
 from plushsense.deploy.faults import Fault, faults_of
+from plushsense.deploy.golden import COLUMNS
 from plushsense.deploy.targets import C_FOLDER, TARGETS, build, missing_tools, require, target_named
 from plushsense.deploy.vectors import Compared, Counts, Export, Vectors, compare, counted
 
@@ -101,9 +102,16 @@ class Caught:
 
 @dataclass(frozen=True)
 class Verified:
-    """What was checked; ``passed`` when nothing differs and no planted fault slipped through."""
+    """What was checked; ``passed`` when nothing differs and no planted fault slipped through.
+
+    ``decisions`` are the answers that were not of a warming toy: without any, nothing was proven. ``own``: the model
+    and its golden vectors are what this PlushSense makes of the bundle beside them; else it is only known that the C
+    and the vectors agree.
+    """
 
     title: str
+    own: bool
+    decisions: int
     counts: tuple[Counts, ...]
     runs: tuple[Run, ...]
     not_run: tuple[tuple[str, str], ...]
@@ -120,13 +128,15 @@ class Verified:
 
     @property
     def passed(self) -> bool:
-        return self.mismatches == 0 and all(f.caught for f in self.faults)
+        return self.mismatches == 0 and self.decisions > 0 and all(f.caught for f in self.faults)
 
     def to_dict(self) -> dict[str, Any]:
         """The object that ``plushsense verify --json`` prints."""
         return {
             "title": self.title,
             "passed": self.passed,
+            "own": self.own,
+            "decisions": self.decisions,
             "vectors": sum(r.vectors for r in self.runs),
             "mismatches": self.mismatches,
             "max_abs_diff": max((r.max_abs_diff for r in self.runs), default=0),
@@ -203,7 +213,10 @@ def verify(
         for each in pool.map(spoil, range(len(pairs)), *zip(*pairs, strict=True)) if pairs else ():
             caught.append(each)
             tell()
-    return Verified(export.title, counted(streams), tuple(runs), tuple(not_run), tuple(caught))
+    decisions = sum(int(v.answers[:, COLUMNS.index("state")].sum()) for v in streams)
+    return Verified(
+        export.title, export.is_own, decisions, counted(streams), tuple(runs), tuple(not_run), tuple(caught)
+    )
 
 
 def _choose(targets: Sequence[str], only: Callable[[Setting], bool]) -> tuple[list[Setting], list[tuple[str, str]]]:
@@ -281,11 +294,15 @@ def _attempt(export: Export, folder: Path, setting: Setting, vector: Vectors, fr
     # A copy: beside its original stands PlushSense's own plushsense.h, which a compiler would find first.
     harness = out / ("harness.cpp" if setting.cpp else "harness.c")
     shutil.copyfile(HARNESS, harness)
-    sources = [folder / LIBRARY[1], harness] + ([] if setting.image else [folder / MODEL[1]])
+    # Of the export itself both forms of the model are there, and must be the same bytes.
+    both = setting.image and folder == export.folder
+    sources = [folder / LIBRARY[1], harness] + ([folder / MODEL[1]] if both or not setting.image else [])
     blobs = {"frames": frames} | ({"image": folder / IMAGE} if setting.image else {})
     classes = len(export.labels)
     defines = {"PLUSH_HARNESS_CHANNELS": vector.frames.shape[1] - 1, "PLUSH_HARNESS_CLASSES": classes}
     defines |= {"PLUSH_HARNESS_IMAGE": 1} if setting.image else {}
+    if both:
+        defines["PLUSH_HARNESS_BOTH"] = 1
     program = build(
         setting.target,
         sources,

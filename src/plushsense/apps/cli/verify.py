@@ -89,6 +89,13 @@ def _text(done: Verified) -> list[str]:
         said += ["", done.first]
     elif done.passed:
         said += ["", "Every number of every answer is equal."]
+        if not done.own:
+            said += [
+                "The model here is not what this PlushSense makes of the bundle beside it: the C agrees with the "
+                "golden vectors in the folder, and nobody vouches for those. Export again to be sure."
+            ]
+    elif not done.decisions:
+        said += ["", "Nothing is proven: in none of the answers the toy had stopped warming. Export the model again."]
     else:
         said += ["", "A planted fault was not noticed: the golden vectors of this export are too weak for it."]
     return said

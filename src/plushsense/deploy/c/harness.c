@@ -11,7 +11,7 @@
  *
  * PLUSH_HARNESS_CHANNELS and PLUSH_HARNESS_CLASSES say of how many the frames and the expected rows are.
  * With PLUSH_HARNESS_IMAGE the model is not the one compiled in (plush_model.c) but the bytes of plush_model.bin, as
- * when a model is swapped without compiling the code again.
+ * when a model is swapped without compiling the code again; with PLUSH_HARNESS_BOTH too they must be the same bytes.
  */
 #include "plush_model.h"
 #include "plushsense.h"
@@ -138,6 +138,10 @@ int main(void)
             values[i] = signed_number(p + 4u + 4u * i);
         due += plush_push(&toy, number(p), values);
     }
+#ifdef PLUSH_HARNESS_BOTH
+    if (bytes != PLUSH_MODEL_BYTES || memcmp(image, plush_model, PLUSH_MODEL_BYTES) != 0)
+        return wrong("plush_model.c does not hold the bytes of plush_model.bin.");
+#endif
     if (due != rows || toy.answers != rows)
         return wrong("plush_push() or toy.answers counts other answers than on_answer saw.");
     if (memory[0] != POISON)
