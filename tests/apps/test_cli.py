@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from plushsense.apps.cli.main import VERBS
+from plushsense.apps.cli.settings import epochs_shown
 from plushsense.dataset.store import Dataset
 
 Cli = Callable[..., Any]
@@ -470,3 +471,14 @@ def test_each_fold_is_deployed_with_ranges_of_its_own_training_windows(dataset: 
     plain = cli(*words[:-1], "--json").json
     assert "int8" not in plain and plain["accuracy"] == found["accuracy"]
     assert cli(*words, "--padding", "mirror").status == 2
+
+
+def test_fine_tuning_is_told_from_training(capsys: pytest.CaptureFixture[str]) -> None:
+    show = epochs_shown()
+    show(1, 1, {"train_loss": 1.5, "validation_accuracy": 0.5})
+    show(1, 1, {"train_loss": 0.0002, "validation_accuracy": None, "what": "fine-tuning for 8 bits"})
+    said = capsys.readouterr().err.splitlines()
+    assert said == [
+        "training: epoch 1 of 1, loss 1.500, validation accuracy 0.500",
+        "fine-tuning for 8 bits: epoch 1 of 1, loss 2.0e-04",
+    ]

@@ -96,7 +96,7 @@ def fine_tune(
                 total += float(loss.detach()) * len(batch)
             history.append({"epoch": epoch, "train_loss": total / len(x), "learning_rate": rate})
             if progress is not None:
-                progress(epoch, epochs, history[-1] | {"validation_accuracy": None})
+                progress(epoch, epochs, history[-1] | {"what": "fine-tuning for 8 bits", "validation_accuracy": None})
     return Tuned(network.export_weights(), history)
 
 

@@ -115,7 +115,8 @@ def epochs_shown(what: str = "training") -> Callable[[int, int, dict[str, Any]],
     rewritten = sys.stderr.isatty()
 
     def show(epoch: int, epochs: int, row: dict[str, Any]) -> None:
-        text = f"{what}: epoch {epoch} of {epochs}, loss {row['train_loss']:.3f}"
+        loss = row["train_loss"]  # fine-tuning's is a small one of another kind
+        text = f"{row.get('what', what)}: epoch {epoch} of {epochs}, loss {loss:{'.3f' if loss >= 0.01 else '.1e'}}"
         if row["validation_accuracy"] is not None:
             text += f", validation accuracy {row['validation_accuracy']:.3f}"
         if rewritten:
