@@ -113,3 +113,13 @@ def test_a_calibration_of_another_network_or_of_no_numbers_is_refused(broken: di
     kept = {name: value for name, value in (bundle.calibration | broken).items() if value is not None}
     with pytest.raises(BundleError, match="train (it )?again"):
         integer_model(replace(bundle, calibration=kept))
+
+
+def test_inputs_that_spread_over_all_32_bits_are_scaled_too() -> None:
+    bundle = make()
+    rng = np.random.default_rng(4)
+    x = rng.integers(-(1 << 31), 1 << 31, size=(20, bundle.arch.channels, bundle.arch.span + 10))
+    wide = replace(bundle, scaler=Scaler.fit(x))
+    network = integer_network(calibrated(wide, x))
+    codes = network.inputs.apply(x.transpose(0, 2, 1))
+    assert codes.min() < 8 and codes.max() > 247 and 120 < codes.mean() < 135

@@ -6,6 +6,7 @@ import os
 from dataclasses import fields
 
 import numpy as np
+from numpy.typing import NDArray
 
 from plushsense.apps.preparation import Warn, opened, silent, windows_for
 from plushsense.core.errors import BundleError
@@ -21,9 +22,22 @@ _BY_PERSON = "validation-subjects"
 
 
 def calibrated_on(bundle: Bundle, dataset: Dataset | str | os.PathLike[str], warn: Warn = silent) -> Bundle:
-    """The bundle with the ranges of its training people's windows, cut as its own were.
+    """The bundle with the ranges of its `training_windows`; one that was fine-tuned for its ranges keeps them.
 
-    One that was fine-tuned for the ranges that it holds keeps them.
+    Raises:
+        ArchError, BundleError: as `training_windows`.
+    """
+    refuse_undeployable(bundle.arch)
+    if bundle.calibration and bundle.provenance.get("quantize_aware"):
+        warn("the bundle was fine-tuned for the calibration that it holds, so that it keeps it")
+        return bundle
+    return calibrated(bundle, training_windows(bundle, dataset, warn))
+
+
+def training_windows(
+    bundle: Bundle, dataset: Dataset | str | os.PathLike[str], warn: Warn = silent
+) -> NDArray[np.int32]:
+    """The raw windows (N, C, T) of the people that a bundle was trained on, cut as its own were.
 
     Args:
         dataset: the one that it was trained on; warned of when its content is another by now.
@@ -35,9 +49,6 @@ def calibrated_on(bundle: Bundle, dataset: Dataset | str | os.PathLike[str], war
     refuse_undeployable(bundle.arch)
     dataset = opened(dataset)
     origin = bundle.provenance
-    if bundle.calibration and origin.get("quantize_aware"):
-        warn("the bundle was fine-tuned for the calibration that it holds, so that it keeps it")
-        return bundle
     # Nobody's windows stand in every fold, held-back ones too.
     if isinstance(origin.get("subjects"), int):
         raise BundleError(
@@ -69,4 +80,4 @@ def calibrated_on(bundle: Bundle, dataset: Dataset | str | os.PathLike[str], war
     missing = sorted(people - set(windows.subject[mine].tolist()))
     if missing:
         warn(f"not in '{dataset.head.name}' any more: {', '.join(missing)}")
-    return calibrated(bundle, windows.x[mine])
+    return windows.x[mine]

@@ -8,14 +8,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from plushsense.apps.calibrating import calibrated_on
-from plushsense.apps.preparation import Warn, silent
+from plushsense.apps.calibrating import calibrated_on, training_windows
+from plushsense.apps.preparation import Warn, opened, silent
 from plushsense.dataset.store import Dataset
 from plushsense.deploy.calibration import integer_model
 from plushsense.deploy.convert import CONVERTERS, check_format, convert
 from plushsense.deploy.emit import Exported, emit, without_people
 from plushsense.deploy.package import package
 from plushsense.models.bundle import Bundle
+
+_TRIED = 512  # windows
 
 
 def export(
@@ -43,14 +45,19 @@ def export(
         BadInput: for a folder that is taken.
     """
     given = bundle if isinstance(bundle, Bundle) else Bundle.load(Path(bundle))
+    windows = None
     if dataset is not None:
-        given = calibrated_on(given, dataset, warn)
+        dataset = opened(dataset)
+        windows = training_windows(given, dataset, warn) if also else None
+        # Some tell as much to a converter, which tries them one by one.
+        windows = None if windows is None else windows[:: -(-len(windows) // _TRIED)]
+        given = calibrated_on(given, dataset, warn if windows is None else silent)
     model = integer_model(given)
     given = replace(given, provenance=without_people(given.provenance))
 
     def converted(folder: Path, facts: dict[str, Any]) -> None:
         for name in dict.fromkeys(also):
-            done = convert(given, folder / CONVERTERS[name].file_name, name)
+            done = convert(given, folder / CONVERTERS[name].file_name, name, windows=windows)
             facts.setdefault("conversions", {})[name] = {
                 "file": done.path.name,
                 "bytes": done.bytes,

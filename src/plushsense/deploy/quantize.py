@@ -177,7 +177,7 @@ def _input_scale(scaler: Scaler, low: Floats, unit: Floats) -> InputScale:
     for offset, scale, start, size in zip(scaler.offset, scaler.scale, low, unit, strict=True):
         ratio = float(scale / size)
         middle = round(float(offset + (start + 127.5 * size) / scale))
-        before, multiplier, after = split_ratio(ratio, 128 / ratio + 1, most_after=22)
+        before, multiplier, after = split_ratio(ratio, 128 / ratio + 1, 22, 16)
         there = ((middle - offset) * scale - start) / size
         rows.append((middle, before, multiplier, round((there + 0.5) * 2.0**after), after))
     return InputScale(*np.array(rows, dtype=np.int64).T)

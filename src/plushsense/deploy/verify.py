@@ -315,7 +315,7 @@ def _attempt(export: Export, folder: Path, setting: Setting, vector: Vectors, fr
         flags=setting.flags,
     )
     try:
-        got = program.run(timeout_s=120 + 0.02 * len(vector.frames))
+        got = program.run(timeout_s=60 + 0.02 * len(vector.frames))
     except ProgramError as cause:
         # None of the answers was given.
         return Compared(len(vector.answers), len(vector.answers), 0, f"{where}: {cause}")

@@ -49,6 +49,7 @@ class BothEngines:
     def __init__(self, integer: IntegerClassifier, original: StreamReader) -> None:
         self.integer, self.original = integer, original
         self.layout, self.step_s = integer.layout, integer.step_s
+        self._told = any(g.affect != "none" for g in integer.model.gestures.gestures)
         self.reset()
 
     @property
@@ -87,7 +88,8 @@ class BothEngines:
         return decisions
 
     def agreement(self) -> dict[str, Any]:
-        """How often both said the same, of the ``decisions`` with an answer; None where there was none.
+        """How often both said the same, of the ``decisions`` with an answer; None where there was none,
+        and for affect where no gesture carries one.
 
         ``gesture`` and ``affect`` are shares, ``largest_difference`` that of any smoothed probability.
         """
@@ -95,6 +97,6 @@ class BothEngines:
         return {
             "decisions": n,
             "gesture": self._gesture / n if n else None,
-            "affect": self._affect / n if n else None,
+            "affect": self._affect / n if n and self._told else None,
             "largest_difference": self._far if n else None,
         }

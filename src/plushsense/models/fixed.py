@@ -143,7 +143,7 @@ class LogitScale(_Table):
         return np.asarray(np.clip(logits, -LOGIT_LIMIT, LOGIT_LIMIT))
 
 
-def split_ratio(ratio: float, highest: float, most_after: int = 30) -> tuple[int, int, int]:
+def split_ratio(ratio: float, highest: float, most_after: int = 30, most_before: int = 30) -> tuple[int, int, int]:
     """(before, multiplier, after) that multiply by ``ratio``; arguments reach up to ``highest``.
 
     ``before`` shifts ``highest`` under 2^15, so that only bits of no weight are lost; the multiplier has 15 bits. A
@@ -151,7 +151,7 @@ def split_ratio(ratio: float, highest: float, most_after: int = 30) -> tuple[int
     """
     if not (ratio > 0 and np.isfinite(ratio) and highest >= 0 and np.isfinite(highest)):
         return 0, 0, 0
-    before = min(max(int(highest).bit_length() - _MULTIPLIER_BITS, 0), 30)
+    before = min(max(int(highest).bit_length() - _MULTIPLIER_BITS, 0), most_before)
     multiplier, after = ratio * 2.0**before, 0
     while multiplier < 1 << 14 and after < most_after:
         multiplier, after = multiplier * 2, after + 1
