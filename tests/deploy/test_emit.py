@@ -116,9 +116,9 @@ def test_the_model_as_c(tmp_path: Path, c_compiler: str) -> None:
     main.write_text(
         '#include <stdio.h>\n#include "plush_model.h"\n#include "plushsense.h"\n'
         "static uint32_t memory[PLUSH_MODEL_MEMORY_WORDS];\nstatic plush_toy toy;\n"
-        "int main(void) { fwrite(plush_model, 1, PLUSH_MODEL_BYTES, stdout);\n"
-        "return (int)plush_begin(&toy, plush_model, PLUSH_MODEL_BYTES, memory, sizeof memory)\n"
-        "       + PLUSH_GESTURE_AT_REST; }\n"
+        "int main(void) { int wrong; fwrite(plush_model, 1, PLUSH_MODEL_BYTES, stdout);\n"
+        "wrong = (int)plush_begin(&toy, plush_model, PLUSH_MODEL_BYTES, memory, sizeof memory);\n"
+        "return wrong + PLUSH_GESTURE_AT_REST + (toy.layout != PLUSH_MODEL_LAYOUT); }\n"
     )
     out = tmp_path / "out"
     words = [c_compiler, "-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror", f"-I{out}"]

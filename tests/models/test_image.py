@@ -6,7 +6,9 @@ import dataclasses
 import struct
 import sys
 import zlib
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,9 +20,9 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from integers import any_network, models, plain_model
 from plushsense.core.errors import BundleError
 from plushsense.core.gestures import Gesture, GestureSet
-from plushsense.core.signal import Channel, CsvFormat, Derived, Layout
+from plushsense.core.signal import Channel, CsvFormat, Derived, Layout, load_layout
 from plushsense.models.arch import Arch, ConvLayer
-from plushsense.models.image import AFFECT_CODES, IntegerModel, grouped, memory_bytes
+from plushsense.models.image import AFFECT_CODES, IntegerModel, grouped, layout_check, memory_bytes
 
 
 class Reader:
@@ -52,10 +54,10 @@ def test_read_back(model: IntegerModel) -> None:
     head = r.take("BBBBHHIIIIHH")
     assert head[:4] == (len(arch.layers), len(layout.channels), arch.channels, arch.classes)
     assert head[4:7] == (arch.step, arch.pooled // arch.step, arch.span)
-    period, gap, units, smoothing, zero = head[7:]
+    period, gap, units, smoothing, check = head[7:]
     assert period * 1000 == layout.period_us * units
     assert gap == layout.gap_ms * units
-    assert (smoothing, zero) == (model.smoothing, 0)
+    assert (smoothing, check) == (model.smoothing, layout_check(model.layout))
     for channel in layout.channels:
         assert r.take("ii") == (channel.valid_min, channel.valid_max)
     derived = {d.name: d.of for d in layout.derived}
@@ -165,3 +167,12 @@ def test_counts_that_do_not_fit_their_bits() -> None:
         made((ConvLayer(2, 1, 1),), classes=256)
     # As many filters as an architecture may have.
     made((ConvLayer(1, 1, 4096), ConvLayer(1, 1, 1))).to_bytes()
+
+
+def test_the_layout_check_tells_other_channels() -> None:
+    plain = load_layout("accel-3")
+    assert layout_check(plain) == layout_check(replace(plain, name="mine", rate_hz=50.0, gap_ms=200))
+    x, y, z = plain.channels
+    others = [(y, x, z), (replace(x, name="w"), y, z), (replace(x, unit="g"), y, z), (replace(x, step=0.5), y, z)]
+    seen = {layout_check(SimpleNamespace(channels=each)) for each in others}  # type: ignore[arg-type]
+    assert len(seen | {layout_check(plain)}) == 5

@@ -17,7 +17,7 @@ from plushsense.core.errors import BadInput
 from plushsense.core.gestures import NOBODY
 from plushsense.deploy.golden import write_golden
 from plushsense.models.bundle import Bundle
-from plushsense.models.image import HEAD_BYTES, IntegerModel, head, memory_bytes
+from plushsense.models.image import HEAD_BYTES, IntegerModel, head, layout_check, memory_bytes
 
 FACTS = "export.json"
 IMAGE = "plush_model.bin"
@@ -134,6 +134,7 @@ def _facts(model: IntegerModel, bundle: Bundle, model_bytes: int) -> dict[str, A
         "symbol": arch.symbol,
         "filters": list(arch.filters),
         "layout": layout.name,
+        "layout_check": layout_check(layout),
         "channels": [{"name": c.name, "unit": c.unit} for c in layout.channels],
         "inputs": list(layout.inputs),
         "classes": arch.classes,
@@ -231,6 +232,7 @@ extern "C" {{
 #define PLUSH_MODEL_MEMORY_BYTES {facts["memory_bytes"]}u /* what a toy with this model remembers in */
 #define PLUSH_MODEL_MEMORY_WORDS (PLUSH_MODEL_MEMORY_BYTES / 4u)
 #define PLUSH_MODEL_CHANNELS {len(facts["channels"])}
+#define PLUSH_MODEL_LAYOUT {facts["layout_check"]}u /* toy.layout of every model for these channels */
 #define PLUSH_MODEL_CLASSES {facts["classes"]}
 #define PLUSH_MODEL_PERIOD_US {facts["period_us"]}
 #define PLUSH_MODEL_STEP {facts["step"]} /* samples from one answer to the next */

@@ -173,23 +173,25 @@ partition and `esp_partition_mmap()`). They need no alignment. The checksum is l
 ```c
 #include <stddef.h>
 
+#include "plush_model.h"
 #include "plushsense.h"
 
 static uint32_t pool[2048]; /* as much as the largest model needs */
 static plush_toy toy;
 
-plush_status swap(const uint8_t *model, uint32_t bytes, uint8_t channels)
+plush_status swap(const uint8_t *model, uint32_t bytes)
 {{
     plush_status status = plush_begin(&toy, model, bytes, pool, sizeof pool);
 
-    /* A model for other sensors would read beyond a frame of yours: begun on nothing, the toy is silent. */
-    if (status == PLUSH_OK && toy.channels != channels)
+    /* A model for other channels cannot read your frames: begun on nothing, the toy is silent. */
+    if (status == PLUSH_OK && toy.layout != PLUSH_MODEL_LAYOUT)
         status = plush_begin(&toy, NULL, 0, NULL, 0); /* PLUSH_NOT_A_MODEL */
     return status;
 }}
 ```
 
-That the number of channels is right does not say that they are: the layout of both exports must be the same.
+`PLUSH_MODEL_LAYOUT` stands for the names, units, steps and order of the channels; where a sensor is mounted, nobody
+checks.
 """
 
 

@@ -4,7 +4,8 @@ All numbers are little-endian. Fixed head (16 bytes): ``PLSH``, u16 version, u16
 of all that follows the head. Then, one after the other:
 
 - u8 layers, u8 measured channels, u8 inputs, u8 classes, u16 step, u16 blocks of the pooling, u32 span (samples),
-  u32 period and u32 gap of the clock in its own units, u32 milliseconds to units, u16 smoothing weight, u16 0
+  u32 period and u32 gap of the clock in its own units, u32 milliseconds to units, u16 smoothing weight, u16
+  layout check (`layout_check`)
 - a measured channel: i32 lowest and i32 highest valid value
 - an input: u8 kind (0 a channel, 1 a magnitude), u8 n, n × u8 measured channels, then i32 offset, i32 bias,
   u16 multiplier, u8 before, u8 after
@@ -21,6 +22,7 @@ The C library believes none of it unseen: it refuses an image in which a count o
 
 from __future__ import annotations
 
+import json
 import math
 import struct
 import zlib
@@ -112,7 +114,7 @@ class IntegerModel:
         units_per_ms = self._units_per_ms
         found = [
             (
-                "layers, measured channels, inputs, classes; step, blocks; span; period, gap, units a ms; smoothing, 0",
+                "layers, channels, inputs, classes; step, blocks; span; period, gap, units a ms; smoothing, layout",
                 struct.pack(
                     "<BBBBHHIIIIHH",
                     len(arch.layers),
@@ -126,7 +128,7 @@ class IntegerModel:
                     layout.gap_ms * units_per_ms,
                     units_per_ms,
                     self.smoothing,
-                    0,
+                    layout_check(layout),
                 ),
             )
         ]
@@ -164,6 +166,12 @@ class IntegerModel:
         """The image."""
         body = b"".join(piece for _, piece in self.sections())
         return head(body) + body
+
+
+def layout_check(layout: Layout) -> int:
+    """16 bits for the order, names, units and steps of a frame's channels: where these differ, so do the sensors."""
+    told = json.dumps([[c.name, c.unit, c.step] for c in layout.channels])
+    return zlib.crc32(told.encode()) & 0xFFFF
 
 
 def head(body: bytes) -> bytes:

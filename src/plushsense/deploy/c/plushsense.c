@@ -195,6 +195,7 @@ static int read_head(plush_toy *toy, source *from)
     toy->gap = le32(p + 16);
     toy->units_per_ms = le32(p + 20);
     toy->smoothing = (uint16_t)le16(p + 24);
+    toy->layout = (uint16_t)le16(p + 26);
     toy->ranges = next_bytes(from, 8u * toy->channels);
     if (toy->layers == 0 || toy->layers > PLUSH_MAX_LAYERS || toy->channels == 0 || toy->inputs == 0 ||
         toy->classes == 0 || toy->step == 0 || toy->step > MOST_STEP || toy->blocks == 0 || toy->period == 0 ||

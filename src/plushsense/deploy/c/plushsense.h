@@ -74,7 +74,7 @@ typedef struct {
     uint32_t *tap_sums;     /* for each of the next `dilation` samples: sum of the activations already under its taps */
 } plush_layer;
 
-/* A toy: everything about one stream. Fields from `answer` to `invalid` may be read, no field may be written. */
+/* A toy: everything about one stream. Fields from `answer` to `invalid` may be read, none may be written. */
 typedef struct plush_toy {
     plush_answer answer;     /* the newest one */
     uint32_t answers;        /* how many there were; wraps, like all counts */
@@ -86,11 +86,12 @@ typedef struct plush_toy {
     void (*on_answer)(const struct plush_toy *toy, void *user);
     void *user;
 
-    /* The model, as it was read. */
+    /* The model, as it was read. `channels` and `layout` may be read, too: `layout` stands for the names, units, steps
+     * and order of the channels in a frame, and PLUSH_MODEL_LAYOUT says it of the model that your program was made for. */
     uint8_t layers, channels, inputs, classes;
     uint16_t step, blocks, features;
     uint32_t span, period, gap, units_per_ms, narrow;
-    uint16_t smoothing;
+    uint16_t smoothing, layout;
     void *memory;
     uint32_t memory_bytes;
     const uint8_t *ranges, *input_plan, *dense, *dense_weights, *names, *title;
