@@ -40,7 +40,9 @@ def add(parser: argparse.ArgumentParser) -> None:
         help=f"samples to stream besides the golden vectors: of DS ({_SAMPLES:,}), or made up (default: none)",
     )
     parser.add_argument(
-        "--faults", action="store_true", help="also plant faults, one at a time, each of which must be noticed"
+        "--faults",
+        action="store_true",
+        help="also plant faults, one at a time, each of which must be noticed (minutes)",
     )
 
 
