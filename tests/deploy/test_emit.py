@@ -95,7 +95,8 @@ def test_no_label_ends_a_comment_or_turns_it_round(label: str) -> None:
 def test_golden_frames_reach_what_they_should(layout: str) -> None:
     model, bundle = made(layout)
     read = model.layout
-    frames = golden_frames(read, bundle.scaler, model.network.arch.span)
+    frames = golden_frames(read, bundle.scaler, model.network.arch.span, inputs=model.network.inputs)
+    assert (np.diff(frames[:, 0]) == 20).sum() > model.network.arch.span // 3, "two periods: halves between two frames"
     steps = np.diff(frames[:, 0])
     assert (
         (steps == read.gap_ms).any()

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import BadInput
 from plushsense.core.signal import MAGNITUDE_FRACTION_BITS, Layout
-from plushsense.models.fixed import SMOOTH_EXTRA_BITS, smooth, softmax
+from plushsense.models.fixed import SMOOTH_EXTRA_BITS, InputScale, smooth, softmax
 from plushsense.models.image import AFFECT_CODES, IntegerModel
 from plushsense.windows.clock import Clock
 from plushsense.windows.features import SampleInputs, Scaler
@@ -21,6 +21,7 @@ FRAMES, ANSWERS = "frames.bin", "answers.bin"
 COLUMNS = ("frame", "ms", "sample", "state", "gesture", "affect", "confidence", "restarts", "invalid")
 Ints = NDArray[np.int64]
 _MS_BITS = 32
+_SEARCHED = 4096  # numbers on each side of a channel's mean
 _INT32 = -(1 << 31), (1 << 31) - 1
 
 
@@ -63,13 +64,14 @@ def answers_of(model: IntegerModel, frames: Ints) -> NDArray[np.int32]:
     return (table & 0xFFFFFFFF).astype(np.uint32).view(np.int32)
 
 
-def golden_frames(layout: Layout, scaler: Scaler, span: int, seed: int = 1) -> Ints:
+def golden_frames(layout: Layout, scaler: Scaler, span: int, seed: int = 1, inputs: InputScale | None = None) -> Ints:
     """Frames (n, 1 + C) that try what can go wrong: the first column is the toy's clock in ms.
 
     Each part lasts longer than ``span``, so that every restart is followed by answers: touches with a jittering clock
     and lost frames; values out of range (also from the start, where there is no valid one yet); gaps just bridged and
     just too long; equal stamps; a clock that starts again; channels stuck at the ends of their range, and jumping
-    between them; the clock's wrap at 2^32.
+    between them; the clock's wrap at 2^32. With the scale of the ``inputs``, also samples in the middle between two
+    whole numbers of which one is read as the next 8-bit number: there a wrong rounding shows.
     """
     make = _Maker(layout, scaler, np.random.default_rng(seed))
     part = span + 150
@@ -84,6 +86,9 @@ def golden_frames(layout: Layout, scaler: Scaler, span: int, seed: int = 1) -> I
     make.touches(part)
     for kind in ("low", "high", "jump"):
         make.extremes(span + 30, kind)
+    if inputs is not None:
+        make.wait(layout.gap_ms + 1)
+        make.halves(part, inputs)
     make.touches(part)
     make.now = (1 << _MS_BITS) - 1 - part * 6
     make.touches(part + 300)
@@ -143,6 +148,38 @@ class _Maker:
             self.put(self.high if top else self.low)
             self.now += self.pace()
 
+    def halves(self, n: int, inputs: InputScale) -> None:
+        """Frames two periods apart, for n samples: those between two frames lie half a number beside an edge."""
+        apart, rest = divmod(2 * self.layout.period_us, 1000)
+        if rest or not 0 < apart <= self.layout.gap_ms:
+            return
+        edges = self._edges(inputs)
+        for _ in range(n // 4):
+            first = np.rint(np.clip(self.mean, self.low, self.high)).astype(np.int64)
+            second = first.copy()
+            for channel, found in edges.items():
+                edge, swing = int(self.rng.choice(found)), int(self.rng.integers(0, 40))
+                first[channel], second[channel] = edge + swing, edge - 1 - swing
+            for values in (first, second):
+                self.put(np.clip(values, self.low, self.high))
+                self.now += apart
+
+    def _edges(self, inputs: InputScale) -> dict[int, Ints]:
+        """For each measured channel that is an input, the numbers near its mean that are the first of an 8-bit one."""
+        names = self.layout.inputs
+        around = np.zeros((2 * _SEARCHED, len(names)), dtype=np.int64)
+        direct = {i: self.layout.index(n) for i, n in enumerate(names) if n in self.layout.names}
+        for i, channel in direct.items():
+            around[:, i] = np.arange(-_SEARCHED, _SEARCHED) + round(float(self.mean[channel]))
+        codes = inputs.apply(around)
+        found = {}
+        for i, channel in direct.items():
+            edges = around[1:, i][codes[1:, i] != codes[:-1, i]]
+            inside = edges[(edges > self.low[channel] + 41) & (edges < self.high[channel] - 41)]
+            if len(inside):
+                found[channel] = inside
+        return found
+
     def _garbage(self, channel: int) -> int:
         """A value out of the channel's range, where 32 bits have one."""
         low, high = int(self.low[channel]), int(self.high[channel])
@@ -166,7 +203,7 @@ def measured(layout: Layout, scaler: Scaler) -> tuple[NDArray[np.float64], NDArr
 
 def write_golden(model: IntegerModel, scaler: Scaler, folder: Path) -> list[Path]:
     """Write the golden vectors into a folder: `FRAMES`, `ANSWERS` and what they hold."""
-    frames = golden_frames(model.layout, scaler, model.network.arch.span)
+    frames = golden_frames(model.layout, scaler, model.network.arch.span, inputs=model.network.inputs)
     answers = answers_of(model, frames)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / FRAMES).write_bytes((frames & 0xFFFFFFFF).astype("<u4").tobytes())
