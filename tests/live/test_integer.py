@@ -24,7 +24,8 @@ from plushsense.live.loop import run
 from plushsense.live.stream import StreamClassifier
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
-from plushsense.models.image import AFFECT_CODES, IntegerModel
+from plushsense.models.events import AFFECT_CODES
+from plushsense.models.image import IntegerModel
 from plushsense.models.reference import random_weights
 from plushsense.windows.clock import resample
 from plushsense.windows.features import Scaler, inputs
@@ -54,6 +55,8 @@ def of_live(model: IntegerModel, frames: list[Frame]) -> np.ndarray:
         if row and frame.device_ms < frames[row - 1].device_ms:
             zero += (frame.device_ms - frames[row - 1].device_ms) - model.layout.period_us / 1000
         for d in classifier.push(frame):
+            if d.state == "warming" and d.events:
+                continue  # an event that ended with the signal, between two steps
             at_ms = d.t_s * 1000 + zero
             assert abs(at_ms * 1000 - round(at_ms * 1000)) < 1e-3, "times are whole microseconds"
             known = d.state == "tracking"

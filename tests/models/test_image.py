@@ -22,7 +22,8 @@ from plushsense.core.errors import BundleError
 from plushsense.core.gestures import Gesture, GestureSet
 from plushsense.core.signal import Channel, CsvFormat, Derived, Layout, load_layout
 from plushsense.models.arch import Arch, ConvLayer
-from plushsense.models.image import AFFECT_CODES, IntegerModel, grouped, layout_check, memory_bytes
+from plushsense.models.events import AFFECT_CODES
+from plushsense.models.image import IntegerModel, grouped, layout_check, memory_bytes
 
 
 class Reader:

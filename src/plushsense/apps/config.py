@@ -234,7 +234,7 @@ def resolve(path: str | Path | None = None, **flags: Mapping[str, Any]) -> RunCo
         ModelSpec(**tables["model"]),
         replace(training, **tables["training"]),
         EvaluationSpec(**tables["evaluation"]),
-        DecideSpec(**tables["live"]),
+        DecideSpec.from_dict(tables["live"]),
     )
 
 

@@ -24,7 +24,8 @@ class Gesture:
     """One gesture: its label, the affect it carries ("none" where nobody said), and its family of look-alikes.
 
     ``free_choice`` marks a label under which everybody did something else; ``nobody`` one that is recorded without a
-    person (the toy at rest).
+    person (the toy at rest). ``idle``: it means that nothing happens, so that it never makes an event; ``energetic``:
+    so abrupt that threshold rules may notice it before the network does.
     """
 
     label: str
@@ -32,13 +33,15 @@ class Gesture:
     family: str = ""
     free_choice: bool = False
     nobody: bool = False
+    idle: bool = False
+    energetic: bool = False
     description: str = ""
 
     def __post_init__(self) -> None:
         for key in ("label", "affect", "family", "description"):
             if not isinstance(getattr(self, key), str):
                 raise GestureError(f"Gesture {self.label!r}: {key} is {getattr(self, key)!r}; it must be a text.")
-        for key in ("free_choice", "nobody"):
+        for key in ("free_choice", "nobody", "idle", "energetic"):
             if not isinstance(getattr(self, key), bool):
                 raise GestureError(
                     f"Gesture '{self.label}': {key} is {getattr(self, key)!r}; it must be true or false."

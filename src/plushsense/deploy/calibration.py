@@ -71,8 +71,9 @@ def integer_model(bundle: Bundle, decide: DecideSpec | None = None) -> IntegerMo
         ArchError, BundleError: as for `integer_network`; ConfigError: for decision settings that there are not.
     """
     spec = decide or DecideSpec.from_dict(bundle.decision)
-    weight = smoothing_weight(spec.smoothing_s, bundle.arch.step * bundle.layout.period_us / 1e6)
-    return IntegerModel(integer_network(bundle), bundle.layout, bundle.gestures, weight)
+    step_s = bundle.arch.step * bundle.layout.period_us / 1e6
+    weight = smoothing_weight(spec.smoothing_s, step_s)
+    return IntegerModel(integer_network(bundle), bundle.layout, bundle.gestures, weight, spec.rules(step_s))
 
 
 def integer_probabilities(network: IntegerNetwork, x: NDArray[np.integer[Any]]) -> NDArray[np.float32]:

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import BadInput
 from plushsense.core.signal import MAGNITUDE_FRACTION_BITS, Layout
+from plushsense.models.events import AFFECT_CODES
 from plushsense.models.fixed import SMOOTH_EXTRA_BITS, InputScale, smooth, softmax
-from plushsense.models.image import AFFECT_CODES, IntegerModel
+from plushsense.models.image import IntegerModel
 from plushsense.windows.clock import Clock
 from plushsense.windows.features import SampleInputs, Scaler
 

@@ -5,15 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from plushsense.devices.base import Frame
 from plushsense.live.stream import Decision, StreamReader
 from plushsense.models import fixed
 from plushsense.models.image import IntegerModel
-
-_CONFIDENCE = float(1 << fixed.PROBABILITY_BITS)
-_SMOOTH = float(1 << (fixed.PROBABILITY_BITS + fixed.SMOOTH_EXTRA_BITS))
 
 
 class IntegerClassifier(StreamReader):
@@ -24,23 +20,17 @@ class IntegerClassifier(StreamReader):
     """
 
     def __init__(self, model: IntegerModel) -> None:
-        super().__init__(model.network.arch, model.layout, model.gestures)
+        super().__init__(model.network.arch, model.layout, model.gestures, model.rules, model.smoothing)
         self.model = model
         self._stepper = model.network.stepper()
-        self._mean: fixed.Ints | None = None
         self.reset()
 
     def _forget(self) -> None:
         self._stepper.reset()
-        self._mean = None
 
-    def _answer(self, block: list[list[int]]) -> tuple[int, float, NDArray[np.float64]] | None:
+    def _answer(self, block: list[list[int]]) -> fixed.Ints | None:
         logits = self._stepper.push(np.array(block, dtype=np.int64))
-        if not logits:
-            return None
-        self._mean = mean = fixed.smooth(self._mean, fixed.softmax(logits[-1]), self.model.smoothing)
-        best = int(mean.argmax())
-        return best, (int(mean[best]) >> fixed.SMOOTH_EXTRA_BITS) / _CONFIDENCE, mean / _SMOOTH
+        return logits[-1] if logits else None
 
 
 class BothEngines:
@@ -63,9 +53,19 @@ class BothEngines:
         return self.integer.invalid
 
     @property
+    def faults(self) -> int:
+        """As of the deployed model."""
+        return self.integer.faults
+
+    @property
     def time_s(self) -> float:
         """As of the deployed model."""
         return self.integer.time_s
+
+    def silence(self) -> Decision:
+        """Nothing was heard for a while; the deployed model's decision."""
+        self.original.silence()
+        return self.integer.silence()
 
     def reset(self) -> None:
         """Begin a new stream, with every count at 0."""
@@ -77,7 +77,9 @@ class BothEngines:
     def push(self, frame: Frame) -> list[Decision]:
         """The deployed model's decisions that this frame completes."""
         decisions = self.integer.push(frame)
-        for one, other in zip(decisions, self.original.push(frame), strict=True):
+        answered = [d for d in decisions if d.probabilities is not None]
+        others = [d for d in self.original.push(frame) if d.probabilities is not None]
+        for one, other in zip(answered, others, strict=True):
             if one.probabilities is None or other.probabilities is None:
                 continue
             self._compared += 1

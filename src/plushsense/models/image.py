@@ -26,7 +26,7 @@ import json
 import math
 import struct
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,13 +34,14 @@ from numpy.typing import NDArray
 from plushsense.core.errors import BundleError
 from plushsense.core.gestures import GestureSet
 from plushsense.core.signal import Layout
+from plushsense.models.events import AFFECT_CODES
 from plushsense.models.fixed import PROBABILITY_BITS, LogitScale, Requantize
 from plushsense.models.integer import IntegerNetwork
+from plushsense.models.rules import Rules
 
 MAGIC = b"PLSH"
 IMAGE_VERSION = 1
 HEAD_BYTES = 16
-AFFECT_CODES = {"none": 0, "positive": 1, "neutral": 2, "negative": 3}
 GROUP = 4  # filters computed together, and channels read together
 MOST_CLOCK_UNITS = 1 << 22  # of the gap and the period: interpolation then needs no more than 32 bits
 
@@ -59,6 +60,7 @@ class IntegerModel:
     layout: Layout
     gestures: GestureSet
     smoothing: int
+    rules: Rules = field(default_factory=Rules)
 
     def __post_init__(self) -> None:
         arch = self.network.arch

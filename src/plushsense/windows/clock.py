@@ -60,6 +60,16 @@ class Clock:
         self._seen_us: int | None = None
         self._forget()
 
+    def forget(self) -> None:
+        """The next frame begins a new segment, as the first one did."""
+        self._seen_us = None
+        self._forget()
+
+    def breaks(self, device_ms: int) -> bool:
+        """Whether a frame of this time would begin a new segment after a gap or a clock reset."""
+        time, seen = int(device_ms) * 1000, self._seen_us
+        return seen is not None and (time < seen or time - seen > self._gap)
+
     def _forget(self) -> None:
         self._held: list[int | None] = [None] * len(self._low)
         self._last: tuple[int, list[int]] | None = None
@@ -78,8 +88,8 @@ class Clock:
         reads these samples.
         """
         time = int(device_ms) * 1000
-        seen, self._seen_us = self._seen_us, time
-        self.restarted = seen is not None and (time < seen or time - seen > self._gap)
+        self.restarted = self.breaks(device_ms)
+        self._seen_us = time
         if self.restarted:
             self.restarts += 1
             self._forget()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from plushsense.apps.cli.output import say
@@ -57,7 +58,10 @@ def run(args: argparse.Namespace) -> int:
     from plushsense.models.bundle import Bundle
 
     bundle = Bundle.load(args.model)
-    classifier = classifier_of(bundle, DecideSpec(args.smoothing) if args.smoothing is not None else None, args.engine)
+    decide = DecideSpec.from_dict(bundle.decision)
+    if args.smoothing is not None:
+        decide = replace(decide, smoothing_s=args.smoothing)
+    classifier = classifier_of(bundle, decide, args.engine)
     with open_device(args.device, bundle.layout, reconnect=args.reconnect) as device:
         say(
             f"reading {args.device}; {bundle.arch.symbol}, a decision every "
