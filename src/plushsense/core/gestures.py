@@ -85,6 +85,11 @@ class GestureSet:
         return tuple(g.affect for g in self.gestures)
 
     @property
+    def tells_affect(self) -> bool:
+        """Whether any gesture carries an affect; in a set where none does, a gesture without one is nothing odd."""
+        return any(g.affect != "none" for g in self.gestures)
+
+    @property
     def families(self) -> tuple[str, ...]:
         """Family of each class."""
         return tuple(g.family for g in self.gestures)

@@ -264,7 +264,7 @@ def _from_files(folder: Path, head: DatasetHead, recordings: list[_Read], stream
         identity = read.path.relative_to(folder / RECORDINGS).with_suffix("").as_posix()
         flags = read.result.warnings + findings(Examined(frames, head.layout, name.rows, usual[label]))
         known = gestures[name.label]
-        if known is None or (known.affect == "none" and not head.gestures.inferred):
+        if known is None or (known.affect == "none" and head.gestures.tells_affect):
             flags.append(f"its label '{name.label}' is not in the gesture set '{head.gestures.name}': no affect")
         if read.sha256 in originals:
             flags.append(f"the same content as {originals[read.sha256]}")

@@ -138,7 +138,7 @@ def not_in_stream(w: Whole) -> Iterator[Said]:
 
 
 def unknown_label(w: Whole) -> Iterator[Said]:
-    if w.dataset.gestures.inferred:
+    if not w.dataset.gestures.tells_affect:
         return
     counts = Counter(gesture_of(o) for o in w.recordings)
     for label, n in sorted(counts.items()):
