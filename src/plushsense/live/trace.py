@@ -33,7 +33,8 @@ class Part:
     """Even samples without a break.
 
     ``start_us`` the time of sample 0 since the stream's first frame, ``ends_us`` that at which it was over: of the last
-    frame, or of the one with which a fault began; ``inputs`` (T, I) raw; ``suspect`` (T,); ``logits`` (n, K) in steps of 1/256, of every step from the one that fills the span.
+    frame, or of the one with which a fault began; ``inputs`` (T, I) raw; ``suspect`` (T,); ``logits`` (n, K) in steps
+    of 1/256, of every step from the one that fills the span.
     """
 
     start_us: int
