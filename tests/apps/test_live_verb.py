@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 COMMAND = [sys.executable, "-m", "plushsense.apps.cli.main"]
-KEYS = ["t_s", "gesture", "affect", "confidence", "source", "state"]
+KEYS = ["t_s", "gesture", "affect", "confidence", "source", "state", "answer", "events"]
 
 
 @pytest.fixture(scope="module")
