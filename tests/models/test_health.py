@@ -14,6 +14,7 @@ from plushsense.models.health import MOST_MS, Health, HealthPlan
 
 ACCEL = load_layout("accel-3")
 LOW, HIGH = int(ACCEL.valid_min_int[0]), int(ACCEL.valid_max_int[0])
+Timed = tuple[int, tuple[int, ...]]
 PLAN = HealthPlan((-900, -900, -900), (900, 900, 900), fault_ms=200, still_ms=300, recover_ms=100)
 
 
@@ -22,15 +23,13 @@ def trembling(at: int, **fixed: int) -> tuple[int, int, int]:
     return fixed.get("x", at % 7), fixed.get("y", -(at % 5)), fixed.get("z", 250 + at % 3)
 
 
-def followed(
-    frames: Iterable[tuple[int, tuple[int, ...]]], plan: HealthPlan = PLAN
-) -> list[tuple[int, str, bool, bool]]:
+def followed(frames: Iterable[Timed], plan: HealthPlan = PLAN) -> list[tuple[int, str, bool, bool]]:
     """(ms, what was said, fault, suspect) of every frame."""
     health = Health(plan, ACCEL)
     return [(ms, health.push(ms, values), health.fault, health.suspect) for ms, values in frames]
 
 
-def said(frames: Iterable[tuple[int, tuple[int, ...]]], plan: HealthPlan = PLAN) -> list[tuple[int, str]]:
+def said(frames: Iterable[Timed], plan: HealthPlan = PLAN) -> list[tuple[int, str]]:
     return [(ms, word) for ms, word, _, _ in followed(frames, plan) if word]
 
 
@@ -75,8 +74,8 @@ def test_wrong_is_counted_without_a_break_but_not_always_of_the_same_channel() -
 
 def test_a_toy_that_is_still_is_suspect_after_half_the_time_and_then_a_fault() -> None:
     found = followed((10 * i, trembling(0) if i >= 10 else trembling(i)) for i in range(60))
-    # The tenth frame is the first that repeats nothing: stillness counts from it.
-    assert [ms for ms, _, _, suspect in found if suspect][0] == 100 + 150
+    # The tenth frame is the last that repeats nothing: stillness counts from it.
+    assert next(ms for ms, _, _, suspect in found if suspect) == 100 + 150
     assert [(ms, word) for ms, word, _, _ in found if word] == [(400, "fault")]
     one_moves = ((10 * i, trembling(0, z=i % 2)) for i in range(100))
     assert not any(word or suspect for _, word, _, suspect in followed(one_moves))
@@ -95,7 +94,7 @@ def test_a_time_of_0_switches_its_rule_off() -> None:
 def test_it_recovers_when_no_frame_was_suspect_for_recover_ms() -> None:
     bad = HIGH + 1
 
-    def frames(until: int, breaks: tuple[int, ...] = ()) -> list[tuple[int, tuple[int, ...]]]:
+    def frames(until: int, breaks: tuple[int, ...] = ()) -> list[Timed]:
         return [(10 * i, trembling(i, x=bad if i < until or i in breaks else 1)) for i in range(120)]
 
     assert said(frames(40)) == [(200, "fault"), (500, "recovered")]
