@@ -11,9 +11,8 @@ from hypothesis import HealthCheck, given, settings
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from troubles import SPECS, STREAMS, TROUBLES, calibrate, events_of, lived, reader_of, same, stream
+from troubles import SPECS, STREAMS, TROUBLES, calibrate, events_of, lived, make_bundle, reader_of, same, stream
 
-from conftest import make_bundle
 from plushsense.core.recfile import Frames, read_stream
 from plushsense.core.signal import Layout, load_layout
 from plushsense.deploy.calibration import integer_model

@@ -7,18 +7,37 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
+from plushsense.core.gestures import Gesture, GestureSet
 from plushsense.core.recfile import Frames
+from plushsense.core.signal import load_layout
 from plushsense.deploy.calibration import calibrated, integer_model
 from plushsense.devices.base import Frame
 from plushsense.live.decide import DecideSpec
 from plushsense.live.integer import IntegerClassifier
 from plushsense.live.stream import Decision, StreamClassifier, StreamReader
 from plushsense.live.trace import Replayed, replay, trace_of
+from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.models.events import ANSWERS, KINDS, NO_GESTURE, SOURCES
 from plushsense.models.fixed import smoothing_weight
 from plushsense.models.gate import JERK, LEVEL, GatePlan, Rule, Signal, Term
 from plushsense.models.health import HealthPlan
+from plushsense.models.reference import random_weights
+from plushsense.windows.features import Scaler
+
+GESTURES = GestureSet(
+    "four",
+    (Gesture("tap", "positive"), Gesture("hold", "neutral"), Gesture("hit", "negative"), Gesture("other")),
+)
+
+
+def make_bundle(padding: str = "stream", layout: str = "accel-3", **decision) -> Bundle:
+    """A model with weights of no meaning; the step is not a divisor of the span."""
+    chosen = load_layout(layout)
+    arch = Arch.parse("5d1_4d3", (6, 5), channels=chosen.n_inputs, classes=4, padding=padding, window=48, step=5)
+    scaler = Scaler(np.linspace(-50, 60, chosen.n_inputs), np.linspace(0.01, 0.02, chosen.n_inputs))
+    return Bundle(arch, random_weights(arch, 3), chosen, scaler, GESTURES, decision=decision)
+
 
 BAD = 40_000  # beyond the valid range of accel-3
 STUCK = 3_000  # inside it, beyond what people reach
@@ -154,3 +173,46 @@ def same(bundle: Bundle, spec: DecideSpec, engine: str, frames: Frames) -> list[
             (labels[a.best], a.share / (1 << 15)) for _, a in found.answers
         ]
     return decisions
+
+
+TOUCH = GestureSet(
+    "touch", (Gesture("rest", "neutral", idle=True), Gesture("stroke", "positive"), Gesture("hit", "negative"))
+)
+
+
+def knowing_bundle(**decision: Any) -> Bundle:
+    """A network made by hand that knows three touches of `toy_frames` by how much x, y and z move."""
+    layout = load_layout("accel-3")
+    arch = Arch.parse("3", (2,), channels=3, classes=3, window=48, step=5)
+    move = np.zeros((2, 3, 3), dtype=np.float32)
+    move[0, :, 2], move[0, :, 0] = 1, -1
+    move[1] = -move[0]
+    # The mean movement m of a window: rest up to 20, stroke up to 230, hit above.
+    weights = random_weights(arch, 0) | {
+        "conv0.weight": move,
+        "conv0.bias": np.zeros(2),
+        "norm0.gain": np.ones(2),
+        "norm0.shift": np.zeros(2),
+        "norm0.mean": np.zeros(2),
+        "norm0.var": np.ones(2),
+        "dense.weight": np.array([[-0.1, -0.1], [0, 0], [0.03, 0.03]]),
+        "dense.bias": np.array([2.0, 0, -7.0]),
+    }
+    weights = {name: np.asarray(values, dtype=np.float32) for name, values in weights.items()}
+    bundle = Bundle(arch, weights, layout, Scaler(np.zeros(3), np.ones(3)), TOUCH, decision=decision)
+    values = toy_frames("rest stroke hit rest")
+    windows = np.stack([values[at : at + arch.span].T for at in range(0, len(values) - arch.span, 10)])
+    return calibrated(bundle, windows.astype(np.int32))
+
+
+def toy_frames(touches: str, seconds: float = 2.0, seed: int = 0) -> np.ndarray:
+    """(T, 3) of these touches in turn, 100 frames a second."""
+    draw = np.random.default_rng(seed)
+    n = round(100 * seconds)
+    made = []
+    for touch in touches.split():
+        t = np.arange(n) / 100
+        size, hz = {"rest": (0, 1), "stroke": (150, 3), "hit": (1000, 14)}[touch]
+        wave = size * np.sin(2 * np.pi * hz * t) * np.minimum(1, np.minimum(t, t[::-1]) / 0.2)
+        made.append(np.stack([wave, 0.6 * wave, 250 + 0.3 * wave], axis=1))
+    return np.rint(np.concatenate(made) + draw.normal(0, 1.5, (len(made) * n, 3))).astype(np.int64)

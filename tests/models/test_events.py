@@ -144,6 +144,9 @@ def test_the_kinds_of_an_answer() -> None:
     assert answered({THING: 0.6, STROKE: 0.32}, plan) == "unsure", "a class without a told affect"
     assert answered({HOLD: 0.5, REST: 0.4}, plan) == "unsure", "an idle class in the set, though of the same affect"
     assert answered({THING: 0.6, STROKE: 0.2}, plan) == "sure", "one class needs no affect"
+    untold = GestureSet("untold", tuple(Gesture(g) for g in "abc"))
+    answer, _ = EventMachine(plan, UNSMOOTHED, untold).step(logits({0: 0.47, 1: 0.47}, classes=3), 0)
+    assert answer.kind == UNSURE, "none is no affect that could be told"
     assert tuple(range(5)) == (IDLE, UNKNOWN, UNSURE, AFFECT, SURE) and len(ANSWERS) == 5
 
 
@@ -173,6 +176,19 @@ def test_a_gesture_is_wanted_from_enter_on_an_affect_by_its_classes_together_and
     assert played([STROKES] * 9, replace(PLAN, known=9 * 256)) != []
 
 
+def test_exactly_enter_is_enough_and_exactly_leave_stays() -> None:
+    shares = softmax(logits(STROKES))
+    for more, n in ((0, 1), (1, 0)):
+        by_gesture = replace(PLAN, enter=int(shares[STROKE]) + more, enter_affect=ONE + 1)
+        assert len(played([STROKES] * 9, by_gesture)) == n
+        alone = replace(PLAN, enter=ONE + 1, enter_affect=int(shares[STROKE] + shares[SCRATCH]) + more)
+        assert len(played([STROKES] * 9, alone)) == n
+    low = {STROKE: 0.28}
+    at = int(softmax(logits(low))[STROKE])
+    assert len(played([STROKES] * 3 + [low] * 9, replace(PLAN, leave=at))) == 1
+    assert len(played([STROKES] * 3 + [low] * 9, replace(PLAN, leave=at + 1))) == 2
+
+
 def test_of_two_affects_of_equal_weight_the_first_code_is_wanted() -> None:
     plan = replace(PLAN, enter=ONE + 1, enter_affect=round(0.4 * ONE), least=1)
     row = np.zeros(7, dtype=np.int64) - 5000
@@ -200,6 +216,12 @@ def test_an_event_begins_when_the_same_was_wanted_for_least_steps_in_a_row() -> 
 def test_affect_first_then_the_gesture_once() -> None:
     found = played([BOTH_NEGATIVE] * 4 + [HITS] * 3 + [BOTH_NEGATIVE] * 2 + [HITS] * 5)
     assert found == [(2, "begun", NEGATIVE, NO_GESTURE, 1, 0), (6, "named", NEGATIVE, HIT, 1, 0)]
+
+
+def test_being_named_breaks_the_row_of_misses() -> None:
+    plan = replace(PLAN, leave_affect=ONE + 1)
+    found = played([BOTH_NEGATIVE] * 3 + [HITS] * 3 + [{HIT: 0.1}] * 9, plan)
+    assert [f[:2] for f in found] == [(2, "begun"), (5, "named"), (9, "ended")]
 
 
 def test_no_event_begins_within_rest_steps_of_the_last() -> None:
@@ -291,6 +313,9 @@ def test_the_gate_and_the_network_make_one_event_not_two() -> None:
     # The other way round: the network has begun, then the gate fires of the same affect.
     found = played([HITS] * 4 + [NOTHING] * 20, plan, gate={3: (NEGATIVE, NO_GESTURE)})
     assert [f[:2] for f in found] == [(2, "begun"), (16, "ended")], "and prolongs it: 10 to wait, then 4 to end"
+    # It had been missed for 3 steps: that is forgotten.
+    found = played([HITS] * 3 + [NOTHING] * 20, replace(PLAN, wait=0), gate={6: (NEGATIVE, NO_GESTURE)})
+    assert found[1:] == [(9, "ended", NEGATIVE, HIT, 1, 6)]
     # One of another affect gives way at once.
     found = played([STROKES] * 4, plan, gate={3: (NEGATIVE, NO_GESTURE)})
     assert [f[:4] for f in found[1:]] == [(3, "ended", POSITIVE, STROKE), (3, "begun", NEGATIVE, NO_GESTURE)]
@@ -315,7 +340,8 @@ def test_a_gate_that_tells_no_affect_takes_that_of_the_gesture_that_names_it() -
     plan = replace(PLAN, wait=10)
     found = played([HITS] * 5, plan, gate={0: (0, NO_GESTURE)})
     assert found == [(0, "begun", 0, NO_GESTURE, 1, 0), (2, "named", NEGATIVE, HIT, 1, 0)]
-    assert played([NOTHING] * 20, plan, gate={0: (0, NO_GESTURE)})[-1][:2] == (13, "ended")
+    for nothing_known in (NOTHING, {THING: 0.5, HIT: 0.3}):
+        assert played([nothing_known] * 20, plan, gate={0: (0, NO_GESTURE)})[-1][:2] == (13, "ended")
 
 
 def test_source_tells_who_began() -> None:

@@ -121,10 +121,10 @@ def test_after_a_gap_all_times_are_counted_anew_but_a_fault_goes_on() -> None:
         assert health.push(10 * i, trembling(i, x=bad)) == ""
     health.clear()
     assert not health.suspect
-    words = [health.push(5 + 10 * i, trembling(i, x=bad)) for i in range(30)]
+    words = [health.push(500 + 10 * i, trembling(i, x=bad)) for i in range(30)]
     assert words.index("fault") == 20, "the 140 ms before the gap do not count"
     for i in range(9):
-        assert health.push(400 + 10 * i, trembling(i)) == ""
+        assert health.push(900 + 10 * i, trembling(i)) == ""
     health.clear()
     assert health.fault
     # The clock was reset: the good time counts from here on.

@@ -76,14 +76,20 @@ class Summary:
 class Run(Iterator[Decision]):
     """A live run: iterate for decisions; `summary` tells at any time how it went.
 
-    A device that sends no frame for `SILENCE_S` gives one decision of the state ``no signal``, and its event ends; so
+    A device that sends no frame for ``silence_s`` gives one decision of the state ``no signal``, and its event ends; so
     does an event that is going on when the device ends.
     """
 
-    def __init__(self, device: Device, classifier: StreamReader | BothEngines, seconds: float | None) -> None:
+    def __init__(
+        self,
+        device: Device,
+        classifier: StreamReader | BothEngines,
+        seconds: float | None,
+        silence_s: float = SILENCE_S,
+    ) -> None:
         self.device = device
         self.classifier = classifier
-        self._seconds = seconds
+        self._seconds, self._silence_s = seconds, silence_s
         self._begun = self._heard = time.perf_counter()
         self._silent = False
         self._decisions = self._warming = self._late = self._events = self._no_signal = 0
@@ -121,7 +127,7 @@ class Run(Iterator[Decision]):
         quiet = now - self._heard
         if self._seconds is not None and quiet >= self._seconds:
             self.over = True
-        if self._silent or quiet < SILENCE_S:
+        if self._silent or quiet < self._silence_s:
             return []
         self._silent = True
         return [self._noted(self.classifier.silence())]
@@ -185,7 +191,13 @@ def percentiles_ms(latencies_s: Sequence[float]) -> dict[str, float | None]:
     return {"p50": p50, "p95": p95, "p99": p99}
 
 
-def run(device: Device, classifier: StreamReader | BothEngines, *, seconds: float | None = None) -> Run:
+def run(
+    device: Device,
+    classifier: StreamReader | BothEngines,
+    *,
+    seconds: float | None = None,
+    silence_s: float = SILENCE_S,
+) -> Run:
     """Run a model on an open device.
 
     Args:
@@ -193,6 +205,7 @@ def run(device: Device, classifier: StreamReader | BothEngines, *, seconds: floa
         classifier: it begins a new stream.
         seconds: stop after so much device time (so that a replay at any speed ends at the same place), or
             when the device has said nothing for so long; None runs until the device ends.
+        silence_s: host time without a frame after which there is no signal.
 
     Raises:
         ConfigError: when the device's channels are not those of the model, or ``seconds`` is not positive.
@@ -202,4 +215,4 @@ def run(device: Device, classifier: StreamReader | BothEngines, *, seconds: floa
         raise ConfigError(f"seconds is {seconds!r}; give a positive duration, or leave it out to run until the end.")
     check_layout(device.layout, classifier.layout)
     classifier.reset()
-    return Run(device, classifier, seconds)
+    return Run(device, classifier, seconds, silence_s)
