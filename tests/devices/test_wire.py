@@ -195,3 +195,24 @@ def test_what_is_written_is_read_back(values: list[int], device_ms: int, delay_m
 def test_decimal_layouts_round_trip(values: list[int], device_ms: int) -> None:
     parsed, _ = lines(PHONE, format_line(PHONE, values, device_ms, 10))
     assert [p.values for p in parsed] == [tuple(values)]
+
+
+FIELDS = st.one_of(
+    st.integers(-(10**19), 10**19).map(str),
+    st.integers(-50, 50).map(lambda n: f"{n:+d}"),
+    st.sampled_from(["1_000", "0x1", "1.0", "-", "+", "--3", "٣", "9" * 15, "9" * 16, "9" * 18, "-" + "9" * 15, "007"]),
+)
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.sampled_from(["accel-3", "plush-14"]), st.data())
+def test_a_plain_line_is_read_at_one_look_as_field_by_field(layout: str, data: st.DataObject) -> None:
+    chosen = load_layout(layout)
+    n = len(chosen.wire) + data.draw(st.sampled_from([0, 0, 0, 0, -1, 1]))
+    fields = data.draw(st.lists(st.one_of(st.integers(0, 999).map(str), FIELDS), min_size=n, max_size=n))
+    line = data.draw(st.sampled_from([" ", "  ", ",", "\t", " ; "])).join(fields).encode() + b"\n"
+    quick, slow = LineParser(chosen), LineParser(chosen)
+    assert quick._plain is not None
+    slow._plain = None
+    assert quick.feed(line * 2) == slow.feed(line * 2)
+    assert quick.counters == slow.counters

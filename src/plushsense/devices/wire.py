@@ -62,6 +62,12 @@ class LineParser:
         low, high = layout.valid_min_int.tolist(), layout.valid_max_int.tolist()
         self._valid = list(zip(low, high, strict=True))
         self._clock_at = layout.wire.index(DEVICE_MS) if DEVICE_MS in layout.wire else -1
+        # A whole line of whole numbers that are small enough in any case: one look instead of one a field.
+        self._plain = (
+            re.compile(rb" *[+-]?[0-9]{1,15}(?: +[+-]?[0-9]{1,15}){%d} *\Z" % (self._fields - 1))
+            if all(step == 1.0 for step in self._steps)
+            else None
+        )
         self._delay_at = layout.wire.index(DELAY_MS) if DELAY_MS in layout.wire else -1
 
     def feed(self, data: bytes) -> list[ParsedLine]:
@@ -105,10 +111,11 @@ class LineParser:
         if self._skipping:
             self._skipping = False
             return None
-        fields = line.translate(_SEPARATORS).split()
+        line = line.translate(_SEPARATORS)
+        fields = line.split()
         if not fields:
             return None
-        numbers = self._numbers(fields)
+        numbers = self._numbers(fields, line)
         if numbers is None:
             self.counters.malformed += 1
             return None
@@ -123,17 +130,27 @@ class LineParser:
                 self._clock_ms = 0
             device_ms = self._clock_ms
         self._begun = True
-        values = tuple(numbers[at] for _, at in self._channels)
-        garbage = any(not low <= v <= high for v, (low, high) in zip(values, self._valid, strict=True))
+        values = tuple([numbers[at] for _, at in self._channels])
+        garbage = False
+        for value, (low, high) in zip(values, self._valid, strict=True):
+            if not low <= value <= high:
+                garbage = True
+                break
         self.counters.frames += 1
         self.counters.garbage += garbage
         self.counters.lost += self._loss.push(device_ms)
         return ParsedLine(device_ms, values, garbage)
 
-    def _numbers(self, fields: list[bytes]) -> list[int] | None:
+    def _numbers(self, fields: list[bytes], line: bytes) -> list[int] | None:
         """All fields as integers (channels in steps, clocks in ms), or None for a line that is no frame."""
         if len(fields) != self._fields:
             return None
+        if self._plain is not None and self._plain.match(line) is not None:
+            plain = [int(field) for field in fields]
+            at, delay = self._clock_at, self._delay_at
+            if (at >= 0 and plain[at] < 0) or (delay >= 0 and plain[delay] < 0):
+                return None
+            return None if at < 0 and plain[delay] > _LONGEST_DELAY_MS else plain
         numbers = [0] * self._fields
         for at in (self._clock_at, self._delay_at):
             if at >= 0:
