@@ -293,6 +293,7 @@ def measure(plan: GatePlan, material: Material, layout: Layout) -> dict[str, Any
     first: dict[int, int] = {}
     wrong = {CALM: 0, BETWEEN: 0}
     calm_hit: set[int] = set()
+    wrong_by: dict[str, int] = {}
     for stretch in material.stretches:
         gate = Gate(plan)
         begun = {int(t): int(np.argmax(stretch.what == t)) for t in np.unique(stretch.what) if t >= 0}
@@ -304,7 +305,10 @@ def measure(plan: GatePlan, material: Material, layout: Layout) -> dict[str, Any
                 first.setdefault(what, at - begun[what])
             elif what != LEFT_OUT:
                 wrong[what] += 1
-                calm_hit.add(int(stretch.calm[at]))
+                if what == CALM:
+                    calm_hit.add(int(stretch.calm[at]))
+                    label = material.calm[int(stretch.calm[at])][1]
+                    wrong_by[label] = wrong_by.get(label, 0) + 1
     by_gesture: dict[str, list[int]] = {}
     for trial, (_, label) in enumerate(material.trials):
         by_gesture.setdefault(label, []).append(trial)
@@ -324,5 +328,6 @@ def measure(plan: GatePlan, material: Material, layout: Layout) -> dict[str, Any
         "false_alarms_per_hour_in_calm_recordings": round(wrong[CALM] / hours[CALM], 2) if hours[CALM] else None,
         "false_alarms_per_hour_between": round(wrong[BETWEEN] / hours[BETWEEN], 2) if hours[BETWEEN] else None,
         "calm_recordings": len(material.calm),
-        "calm_recordings_with_a_false_alarm": len(calm_hit - {-1}),
+        "calm_recordings_with_a_false_alarm": len(calm_hit),
+        "false_alarms_by_gesture": dict(sorted(wrong_by.items())),
     }

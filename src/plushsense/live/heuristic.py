@@ -14,6 +14,7 @@ would by hand (`fit_heuristic`): as sensitive as goes without answering what sho
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -104,7 +105,7 @@ class _Rules:
             _NEGATIVE: layout.samples(plan.negative_s),
             _POSITIVE: layout.samples(plan.positive_s),
         }
-        self._weight = 1.0 - 2.718281828 ** (-1.0 / (_SLOW_S * layout.rate_hz))
+        self._weight = -math.expm1(-1.0 / (_SLOW_S * layout.rate_hz))
         self.number = 0
         self.forget()
 
@@ -114,7 +115,7 @@ class _Rules:
         self._swings = [_Swings(self.plan.swing, self._weight) for _ in self._touch]
         self._sample = 0
         self.affect = 0
-        self._since = self._held = 0
+        self._held = 0
 
     def _says(self, row: list[int]) -> int:
         """The affect whose rule holds now, 0 for none."""
@@ -147,7 +148,7 @@ class _Rules:
             updates.append(self.end(now))
         if said and not self.affect:
             self.number += 1
-            self.affect, self._since, self._held = said, now, self._sample
+            self.affect, self._held = said, self._sample
             updates.append(Update(BEGUN, self.number, said, NO_GESTURE, GATE, now, now))
         return updates
 
