@@ -5,64 +5,155 @@ The frames are made up: an export is given away, and no person's recording belon
 
 from __future__ import annotations
 
+from collections.abc import Container, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import BadInput
 from plushsense.core.signal import MAGNITUDE_FRACTION_BITS, Layout
-from plushsense.models.events import AFFECT_CODES
-from plushsense.models.fixed import SMOOTH_EXTRA_BITS, InputScale, smooth, softmax
+from plushsense.models.events import AFFECT_CODES, EventMachine, Update
+from plushsense.models.fixed import InputScale
+from plushsense.models.gate import Gate
+from plushsense.models.health import Health
 from plushsense.models.image import IntegerModel
 from plushsense.windows.clock import Clock
 from plushsense.windows.features import SampleInputs, Scaler
 
 FRAMES, ANSWERS = "frames.bin", "answers.bin"
-COLUMNS = ("frame", "ms", "sample", "state", "gesture", "affect", "confidence", "restarts", "invalid")
+ANSWER, EVENT, HEALTH = range(3)
+# The columns of a row by its kind; those of logits and probabilities follow, 0 but in an answer.
+COLUMNS = {
+    ANSWER: (
+        *("kind", "frame", "ms", "sample", "state", "gesture", "affect", "confidence", "answer", "known"),
+        *("restarts", "invalid"),
+    ),
+    EVENT: (
+        *("kind", "frame", "ms", "number", "what", "gesture", "affect", "source", "since", "unused"),
+        *("restarts", "invalid"),
+    ),
+    HEALTH: (
+        *("kind", "frame", "ms", "faults", "state", "suspect", "unused", "unused", "unused", "unused"),
+        *("restarts", "invalid"),
+    ),
+}
+HEAD = len(COLUMNS[ANSWER])
+WARMING, TRACKING, FAULT = range(3)
 Ints = NDArray[np.int64]
 _MS_BITS = 32
 _SEARCHED = 4096  # numbers on each side of a channel's mean
 _INT32 = -(1 << 31), (1 << 31) - 1
 
 
-def answers_of(model: IntegerModel, frames: Ints) -> NDArray[np.int32]:
-    """What the toy answers to frames (n, 1 + C), the first column its clock in ms: (answers, 9 + 2 K) int32.
+def column(rows: NDArray[Any], name: str, kind: int = ANSWER) -> NDArray[Any]:
+    """One column of the rows of a kind."""
+    found: NDArray[Any] = rows[rows[:, 0] == kind][:, COLUMNS[kind].index(name)]
+    return found
 
-    The columns are `COLUMNS`, then the K logits in steps of 1/256 and the K smoothed probabilities in steps of 2^-27;
-    from gesture to confidence, logits and probabilities are 0 while warming. ``frame`` is the row that completed the
-    step, ``restarts`` and ``invalid`` the counts until then; times and counts wrap at 2^32.
+
+def answers_of(model: IntegerModel, frames: Ints, silences: Container[int] = ()) -> NDArray[np.int32]:
+    """What the toy says to frames (n, 1 + C), the first column its clock in ms: rows (m, 12 + 2 K) int32.
+
+    A row is an answer, something that happened to an event, or a change of what health says; its columns are those of
+    `COLUMNS`, then the K logits in steps of 1/256 and the K smoothed probabilities in steps of 2^-27, which are 0 but
+    in an answer of a toy that tracks, as everything from gesture to known. ``frame`` is the row of the frame that
+    brought it about, ``restarts`` and ``invalid`` the counts until then; times and counts wrap at 2^32. What happens to
+    an event in a step stands before the step's answer, what health says after all else of its frame.
+
+    Args:
+        silences: the frames after which nothing is heard for a while (``plush_silence``).
     """
-    arch, layout = model.network.arch, model.layout
-    affects = [AFFECT_CODES[g.affect] for g in model.gestures.gestures]
-    clock, inputs, stepper = Clock(layout), SampleInputs(layout), model.network.stepper()
-    classes, phase, period = arch.classes, arch.span % arch.step, layout.period_us
-    rows: list[list[int]] = []
-    mean: Ints | None = None
-    block: list[list[int]] = []
-    count = 0
-    for at, (ms, *values) in enumerate(frames.tolist()):
+    return _Toy(model).rows_of(frames, silences)
+
+
+class _Toy:
+    """Drives the rooms that define a toy as `plushsense.live.stream.StreamReader` does, in the C's own clock."""
+
+    def __init__(self, model: IntegerModel) -> None:
+        arch, rules = model.network.arch, model.rules
+        self.model, self.arch = model, arch
+        self.affects = [AFFECT_CODES[g.affect] for g in model.gestures.gestures]
+        self.clock, self.inputs, self.stepper = Clock(model.layout), SampleInputs(model.layout), model.network.stepper()
+        self.health, self.gate = Health(rules.health, model.layout), Gate(rules.gate)
+        self.machine = EventMachine(rules.events, model.smoothing, model.gestures)
+        self.rows: list[list[int]] = []
+        self.frame = self.seen = 0
+        self.restart()
+
+    def restart(self) -> None:
+        self.stepper.reset()
+        self.gate.reset()
+        self.block: list[list[int]] = []
+        self.count = 0
+
+    def rows_of(self, frames: Ints, silences: Container[int]) -> NDArray[np.int32]:
+        for self.frame, (ms, *values) in enumerate(frames.tolist()):
+            said = self.health.fault, self.health.suspect
+            self.push(ms, values)
+            now = self.health.fault, self.health.suspect
+            if now != said:
+                state = FAULT if now[0] else TRACKING if self.count >= self.arch.span else WARMING
+                self.say(HEALTH, ms, self.health.faults, state, int(now[1]))
+            if self.frame in silences:
+                self.tell(self.machine.lost(self.seen))
+        table = np.array(self.rows, dtype=np.int64).reshape(len(self.rows), HEAD + 2 * self.arch.classes)
+        return (table & 0xFFFFFFFF).astype(np.uint32).view(np.int32)
+
+    def say(self, kind: int, ms: int, *what: int, logits: Sequence[int] = (), mean: Sequence[int] = ()) -> None:
+        counts = self.clock.restarts, self.clock.invalid
+        blank = [0] * self.arch.classes
+        row = [kind, self.frame, ms, *what, *[0] * (HEAD - 5 - len(what)), *counts, *(logits or blank), *(mean or blank)]
+        self.rows.append(row)
+
+    def tell(self, updates: Sequence[Update]) -> None:
+        for u in updates:
+            self.say(EVENT, u.now, u.number, u.kind, u.gesture, u.affect, u.source, u.since)
+
+    def push(self, ms: int, values: list[int]) -> None:
+        clock, health, layout = self.clock, self.health, self.model.layout
+        if ms < self.seen or ms - self.seen > layout.gap_ms:
+            self.tell(self.machine.lost(self.seen))
+            health.clear()
+        self.seen = ms
+        found = health.push(ms, values)
+        if found == "fault":
+            self.tell(self.machine.lost(ms))
+        if found:
+            clock.forget()
+            self.restart()
+        if health.fault:
+            return
         samples = clock.push(ms, values)
         if clock.restarted:
-            stepper.reset()
-            mean, block, count = None, [], 0
+            self.restart()
         for later, sample in zip(range(len(samples) - 1, -1, -1), samples, strict=True):
-            count += 1
-            block.append(inputs(sample))
-            if count % arch.step != phase:
-                continue
-            time_ms = ((clock.now_us or 0) - later * period) // 1000
-            logits = stepper.push(np.array(block, dtype=np.int64))
-            block = []
-            row = [at, time_ms, count, 0, 0, 0, 0, clock.restarts, clock.invalid, *[0] * (2 * classes)]
-            if logits:
-                mean = smooth(mean, softmax(logits[-1]), model.smoothing)
-                best = int(mean.argmax())
-                row[3:7] = 1, best, affects[best], int(mean[best]) >> SMOOTH_EXTRA_BITS
-                row[9:] = [*logits[-1].tolist(), *mean.tolist()]
-            rows.append(row)
-    table = np.array(rows, dtype=np.int64).reshape(len(rows), len(COLUMNS) + 2 * classes)
-    return (table & 0xFFFFFFFF).astype(np.uint32).view(np.int32)
+            self.sample(((clock.now_us or 0) - later * layout.period_us) // 1000, sample)
+
+    def sample(self, ms: int, sample: Ints) -> None:
+        arch, suspect = self.arch, self.health.suspect
+        self.count += 1
+        inputs = self.inputs(sample)
+        fired = self.gate.push(inputs, suspect)
+        if fired >= 0:
+            rule = self.model.rules.gate.rules[fired]
+            self.tell(self.machine.gate(rule.affect, rule.gesture, ms))
+        self.block.append(inputs)
+        if self.count % arch.step != arch.span % arch.step:
+            return
+        logits = self.stepper.push(np.array(self.block, dtype=np.int64))
+        self.block = []
+        if not logits:
+            self.tell(self.machine.blind_step(ms))
+            self.say(ANSWER, ms, self.count, WARMING)
+            return
+        answer, updates = self.machine.step(logits[-1], ms, suspect)
+        self.tell(updates)
+        best = answer.best, self.affects[answer.best], answer.share, answer.kind, answer.known
+        mean = self.machine.mean
+        assert mean is not None
+        self.say(ANSWER, ms, self.count, TRACKING, *best, logits=logits[-1].tolist(), mean=mean[:-1].tolist())
 
 
 def golden_frames(layout: Layout, scaler: Scaler, span: int, seed: int = 1, inputs: InputScale | None = None) -> Ints:
