@@ -1,4 +1,4 @@
-"""Golden vectors: frames that a toy may meet at its worst, and the answers that ``models/integer`` gives to them.
+"""Golden vectors: frames that a toy may meet at its worst, and what the rooms that define a toy say to them.
 
 The frames are made up: an export is given away, and no person's recording belongs in it.
 """
@@ -17,7 +17,7 @@ from plushsense.core.signal import MAGNITUDE_FRACTION_BITS, Layout
 from plushsense.models.events import AFFECT_CODES, EventMachine, Update
 from plushsense.models.fixed import InputScale
 from plushsense.models.gate import Gate
-from plushsense.models.health import Health
+from plushsense.models.health import Health, HealthPlan
 from plushsense.models.image import IntegerModel
 from plushsense.windows.clock import Clock
 from plushsense.windows.features import SampleInputs, Scaler
@@ -41,6 +41,11 @@ COLUMNS = {
 }
 HEAD = len(COLUMNS[ANSWER])
 WARMING, TRACKING, FAULT = range(3)
+_KINDS = {
+    ANSWER: "an answer",
+    EVENT: "something that happened to an event",
+    HEALTH: "health says something else than at the frame before",
+}
 Ints = NDArray[np.int64]
 _MS_BITS = 32
 _SEARCHED = 4096  # numbers on each side of a channel's mean
@@ -156,24 +161,32 @@ class _Toy:
         self.say(ANSWER, ms, self.count, TRACKING, *best, logits=logits[-1].tolist(), mean=mean[:-1].tolist())
 
 
-def golden_frames(layout: Layout, scaler: Scaler, span: int, seed: int = 1, inputs: InputScale | None = None) -> Ints:
+def golden_frames(
+    layout: Layout,
+    scaler: Scaler,
+    span: int,
+    seed: int = 1,
+    inputs: InputScale | None = None,
+    health: HealthPlan | None = None,
+) -> Ints:
     """Frames (n, 1 + C) that try what can go wrong: the first column is the toy's clock in ms.
 
-    Each part lasts longer than ``span``, so that every restart is followed by answers: touches with a jittering clock
-    and lost frames; values out of range (also from the start, where there is no valid one yet); gaps just bridged and
-    just too long; equal stamps; a clock that starts again; channels stuck at the ends of their range, and jumping
-    between them; the clock's wrap at 2^32. With the scale of the ``inputs``, also samples in the middle between two
-    whole numbers of which one is read as the next 8-bit number: there a wrong rounding shows.
+    Each part lasts longer than ``span``, so that every restart is followed by answers: touches and blows with a
+    jittering clock and lost frames; values out of range (also from the start, where there is no valid one yet); gaps
+    just bridged and just too long; equal stamps; a clock that starts again; channels at the ends of their range, and
+    jumping between them; sensors that fail and recover as the ``health`` settings tell it; the clock's wrap at 2^32.
+    With the scale of the ``inputs``, also samples in the middle between two whole numbers of which one is read as the
+    next 8-bit number: there a wrong rounding shows.
     """
-    make = _Maker(layout, scaler, np.random.default_rng(seed))
+    make = Maker(layout, scaler, np.random.default_rng(seed))
     part = span + 150
     make.touches(6, garbage_channel=0)
-    make.touches(part + 300, lost=0.03)
+    make.touches(part + 300, lost=0.03, blows=0.02)
     make.touches(part, garbage=0.05)
     make.wait(layout.gap_ms)
     make.touches(60)
     make.wait(layout.gap_ms + 1)
-    make.touches(part, equal=0.1)
+    make.touches(part, equal=0.1, blows=0.01)
     make.now = 5
     make.touches(part)
     for kind in ("low", "high", "jump"):
@@ -182,12 +195,14 @@ def golden_frames(layout: Layout, scaler: Scaler, span: int, seed: int = 1, inpu
         make.wait(layout.gap_ms + 1)
         make.halves(part, inputs)
     make.touches(part)
+    if health is not None:
+        make.troubles(health, part)
     make.now = (1 << _MS_BITS) - 1 - part * 6
-    make.touches(part + 300)
+    make.touches(part + 300, blows=0.02)
     return np.array(make.rows, dtype=np.int64)
 
 
-class _Maker:
+class Maker:
     """Frames one after the other; ``now`` is the next one's time in ms."""
 
     def __init__(self, layout: Layout, scaler: Scaler, rng: np.random.Generator) -> None:
@@ -198,6 +213,7 @@ class _Maker:
         self.now = 1000
         self._owed = 0.0
         self._walk = np.zeros(len(self.mean))
+        self._blow = np.zeros(len(self.mean))
         self._phase = rng.uniform(0, 6, len(self.mean))
 
     def pace(self) -> int:
@@ -215,29 +231,94 @@ class _Maker:
         self.rows.append([self.now & 0xFFFFFFFF, *values.tolist()])
 
     def touches(
-        self, n: int, *, lost: float = 0.0, garbage: float = 0.0, equal: float = 0.0, garbage_channel: int | None = None
+        self,
+        n: int,
+        *,
+        lost: float = 0.0,
+        garbage: float = 0.0,
+        equal: float = 0.0,
+        blows: float = 0.0,
+        garbage_channel: int | None = None,
+        stuck: dict[int, int] | None = None,
     ) -> None:
-        """Something like gestures: a slow wandering, at times a rhythm, noise."""
+        """Something like gestures: a slow wandering, at times a rhythm, noise, and blows that die away.
+
+        ``lost``, ``garbage`` (of a channel), ``equal`` (stamps) and ``blows`` are how likely each is in a frame;
+        ``stuck`` holds channels at one value.
+        """
         rng, c = self.rng, len(self.mean)
         for k in range(n):
             self._walk = 0.98 * self._walk + 0.2 * rng.normal(size=c)
+            self._blow *= 0.6
+            if blows and rng.random() < blows:
+                self._blow = rng.normal(size=c) * 12
             rhythm = np.sin(len(self.rows) * (0.05 + 0.02 * (k // 97 % 9)) + self._phase) * (k // 61 % 3)
-            wanted = self.mean + self.spread * (self._walk + rhythm + 0.1 * rng.normal(size=c))
+            wanted = self.mean + self.spread * (self._walk + self._blow + rhythm + 0.1 * rng.normal(size=c))
             values = np.clip(np.rint(wanted), self.low, self.high).astype(np.int64)
             spoilt = np.flatnonzero(rng.random(c) < garbage)
             if garbage_channel is not None:
                 spoilt = np.array([garbage_channel])
             for channel in spoilt:
                 values[channel] = self._garbage(int(channel))
+            for channel, value in (stuck or {}).items():
+                values[channel] = value
             if rng.random() >= lost:
                 self.put(values)
             if rng.random() >= equal:
                 self.now += max(0, self.pace() + int(rng.integers(-2, 3)))
 
+    def frozen(self, n: int) -> None:
+        """The same frame again and again."""
+        for _ in range(n):
+            self.put(np.array(self.rows[-1][1:], dtype=np.int64))
+            self.now += self.pace()
+
+    def frames_of(self, ms: int) -> int:
+        """How many frames come in so long a time."""
+        return -(-ms * 1000 // self.layout.period_us)
+
+    def troubles(self, health: HealthPlan, after: int) -> None:
+        """Sensors that fail for long enough, and recover: ``after`` frames of touches stand after each failure.
+
+        A channel out of range or stuck beyond what touches reach, first for a moment only; then all of them frozen;
+        then good frames too few to be believed, and a gap amid the failure.
+        """
+        few, enough = self.frames_of(health.fault_ms) // 2, self.frames_of(health.fault_ms + health.recover_ms) + 20
+        back = self.frames_of(health.recover_ms) + after
+        if health.fault_ms:
+            ends = self._beyond(health)
+            self.touches(few + 3, stuck=ends)
+            self.touches(30)
+            self.touches(enough, stuck=ends)
+            self.touches(self.frames_of(health.recover_ms) // 2)
+            self.touches(20, garbage=0.5)
+            self.touches(back, blows=0.02)
+            self.touches(enough, garbage_channel=len(self.mean) - 1)
+            self.wait(self.layout.gap_ms + 40)
+            self.touches(back)
+        if health.still_ms:
+            self.frozen(self.frames_of(health.still_ms) * 3 // 4)
+            self.touches(self.frames_of(health.still_ms) // 2)
+            self.frozen(self.frames_of(health.still_ms) + 20)
+            self.now = 40
+            self.touches(back, blows=0.02)
+
+    def _beyond(self, health: HealthPlan) -> dict[int, int]:
+        """A channel and a value at which it cannot be stuck; where every value may be, one that is out of range."""
+        for channel, (high, most) in enumerate(zip(health.high, self.high.tolist(), strict=False)):
+            if high < most:
+                return {channel: min(int(most), high + 3)}
+        for channel, (low, least) in enumerate(zip(health.low, self.low.tolist(), strict=False)):
+            if low > least:
+                return {channel: max(int(least), low - 3)}
+        return {0: self._garbage(0)}
+
     def extremes(self, n: int, kind: str) -> None:
+        """At the ends of the ranges, and beside them: sensors that repeat an end exactly would be at fault."""
         for k in range(n):
             top = kind == "high" or (kind == "jump" and bool(k // 3 % 2))
-            self.put(self.high if top else self.low)
+            beside = np.minimum(k % 2, self.high - self.low)
+            self.put(self.high - beside if top else self.low + beside)
             self.now += self.pace()
 
     def halves(self, n: int, inputs: InputScale) -> None:
@@ -295,24 +376,30 @@ def measured(layout: Layout, scaler: Scaler) -> tuple[NDArray[np.float64], NDArr
 
 def write_golden(model: IntegerModel, scaler: Scaler, folder: Path) -> list[Path]:
     """Write the golden vectors into a folder: `FRAMES`, `ANSWERS` and what they hold."""
-    frames = golden_frames(model.layout, scaler, model.network.arch.span, inputs=model.network.inputs)
+    span, inputs = model.network.arch.span, model.network.inputs
+    frames = golden_frames(model.layout, scaler, span, inputs=inputs, health=model.rules.health)
     answers = answers_of(model, frames)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / FRAMES).write_bytes((frames & 0xFFFFFFFF).astype("<u4").tobytes())
     (folder / ANSWERS).write_bytes(answers.astype("<i4").tobytes())
     classes = model.network.arch.classes
+    kinds = "\n".join(f"  - {kind}, {what}: {', '.join(COLUMNS[kind][1:])}" for kind, what in _KINDS.items())
     (folder / "README.md").write_text(
         f"""# Golden vectors
 
-Made up, no person's recording: {len(frames)} frames with lost ones, garbage, gaps, clock resets and a wrap of the
-clock, and the {len(answers)} answers that PlushSense gives to them. `plushsense verify` feeds them to the C in this
-export and compares every number.
+Made up, no person's recording: {len(frames)} frames with blows, lost frames, garbage, gaps, clock resets, sensors that
+fail and a wrap of the clock, and the {len(answers)} rows that PlushSense says to them. `plushsense verify` feeds them
+to the C in this export and compares every number.
 
 - `{FRAMES}`: rows of 32-bit little-endian numbers: the toy's clock in ms (unsigned), then the measured channels
   ({", ".join(model.layout.names)}).
-- `{ANSWERS}`: rows of 32-bit little-endian numbers: {", ".join(COLUMNS)}, {classes} logits in steps of 1/256,
-  {classes} smoothed probabilities in steps of 2^-27. From gesture to confidence, logits and probabilities are 0 while
-  warming.
+- `{ANSWERS}`: rows of {HEAD + 2 * classes} 32-bit little-endian numbers. The first is the row's kind, and tells what
+  the next {HEAD - 1} are:
+{kinds}
+
+  `frame` is the frame that brought it about. After them stand {classes} logits in steps of 1/256 and {classes} smoothed
+  probabilities in steps of 2^-27. From gesture to known, logits and probabilities are 0 while warming; the last two are
+  0 in rows of another kind than {ANSWER}.
 """,
         encoding="utf-8",
         newline="\n",
@@ -321,13 +408,13 @@ export and compares every number.
 
 
 def read_golden(folder: Path, channels: int, classes: int) -> tuple[Ints, NDArray[np.int32]]:
-    """The frames (n, 1 + C) and answers (m, 9 + 2 K) of a folder.
+    """The frames (n, 1 + C) and rows (m, 12 + 2 K) of a folder.
 
     Raises:
         BadInput: for a file that is missing or does not hold whole rows.
     """
     found = []
-    for name, columns, kind in ((FRAMES, 1 + channels, "<i4"), (ANSWERS, len(COLUMNS) + 2 * classes, "<i4")):
+    for name, columns, kind in ((FRAMES, 1 + channels, "<i4"), (ANSWERS, HEAD + 2 * classes, "<i4")):
         path = folder / name
         try:
             data = path.read_bytes()
