@@ -39,7 +39,7 @@ from plushsense.models.rules import Rules
 from plushsense.windows.clock import resample
 from plushsense.windows.features import Scaler, inputs
 
-_MOST_DRILLS = 4
+_LEAST_DRILLS, _MOST_DRILLS = 2, 4
 _SPREAD = 450  # of a logit over the frames, in steps of 1/256
 _AFFECTS: tuple[tuple[str, bool], ...] = (
     ("positive", False),
@@ -61,16 +61,19 @@ class Drill:
 
 
 def drills_of(model: IntegerModel, scaler: Scaler) -> list[Drill]:
-    """A few drills for a model, the same ones each time: until they reach everything (`reached`), or it is enough."""
+    """A few drills for a model, the same ones each time: until they reach everything (`reached`), or it is enough.
+
+    Every second one has events that are held for long and end soon, the others such as rather give way to others.
+    """
     found: list[Drill] = []
     have: set[str] = set()
     for seed in range(1, _MOST_DRILLS + 1):
         drill = _drill(model, scaler, seed)
         new = reached(drill) - have
-        if new or not found:
+        if new or seed <= _LEAST_DRILLS:
             found.append(drill)
             have |= new
-        if have >= everything():
+        if have >= everything() and seed >= _LEAST_DRILLS:
             break
     return found
 
@@ -133,8 +136,9 @@ def _drill(model: IntegerModel, scaler: Scaler, seed: int) -> Drill:
     shares = column(answers_of(drilled, frames), "confidence")
     known = column(answers_of(drilled, frames), "known")
     tracking = column(answers_of(drilled, frames), "state") == TRACKING
-    events = _events(shares[tracking], known[tracking], rng)
-    rules = Rules(events, _gate(model, frames, rng), health)
+    held = bool(seed % 2)
+    events = _events(shares[tracking], known[tracking], held, rng)
+    rules = Rules(events, _gate(model, frames, held, rng), health)
     drilled = replace(drilled, rules=rules)
     return Drill(drilled, frames, silences, answers_of(drilled, frames, silences))
 
@@ -175,7 +179,7 @@ def _levelled(model: IntegerModel, logits: Ints) -> IntegerModel:
         return model
 
 
-def _events(shares: NDArray[np.int32], known: NDArray[np.int32], rng: np.random.Generator) -> EventPlan:
+def _events(shares: NDArray[np.int32], known: NDArray[np.int32], held: bool, rng: np.random.Generator) -> EventPlan:
     def share(low: float, high: float) -> int:
         """A share that so many of the steps stay below."""
         return int(np.quantile(shares, rng.uniform(low, high))) if len(shares) else ONE // 2
@@ -183,18 +187,18 @@ def _events(shares: NDArray[np.int32], known: NDArray[np.int32], rng: np.random.
     def steps(low: int, high: int) -> int:
         return int(rng.integers(low, high + 1))
 
-    enter = share(0.3, 0.6)
+    enter = share(0.35, 0.6)
     return EventPlan(
         enter=enter,
-        leave=share(0.05, 0.2),
+        leave=min(enter, share(0.2, 0.4) if held else share(0.0, 0.05) // 2),
         enter_affect=min(ONE, share(0.4, 0.7)),
         leave_affect=share(0.1, 0.4),
         sure=int(rng.integers(ONE // 8, ONE // 3)),
         known=int(np.quantile(known, 0.1)) if len(known) else 0,
         least=steps(2, 3),
         switch=steps(2, 4),
-        end=steps(2, 4),
-        hold=steps(1, 5),
+        end=steps(1, 2) if held else steps(3, 4),
+        hold=steps(5, 9) if held else steps(1, 4),
         rest=steps(1, 4),
         wait=steps(2, 6),
     )
@@ -216,23 +220,28 @@ def _frames(
     layout, span = model.layout, model.network.arch.span
     make, silences = Maker(layout, scaler, rng), []
     part = span + 400
-    make.touches(part, blows=0.02, garbage=0.002)
+    make.touches(part, blows=0.02, garbage=0.05 / len(make.mean))
     for _ in range(4):
         make.touches(int(rng.integers(20, 60)), blows=0.05)
         silences.append(len(make.rows) - 1)
     make.touches(200, lost=0.03, blows=0.02)
+    for n in range(40):
+        make.touches(7)
+        make.frozen(4)
+        if n % 2:  # else the gate would only prolong its event
+            silences.append(len(make.rows) - 1)
     for _ in range(3):
         make.touches(30, blows=0.2)
         make.wait(layout.gap_ms + 1)
     make.touches(part, blows=0.03)
     make.troubles(health, span + 250)
     make.now = 7
-    make.touches(part, garbage=0.01, blows=0.02)
+    make.touches(part, garbage=0.15 / len(make.mean), blows=0.02)
     return np.array(make.rows, dtype=np.int64), tuple(silences)
 
 
-def _gate(model: IntegerModel, frames: Ints, rng: np.random.Generator) -> GatePlan:
-    """Signals of every kind, and thresholds that the frames reach now and then."""
+def _gate(model: IntegerModel, frames: Ints, rarely: bool, rng: np.random.Generator) -> GatePlan:
+    """Signals of every kind, and thresholds that the frames reach now and then; unless ``rarely``, often."""
     arch, layout = model.network.arch, model.layout
     segments = [inputs(s.data, layout) for s in resample(Frames(frames[:, 1:], frames[:, 0]), layout) if len(s)]
     rows = max(segments, key=len)
@@ -246,21 +255,23 @@ def _gate(model: IntegerModel, frames: Ints, rng: np.random.Generator) -> GatePl
         Signal(JERK, several, lag=lag, shift=max(0, reach - 18), baseline=3, noise=4, floor=2),
         Signal(JERK, some(2), lag=1, shift=max(0, reach - 12), baseline=6, noise=6, floor=1),
         Signal(LEVEL, some(1), shift=max(0, reach - 20), baseline=5, noise=5, floor=3),
-        Signal(LEVEL, some(1), shift=max(0, reach - 10), baseline=2, noise=7, floor=1),
+        Signal(LEVEL, some(1), shift=max(0, reach - 8), baseline=2, noise=7, floor=4),
     )
     loud = Rule((Term(0, 1 << 25),), 0, NO_GESTURE)
     gate = Gate(GatePlan(signals, (loud,)))
     sizes = np.array([(gate.push(row), list(gate.sizes))[1] for row in rows.tolist()])
 
     def term(signal: int, quantile: float, sign: int, times: int) -> Term:
-        return Term(signal, max(1, int(np.quantile(sizes[:, signal], quantile))), sign, times)
+        return Term(signal, max(1, int(np.quantile(sizes[:, signal], quantile, method="lower"))), sign, times)
 
     gesture = int(rng.integers(0, arch.classes))
+    often = () if rarely else (Rule((term(1, 0.5, 1, 4),), 2, NO_GESTURE, within=0, deaf=3),)
     return GatePlan(
         signals,
         (
             Rule((term(0, 0.97, 1, 2), term(2, 0.8, 0, 1)), 3, NO_GESTURE, within=3, deaf=int(rng.integers(5, 25))),
             Rule((term(3, 0.9, -1, 3), term(1, 0.9, 0, 1)), 1, gesture, within=6, deaf=int(rng.integers(0, 12))),
             Rule((term(2, 0.93, 1, 2), term(3, 0.5, 0, 1), term(1, 0.5, 1, 1)), 0, NO_GESTURE, within=4, deaf=30),
+            *often,
         ),
     )

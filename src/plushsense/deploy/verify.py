@@ -343,7 +343,9 @@ def _plant(
         (copy / IMAGE).write_bytes(fault.image)
     if fault.source is not None:
         (copy / LIBRARY[1]).write_text(fault.source, _ANY)
-    plain = replace(setting, optimise="-O2", flags=("-std=c99",), image=fault.image is not None)
+    # Where compiling takes longer than running, less of it.
+    optimise = "-O1" if setting.target == "host" else "-O2"
+    plain = replace(setting, optimise=optimise, flags=("-std=c99",), image=fault.image is not None)
     asked = list(enumerate(streams))[: 1 if fault.image is not None else None]
     # First whom it concerns.
     for n, stream in reversed(asked) if fault.kind in RULES else asked:
