@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import plushsense.deploy
-from plushsense.deploy.golden import HEAD
+from plushsense.deploy.golden import ANSWER, HEAD
 from plushsense.models.image import IntegerModel
 
 C_FOLDER = Path(plushsense.deploy.__file__).parent / "c"
@@ -49,6 +49,13 @@ class Seat:
 
     def __del__(self) -> None:
         self.library.seat_free(self.toy)
+
+
+def answers(rows: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Only the answers among the rows, without their kind: frame, ms, sample, state, gesture, affect, confidence,
+    restarts, invalid, then logits and probabilities."""
+    own = rows[rows[:, 0] == ANSWER]
+    return own[:, [1, 2, 3, 4, 5, 6, 7, 10, 11, *range(HEAD, own.shape[1])]]
 
 
 def seat(library: Any, model: IntegerModel, **how: int) -> Seat:

@@ -30,7 +30,7 @@ from plushsense.deploy.golden import (
     measured,
 )
 from plushsense.models.events import ANSWERS, BEGUN, ENDED, GATE, KINDS, NO_GESTURE, ONE, SOURCES, EventPlan
-from plushsense.models.fixed import LOGIT_LIMIT, LogitScale, split_ratio
+from plushsense.models.fixed import LOGIT_LIMIT, PROBABILITY_BITS, LogitScale, split_ratio
 from plushsense.models.gate import JERK, LEVEL, Gate, GatePlan, Rule, Signal, Term
 from plushsense.models.health import HealthPlan
 from plushsense.models.image import IntegerModel
@@ -39,7 +39,6 @@ from plushsense.models.rules import Rules
 from plushsense.windows.clock import resample
 from plushsense.windows.features import Scaler, inputs
 
-_LEAST_DRILLS, _MOST_DRILLS = 2, 4
 _SPREAD = 450  # of a logit over the frames, in steps of 1/256
 _AFFECTS: tuple[tuple[str, bool], ...] = (
     ("positive", False),
@@ -47,6 +46,27 @@ _AFFECTS: tuple[tuple[str, bool], ...] = (
     ("negative", False),
     ("none", False),
     ("neutral", False),
+)
+
+
+@dataclass(frozen=True)
+class _Course:
+    """What a drill is about: with a gate that fires now and then, or ``often``, or none; whether the leave share is
+    ``near``, that of entering, so that events end, or far from it, so that they give way to others."""
+
+    gate: bool
+    often: bool
+    near: bool
+    end: tuple[int, int]
+    hold: tuple[int, int]
+    smoothing: int
+
+
+COURSES = (
+    _Course(True, False, True, (1, 2), (5, 9), 12_000),
+    _Course(True, True, False, (3, 4), (1, 4), 6000),
+    _Course(False, False, True, (3, 3), (0, 2), 1 << PROBABILITY_BITS),
+    _Course(False, False, False, (4, 8), (1, 4), 16_000),
 )
 
 
@@ -61,21 +81,9 @@ class Drill:
 
 
 def drills_of(model: IntegerModel, scaler: Scaler) -> list[Drill]:
-    """A few drills for a model, the same ones each time: until they reach everything (`reached`), or it is enough.
-
-    Every second one has events that are held for long and end soon, the others such as rather give way to others.
-    """
-    found: list[Drill] = []
-    have: set[str] = set()
-    for seed in range(1, _MOST_DRILLS + 1):
-        drill = _drill(model, scaler, seed)
-        new = reached(drill) - have
-        if new or seed <= _LEAST_DRILLS:
-            found.append(drill)
-            have |= new
-        if have >= everything() and seed >= _LEAST_DRILLS:
-            break
-    return found
+    """A few drills for a model, one of each of `COURSES`, the same ones each time."""
+    plain = replace(model, rules=Rules(), gestures=_gestures(model))
+    return [_drill(plain, scaler, course, seed) for seed, course in enumerate(COURSES, 1)]
 
 
 def everything() -> set[str]:
@@ -126,63 +134,61 @@ def reached(drill: Drill) -> set[str]:
     return found
 
 
-def _drill(model: IntegerModel, scaler: Scaler, seed: int) -> Drill:
+def _drill(plain: IntegerModel, scaler: Scaler, course: _Course, seed: int) -> Drill:
     rng = np.random.default_rng(seed)
-    health = _health(model, scaler, rng)
-    frames, silences = _frames(model, scaler, health, rng)
-    plain = replace(model, rules=Rules(), gestures=_gestures(model))
-    drilled = _levelled(plain, column_logits(answers_of(plain, frames)))
-    drilled = replace(drilled, smoothing=int(rng.choice([6000, 12_000, 1 << 15])))
-    shares = column(answers_of(drilled, frames), "confidence")
-    known = column(answers_of(drilled, frames), "known")
-    tracking = column(answers_of(drilled, frames), "state") == TRACKING
-    held = bool(seed % 2)
-    events = _events(shares[tracking], known[tracking], held, rng)
-    rules = Rules(events, _gate(model, frames, held, rng), health)
-    drilled = replace(drilled, rules=rules)
+    health = _health(plain, scaler, rng)
+    frames, silences = (_troubled if course.gate else _calm)(plain, scaler, health, rng)
+    level = _Level(plain, _logits(answers_of(plain, frames)))
+    gate = _gate(plain, frames, course.often, rng) if course.gate else GatePlan()
+    rules = Rules(_events(level, course, rng), gate, health)
+    drilled = replace(level.model, smoothing=course.smoothing, rules=rules)
     return Drill(drilled, frames, silences, answers_of(drilled, frames, silences))
 
 
-def column_logits(rows: NDArray[np.int32]) -> Ints:
+def _logits(rows: NDArray[np.int32]) -> NDArray[np.float64]:
     """The logits (n, K) of the answers of a toy that tracks."""
     classes = (rows.shape[1] - HEAD) // 2
     told = (rows[:, 0] == ANSWER) & (rows[:, COLUMNS[ANSWER].index("state")] == TRACKING)
-    found: Ints = rows[told, HEAD : HEAD + classes].astype(np.int64)
-    return found
+    return rows[told, HEAD : HEAD + classes].astype(np.float64)
 
 
 def _gestures(model: IntegerModel) -> GestureSet:
-    told = [_AFFECTS[k % len(_AFFECTS)] if k < 5 else _AFFECTS[(0, 2, 4)[k % 3]] for k in range(len(model.gestures))]
+    told = [_AFFECTS[k if k < 5 else (0, 2, 4, 0, 2, 1)[k % 6]] for k in range(len(model.gestures))]
     gestures = tuple(
         Gesture(g.label, affect, idle=idle) for g, (affect, idle) in zip(model.gestures.gestures, told, strict=True)
     )
     return GestureSet(model.gestures.name, gestures)
 
 
-def _levelled(model: IntegerModel, logits: Ints) -> IntegerModel:
-    """With a last layer whose logits are 0 on the average and all spread alike, so that classes take turns."""
-    dense = model.network.dense
-    if not len(logits):
-        return model
-    spread = np.maximum(logits.std(axis=0), 1.0)
-    bias, rows = dense.bias.copy(), []
-    for k, (mean, own) in enumerate(zip(logits.mean(axis=0), spread, strict=True)):
-        before, multiplier, after = (int(getattr(dense.scale, n)[k]) for n in ("before", "multiplier", "after"))
-        ratio = max(multiplier, 1) / 2.0 ** (before + after)
-        bias[k] -= round(mean / ratio)
-        ratio *= float(np.clip(_SPREAD / own, 1 / 64, 64))
-        rows.append(split_ratio(ratio, 2 * LOGIT_LIMIT / ratio))
-    try:
-        level = IntegerDense(dense.weights, bias, LogitScale(*np.array(rows, dtype=np.int64).T))
-        return replace(model, network=replace(model.network, dense=level))
-    except BundleError:  # a sum could leave 32 bits
-        return model
+class _Level:
+    """A model with a last layer whose logits (n, K) are 0 on the average and all spread alike, so that classes take
+    turns; ``shares`` (n,) of the best class and the highest logits ``known`` (n,) come about as these say."""
+
+    def __init__(self, model: IntegerModel, logits: NDArray[np.float64]) -> None:
+        dense = model.network.dense
+        mean, spread = logits.mean(axis=0), np.maximum(logits.std(axis=0), 1.0)
+        gain = np.clip(_SPREAD / spread, 1 / 64, 64)
+        bias, rows = dense.bias.copy(), []
+        for k in range(len(gain)):
+            before, multiplier, after = (int(getattr(dense.scale, n)[k]) for n in ("before", "multiplier", "after"))
+            ratio = max(multiplier, 1) / 2.0 ** (before + after)
+            bias[k] -= round(float(mean[k]) / ratio)
+            rows.append(split_ratio(ratio * gain[k], 2 * LOGIT_LIMIT / (ratio * gain[k])))
+        try:
+            level = IntegerDense(dense.weights, bias, LogitScale(*np.array(rows, dtype=np.int64).T))
+            self.model = replace(model, network=replace(model.network, dense=level))
+            reached = (logits - mean) * gain
+        except BundleError:  # a sum could leave 32 bits
+            self.model, reached = model, logits
+        reached = np.clip(reached, -LOGIT_LIMIT, LOGIT_LIMIT)
+        self.known = reached.max(axis=1)
+        self.shares = ONE / np.exp((reached - self.known[:, None]) / 256).sum(axis=1)
 
 
-def _events(shares: NDArray[np.int32], known: NDArray[np.int32], held: bool, rng: np.random.Generator) -> EventPlan:
+def _events(level: _Level, course: _Course, rng: np.random.Generator) -> EventPlan:
     def share(low: float, high: float) -> int:
         """A share that so many of the steps stay below."""
-        return int(np.quantile(shares, rng.uniform(low, high))) if len(shares) else ONE // 2
+        return int(np.quantile(level.shares, rng.uniform(low, high)))
 
     def steps(low: int, high: int) -> int:
         return int(rng.integers(low, high + 1))
@@ -190,15 +196,15 @@ def _events(shares: NDArray[np.int32], known: NDArray[np.int32], held: bool, rng
     enter = share(0.35, 0.6)
     return EventPlan(
         enter=enter,
-        leave=min(enter, share(0.2, 0.4) if held else share(0.0, 0.05) // 2),
-        enter_affect=min(ONE, share(0.4, 0.7)),
+        leave=enter if course.near else share(0.0, 0.05) // 2,
+        enter_affect=share(0.4, 0.7),
         leave_affect=share(0.1, 0.4),
         sure=int(rng.integers(ONE // 8, ONE // 3)),
-        known=int(np.quantile(known, 0.1)) if len(known) else 0,
+        known=int(np.quantile(level.known, 0.12)),
         least=steps(2, 3),
         switch=steps(2, 4),
-        end=steps(1, 2) if held else steps(3, 4),
-        hold=steps(5, 9) if held else steps(1, 4),
+        end=steps(*course.end),
+        hold=steps(*course.hold),
         rest=steps(1, 4),
         wait=steps(2, 6),
     )
@@ -214,9 +220,10 @@ def _health(model: IntegerModel, scaler: Scaler, rng: np.random.Generator) -> He
     return HealthPlan(tuple(low.tolist()), tuple(high.tolist()), **times)
 
 
-def _frames(
+def _troubled(
     model: IntegerModel, scaler: Scaler, health: HealthPlan, rng: np.random.Generator
 ) -> tuple[Ints, tuple[int, ...]]:
+    """Blows and failing sensors, also while the network is warming."""
     layout, span = model.layout, model.network.arch.span
     make, silences = Maker(layout, scaler, rng), []
     part = span + 400
@@ -240,8 +247,20 @@ def _frames(
     return np.array(make.rows, dtype=np.int64), tuple(silences)
 
 
-def _gate(model: IntegerModel, frames: Ints, rarely: bool, rng: np.random.Generator) -> GatePlan:
-    """Signals of every kind, and thresholds that the frames reach now and then; unless ``rarely``, often."""
+def _calm(
+    model: IntegerModel, scaler: Scaler, health: HealthPlan, rng: np.random.Generator
+) -> tuple[Ints, tuple[int, ...]]:
+    """Touches for long, now and then a frame in doubt, or silence."""
+    make, silences = Maker(model.layout, scaler, rng), []
+    make.touches(model.network.arch.span)
+    for _ in range(12):
+        make.touches(170, garbage=0.02 / len(make.mean))
+        silences.append(len(make.rows) - 1)
+    return np.array(make.rows, dtype=np.int64), tuple(silences)
+
+
+def _gate(model: IntegerModel, frames: Ints, often: bool, rng: np.random.Generator) -> GatePlan:
+    """Signals of every kind, and thresholds that the frames reach now and then, or ``often``."""
     arch, layout = model.network.arch, model.layout
     segments = [inputs(s.data, layout) for s in resample(Frames(frames[:, 1:], frames[:, 0]), layout) if len(s)]
     rows = max(segments, key=len)
@@ -265,13 +284,13 @@ def _gate(model: IntegerModel, frames: Ints, rarely: bool, rng: np.random.Genera
         return Term(signal, max(1, int(np.quantile(sizes[:, signal], quantile, method="lower"))), sign, times)
 
     gesture = int(rng.integers(0, arch.classes))
-    often = () if rarely else (Rule((term(1, 0.5, 1, 4),), 2, NO_GESTURE, within=0, deaf=3),)
+    more = (Rule((term(1, 0.5, 1, 4),), 2, NO_GESTURE, within=0, deaf=3),) if often else ()
     return GatePlan(
         signals,
         (
             Rule((term(0, 0.97, 1, 2), term(2, 0.8, 0, 1)), 3, NO_GESTURE, within=3, deaf=int(rng.integers(5, 25))),
             Rule((term(3, 0.9, -1, 3), term(1, 0.9, 0, 1)), 1, gesture, within=6, deaf=int(rng.integers(0, 12))),
             Rule((term(2, 0.93, 1, 2), term(3, 0.5, 0, 1), term(1, 0.5, 1, 1)), 0, NO_GESTURE, within=4, deaf=30),
-            *often,
+            *more,
         ),
     )

@@ -298,6 +298,8 @@ class Maker:
             self.touches(back)
         if health.still_ms:
             self.frozen(self.frames_of(health.still_ms) * 3 // 4)
+            self.wait(self.layout.gap_ms + 10)
+            self.frozen(4)
             self.touches(self.frames_of(health.still_ms) // 2)
             self.frozen(self.frames_of(health.still_ms) + 20)
             self.now = 40

@@ -101,6 +101,7 @@ class Export:
             raise BadInput(f"'{self.folder / FACTS}' has the smoothing {smoothing!r}: export the model again.")
         self.model: IntegerModel = replace(model, smoothing=smoothing)
         self.image = (self.folder / IMAGE).read_bytes()
+        self._drills: list[Vectors] | None = None
         arch = self.model.network.arch
         frames, answers = read_golden(self.folder / GOLDEN, len(self.model.layout.channels), arch.classes)
         self.golden = Vectors("golden", frames, answers, self.samples_of(frames))
@@ -140,8 +141,12 @@ class Export:
         do. None for a model that is not that of the bundle beside it."""
         if not self.is_own:
             return []
-        found = drills_of(self.model, self.bundle.scaler)
-        return [Vectors("drill", d.frames, d.rows, self.samples_of(d.frames), d.model, d.silences) for d in found]
+        if self._drills is None:
+            found = drills_of(self.model, self.bundle.scaler)
+            self._drills = [
+                Vectors("drill", d.frames, d.rows, self.samples_of(d.frames), d.model, d.silences) for d in found
+            ]
+        return self._drills
 
     def made_up(self, samples: int) -> list[Vectors]:
         """More frames such as the golden ones, until they make this many samples."""
