@@ -129,6 +129,16 @@ static uint32_t part_of(uint32_t distance, uint32_t into, uint32_t by, uint32_t 
     return quotient + (rest + add) / by;
 }
 
+static int same(const int32_t *one, const int32_t *other, uint32_t n)
+{
+    while (n > 0 && *one == *other) {
+        one++;
+        other++;
+        n--;
+    }
+    return n == 0;
+}
+
 static uint64_t square(int32_t v)
 {
     uint32_t size = v < 0 ? 0u - (uint32_t)v : (uint32_t)v;
@@ -467,7 +477,7 @@ static int has_gate(const plush_toy *toy)
 /* Hands out the memory of a model that was read. Returns the bytes of it. */
 static uint32_t share_out(plush_toy *toy, uint8_t *memory)
 {
-    uint32_t used = 0, start, i;
+    uint32_t used = 0, i;
 
     toy->held = (int32_t *)take(memory, &used, 4u * toy->channels);
     toy->before = (int32_t *)take(memory, &used, 4u * toy->channels);
@@ -483,6 +493,8 @@ static uint32_t share_out(plush_toy *toy, uint8_t *memory)
     toy->logits = (int32_t *)take(memory, &used, 4u * toy->classes);
     toy->smooth = (int32_t *)take(memory, &used, 4u * (toy->classes + 1u));
     if (has_gate(toy)) {
+        uint32_t start;
+
         toy->gate_inputs = (int32_t *)take(memory, &used, UINT32_C(4) * toy->inputs * (toy->gate_past + 1u));
         start = used;
         toy->gate_state = (int32_t *)take(memory, &used, 4u * SIGNAL_WORDS * toy->gate_signals);
@@ -825,7 +837,7 @@ static plush_kind kind_of(const plush_toy *toy, uint32_t best)
     for (k = 0; k < toy->classes; k++)
         if (share_of(toy, k) >= sure) {
             members++;
-            affects |= UINT32_C(1) << (is_idle(toy, k) ? PLUSH_AFFECT_NONE : affect_of(toy, k));
+            affects |= UINT32_C(1) << (is_idle(toy, k) ? 0u : affect_of(toy, k));
         }
     if (members == 1)
         return PLUSH_SURE_GESTURE;
@@ -912,7 +924,7 @@ static uint32_t affect_alone(const plush_toy *toy)
             affect = other;
         }
     }
-    return most >= setting(toy, ENTER_AFFECT) ? affect : PLUSH_AFFECT_NONE;
+    return most >= setting(toy, ENTER_AFFECT) ? affect : 0u;
 }
 
 /* How many steps in a row the same was wanted. */
@@ -1108,8 +1120,8 @@ static const uint8_t *follow(const plush_toy *toy, const uint8_t *signal, int32_
     return how + 8;
 }
 
-/* Whether a term holds after one more sample; `row` counts those in a row, `hold` those for which it goes on. */
-static int holds(const uint8_t *term, int32_t size, uint32_t longer, uint8_t *row, uint16_t *hold)
+/* Whether a term holds after one more sample; `row` counts those in a row, `left` those for which it goes on. */
+static int holds(const uint8_t *term, int32_t size, uint32_t longer, uint8_t *row, uint16_t *left)
 {
     int32_t threshold = (int32_t)le32(term + 4);
 
@@ -1117,13 +1129,13 @@ static int holds(const uint8_t *term, int32_t size, uint32_t longer, uint8_t *ro
         if (*row < term[2])
             ++*row;
         if (*row == term[2])
-            *hold = (uint16_t)(longer + 1);
+            *left = (uint16_t)(longer + 1);
     } else {
         *row = 0;
     }
-    if (*hold == 0)
+    if (*left == 0)
         return 0;
-    --*hold;
+    --*left;
     return 1;
 }
 
@@ -1132,7 +1144,7 @@ static const uint8_t *judge(const plush_toy *toy)
 {
     const uint8_t *rule = toy->gate_first_rule, *fired = NULL;
     uint8_t *row = toy->gate_in_row;
-    uint16_t *hold = toy->gate_hold;
+    uint16_t *left = toy->gate_hold;
     uint32_t r, n;
 
     for (r = 0; r < toy->gate_rules; r++) {
@@ -1140,7 +1152,7 @@ static const uint8_t *judge(const plush_toy *toy)
         int every = 1;
 
         for (n = rule[0]; n > 0; n--, term += TERM_BYTES)
-            every &= holds(term, toy->gate_state[SIGNAL_WORDS * term[0] + SIZE], rule[3], row++, hold++);
+            every &= holds(term, toy->gate_state[SIGNAL_WORDS * term[0] + SIZE], rule[3], row++, left++);
         if (every && fired == NULL)
             fired = rule;
         rule = term;
@@ -1162,7 +1174,7 @@ static void gate_sample(plush_toy *toy, uint32_t ms)
         memset(toy->gate_state, 0, toy->gate_bytes);
         return;
     }
-    if (toy->gate_seen > 0 && memcmp(past_inputs(toy, 0), past_inputs(toy, 1), 4u * toy->inputs) == 0)
+    if (toy->gate_seen > 0 && same(past_inputs(toy, 0), past_inputs(toy, 1), toy->inputs))
         return;
     for (n = 0; n < toy->gate_signals; n++)
         signal = follow(toy, signal, toy->gate_state + SIGNAL_WORDS * n);
@@ -1217,7 +1229,7 @@ static int examine(plush_toy *toy, uint32_t ms, const int32_t *values)
     if (wrong && !toy->wrong)
         toy->wrong_ms = ms;
     toy->wrong = (uint8_t)wrong;
-    still = toy->compared && frozen_ms != 0 && memcmp(toy->last, values, 4u * toy->channels) == 0;
+    still = toy->compared && frozen_ms != 0 && same(toy->last, values, toy->channels);
     if (!still)
         toy->moved_ms = ms;
     quiet = ms - toy->moved_ms;
