@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import subprocess
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import plushsense.deploy
+from plushsense.deploy.golden import ANSWER, HEAD
 from plushsense.models.image import IntegerModel
 
 C_FOLDER = Path(plushsense.deploy.__file__).parent / "c"
@@ -26,24 +28,34 @@ class Seat:
         self.toy = ctypes.c_void_p(library.seat_new(image, len(image), ctypes.byref(status), too_few, off))
         self.status = status.value
 
-    def push(self, frames: NDArray[np.int64]) -> NDArray[np.int32]:
-        """The answers (n, 9 + 2 K) that these frames complete."""
+    def push(self, frames: NDArray[np.int64], silences: Sequence[int] = ()) -> NDArray[np.int32]:
+        """The rows (n, 12 + 2 K), as `answers_of` gives them, that these frames bring about."""
         words = np.ascontiguousarray(frames & 0xFFFFFFFF).astype(np.uint32)
         # A frame completes one sample, and more after a gap: the rows hold them all.
-        rows = np.empty((40 * len(frames) + 1000, 9 + 2 * self.classes), dtype=np.int32)
-        due = self.library.seat_push(
+        rows = np.empty((40 * len(frames) + 1000, HEAD + 2 * self.classes), dtype=np.int32)
+        silent = np.array(sorted(silences), dtype=np.uint32)
+        made = self.library.seat_push(
             self.toy,
             ctypes.c_void_p(words.ctypes.data),
             len(frames),
             self.channels,
             ctypes.c_void_p(rows.ctypes.data),
             len(rows),
+            ctypes.c_void_p(silent.ctypes.data),
+            len(silent),
         )
-        assert due <= len(rows)
-        return rows[:due]
+        assert made < len(rows), "every answer is counted, and every row has room"
+        return rows[:made]
 
     def __del__(self) -> None:
         self.library.seat_free(self.toy)
+
+
+def answers(rows: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Only the answers among the rows, without their kind: frame, ms, sample, state, gesture, affect, confidence,
+    restarts, invalid, then logits and probabilities."""
+    own = rows[rows[:, 0] == ANSWER]
+    return own[:, [1, 2, 3, 4, 5, 6, 7, 10, 11, *range(HEAD, own.shape[1])]]
 
 
 def seat(library: Any, model: IntegerModel, **how: int) -> Seat:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,13 @@ from numpy.typing import NDArray
 from plushsense.core.gestures import AFFECTS, Gesture, GestureSet
 from plushsense.core.signal import Channel, CsvFormat, Derived, Layout, magnitude_limit
 from plushsense.models.arch import Arch, ConvLayer
+from plushsense.models.events import NO_GESTURE, EventPlan
 from plushsense.models.fixed import InputScale, LogitScale, Requantize, split_ratio
+from plushsense.models.gate import JERK, LEVEL, MOST_SIZE, GatePlan, Rule, Signal, Term
+from plushsense.models.health import HealthPlan
 from plushsense.models.image import IntegerModel
 from plushsense.models.integer import IntegerDense, IntegerLayer, IntegerNetwork
+from plushsense.models.rules import Rules
 
 Ints = NDArray[np.int64]
 INT32 = -(1 << 31), (1 << 31) - 1
@@ -92,6 +97,68 @@ def any_network(arch: Arch, layout: Layout, rng: np.random.Generator) -> Integer
     return IntegerNetwork(arch, InputScale(*np.array(columns, dtype=np.int64).T), tuple(layers), dense)
 
 
+def any_events(rng: np.random.Generator) -> EventPlan:
+    """Settings that a random network reaches now and then."""
+
+    def one(*of: int) -> int:
+        return int(rng.choice(of))
+
+    return EventPlan(
+        enter=one(0, 8000, 16000, 30000, 32769),
+        leave=one(0, 8000, 16000, 32769),
+        enter_affect=one(0, 10000, 20000, 32769),
+        leave_affect=one(0, 10000, 20000),
+        sure=int(rng.integers(2000, 20000)),
+        known=one(-(1 << 14), 0, 300, 1000, 1 << 14) if rng.random() < 0.5 else -(1 << 14),
+        least=one(1, 2, 4),
+        switch=one(1, 2, 5),
+        end=one(1, 2, 5),
+        hold=one(0, 1, 6),
+        rest=one(0, 1, 6),
+        wait=one(0, 3, 8),
+    )
+
+
+def any_health(layout: Layout, rng: np.random.Generator) -> HealthPlan:
+    """With limits within the middle third of the ranges, or without; short times, some switched off."""
+    low, high = layout.valid_min_int, layout.valid_max_int
+    third = (high - low) // 3
+    limits = (tuple((low + third).tolist()), tuple((high - third).tolist())) if rng.random() < 0.6 else ((), ())
+    times = {"fault_ms": (0, 30, 100, 500), "still_ms": (0, 20, 41, 100), "recover_ms": (0, 50, 300)}
+    return HealthPlan(*limits, **{name: int(rng.choice(some)) for name, some in times.items()})
+
+
+def any_gate(arch: Arch, rng: np.random.Generator) -> GatePlan:
+    """Up to 4 signals and 3 rules, also with the narrowest and widest of every setting."""
+
+    def one(*of: int) -> int:
+        return int(rng.choice(of))
+
+    def signal() -> Signal:
+        kind = one(LEVEL, JERK)
+        several = tuple(int(i) for i in rng.integers(0, arch.channels, 1 if kind == LEVEL else one(1, 2, 5)))
+        how = one(1, 2, 16), one(0, 3, 8, 20, 24), one(1, 3, 7, 15), one(1, 4, 8, 15), one(1, 10, 1000, 1 << 20)
+        return Signal(kind, several, *how)
+
+    signals = tuple(signal() for _ in range(one(1, 2, 4)))
+
+    def rule() -> Rule:
+        most = len(signals) - 1
+        size = one(1, 8, 30, 100, MOST_SIZE)
+        terms = [Term(int(rng.integers(0, most + 1)), size, one(-1, 0, 1), one(1, 2, 3)) for _ in range(one(1, 1, 2))]
+        gesture = one(NO_GESTURE, int(rng.integers(0, arch.classes)))
+        return Rule(tuple(terms), one(0, 1, 2, 3), gesture, one(0, 4, 255), one(0, 10, 50))
+
+    return GatePlan(signals, tuple(rule() for _ in range(one(1, 2, 3))))
+
+
+def any_rules(arch: Arch, layout: Layout, rng: np.random.Generator) -> Rules:
+    """All, some or none of the rules."""
+    gate = any_gate(arch, rng) if rng.random() < 0.7 else GatePlan()
+    health = any_health(layout, rng) if rng.random() < 0.7 else HealthPlan(fault_ms=0)
+    return Rules(any_events(rng) if rng.random() < 0.8 else EventPlan(), gate, health)
+
+
 @st.composite
 def models(draw: st.DrawFn, longest: int = 700) -> IntegerModel:
     """Any model that fits the toy and whose span is at most ``longest`` samples."""
@@ -112,9 +179,11 @@ def models(draw: st.DrawFn, longest: int = 700) -> IntegerModel:
         pool=step * draw(st.integers(1, 10)),
     )
     rng = np.random.default_rng(draw(st.integers(0, 1 << 30)))
-    gestures = tuple(Gesture(f"gèste {i}", AFFECTS[i % 4]) for i in range(arch.classes))
+    idle = rng.random(arch.classes) < 0.2
+    gestures = tuple(Gesture(f"gèste {i}", AFFECTS[i % 4], idle=bool(idle[i])) for i in range(arch.classes))
     smoothing = draw(st.sampled_from((1, 2, 5000, 32767, 1 << 15)))
-    return IntegerModel(any_network(arch, layout, rng), layout, GestureSet("any", gestures), smoothing)
+    network, rules = any_network(arch, layout, rng), any_rules(arch, layout, rng)
+    return IntegerModel(network, layout, GestureSet("any", gestures), smoothing, rules)
 
 
 def any_frames(model: IntegerModel, seed: int, n: int | None = None, start: int | None = None) -> Ints:
@@ -165,6 +234,17 @@ def plain_model(seed: int = 1, **changes: Any) -> IntegerModel:
     arch = Arch((ConvLayer(5, 2, 6), ConvLayer(4, 3, 5)), **settings)
     gestures = GestureSet("plain", tuple(Gesture(f"gesture {i}", AFFECTS[i % 4]) for i in range(arch.classes)))
     return IntegerModel(any_network(arch, layout, np.random.default_rng(seed)), layout, gestures, 5000)
+
+
+def ruled_model(seed: int = 1, **changes: Any) -> IntegerModel:
+    """`plain_model` with every kind of rule, and an idle class."""
+    model, rng = plain_model(seed, **changes), np.random.default_rng(seed)
+    arch, gestures = model.network.arch, list(model.gestures.gestures)
+    gestures[0] = replace(gestures[0], idle=True)
+    low, high = model.layout.valid_min_int // 2, model.layout.valid_max_int // 2
+    health = HealthPlan(tuple(low.tolist()), tuple(high.tolist()), fault_ms=200, still_ms=90, recover_ms=150)
+    rules = Rules(any_events(rng), any_gate(arch, rng), health)
+    return replace(model, gestures=GestureSet("ruled", tuple(gestures)), rules=rules)
 
 
 def edged_model() -> IntegerModel:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from plushsense.core.signal import Layout
+from plushsense.deploy.golden import ANSWER
 from plushsense.deploy.package import ARDUINO, IDF, IDF_EXAMPLE, SKETCH
 from plushsense.devices.wire import LineParser
 from plushsense.models.image import IntegerModel
@@ -74,5 +75,6 @@ def told(answers: np.ndarray, model: IntegerModel, since: int = 0) -> list[str]:
     labels = model.gestures.labels
     return [
         f"{(ms - since) & 0xFFFFFFFF} {f'{gesture} {sure}/32768 {labels[gesture]}' if state else 'warming'}"
-        for _, ms, _, state, gesture, _, sure, *_ in answers.astype(np.int64).tolist()
+        for kind, _, ms, _, state, gesture, _, sure, *_ in answers.astype(np.int64).tolist()
+        if kind == ANSWER
     ]

@@ -7,6 +7,7 @@ import re
 import struct
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +19,9 @@ TESTS = Path(__file__).parents[1]
 sys.path.insert(0, str(TESTS))
 
 from c_toy import Seat, seat  # noqa: E402
-from integers import any_frames, models, plain_model  # noqa: E402
+from integers import any_frames, models, plain_model, ruled_model  # noqa: E402
 from plushsense.deploy.golden import answers_of  # noqa: E402
+from plushsense.models.gate import JERK, LEVEL, MOST_SIZE, GatePlan, Rule, Signal, Term  # noqa: E402
 from plushsense.models.image import IntegerModel, head  # noqa: E402
 
 OK, NOT_A_MODEL, OTHER_VERSION, DAMAGED, TOO_SMALL = range(5)
@@ -36,7 +38,7 @@ def test_what_plush_begin_says(c_library: Any) -> None:
     assert status(image) == OK
     assert status(image + b"what stands behind it in flash") == OK
     assert status(b"") == status(image[:15]) == status(b"PLSX" + image[4:]) == NOT_A_MODEL
-    assert status(image[:4] + b"\2" + image[5:]) == OTHER_VERSION
+    assert status(image[:4] + b"\1" + image[5:]) == OTHER_VERSION == status(image[:4] + b"\3" + image[5:])
     for cut in (16, 17, len(image) // 2, len(image) - 1):
         assert status(image[:cut]) == DAMAGED
     for at in range(16, len(image), 7):
@@ -94,15 +96,75 @@ def test_a_good_checksum_makes_no_model(c_library: Any) -> None:
         "multiplier": (layer + 12, struct.pack("<H", 32768)),
         "shift before": (layer + 14, b"\x1f"),
         "shift after": (layer + 15, b"\xff"),
-        "an unknown affect": (body.index(b"gesture 1") - 1, b"\4"),
-        "a label without end": (body.index(b"gesture 2") + 9, b"x"),
-        "a title without end": (len(body) - 1, b"x"),
+        "an unknown affect": (body.index(b"gesture 0") - 2, b"\x08"),
+        "a label without end": (body.index(b"gesture 0"), b"x" * (len(body) - body.index(b"gesture 0"))),
+        "no rules": (len(body) - 2, b"\xff\xff"),
     }
     for what, (at, change) in changes.items():
         wrong = sealed(body[:at] + change + body[at + len(change) :])
         assert Seat(c_library, wrong, 4, 3).status == DAMAGED, what
     assert Seat(c_library, sealed(body + b"\0"), 4, 3).status == DAMAGED
     assert Seat(c_library, sealed(body), 4, 3).status == OK
+
+
+def test_a_good_checksum_makes_no_rules(c_library: Any) -> None:
+    """Every setting that the plans refuse, one at a time."""
+    model = ruled_model(4)
+    one = Signal(JERK, (0, 1), 16, 24, 15, 15, 1 << 20)
+    two = Signal(LEVEL, (1,), 1, 0, 1, 1, 1)
+    rule = Rule((Term(1, MOST_SIZE, -1, 255), Term(0, 1, 1, 1)), 3, 2, 255, 65535)
+    model = replace(model, rules=replace(model.rules, gate=GatePlan((one, two), (rule,))))
+    body = model.to_bytes()[16:]
+    term = len(body) - 16
+    rule_at, level, jerk = term - 6, term - 6 - 11, term - 6 - 11 - 12
+    gate = jerk - 2
+    health = gate - 8 - 4 * 8
+    events = health - 24
+    assert body[gate : gate + 2] == b"\2\1" and body[jerk] == 1 and body[level] == 0
+    changes: dict[str, tuple[int, bytes]] = {
+        **{f"share {n}": (events + 2 * n, struct.pack("<H", 32770)) for n in range(5)},
+        "known": (events + 10, struct.pack("<h", 16385)),
+        "known below": (events + 10, struct.pack("<h", -16385)),
+        **{f"no steps {n}": (events + 2 * n, bytes(2)) for n in (6, 7, 8)},
+        **{f"health time {n}": (health + 2 * n, struct.pack("<H", 60001)) for n in range(3)},
+        "limits or not": (health + 6, b"\2"),
+        "something more": (health + 7, b"\1"),
+        "limits the wrong way round": (health + 8, struct.pack("<ii", 5, 4)),
+        "33 signals": (gate, b"\x21"),
+        "17 rules": (gate + 1, b"\x11"),
+        "signals without rules": (gate + 1, b"\0"),
+        "kind": (jerk, b"\2"),
+        "no inputs": (jerk + 1, b"\0"),
+        "a level of two": (jerk, b"\0"),
+        "an input that there is not": (jerk + 3, b"\2"),
+        "lag 0": (jerk + 4, b"\0"),
+        "lag 17": (jerk + 4, b"\x11"),
+        "shift": (jerk + 5, b"\x19"),
+        "baseline 0": (level + 5, b"\0"),
+        "baseline 16": (level + 5, b"\x10"),
+        "noise 0": (level + 6, b"\0"),
+        "noise 16": (level + 6, b"\x10"),
+        "floor 0": (level + 7, bytes(4)),
+        "floor": (level + 7, struct.pack("<I", (1 << 20) + 1)),
+        "no terms": (rule_at, b"\0"),
+        "9 terms": (rule_at, b"\x09"),
+        "affect": (rule_at + 1, b"\4"),
+        "gesture": (rule_at + 2, b"\3"),
+        "a signal that there is not": (term, b"\2"),
+        "sign": (term + 1, b"\2"),
+        "no times": (term + 2, b"\0"),
+        "more of a term": (term + 3, b"\1"),
+        "threshold 0": (term + 4, bytes(4)),
+        "threshold": (term + 4, struct.pack("<I", MOST_SIZE + 1)),
+    }
+    for what, (at, change) in changes.items():
+        wrong = sealed(body[:at] + change + body[at + len(change) :])
+        assert Seat(c_library, wrong, 4, 3).status == DAMAGED, what
+    for cut in range(events, len(body)):
+        assert Seat(c_library, sealed(body[:cut]), 4, 3).status == DAMAGED
+    fine = {"gesture": (rule_at + 2, b"\xff"), "affect": (rule_at + 1, b"\0"), "known": (events + 10, b"\0\xc0")}
+    for what, (at, change) in {"as it is": (0, body[:1]), **fine}.items():
+        assert Seat(c_library, sealed(body[:at] + change + body[at + len(change) :]), 4, 3).status == OK, what
 
 
 def test_a_toy_that_never_began_is_quiet(c_library: Any) -> None:
@@ -113,7 +175,7 @@ def test_a_toy_that_never_began_is_quiet(c_library: Any) -> None:
         c_library.seat_restart(toy.toy)
         assert len(toy.push(frames)) == 0
         assert c_library.seat_name(toy.toy, 0) == c_library.seat_title(toy.toy) == b""
-    never = (ctypes.c_uint64 * 128)()
+    never = (ctypes.c_uint64 * 256)()
     assert c_library.plush_push(never, 5, (ctypes.c_int32 * 255)()) == 0
 
 
@@ -156,13 +218,13 @@ def test_sanitizers_find_nothing_in_any_bytes(sanitized: list[Path], tmp_path: P
     frames = any_frames(plain_model(), 3, 60)
     wide = np.zeros((60, 40), dtype=np.int64)
     wide[:, : frames.shape[1]] = frames
-    base = plain_model().to_bytes()[16:]
+    base = ruled_model(4).to_bytes()[16:]
     layers = [m.start() for m in re.finditer(re.escape(struct.pack("<HHHH", 4, 3, 6, 5)), base)] + [92]
     spots = [
         *range(28),
         *range(60, 92),
         *(at + i for at in layers for i in range(24)),
-        *range(len(base) - 60, len(base)),
+        *range(base.index(b"gesture 0") - 3, len(base)),
     ]
     edges = [0, 1, 2, 3, 4, 5, 127, 128, 254, 255]
     images = []
@@ -197,7 +259,7 @@ def test_sanitizers_find_nothing_in_any_bytes(sanitized: list[Path], tmp_path: P
         status, made = struct.unpack_from("<iI", out, at)
         statuses.append(status)
         classes = image[16 + 3] if status == OK else 0
-        at += 8 + 4 * made * (9 + 2 * classes)
+        at += 8 + 4 * made * (12 + 2 * classes)
     assert at == len(out)
     assert statuses.count(OK) > 200
     assert statuses.count(DAMAGED) > 1000

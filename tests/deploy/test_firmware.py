@@ -22,7 +22,7 @@ from plushsense.core.signal import Channel, load_layout
 from plushsense.deploy.calibration import integer_model
 from plushsense.deploy.emit import emit
 from plushsense.deploy.firmware import TEMPLATES, firmware
-from plushsense.deploy.golden import answers_of, read_golden
+from plushsense.deploy.golden import answers_of, column, read_golden
 from plushsense.deploy.package import ARDUINO, SKETCH, changed_copies, copies, package
 from plushsense.devices.wire import LineParser, format_line
 from plushsense.models.image import IntegerModel
@@ -48,12 +48,12 @@ def test_the_example_feels_what_the_computer_reads_of_its_lines(
     assert abs((frames[400, 0] - frames[0, 0]) - 4000) <= 2
     assert sorted(between)[-2] == pytest.approx(40, abs=12) and sorted(between)[-1] == pytest.approx(255, abs=12)
     answers = answers_of(model, frames)
-    assert set(answers[:, 3]) == {0, 1}
-    assert answers[-1, 7] == 1  # the restart of the long gap
-    assert answers[-1, 8] == 0  # made-up readings are within the valid ranges
+    assert set(column(answers, "state")) == {0, 1}
+    assert answers[-1, 10] == 1  # the restart of the long gap
+    assert answers[-1, 11] == 0  # made-up readings are within the valid ranges
     lines = play(BUILDS[board](out, tmp_path, "TELL_ANSWERS=1"))[0].decode().splitlines()
     # A wire without a clock tells the time since its first frame.
-    since = int(lines[0].split()[0]) - int(answers[0, 1]) if layout == "plush-14" else 0
+    since = int(lines[0].split()[0]) - int(column(answers, "ms")[0]) if layout == "plush-14" else 0
     assert lines == told(answers, model, -since)
     assert len({pin for _, pin, _ in pins}) >= 3  # the eyes moved
 
@@ -65,7 +65,7 @@ def test_lines_that_come_in_are_felt_like_golden_frames(
 ) -> None:
     out, model = packages[layout]
     frames, answers = read_golden(out / "golden", model.layout.n_channels, len(model.gestures))
-    frames, answers = frames[:900], answers[answers[:, 0] < 900]
+    frames, answers = frames[:900], answers[answers[:, 1] < 900]
     before = np.concatenate([[0], np.maximum(0, np.diff(frames[:, 0]))])
     lines = [format_line(model.layout, row[1:], row[0], d) for row, d in zip(frames.tolist(), before, strict=True)]
     (tmp_path / "lines").write_bytes(b"7 8 half a line\n" + b"".join(lines))

@@ -32,14 +32,14 @@ def test_counts(target: str, small: Path, target_here: Here) -> None:
     assert {p: p.read_bytes() for p in small.rglob("*") if p.is_file()} == before
     assert cost.step is not None and cost.even is not None and cost.step_most is not None and cost.gap is not None
     assert sum(cost.stages.values()) == cost.step
-    assert all(part > 0 for part in cost.stages.values())
+    assert all(part > 0 for name, part in cost.stages.items() if name != "gate") and cost.stages["gate"] == 0
     # Jitter costs interpolation; a step of it may hold one sample more; a gap of 100 ms makes up for two steps
     # but reads one frame only.
     assert cost.even < cost.step < cost.step_most < 1.3 * cost.step
     assert 1.6 * cost.step < cost.gap < 2.2 * cost.step
     assert cost.sections["plush_model"]["rodata"] == facts["model_bytes"]
     assert cost.flash_bytes > facts["model_bytes"] + 2000
-    assert abs(cost.toy_bytes - TOY_BYTES) <= 8 and cost.memory_bytes == facts["memory_bytes"]
+    assert 0 <= TOY_BYTES - cost.toy_bytes <= 24 and cost.memory_bytes == facts["memory_bytes"]
     assert cost.ram_bytes == cost.toy_bytes + cost.memory_bytes
     assert cost.stack_push is not None
     assert cost.stack_functions["plush_push"] < cost.stack_push < sum(cost.stack_functions.values()) + 64

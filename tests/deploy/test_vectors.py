@@ -20,7 +20,8 @@ from plushsense.deploy.vectors import Export, compare
 
 def test_comparing_names_the_first_number_that_differs() -> None:
     labels = ("a", "b")
-    expected = np.arange(39, dtype=np.int32).reshape(3, 13)
+    expected = np.arange(48, dtype=np.int32).reshape(3, 16)
+    expected[:, 0] = 0, 1, 2
 
     def seen(rows: np.ndarray, words: bytes = b"") -> tuple[int, int, str | None]:
         found = compare(expected, rows.astype("<i4").tobytes() + words, labels)
@@ -29,21 +30,25 @@ def test_comparing_names_the_first_number_that_differs() -> None:
 
     assert seen(expected) == (0, 0, None)
     one = expected.copy()
-    one[1, 12] += 5
+    one[1, 15] += 5
     one[2, 4] -= 9
-    assert seen(one) == (2, 9, "answer 1 (frame 13): the smoothed probability of 'b' should be 25 and is 30")
+    said = "row 1 (event, frame 17): the smoothed probability of 'b' should be 31 and is 36"
+    assert seen(one) == (2, 9, said)
     logit = expected.copy()
-    logit[0, 9] = -1
-    assert seen(logit) == (1, 10, "answer 0 (frame 0): the logit of 'a' should be 9 and is -1")
-    field = expected.copy()
-    field[0, 1] = 7
-    assert seen(field) == (1, 6, "answer 0 (frame 0): 'ms' should be 1 and is 7")
-    assert seen(expected[:2]) == (1, 0, "answer 2 (frame 26) never came")
-    assert seen(np.concatenate([expected, expected[:1]])) == (1, 0, "answer 3 (frame 0) is one too many")
+    logit[0, 12] = -1
+    assert seen(logit) == (1, 13, "row 0 (answer, frame 1): the logit of 'a' should be 12 and is -1")
+    for row, column, name in ((0, 8, "answer"), (1, 8, "since"), (2, 5, "suspect"), (2, 2, "ms")):
+        field, was = expected.copy(), int(expected[row, column])
+        field[row, column] += 7
+        kind = ("answer", "event", "health")[row]
+        said = f"row {row} ({kind}, frame {16 * row + 1}): '{name}' should be {was} and is {was + 7}"
+        assert seen(field) == (1, 7, said)
+    assert seen(expected[:2]) == (1, 0, "row 2 (health, frame 33) never came")
+    assert seen(np.concatenate([expected, expected[:1]])) == (1, 0, "row 3 (answer, frame 1) is one too many")
     assert seen(expected, b"Something.") == (1, 0, "Something")
-    assert seen(expected[:0], b"Nothing.") == (3, 0, "Nothing; answer 0 (frame 0) never came")
+    assert seen(expected[:0], b"Nothing.") == (3, 0, "Nothing; row 0 (answer, frame 1) never came")
     far = expected.copy()
-    far[0, 9], high = -(1 << 31), (1 << 31) - 1
+    far[0, 12], high = -(1 << 31), (1 << 31) - 1
     assert compare(np.full_like(far, high), far.astype("<i4").tobytes(), labels).max_abs_diff == 2**32 - 1
 
 
@@ -55,7 +60,7 @@ BAD = [
     (lambda o: (o / "export.json").write_text("{"), "cannot be read"),
     (lambda o: (o / "golden" / "frames.bin").unlink(), "cannot be read"),
     (lambda o: (o / "golden" / "frames.bin").write_bytes(b"abc"), "no whole rows of 14 numbers"),
-    (lambda o: (o / "golden" / "answers.bin").write_bytes(bytes(4)), "no whole rows of 45 numbers"),
+    (lambda o: (o / "golden" / "answers.bin").write_bytes(bytes(4)), "no whole rows of 48 numbers"),
     (lambda o: (o / "model.plush").write_bytes(b"abc"), "model.plush"),
 ]
 
@@ -76,8 +81,9 @@ def test_golden_vectors_of_another_model_or_damaged(own: Path, tmp_path: Path) -
     shutil.rmtree(own / "golden")
     shutil.copytree(other / "golden", own / "golden")
     frames = bytearray((other / "golden" / "frames.bin").read_bytes())
-    frames[9000] ^= 16
+    for at in range(9000, 9400, 4):  # some of them garbage already
+        frames[at] ^= 16
     (other / "golden" / "frames.bin").write_bytes(bytes(frames))
     for folder in (own, other):
-        with pytest.raises(BadInput, match=r"they are damaged, or of another model \(answer "):
+        with pytest.raises(BadInput, match=r"they are damaged, or of another model \(row "):
             Export(folder)

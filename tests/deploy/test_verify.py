@@ -20,8 +20,8 @@ from plushsense.core.errors import BadInput, ToolError
 from plushsense.core.signal import Layout, load_layout
 from plushsense.dataset.importers import import_recordings
 from plushsense.dataset.index import open_dataset
-from plushsense.deploy.faults import TEXTS
-from plushsense.deploy.golden import COLUMNS
+from plushsense.deploy.faults import RULES, TEXTS
+from plushsense.deploy.golden import column
 from plushsense.deploy.package import ARDUINO, package
 from plushsense.deploy.targets import TARGETS
 from plushsense.deploy.vectors import Export
@@ -85,8 +85,8 @@ def test_every_way_to_compile_on_the_host(all_compilers: None, small: Path) -> N
     assert {(cc, o) for cc in ("gcc", "clang") for o in ("-O0", "-O2", "-O3")} <= made
     assert {("gcc", "-O1 sanitizers"), ("gcc", "-O2 called from C++"), ("gcc", "-O2 plush_model.bin")} <= made
     assert all("sanitizers" in what for what, _ in done.not_run), "clang's are a package of their own"
-    answers = len(Export(small).golden.answers)
-    assert answers > 500 and {r.vectors for r in done.runs} == {answers}
+    rows = [len(v.answers) for v in (Export(small).golden, *Export(small).drills())]
+    assert min(rows) > 500 and {r.vectors for r in done.runs} == {sum(rows)}
 
 
 MAIN = {
@@ -110,7 +110,7 @@ def test_the_same_on_every_chip(emulators: None, tmp_path: Path, name: str) -> N
     assert done.first is None and done.passed
     assert [r.target for r in done.runs] == ["host", *EMULATED]
     assert sum(c.samples for c in done.counts) >= 5000
-    tracking = export.golden.answers[:, COLUMNS.index("state")]
+    tracking = column(export.golden.answers, "state")
     assert tracking.sum() > 100 and (tracking == 0).sum() > 100
     assert {r.vectors for r in done.runs} == {sum(c.answers for c in done.counts)}
 
@@ -122,7 +122,7 @@ def test_every_fault_is_caught_on_the_host(c_compiler: str, small: Path, capsys:
     export = Export(small)
     done = verify(export, ["host"], only=plainly, plant=lambda fault: True)
     assert [f.fault for f in done.faults if not f.caught] == [] and done.passed
-    assert {f.kind for f in done.faults} == {"weight", "shift", "index", "rounding", "clamp", "rule", "constant"}
+    assert {f.kind for f in done.faults} == {"weight", "shift", "index", "rounding", "clamp", "rule", "constant"} | set(RULES)
     assert len(done.faults) == len(TEXTS) + 10
     # By an answer, not because the toy would not begin or crashed.
     assert all("should be" in (f.first or "") and "plush_begin" not in (f.first or "") for f in done.faults)
@@ -141,7 +141,7 @@ def test_golden_vectors_that_are_too_weak_let_a_fault_through(
     c_compiler: str, own: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     golden = Export(own).golden
-    few = golden.answers[golden.answers[:, 0] < 40]
+    few = golden.answers[golden.answers[:, 1] < 40]
     assert len(few)
     (own / "golden" / "frames.bin").write_bytes(golden.frames[:40].astype("<u4").tobytes())
     (own / "golden" / "answers.bin").write_bytes(few.astype("<i4").tobytes())
@@ -154,12 +154,12 @@ def test_golden_vectors_that_are_too_weak_let_a_fault_through(
 def test_a_file_edited_by_hand_is_what_is_tested(
     c_compiler: str, two_settings: None, own: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    edit(own / "plushsense.c", "int32_t now = (int32_t)(((e << 15)", "int32_t now = (int32_t)(((e << 14)")
+    edit(own / "plushsense.c", "(int32_t)(((e << 15)", "(int32_t)(((e << 14)")
     code, said, _ = run(capsys, str(own), "--target", "host")
     assert code == 1 and not said["passed"]
     assert said["mismatches"] == sum(r["mismatches"] for r in said["runs"]) > 0
     assert said["max_abs_diff"] >= 1
-    assert said["first"].startswith("On host (gcc -O0), golden: answer ")
+    assert said["first"].startswith("On host (gcc -O0), golden: row ")
     assert "'confidence' should be " in said["first"] and said["first"].count(".") == 1
 
 
@@ -241,8 +241,8 @@ def test_recordings_go_through_the_c(
     out = exported(tmp_path / "out", bundle_of("accel-3", "5d1_4d3", "3,5"))
     code, said, err = run(capsys, str(out), "--target", "host", "--dataset", str(recorded), "--samples", "5000")
     assert code == 0 and said["mismatches"] == 0
-    assert [s["name"] for s in said["streams"]] == ["golden", "recordings"]
-    assert said["streams"][1]["frames"] == 780 and "these recordings make" in err
+    assert [s["name"] for s in said["streams"]] == ["golden", "drill", "recordings"]
+    assert said["streams"][2]["frames"] == 780 and "these recordings make" in err
     assert all(r["vectors"] == sum(s["answers"] for s in said["streams"]) for r in said["runs"])
     assert sorted(p.name for p in out.iterdir()) == sorted(
         p.name for p in exported(tmp_path / "b", Export(out).bundle).iterdir()
@@ -269,8 +269,8 @@ def test_long_streams_are_cut_where_an_emulator_has_no_more_room(
     vectors = export.made_up(5000)
     assert len(vectors) >= 3 and {len(v.frames) for v in vectors[:-1]} == {2000}
     done = verify(export, ["host"], vectors, only=plainly)
-    assert done.passed and [c.name for c in done.counts] == ["golden", "made up"]
-    assert done.counts[1].samples >= 4900 and done.runs[0].vectors == sum(c.answers for c in done.counts)
+    assert done.passed and [c.name for c in done.counts] == ["golden", "drill", "made up"]
+    assert done.counts[2].samples >= 4900 and done.runs[0].vectors == sum(c.answers for c in done.counts)
 
 
 def test_a_model_of_another_layout_among_the_files_is_named(c_compiler: str, own: Path, tmp_path: Path) -> None:

@@ -5,6 +5,8 @@
 #include <stdio.h>
 #include <stdlib.h>
 
+#define HEAD 12u
+
 typedef struct {
     plush_toy toy;
     uint8_t *model;
@@ -13,28 +15,68 @@ typedef struct {
     uint32_t frame, made, most;
 } seat;
 
-static void note(const plush_toy *toy, void *user)
+/* A row as golden/answers.bin has it: kind, frame and ms, seven that depend on the kind, the counts; zeros. */
+static int32_t *row_of(seat *s, int32_t kind, uint32_t ms)
 {
-    seat *s = (seat *)user;
-    uint32_t k, told = toy->answer.state == PLUSH_TRACKING;
-    int32_t *row = s->rows + (size_t)s->made * (9u + 2u * toy->classes);
+    uint32_t width = HEAD + 2u * s->toy.classes;
+    int32_t *row = s->rows + (size_t)s->made * width;
 
     if (s->made >= s->most)
-        return;
+        return NULL;
     s->made++;
-    row[0] = (int32_t)s->frame;
-    row[1] = (int32_t)toy->answer.ms;
-    row[2] = (int32_t)toy->answer.sample;
-    row[3] = (int32_t)toy->answer.state;
-    row[4] = toy->answer.gesture;
-    row[5] = (int32_t)toy->answer.affect;
-    row[6] = toy->answer.confidence;
-    row[7] = (int32_t)toy->restarts;
-    row[8] = (int32_t)toy->invalid;
-    for (k = 0; k < toy->classes; k++) {
-        row[9 + k] = told ? toy->logits[k] : 0;
-        row[9 + toy->classes + k] = told ? toy->smooth[k] : 0;
+    memset(row, 0, 4u * width);
+    row[0] = kind;
+    row[1] = (int32_t)s->frame;
+    row[2] = (int32_t)ms;
+    row[10] = (int32_t)s->toy.restarts;
+    row[11] = (int32_t)s->toy.invalid;
+    return row;
+}
+
+static void note(const plush_toy *toy, void *user)
+{
+    int32_t *row = row_of((seat *)user, 0, toy->answer.ms);
+    uint32_t k;
+
+    if (row == NULL)
+        return;
+    row[3] = (int32_t)toy->answer.sample;
+    row[4] = (int32_t)toy->answer.state;
+    row[5] = toy->answer.gesture;
+    row[6] = (int32_t)toy->answer.affect;
+    row[7] = toy->answer.confidence;
+    row[8] = (int32_t)toy->answer.kind;
+    row[9] = toy->answer.known;
+    for (k = 0; k < toy->classes && toy->answer.state == PLUSH_TRACKING; k++) {
+        row[HEAD + k] = toy->logits[k];
+        row[HEAD + toy->classes + k] = toy->smooth[k];
     }
+}
+
+static void note_event(const plush_toy *toy, void *user)
+{
+    int32_t *row = row_of((seat *)user, 1, toy->event.ms);
+
+    if (row == NULL)
+        return;
+    row[3] = (int32_t)toy->event.number;
+    row[4] = (int32_t)toy->event.what;
+    row[5] = toy->event.gesture;
+    row[6] = (int32_t)toy->event.affect;
+    row[7] = (int32_t)toy->event.source;
+    row[8] = (int32_t)toy->event.since_ms;
+}
+
+static void note_health(seat *s, uint32_t ms)
+{
+    int32_t *row = row_of(s, 2, ms);
+
+    if (row == NULL)
+        return;
+    row[3] = (int32_t)s->toy.faults;
+    row[4] = (int32_t)(s->toy.answer.state != PLUSH_FAULT && s->toy.warm >= s->toy.span ? PLUSH_TRACKING
+                                                                                        : s->toy.answer.state);
+    row[5] = s->toy.suspect;
 }
 
 /* A toy whose model and memory have exactly the bytes they need, so that one byte too far is noticed. `too_few` bytes
@@ -69,20 +111,33 @@ void seat_free(void *p)
     free(s);
 }
 
-/* Frames, rows of ms and values, to answers, rows as golden/answers.bin has them; returns how many fell due. */
-uint32_t seat_push(void *p, const int32_t *frames, uint32_t n, uint32_t channels, int32_t *rows, uint32_t most)
+/* Frames, rows of ms and values, to rows as golden/answers.bin has them; returns how many there were. After a frame
+ * whose number stands in `silences`, nothing is heard for a while. */
+uint32_t seat_push(void *p, const int32_t *frames, uint32_t n, uint32_t channels, int32_t *rows, uint32_t most,
+                   const uint32_t *silences, uint32_t silent)
 {
     seat *s = (seat *)p;
-    uint32_t i, due = 0;
+    uint32_t i, answered = s->toy.answers, due = 0;
 
     s->rows = rows;
     s->made = 0;
     s->most = most;
     s->toy.on_answer = note;
+    s->toy.on_event = note_event;
     s->toy.user = s;
-    for (i = 0; i < n; i++, s->frame++, frames += 1 + channels)
+    for (i = 0; i < n; i++, s->frame++, frames += 1 + channels) {
+        uint32_t fault = s->toy.answer.state == PLUSH_FAULT, suspect = s->toy.suspect;
+
         due += plush_push(&s->toy, (uint32_t)frames[0], frames + 1);
-    return due;
+        if (fault != (s->toy.answer.state == PLUSH_FAULT) || suspect != s->toy.suspect)
+            note_health(s, (uint32_t)frames[0]);
+        if (silent > 0 && *silences == s->frame) {
+            silences++;
+            silent--;
+            plush_silence(&s->toy);
+        }
+    }
+    return due == s->toy.answers - answered ? s->made : UINT32_MAX;
 }
 
 void seat_restart(void *p)
@@ -98,6 +153,8 @@ void seat_age(void *p, uint32_t by)
     toy->answers += by;
     toy->restarts += by;
     toy->invalid += by;
+    toy->faults += by;
+    toy->event.number += by;
     toy->answer.sample += by;
 }
 
@@ -159,7 +216,7 @@ int main(int argc, char **argv)
     if (f == NULL)
         return 2;
     for (;;) {
-        uint32_t bytes = word(f), n, columns, due, fit, width;
+        uint32_t bytes = word(f), n, columns, told = 0, fit, width;
         uint8_t *model = (uint8_t *)malloc(bytes ? bytes : 1);
         int32_t *frames, *rows;
         int status;
@@ -174,14 +231,16 @@ int main(int argc, char **argv)
             return 2;
         s = (seat *)seat_new(model, bytes, &status, 0, 0);
         free(model);
-        width = 9u + 2u * s->toy.classes;
-        rows = (int32_t *)malloc((size_t)4 * width * 4096);
+        width = HEAD + 2u * s->toy.classes;
+        rows = (int32_t *)malloc((size_t)4 * width * 16384);
         /* A damaged model may have more channels than the frames. */
         fit = s->toy.channels + 1u > columns ? 0 : n;
-        due = seat_push(s, frames, fit, columns - 1, rows, 4096);
+        seat_push(s, frames, fit, columns - 1, rows, 16384, NULL, 0);
         for (n = 0; n < s->toy.classes; n++)
-            due += (uint32_t)(plush_gesture_name(&s->toy, (uint8_t)n)[0] == 1);
-        due += (uint32_t)(plush_model_title(&s->toy)[0] == 1);
+            told += (uint32_t)(plush_gesture_name(&s->toy, (uint8_t)n)[0] == 1);
+        told += (uint32_t)(plush_model_title(&s->toy)[0] == 1);
+        if (told == UINT32_MAX)
+            return 2;
         fwrite(&status, 4, 1, stdout);
         fwrite(&s->made, 4, 1, stdout);
         fwrite(rows, 4, (size_t)width * s->made, stdout);

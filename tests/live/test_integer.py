@@ -8,14 +8,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
+sys.path.insert(0, str(Path(__file__).parent))
 
 from c_toy import Seat, compiled
+from troubles import SPECS, STREAMS, calibrate, knowing_bundle, make_bundle, toy_frames
 from plushsense.core.gestures import load_gestures
 from plushsense.core.recfile import Frames
 from plushsense.core.signal import load_layout
 from plushsense.deploy.calibration import calibrated, integer_model
+from plushsense.deploy.golden import ANSWER, EVENT
 from plushsense.devices.base import Frame
 from plushsense.devices.opening import open_device
 from plushsense.live.decide import DecideSpec
@@ -24,13 +28,14 @@ from plushsense.live.loop import run
 from plushsense.live.stream import StreamClassifier
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
-from plushsense.models.events import AFFECT_CODES
+from plushsense.models.events import AFFECT_CODES, ANSWERS, NO_GESTURE
+from plushsense.models.gate import JERK, GatePlan, Rule, Signal, Term
+from plushsense.models.health import HealthPlan
 from plushsense.models.image import IntegerModel
 from plushsense.models.reference import random_weights
 from plushsense.windows.clock import resample
 from plushsense.windows.features import Scaler, inputs
-
-COLUMNS = 9  # of an answer: row, ms, sample, state, gesture, affect, confidence, restarts, invalid
+TROUBLED = calibrate(make_bundle())
 
 
 @pytest.fixture(scope="session")
@@ -39,51 +44,62 @@ def library(c_compiler: str, tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 
 def of_the_c(library: Any, model: IntegerModel, frames: list[Frame]) -> np.ndarray:
-    """The C's answers, (m, COLUMNS)."""
+    """The C's answers and events; in the end nothing more is heard."""
     toy = Seat(library, model.to_bytes(), len(model.layout.channels), model.network.arch.classes)
     assert toy.status == 0
-    return toy.push(np.array([[f.device_ms, *f.values] for f in frames], dtype=np.int64))[:, :COLUMNS]
+    numbers = np.array([[f.device_ms, *f.values] for f in frames], dtype=np.int64)
+    rows = toy.push(numbers, [len(frames) - 1]).astype(np.int64)
+    rows[:, 2] %= 2**32  # the toy's clock is a uint32_t, and a garbled line may hold any time
+    rows[rows[:, 0] == EVENT, 8] %= 2**32
+    answers = np.delete(rows[rows[:, 0] == ANSWER], [3, 9], axis=1)[:, :10]
+    events = rows[rows[:, 0] == EVENT][:, :10]
+    return np.concatenate([answers, events])
 
 
 def of_live(model: IntegerModel, frames: list[Frame]) -> np.ndarray:
-    """The live engine's decisions in the C's terms, with every decimal that they have."""
+    """The live engine's decisions and events in the C's terms, with every decimal that they have."""
     classifier = IntegerClassifier(model)
-    rows = []
-    zero = frames[0].device_ms
-    for row, frame in enumerate(frames):
+    answers, events = [], []
+    labels, period = model.gestures.labels, model.layout.period_us
+    zero = frames[0].device_ms * 1000.0
+
+    def ms(t_s: float, zero: float) -> int:
+        at = t_s * 1e6 + zero
+        assert abs(at - round(at)) < 0.01, "times are whole microseconds"
+        return int(round(at) // 1000 % 2**32)
+
+    for row, frame in enumerate([*frames, None]):
+        before = zero
         # Over a clock reset a decision's time goes on where it was; the toy's own clock does not.
-        if row and frame.device_ms < frames[row - 1].device_ms:
-            zero += (frame.device_ms - frames[row - 1].device_ms) - model.layout.period_us / 1000
-        for d in classifier.push(frame):
-            if d.state == "no signal":
+        if row and frame and frame.device_ms < frames[row - 1].device_ms:
+            zero += (frame.device_ms - frames[row - 1].device_ms) * 1000 - period
+        for d in classifier.push(frame) if frame else [classifier.silence()]:
+            row = min(row, len(frames) - 1)
+            since = before if d.state == "no signal" else zero
+            for e in d.events:
+                gesture = 255 if e.gesture is None else labels.index(e.gesture)
+                what = ("begun", "named", "ended").index(e.what) + 1, gesture, AFFECT_CODES[e.affect]
+                source = int(e.source == "gate")
+                events.append([1, row, ms(e.t_s, since), e.number, *what, source, ms(e.since_s, since), 0])
+            if d.source == "gate" or d.state in ("no signal", "sensor fault"):
                 continue  # said between two steps
-            at_ms = d.t_s * 1000 + zero
-            assert abs(at_ms * 1000 - round(at_ms * 1000)) < 1e-3, "times are whole microseconds"
             known = d.state == "tracking"
             confidence = (d.confidence or 0.0) * 2**15
             assert confidence == int(confidence), "confidence comes in steps of 2^-15"
-            rows.append(
-                [
-                    row,
-                    (round(at_ms * 1000) // 1000) % 2**32,
-                    int(known),
-                    model.gestures.labels.index(d.gesture) if d.gesture is not None else 0,
-                    AFFECT_CODES[d.affect] if d.affect is not None else 0,
-                    int(confidence),
-                    classifier.restarts,
-                    classifier.invalid,
-                ]
-            )
-    return np.array(rows)
+            best = labels.index(d.gesture) if d.gesture is not None else 0
+            affect = AFFECT_CODES[d.affect] if d.affect is not None else 0
+            kind = ANSWERS.index(d.answer) if d.answer is not None else 0
+            counts = classifier.restarts, classifier.invalid
+            answers.append([0, row, ms(d.t_s, zero), int(known), best, affect, int(confidence), kind, *counts])
+    return np.array([*answers, *events]).reshape(-1, 10)
 
 
 def equal(library: Any, model: IntegerModel, frames: list[Frame]) -> np.ndarray:
-    """Assert that both say the same; the live engine's answers."""
+    """Assert that both say the same, answers and events; the live engine's answers: row, ms, whether it tracks, gesture,
+    affect, confidence, restarts, invalid."""
     found, wanted = of_live(model, frames), of_the_c(library, model, frames)
-    wanted = np.delete(wanted, 2, axis=1).astype(np.int64)
-    wanted[:, 1] %= 2**32  # the toy's clock is a uint32_t, and a garbled line may hold any time
     np.testing.assert_array_equal(found, wanted)
-    return found
+    return found[found[:, 0] == ANSWER][:, [1, 2, 3, 4, 5, 6, 8, 9]]
 
 
 def virtual(query: str, layout: str = "plush-15") -> list[Frame]:
@@ -138,6 +154,30 @@ def test_a_real_session(library: Any, real_data: Path) -> None:
             frames.extend(some)
     found = equal(library, integer_model(model_for("accel-3")), frames)
     assert (found[:, 2] == 1).sum() > 1000
+
+
+@settings(max_examples=40, deadline=None)
+@given(STREAMS, SPECS)
+def test_events_are_the_c_librarys_to_the_step(library: Any, frames: Frames, spec: DecideSpec) -> None:
+    rows = zip(frames.device_ms.tolist(), frames.values.tolist(), strict=True)
+    equal(library, integer_model(TROUBLED, spec), [Frame(0, ms, tuple(row)) for ms, row in rows])
+
+
+def test_what_a_toy_that_knows_its_touches_tells(library: Any) -> None:
+    """Not random: events of the network and of the gate, a fault and a recovery, told alike."""
+    spec = DecideSpec(
+        gate=GatePlan((Signal(JERK, (0, 1, 2), lag=2, floor=60),), (Rule((Term(0, 40),), 3, NO_GESTURE, deaf=50),)),
+        health=HealthPlan((-3000,) * 3, (3000,) * 3, still_ms=200),
+    )
+    bundle, values = knowing_bundle(), toy_frames("hit rest stroke rest hit rest stroke")
+    values[1050:1150] = values[1050]
+    frames = [Frame(0, 1000 + 10 * i, tuple(row)) for i, row in enumerate(values.tolist())]
+    model = integer_model(bundle, spec)
+    equal(library, model, frames)
+    events = of_live(model, frames)
+    events = events[events[:, 0] == EVENT]
+    assert {(what, source) for what, source in events[:, [4, 7]].tolist()} >= {(1, 0), (1, 1), (2, 1), (3, 0), (3, 1)}
+    assert set(events[:, 6]) == {1, 3}
 
 
 def test_both_engines_are_counted_against_each_other() -> None:

@@ -22,8 +22,11 @@ from plushsense.core.errors import BundleError
 from plushsense.core.gestures import Gesture, GestureSet
 from plushsense.core.signal import Channel, CsvFormat, Derived, Layout, load_layout
 from plushsense.models.arch import Arch, ConvLayer
-from plushsense.models.events import AFFECT_CODES
+from plushsense.models.events import AFFECT_CODES, NO_GESTURE
+from plushsense.models.gate import JERK, LEVEL, GatePlan, Rule, Signal, Term
+from plushsense.models.health import HealthPlan
 from plushsense.models.image import IntegerModel, grouped, layout_check, memory_bytes
+from plushsense.models.rules import Rules
 
 
 class Reader:
@@ -50,7 +53,7 @@ def test_read_back(model: IntegerModel) -> None:
     image = model.to_bytes()
     network, layout, arch = model.network, model.layout, model.network.arch
     magic, version, zero, length, crc = struct.unpack_from("<4sHHII", image)
-    assert (magic, version, zero, length, crc) == (b"PLSH", 1, 0, len(image), zlib.crc32(image[16:]))
+    assert (magic, version, zero, length, crc) == (b"PLSH", 2, 0, len(image), zlib.crc32(image[16:]))
     r = Reader(image[16:])
     head = r.take("BBBBHHIIIIHH")
     assert head[:4] == (len(arch.layers), len(layout.channels), arch.channels, arch.classes)
@@ -89,9 +92,25 @@ def test_read_back(model: IntegerModel) -> None:
     for row in network.dense.weights:
         assert [v - 128 for v in r.take(f"{len(row)}B")] == row.tolist()
     for gesture in model.gestures.gestures:
-        assert r.take("B") == (AFFECT_CODES[gesture.affect],)
-        assert r.text() == gesture.label
+        assert r.take("B") == (AFFECT_CODES[gesture.affect] + 4 * gesture.idle,)
+    assert [r.text() for _ in model.gestures.gestures] == list(model.gestures.labels)
     assert r.text() == arch.title
+    events, health, gate = model.rules.events, model.rules.health, model.rules.gate
+    assert r.take("HHHHH") == (events.enter, events.leave, events.enter_affect, events.leave_affect, events.sure)
+    assert r.take("h") == (events.known,)
+    assert r.take("HHHHHH") == (events.least, events.switch, events.end, events.hold, events.rest, events.wait)
+    assert r.take("HHHBB") == (health.fault_ms, health.still_ms, health.recover_ms, bool(health.low), 0)
+    for limits in zip(health.low, health.high, strict=True):
+        assert r.take("ii") == limits
+    assert r.take("BB") == ((len(gate.signals), len(gate.rules)) if gate.rules else (0, 0))
+    for s in gate.signals:
+        assert r.take("BB") == (s.kind, len(s.inputs))
+        assert r.take(f"{len(s.inputs)}B") == s.inputs
+        assert r.take("BBBBI") == (s.lag, s.shift, s.baseline, s.noise, s.floor)
+    for rule in gate.rules:
+        assert r.take("BBBBH") == (len(rule.terms), rule.affect, rule.gesture, rule.within, rule.deaf)
+        for t in rule.terms:
+            assert r.take("BbBBI") == (t.signal, t.sign, t.times, 0, t.threshold)
     assert r.at == len(r.data)
 
 
@@ -100,8 +119,11 @@ def test_weights_of_every_size_fit_a_byte() -> None:
     assert sorted(grouped(weights).ravel().tolist()) == list(range(256))
 
 
+PULL = Rule((Term(0, 16),), 3, NO_GESTURE)
+
+
 def test_memory_of_the_papers_network() -> None:
-    """Issue 5 allows 6 KB, with the 304 bytes of a plush_toy."""
+    """Issue 5 allows 6 KB, with the bytes of a plush_toy."""
     axes = tuple(Channel(a, "raw", "motion", valid_min=-40_000, valid_max=40_000) for a in "xyz")
     touch = tuple(Channel(f"c{i}", "raw", "touch") for i in range(10))
     names = tuple(c.name for c in (*touch, *axes))
@@ -118,7 +140,10 @@ def test_memory_of_the_papers_network() -> None:
     arch = Arch.parse("14d1_39d2_41d4", (8, 12, 16))
     gestures = GestureSet("18", tuple(Gesture(f"g{i}") for i in range(18)))
     model = IntegerModel(any_network(arch, layout, np.random.default_rng(1)), layout, gestures, 5000)
-    assert memory_bytes(model) == 4740
+    assert memory_bytes(model) == 4744
+    most = Rules(health=HealthPlan((0,) * 13, (1,) * 13), gate=GatePlan((Signal(JERK, (1, 2), 16),), (PULL, PULL)))
+    # The frame before; 17 samples of 11 inputs, a signal, and two terms.
+    assert memory_bytes(other(model, rules=most)) == 4744 + 4 * 13 + 4 * 11 * 17 + 12 + 4 + 4
     rings = 14 * 12 + 77 * 8 + 161 * 12
     assert memory_bytes(model) > rings + 2 * 16 * 50
     assert arch.state_bytes_int8 < memory_bytes(model)
@@ -145,6 +170,13 @@ def test_what_a_toy_cannot_hold() -> None:
         wrong = GestureSet("wrong", (Gesture(label), *gestures[1:]))
         with pytest.raises(BundleError, match="rename it"):
             other(model, gestures=wrong)
+    for rules, words in (
+        (Rules(health=HealthPlan((0,), (1,))), "limits are of 1 channels, layout 'plain' has 4"),
+        (Rules(gate=GatePlan((Signal(LEVEL, (2,)),), (PULL,))), "an input that there is not: the model has 2"),
+        (Rules(gate=GatePlan((Signal(LEVEL, (1,)),), (replace(PULL, gesture=3),))), "a gesture that there is not"),
+    ):
+        with pytest.raises(BundleError, match=words):
+            other(model, rules=rules)
     with pytest.raises(BundleError, match="2 gestures"):
         other(model, gestures=GestureSet("few", gestures[:2]))
 

@@ -18,7 +18,7 @@ from plushsense.deploy.golden import read_golden
 from plushsense.deploy.targets import C_FOLDER, TARGETS, Program, build, said_by, tool
 
 STEPS = 50  # decisions that are counted
-STAGES = ("inputs", "network", "dense", "decision", "pooling")
+STAGES = ("health", "inputs", "gate", "network", "dense", "decision", "events", "pooling")
 _HEAP = ("malloc", "calloc", "realloc", "free", "reallocarray", "aligned_alloc", "sbrk", "_sbrk", "_Znw", "_Zna")
 # The compiler's helpers for floating point: __addsf3, __mulsf3, __floatsidf, __aeabi_fadd, __aeabi_i2d …
 _FLOAT = re.compile(r"^__(\w*[sdt]f\d?$|float|fix|aeabi_[fd](?!iv)|aeabi_u?[il]2[fd])")
@@ -33,7 +33,8 @@ class Cost:
 
     ``step`` is the mean over `STEPS` decisions with frames up to a fifth of a period early or late, ``even`` with
     even stamps, ``step_most`` the dearest step; ``gap`` is the dearest single call, which bridges the longest gap;
-    ``stages`` add up to ``step``, ``clock`` (with the check of values) being what the others leave of it.
+    ``stages`` add up to ``step``, ``clock`` (with the check of values) being what the others leave of it; ``gate`` is 0
+    for a model without one.
     ``stack_push``, ``stack_begin`` and ``stack_memory_bytes`` are how deep the stack went below the caller of these
     functions, without a callback; ``stack_functions`` is the frame that the compiler gives to each function.
     """

@@ -135,19 +135,39 @@ line at 115200 baud, so that `plushsense record` and `plushsense live --device s
 static uint32_t memory[PLUSH_MODEL_MEMORY_WORDS];
 static plush_toy toy;
 
+void react(plush_affect affect); /* yours */
+
+static void on_event(const plush_toy *of, void *user)
+{{
+    (void)user;
+    if (of->event.what == PLUSH_BEGUN)
+        react(of->event.affect);
+}}
+
 int begin(void)
 {{
-    return plush_begin(&toy, plush_model, PLUSH_MODEL_BYTES, memory, sizeof memory) == PLUSH_OK;
+    plush_status status = plush_begin(&toy, plush_model, PLUSH_MODEL_BYTES, memory, sizeof memory);
+
+    toy.on_event = on_event;
+    return status == PLUSH_OK;
 }}
 
 /* Every frame: `ms` is when it was read, `values` holds {channels} integers. */
-void frame(uint32_t ms, const int32_t *values, void (*react)(plush_affect, const char *gesture))
+void frame(uint32_t ms, const int32_t *values)
 {{
-    if (plush_push(&toy, ms, values) > 0 && toy.answer.state == PLUSH_TRACKING &&
-        toy.answer.confidence > PLUSH_ONE / 2)
-        react(toy.answer.affect, plush_gesture_name(&toy, toy.answer.gesture));
+    plush_push(&toy, ms, values);
 }}
 ```
+
+**React to events.** There is one for each touch: it *begins* when its affect is sure (a blow within a few samples, by the
+gate; else by the network), is *named* when its gesture is sure too, if that comes later, and *ends*. `toy.event` is the
+newest thing that happened to one: `what`, `number`, `affect`, `gesture` (`PLUSH_NO_GESTURE` while unnamed), `source`,
+`since_ms`, `ms`. `toy.answer`, every step, is what the network makes of it all, sure or not: its `kind` says whether it is
+idle, unknown, unsure, sure of an affect or of a gesture.
+
+**Sensors that fail** (out of range, stuck at an end, all frozen; the limits stand in the model) end the event that goes on.
+`toy.answer.state` is `PLUSH_FAULT` until they have recovered, then the toy is warming; `toy.faults` counts. When no frame
+comes at all, nobody can tell the toy but you: `plush_silence(&toy)` ends what goes on.
 
 One task or interrupt uses a toy at a time. Several toys may share a model, each with its own `plush_toy` and memory.
 

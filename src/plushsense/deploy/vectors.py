@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +16,11 @@ from plushsense.core.recfile import Frames
 from plushsense.dataset.store import Dataset
 from plushsense.deploy.calibration import integer_model
 from plushsense.deploy.emit import BUNDLE, FACTS, GOLDEN, IMAGE, LIBRARY, MODEL, read_facts
-from plushsense.deploy.golden import COLUMNS, answers_of, golden_frames, read_golden
+from plushsense.deploy.drill import drills_of
+from plushsense.deploy.golden import COLUMNS, HEAD, TRACKING, answers_of, column, golden_frames, read_golden
 from plushsense.deploy.streams import frames_of
 from plushsense.models.bundle import Bundle
-from plushsense.models.image import IntegerModel
+from plushsense.models.image import IntegerModel, memory_bytes
 from plushsense.windows.clock import resample
 
 Ints = NDArray[np.int64]
@@ -27,12 +30,36 @@ MOST_FRAME_BYTES = 8 << 20
 
 @dataclass(frozen=True, eq=False)
 class Vectors:
-    """Frames (n, 1 + C) and the answers (m, 9 + 2 K) that they must get; ``samples`` even ones are made of them."""
+    """Frames (n, 1 + C) and the rows (m, 12 + 2 K) that they must get; ``samples`` even ones are made of them.
+
+    ``model``: whose they are, where that is not the export's own; ``silences``: frames after which nothing is heard.
+    """
 
     name: str
     frames: Ints
     answers: NDArray[np.int32]
     samples: int
+    model: IntegerModel | None = None
+    silences: tuple[int, ...] = ()
+
+    @property
+    def decisions(self) -> int:
+        """How many answers are not of a warming toy."""
+        return int((column(self.answers, "state") == TRACKING).sum())
+
+    @property
+    def memory_bytes(self) -> int:
+        """What a toy needs for them, if that is not what the export's own needs."""
+        return memory_bytes(self.model) if self.model else 0
+
+    def to_bytes(self) -> bytes:
+        """A case as the harness reads it: the model's bytes (none: the export's own), silences, frames, each with how
+        many there are before them."""
+        image = self.model.to_bytes() if self.model else b""
+        counts = [struct.pack("<I", n) for n in (len(image), len(self.silences), len(self.frames))]
+        frames = (self.frames & 0xFFFFFFFF).astype("<u4").tobytes()
+        silences = struct.pack(f"<{len(self.silences)}I", *self.silences)
+        return counts[0] + image + bytes(-len(image) % 4) + counts[1] + silences + counts[2] + frames
 
 
 @dataclass(frozen=True)
@@ -74,6 +101,7 @@ class Export:
             raise BadInput(f"'{self.folder / FACTS}' has the smoothing {smoothing!r}: export the model again.")
         self.model: IntegerModel = replace(model, smoothing=smoothing)
         self.image = (self.folder / IMAGE).read_bytes()
+        self._drills: list[Vectors] | None = None
         arch = self.model.network.arch
         frames, answers = read_golden(self.folder / GOLDEN, len(self.model.layout.channels), arch.classes)
         self.golden = Vectors("golden", frames, answers, self.samples_of(frames))
@@ -108,12 +136,25 @@ class Export:
                 "golden vectors can be checked: export the model again."
             )
 
+    def drills(self) -> list[Vectors]:
+        """The export's network with rules that speak up on made-up frames (`plushsense.deploy.drill`): its own may never
+        do. None for a model that is not that of the bundle beside it."""
+        if not self.is_own:
+            return []
+        if self._drills is None:
+            found = drills_of(self.model, self.bundle.scaler)
+            self._drills = [
+                Vectors("drill", d.frames, d.rows, self.samples_of(d.frames), d.model, d.silences) for d in found
+            ]
+        return self._drills
+
     def made_up(self, samples: int) -> list[Vectors]:
         """More frames such as the golden ones, until they make this many samples."""
         seed, have = 2, 0
         pieces: list[Ints] = []
         while have < samples:
-            pieces.append(golden_frames(self.model.layout, self.bundle.scaler, self.model.network.arch.span, seed))
+            span, health = self.model.network.arch.span, self.model.rules.health
+            pieces.append(golden_frames(self.model.layout, self.bundle.scaler, span, seed, health=health))
             have += self.samples_of(pieces[-1])
             seed += 1
         return [self.answered("made up", p) for p in in_parts(np.concatenate(pieces))] if pieces else []
@@ -136,7 +177,7 @@ class Export:
 
 @dataclass(frozen=True)
 class Compared:
-    """Answers beside those that were expected."""
+    """Rows beside those that were expected."""
 
     vectors: int
     mismatches: int
@@ -145,7 +186,7 @@ class Compared:
 
 
 def compare(expected: NDArray[np.int32], got: bytes, labels: Sequence[str]) -> Compared:
-    """What a toy wrote beside the answers (m, 9 + 2 K) that it should give; ``first`` is half a sentence."""
+    """What a toy wrote beside the rows (m, 12 + 2 K) that it should give; ``first`` is half a sentence."""
     width = expected.shape[1]
     whole = len(got) // (4 * width)
     rows = np.frombuffer(got[: whole * 4 * width], dtype="<i4").reshape(whole, width).astype(np.int64)
@@ -159,23 +200,29 @@ def compare(expected: NDArray[np.int32], got: bytes, labels: Sequence[str]) -> C
         at = int(wrong[0])
         field = int(np.flatnonzero(off[at])[0])
         first = (
-            f"answer {at} (frame {int(expected[at, 0])}): {_column(field, labels)} should be "
+            f"row {at} ({_row(expected[at])}): {_column(field, int(expected[at, 0]), labels)} should be "
             f"{int(expected[at, field])} and is {int(rows[at, field])}"
         )
     elif whole < len(expected):
-        first = f"answer {whole} (frame {int(expected[whole, 0])}) never came"
+        first = f"row {whole} ({_row(expected[whole])}) never came"
     elif whole > len(expected):
-        first = f"answer {both} (frame {int(rows[both, 0])}) is one too many"
+        first = f"row {both} ({_row(rows[both])}) is one too many"
     if words:
         first = f"{words.rstrip('.')}" if first is None else f"{words.rstrip('.')}; {first}"
         mismatches = max(mismatches, 1)
     return Compared(len(expected), mismatches, int(off.max()) if off.size else 0, first)
 
 
-def _column(field: int, labels: Sequence[str]) -> str:
-    if field < len(COLUMNS):
-        return f"'{COLUMNS[field]}'"
-    what, at = divmod(field - len(COLUMNS), len(labels))
+def _row(row: NDArray[Any]) -> str:
+    """Which one it is."""
+    kind = ("answer", "event", "health")[int(row[0])] if int(row[0]) in COLUMNS else "of no kind"
+    return f"{kind}, frame {int(row[1])}"
+
+
+def _column(field: int, kind: int, labels: Sequence[str]) -> str:
+    if field < HEAD:
+        return f"'{COLUMNS.get(kind, COLUMNS[0])[field]}'"
+    what, at = divmod(field - HEAD, len(labels))
     return f"{('the logit', 'the smoothed probability')[what]} of '{labels[at]}'"
 
 

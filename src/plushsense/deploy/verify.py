@@ -1,7 +1,8 @@
 """The proof: the C in an export folder gives, number for number, the answers that ``models/integer`` gives.
 
 What is compiled is what lies in the folder, so that a file edited by hand is what is tested. Golden vectors always
-run; real recordings, or more made-up frames, on demand. Every number of every answer is compared.
+run, and drills, in which the same network has rules that speak up; real recordings, or more made-up frames, on demand.
+Every number of every answer, event and change of health is compared.
 """
 
 from __future__ import annotations
@@ -16,14 +17,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from plushsense.core.errors import BuildError, ProgramError, ToolError
 from plushsense.deploy.emit import IMAGE, LIBRARY, MODEL
-from plushsense.deploy.faults import Fault, faults_of
-from plushsense.deploy.golden import COLUMNS
+from plushsense.deploy.faults import RULES, Fault, faults_of
 from plushsense.deploy.targets import C_FOLDER, TARGETS, build, missing_tools, require, target_named
 from plushsense.deploy.vectors import Compared, Counts, Export, Vectors, compare, counted
 
 Progress = Callable[[int, int], None]
+Stream = tuple[Vectors, ...]  # what one program runs, one after the other
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror")
 SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-g")
 HARNESS = C_FOLDER / "harness.c"
@@ -172,7 +175,8 @@ def verify(
         ConfigError: for an unknown target; ToolError: for one asked for by name whose tools are missing.
     """
     settings, not_run = _choose(targets, only)
-    streams = (export.golden, *vectors)
+    drills = export.drills()
+    streams = [(export.golden,), *([tuple(drills)] if drills else []), *((v,) for v in vectors)]
     planted: list[Fault] = []
     if plant:
         export.require_own()
@@ -187,8 +191,8 @@ def verify(
         ThreadPoolExecutor(jobs) as pool,
     ):
         room = Path(work)
-        for n, vector in enumerate(streams):
-            (room / f"frames-{n}.bin").write_bytes((vector.frames & 0xFFFFFFFF).astype("<u4").tobytes())
+        for n, stream in enumerate(streams):
+            (room / f"cases-{n}.bin").write_bytes(b"".join(v.to_bytes() for v in stream))
 
         def tell() -> None:
             nonlocal done
@@ -207,16 +211,17 @@ def verify(
             planted = []
 
         def spoil(n: int, fault: Fault, target: str) -> Caught:
-            return _plant(export, fault, next(s for s in settings if s.target == target), room, room / f"fault-{n}")
+            setting = next(s for s in settings if s.target == target)
+            return _plant(export, fault, setting, streams[: 1 + bool(drills)], room, room / f"fault-{n}")
 
         pairs = [(fault, target) for fault in planted for target in chosen]
         for each in pool.map(spoil, range(len(pairs)), *zip(*pairs, strict=True)) if pairs else ():
             caught.append(each)
             tell()
-    decisions = sum(int(v.answers[:, COLUMNS.index("state")].sum()) for v in streams)
-    return Verified(
-        export.title, export.is_own, decisions, counted(streams), tuple(runs), tuple(not_run), tuple(caught)
-    )
+    every = [v for stream in streams for v in stream]
+    # Of drills it is not the export's own model that decides.
+    decisions = sum(v.decisions for v in every if v.model is None)
+    return Verified(export.title, export.is_own, decisions, counted(every), tuple(runs), tuple(not_run), tuple(caught))
 
 
 def _choose(targets: Sequence[str], only: Callable[[Setting], bool]) -> tuple[list[Setting], list[tuple[str, str]]]:
@@ -265,14 +270,14 @@ def _no_sanitizers(setting: Setting) -> str:
     return ""
 
 
-def _run(export: Export, setting: Setting, streams: Iterable[Vectors], room: Path, out: Path) -> Run:
+def _run(export: Export, setting: Setting, streams: Iterable[Stream], room: Path, out: Path) -> Run:
     began = time.monotonic()
     compared = []
-    for n, vector in enumerate(streams):
+    for n, stream in enumerate(streams):
         try:
-            compared.append(_attempt(export, export.folder, setting, vector, room / f"frames-{n}.bin", out))
+            compared.append(_attempt(export, export.folder, setting, stream, room / f"cases-{n}.bin", out))
         except BuildError as cause:
-            lost = len(vector.answers)
+            lost = sum(len(v.answers) for v in stream)
             compared.append(Compared(lost, lost, 0, f"On {setting.target} ({setting.said}): {cause}"))
     shutil.rmtree(out, ignore_errors=True)
     return Run(
@@ -287,9 +292,10 @@ def _run(export: Export, setting: Setting, streams: Iterable[Vectors], room: Pat
     )
 
 
-def _attempt(export: Export, folder: Path, setting: Setting, vector: Vectors, frames: Path, out: Path) -> Compared:
+def _attempt(export: Export, folder: Path, setting: Setting, stream: Stream, cases: Path, out: Path) -> Compared:
     """One program on one stream; ``first`` is a whole sentence."""
-    where = f"On {setting.target} ({setting.compiler} {setting.said}), {vector.name}"
+    where = f"On {setting.target} ({setting.compiler} {setting.said}), {stream[0].name}"
+    expected = np.concatenate([v.answers for v in stream])
     out.mkdir(parents=True, exist_ok=True)
     # A copy: beside its original stands PlushSense's own plushsense.h, which a compiler would find first.
     harness = out / ("harness.cpp" if setting.cpp else "harness.c")
@@ -297,9 +303,10 @@ def _attempt(export: Export, folder: Path, setting: Setting, vector: Vectors, fr
     # Of the export itself both forms of the model are there, and must be the same bytes.
     both = setting.image and folder == export.folder
     sources = [folder / LIBRARY[1], harness] + ([folder / MODEL[1]] if both or not setting.image else [])
-    blobs = {"frames": frames} | ({"image": folder / IMAGE} if setting.image else {})
+    blobs = {"cases": cases} | ({"image": folder / IMAGE} if setting.image else {})
     classes = len(export.labels)
-    defines = {"PLUSH_HARNESS_CHANNELS": vector.frames.shape[1] - 1, "PLUSH_HARNESS_CLASSES": classes}
+    defines = {"PLUSH_HARNESS_CHANNELS": stream[0].frames.shape[1] - 1, "PLUSH_HARNESS_CLASSES": classes}
+    defines["PLUSH_HARNESS_MEMORY_BYTES"] = max(v.memory_bytes for v in stream)
     defines |= {"PLUSH_HARNESS_IMAGE": 1} if setting.image else {}
     if both:
         defines["PLUSH_HARNESS_BOTH"] = 1
@@ -315,16 +322,19 @@ def _attempt(export: Export, folder: Path, setting: Setting, vector: Vectors, fr
         flags=setting.flags,
     )
     try:
-        got = program.run(timeout_s=60 + 0.02 * len(vector.frames))
+        got = program.run(timeout_s=60 + 0.02 * sum(len(v.frames) for v in stream))
     except ProgramError as cause:
         # None of the answers was given.
-        return Compared(len(vector.answers), len(vector.answers), 0, f"{where}: {cause}")
-    seen = compare(vector.answers, got, export.labels)
+        return Compared(len(expected), len(expected), 0, f"{where}: {cause}")
+    seen = compare(expected, got, export.labels)
     return replace(seen, first=f"{where}: {seen.first}.") if seen.first else seen
 
 
-def _plant(export: Export, fault: Fault, setting: Setting, room: Path, out: Path) -> Caught:
-    """Plant one fault in a copy, and see whether the golden vectors notice it."""
+def _plant(
+    export: Export, fault: Fault, setting: Setting, streams: Sequence[Stream], room: Path, out: Path
+) -> Caught:
+    """Plant one fault in a copy, and see whether the golden vectors notice it, or the drills, which have models of
+    their own: a fault in the export's they cannot notice."""
     copy = out / "export"
     copy.mkdir(parents=True)
     for name in (*LIBRARY, *MODEL, IMAGE):
@@ -333,7 +343,14 @@ def _plant(export: Export, fault: Fault, setting: Setting, room: Path, out: Path
         (copy / IMAGE).write_bytes(fault.image)
     if fault.source is not None:
         (copy / LIBRARY[1]).write_text(fault.source, _ANY)
-    plain = replace(setting, optimise="-O2", flags=("-std=c99",), image=fault.image is not None)
-    seen = _attempt(export, copy, plain, export.golden, room / "frames-0.bin", out)
+    # Where compiling takes longer than running, less of it.
+    optimise = "-O1" if setting.target == "host" else "-O2"
+    plain = replace(setting, optimise=optimise, flags=("-std=c99",), image=fault.image is not None)
+    asked = list(enumerate(streams))[: 1 if fault.image is not None else None]
+    # First whom it concerns.
+    for n, stream in reversed(asked) if fault.kind in RULES else asked:
+        seen = _attempt(export, copy, plain, stream, room / f"cases-{n}.bin", out)
+        if seen.mismatches:
+            break
     shutil.rmtree(out, ignore_errors=True)
     return Caught(setting.target, fault.kind, fault.name, seen.mismatches > 0, seen.first)

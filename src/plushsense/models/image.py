@@ -13,11 +13,18 @@ of all that follows the head. Then, one after the other:
   u8 after; then the weights, each as weight + 128, for every 4 filters (the last ones filled up), tap and 4 channels
   (filled up): 4 filters × 4 channels
 - a class: i32 bias, u16 multiplier, u8 before, u8 after; then classes × features weights, each as weight + 128
-- a class: u8 affect (0 none, 1 positive, 2 neutral, 3 negative), its label in UTF-8 and a 0
-- the model's title in UTF-8 and a 0, with which the image ends
+- a class: u8 affect (0 none, 1 positive, 2 neutral, 3 negative), with 4 added when it is idle
+- a class: its label in UTF-8 and a 0; then the model's title in UTF-8 and a 0
+- events: u16 enter, leave, enter_affect, leave_affect, sure, i16 known, u16 least, switch, end, hold, rest, wait
+- health: u16 fault_ms, still_ms, recover_ms, u8 whether there are limits, u8 0; with limits, a measured channel: i32
+  low and i32 high
+- gate: u8 signals, u8 rules (without rules neither); a signal: u8 kind, u8 n, n × u8 inputs, u8 lag, u8 shift,
+  u8 baseline, u8 noise, u32 floor; a rule: u8 terms, u8 affect, u8 gesture, u8 within, u16 deaf; a term: u8 signal,
+  i8 sign, u8 times, u8 0, u32 threshold
 
-The C library believes none of it unseen: it refuses an image in which a count or a scale is out of the ranges that
-`IntegerModel` and `plushsense.models.fixed` accept, a section is not whole, or the span is not that of the layers.
+The C library believes none of it unseen: it refuses an image in which a count, a scale or a setting is out of the
+ranges that `IntegerModel`, `plushsense.models.fixed` and the plans of `plushsense.models.rules` accept, a section is
+not whole, or the span is not that of the layers.
 """
 
 from __future__ import annotations
@@ -34,14 +41,16 @@ from numpy.typing import NDArray
 from plushsense.core.errors import BundleError
 from plushsense.core.gestures import GestureSet
 from plushsense.core.signal import Layout
-from plushsense.models.events import AFFECT_CODES
+from plushsense.models.events import AFFECT_CODES, NO_GESTURE
 from plushsense.models.fixed import PROBABILITY_BITS, LogitScale, Requantize
+from plushsense.models.gate import JERK, GatePlan
 from plushsense.models.integer import IntegerNetwork
 from plushsense.models.rules import Rules
 
 MAGIC = b"PLSH"
-IMAGE_VERSION = 1
+IMAGE_VERSION = 2  # 2: with the rules of events, gate and health
 HEAD_BYTES = 16
+IDLE_BIT = 4
 GROUP = 4  # filters computed together, and channels read together
 MOST_CLOCK_UNITS = 1 << 22  # of the gap and the period: interpolation then needs no more than 32 bits
 
@@ -101,6 +110,16 @@ class IntegerModel:
                 raise BundleError(
                     f"Channel '{derived.name}' is made of {len(derived.of)} others: the toy takes at most 255."
                 )
+        health, gate = self.rules.health, self.rules.gate
+        if health.low and len(health.low) != len(self.layout.channels):
+            raise BundleError(
+                f"The health limits are of {len(health.low)} channels, layout '{self.layout.name}' has "
+                f"{len(self.layout.channels)}: train again."
+            )
+        if any(i >= arch.channels for s in gate.signals for i in s.inputs):
+            raise BundleError(f"The gate reads an input that there is not: the model has {arch.channels}; train again.")
+        if any(arch.classes <= r.gesture != NO_GESTURE for r in gate.rules):
+            raise BundleError(f"The gate says a gesture that there is not: there are {arch.classes}; train again.")
         for gesture in self.gestures.gestures:
             if "\0" in gesture.label or gesture.label.encode(errors="replace").decode() != gesture.label:
                 raise BundleError(f"The gesture {gesture.label!r} has a character that the toy cannot keep: rename it.")
@@ -158,16 +177,43 @@ class IntegerModel:
         found.append(
             ("dense layer: weights of each class", (dense.weights.astype(np.int16) + 128).astype(np.uint8).tobytes())
         )
+        told = bytes(AFFECT_CODES[g.affect] + (IDLE_BIT if g.idle else 0) for g in self.gestures.gestures)
+        found.append(("affect of each class, 4 more when it is idle", told))
         for gesture in self.gestures.gestures:
-            label = bytes([AFFECT_CODES[gesture.affect]]) + gesture.label.encode() + b"\0"
-            found.append((f"class '{gesture.label}', {gesture.affect}", label))
+            idle = ", idle" if gesture.idle else ""
+            found.append((f"class '{gesture.label}', {gesture.affect}{idle}", gesture.label.encode() + b"\0"))
         found.append((f"title '{arch.title}'", arch.title.encode() + b"\0"))
-        return found
+        return found + _rules(self.rules)
 
     def to_bytes(self) -> bytes:
         """The image."""
         body = b"".join(piece for _, piece in self.sections())
         return head(body) + body
+
+
+def _rules(rules: Rules) -> list[tuple[str, bytes]]:
+    events, health, gate = rules.events, rules.health, rules.gate
+    row = {"known": "h"}
+    plan = b"".join(struct.pack("<" + row.get(name, "H"), value) for name, value in events.to_dict().items())
+    found = [(f"events: {', '.join(events.to_dict())}", plan)]
+    times = struct.pack("<HHHBB", health.fault_ms, health.still_ms, health.recover_ms, bool(health.low), 0)
+    found.append(("health: fault, still, recover (ms), whether limits follow", times))
+    if health.low:
+        limits = b"".join(struct.pack("<ii", *pair) for pair in zip(health.low, health.high, strict=True))
+        found.append(("health: lowest and highest value of each channel that touches reach", limits))
+    if not gate.rules:
+        return [*found, ("gate: no signals, no rules", bytes(2))]
+    found.append(("gate: signals, rules", bytes([len(gate.signals), len(gate.rules)])))
+    for n, s in enumerate(gate.signals, 1):
+        head = bytes([s.kind, len(s.inputs), *s.inputs, s.lag, s.shift, s.baseline, s.noise])
+        what = f"gate: signal {n}, {'jerk' if s.kind == JERK else 'level'}; inputs, lag, shift, baseline, noise, floor"
+        found.append((what, head + struct.pack("<I", s.floor)))
+    for n, r in enumerate(gate.rules, 1):
+        head = struct.pack("<BBBBH", len(r.terms), r.affect, r.gesture, r.within, r.deaf)
+        found.append((f"gate: rule {n}: terms, affect, gesture, within, deaf", head))
+        terms = b"".join(struct.pack("<BbBBI", t.signal, t.sign, t.times, 0, t.threshold) for t in r.terms)
+        found.append((f"gate: rule {n}: signal, sign, times, threshold of each term", terms))
+    return found
 
 
 def layout_check(layout: Layout) -> int:
@@ -190,9 +236,22 @@ def memory_bytes(model: IntegerModel) -> int:
         pieces.append((layer.reach + 1) * _filled(read))
         pieces.append(4 * (layer.dilation if layer.kernel > 1 else 1))  # sums under the taps
     pieces.append(2 * features * (arch.pooled // arch.step))
-    pieces += [4 * features, 4 * arch.classes, 4 * arch.classes]  # sums, logits, smoothed probabilities
+    pieces += [4 * features, 4 * arch.classes, 4 * arch.classes + 4]  # sums, logits, smoothed probabilities and known
     pieces += [channels, features]  # which channels are valid, the newest features
+    health, gate = model.rules.health, model.rules.gate
+    if health.low or health.still_ms:
+        pieces.append(4 * channels)  # the frame before
+    if gate.rules:
+        pieces.append(4 * arch.channels * (gate_past(gate) + 1))  # inputs
+        pieces.append(12 * len(gate.signals))  # baseline, noise, size
+        terms = sum(len(rule.terms) for rule in gate.rules)
+        pieces += [2 * terms, terms]  # how long each holds, how many in a row
     return sum(_filled(piece) for piece in pieces)
+
+
+def gate_past(gate: GatePlan) -> int:
+    """How many samples the gate looks back: the longest lag."""
+    return max((s.lag for s in gate.signals if s.kind == JERK), default=1)
 
 
 def _filled(n: int) -> int:

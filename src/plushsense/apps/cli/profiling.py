@@ -15,10 +15,13 @@ if TYPE_CHECKING:
 
 _STAGES = {
     "clock": "clock, validity",
+    "health": "health of the sensors",
     "inputs": "inputs, magnitude",
+    "gate": "gate",
     "network": "network",
     "dense": "dense layer",
     "decision": "softmax, smoothing",
+    "events": "events",
     "pooling": "pooling, answer",
 }
 

@@ -1,24 +1,32 @@
 /*
- * Feeds frames to one toy and writes every answer, so that `plushsense verify` can compare every number of it.
+ * Feeds frames to one toy and writes every answer, event and change of health, so that `plushsense verify` can compare
+ * every number of it.
  *
- * The frames are rows of 32-bit little-endian numbers: milliseconds, then the measured channels. What is written are
- * rows of the same kind, one for each answer:
+ * What is fed are cases, one after the other, of 32-bit little-endian numbers: the bytes of a model, and the model, filled
+ * up to whole numbers (0 bytes: the export's own); how many silences, and after which frames; how many frames, and each:
+ * milliseconds, then the measured channels. What is written are rows of the same kind:
  *
- *     frame, ms, sample, state, gesture, affect, confidence, restarts, invalid, logits x classes, smooth x classes
+ *     0, frame, ms, sample, state, gesture, affect, confidence, answer, known, restarts, invalid, logits x classes,
+ *         smooth x classes; while warming all from gesture to known is 0, and logits and smooth
+ *     1, frame, ms, number, what, gesture, affect, source, since, 0, restarts, invalid, and zeros: an event
+ *     2, frame, ms, faults, state, suspect, 0, 0, 0, 0, restarts, invalid, and zeros: health says something else
  *
- * where from gesture to smooth all is 0 while warming. When something is wrong that no row can show, one more row is
- * written, not whole: words that say it.
+ * When something is wrong that no row can show, one more row is written, not whole: words that say it.
  *
- * PLUSH_HARNESS_CHANNELS and PLUSH_HARNESS_CLASSES say of how many the frames and the expected rows are.
- * With PLUSH_HARNESS_IMAGE the model is not the one compiled in (plush_model.c) but the bytes of plush_model.bin, as
- * when a model is swapped without compiling the code again; with PLUSH_HARNESS_BOTH too they must be the same bytes.
+ * PLUSH_HARNESS_CHANNELS and PLUSH_HARNESS_CLASSES say of how many the frames and the expected rows are,
+ * PLUSH_HARNESS_MEMORY_BYTES how much memory the cases' own models need.
+ * With PLUSH_HARNESS_IMAGE the export's model is not the one compiled in (plush_model.c) but the bytes of
+ * plush_model.bin, as when a model is swapped without compiling the code again; with PLUSH_HARNESS_BOTH too they must be
+ * the same bytes.
  */
 #include "plush_model.h"
 #include "plushsense.h"
 
 #include <string.h>
 
-#define HEAD 9u
+#define HEAD 12u
+#define OWN_WORDS (PLUSH_HARNESS_MEMORY_BYTES / 4u)
+#define MEMORY_WORDS (PLUSH_MODEL_MEMORY_WORDS > OWN_WORDS ? PLUSH_MODEL_MEMORY_WORDS : OWN_WORDS)
 #define MOST_CLASSES 255u
 #define GUARD_WORDS 4u
 #define POISON UINT32_C(0xa5c35a3c)
@@ -27,7 +35,7 @@
 extern "C" {
 #endif
 void target_write(const void *bytes, uint32_t n);
-extern const uint8_t frames[], frames_end[];
+extern const uint8_t cases[], cases_end[];
 #ifdef PLUSH_HARNESS_IMAGE
 extern const uint8_t image[], image_end[];
 #endif
@@ -37,9 +45,9 @@ extern const uint8_t image[], image_end[];
 
 static plush_toy toy;
 /* One word before and some after, which nobody may touch. */
-static uint32_t memory[1u + PLUSH_MODEL_MEMORY_WORDS + GUARD_WORDS];
+static uint32_t memory[1u + MEMORY_WORDS + GUARD_WORDS];
 static uint8_t row[4u * (HEAD + 2u * MOST_CLASSES)];
-static uint32_t rows, frame;
+static uint32_t answers, frame;
 
 static uint8_t *put(uint8_t *to, uint32_t value)
 {
@@ -64,26 +72,71 @@ static int32_t signed_number(const uint8_t *p)
     return value;
 }
 
+/* What every row has: its kind, seven numbers that depend on it, the counts; then zeros. */
+static void begin_row(uint32_t kind, uint32_t ms, const uint32_t what[7])
+{
+    uint8_t *to = put(put(put(row, kind), frame), ms);
+    uint32_t i;
+
+    for (i = 0; i < 7; i++)
+        to = put(to, what[i]);
+    to = put(put(to, toy.restarts), toy.invalid);
+    memset(to, 0, 4u * 2u * MOST_CLASSES);
+}
+
+static void end_row(void)
+{
+    target_write(row, 4u * (HEAD + 2u * toy.classes));
+}
+
 static void on_answer(const plush_toy *of, void *user)
 {
-    uint8_t *to = row;
-    uint32_t i, told = of->answer.state == PLUSH_TRACKING;
+    uint32_t what[7], i;
 
-    to = put(to, *(const uint32_t *)user);
-    to = put(to, of->answer.ms);
-    to = put(to, of->answer.sample);
-    to = put(to, (uint32_t)of->answer.state);
-    to = put(to, told ? of->answer.gesture : 0u);
-    to = put(to, told ? (uint32_t)of->answer.affect : 0u);
-    to = put(to, told ? of->answer.confidence : 0u);
-    to = put(to, of->restarts);
-    to = put(to, of->invalid);
-    for (i = 0; i < of->classes; i++)
-        to = put(to, told ? (uint32_t)of->logits[i] : 0u);
-    for (i = 0; i < of->classes; i++)
-        to = put(to, told ? (uint32_t)of->smooth[i] : 0u);
-    target_write(row, (uint32_t)(to - row));
-    rows++;
+    (void)user;
+    what[0] = of->answer.sample;
+    what[1] = (uint32_t)of->answer.state;
+    what[2] = of->answer.gesture;
+    what[3] = (uint32_t)of->answer.affect;
+    what[4] = of->answer.confidence;
+    what[5] = (uint32_t)of->answer.kind;
+    what[6] = (uint32_t)of->answer.known;
+    begin_row(0, of->answer.ms, what);
+    for (i = 0; i < of->classes && of->answer.state == PLUSH_TRACKING; i++) {
+        put(row + 4u * (HEAD + i), (uint32_t)of->logits[i]);
+        put(row + 4u * (HEAD + of->classes + i), (uint32_t)of->smooth[i]);
+    }
+    end_row();
+    answers++;
+}
+
+static void on_event(const plush_toy *of, void *user)
+{
+    uint32_t what[7];
+
+    (void)user;
+    what[0] = of->event.number;
+    what[1] = (uint32_t)of->event.what;
+    what[2] = of->event.gesture;
+    what[3] = (uint32_t)of->event.affect;
+    what[4] = (uint32_t)of->event.source;
+    what[5] = of->event.since_ms;
+    what[6] = 0;
+    begin_row(1, of->event.ms, what);
+    end_row();
+}
+
+static void on_health(uint32_t ms)
+{
+    uint32_t what[7] = {0, 0, 0, 0, 0, 0, 0};
+
+    what[0] = toy.faults;
+    what[1] = (uint32_t)toy.answer.state;
+    if (toy.answer.state != PLUSH_FAULT && toy.warm >= toy.span) /* the answer is told at the end of the step */
+        what[1] = PLUSH_TRACKING;
+    what[2] = toy.suspect;
+    begin_row(2, ms, what);
+    end_row();
 }
 
 static int wrong(const char *words)
@@ -92,30 +145,11 @@ static int wrong(const char *words)
     return 0;
 }
 
-int main(void)
+static int status_words(plush_status status)
 {
-#ifdef PLUSH_HARNESS_IMAGE
-    const uint8_t *model = image;
-    uint32_t bytes = (uint32_t)(image_end - image);
-#else
-    const uint8_t *model = plush_model;
-    uint32_t bytes = PLUSH_MODEL_BYTES;
-#endif
-    const uint8_t *p;
-    int32_t values[256];
-    uint32_t i, due = 0;
-
-    /* What was in the memory before must not matter. */
-    for (i = 0; i < sizeof memory / sizeof memory[0]; i++)
-        memory[i] = POISON;
-    memset(&toy, 0xa5, sizeof toy);
-    if (plush_memory_bytes(model, bytes) > PLUSH_MODEL_MEMORY_BYTES)
-        return wrong("PLUSH_MODEL_MEMORY_BYTES is less than plush_memory_bytes() says.");
-    if (PLUSH_MODEL_MEMORY_BYTES > 4u * PLUSH_MODEL_MEMORY_WORDS)
-        return wrong("PLUSH_MODEL_MEMORY_WORDS is less than PLUSH_MODEL_MEMORY_BYTES.");
-    switch (plush_begin(&toy, model, bytes, memory + 1, PLUSH_MODEL_MEMORY_BYTES)) {
+    switch (status) {
     case PLUSH_OK:
-        break;
+        return 1;
     case PLUSH_NOT_A_MODEL:
         return wrong("plush_begin() says PLUSH_NOT_A_MODEL.");
     case PLUSH_OTHER_VERSION:
@@ -127,27 +161,92 @@ int main(void)
     default:
         return wrong("plush_begin() says something that it cannot say.");
     }
-    if (toy.channels != PLUSH_MODEL_CHANNELS || toy.classes != PLUSH_MODEL_CLASSES)
-        return wrong("PLUSH_MODEL_CHANNELS or PLUSH_MODEL_CLASSES is not that of the model.");
-    if (toy.channels != PLUSH_HARNESS_CHANNELS || toy.classes != PLUSH_HARNESS_CLASSES)
-        return wrong("The model has other channels or classes than model.plush: put the files of one export together.");
-    toy.on_answer = on_answer;
-    toy.user = &frame;
-    for (p = frames; p < frames_end; p += 4u * (1u + toy.channels), frame++) {
+}
+
+/* The frames of a case: how many silences, after which frames; how many frames. Returns where the next case begins. */
+static const uint8_t *feed(const uint8_t *p)
+{
+    const uint8_t *silences = p + 4, *silent = silences + 4u * number(p), *end;
+    int32_t values[256];
+    uint32_t i, due = 0;
+
+    answers = 0;
+    p = silent + 4;
+    end = p + 4u * (1u + toy.channels) * number(silent);
+    for (frame = 0; p < end; p += 4u * (1u + toy.channels), frame++) {
+        int fault = toy.answer.state == PLUSH_FAULT, suspect = toy.suspect;
+
         for (i = 0; i < toy.channels; i++)
             values[i] = signed_number(p + 4u + 4u * i);
         due += plush_push(&toy, number(p), values);
+        if (fault != (toy.answer.state == PLUSH_FAULT) || suspect != toy.suspect)
+            on_health(number(p));
+        if (silences < silent && number(silences) == frame) {
+            silences += 4;
+            plush_silence(&toy);
+        }
     }
+    return due == answers && toy.answers == answers ? end : NULL;
+}
+
+/* One case. Returns where the next one begins; NULL after words. */
+static const uint8_t *run(const uint8_t *p, const uint8_t *model, uint32_t bytes)
+{
+    uint32_t own = number(p), room, i;
+
+    p += 4;
+    if (own != 0) {
+        model = p;
+        bytes = own;
+        p += (own + 3u) / 4u * 4u;
+    }
+    /* What was in the memory before must not matter. */
+    for (i = 0; i < sizeof memory / sizeof memory[0]; i++)
+        memory[i] = POISON;
+    memset(&toy, 0xa5, sizeof toy);
+    room = own != 0 ? plush_memory_bytes(model, bytes) : PLUSH_MODEL_MEMORY_BYTES;
+    if (plush_memory_bytes(model, bytes) > room)
+        return wrong("PLUSH_MODEL_MEMORY_BYTES is less than plush_memory_bytes() says."), NULL;
+    if (room > 4u * MEMORY_WORDS)
+        return wrong("plush_memory_bytes() says more than PlushSense does."), NULL;
+    if (!status_words(plush_begin(&toy, model, bytes, memory + 1, room)))
+        return NULL;
+    if (toy.channels != PLUSH_MODEL_CHANNELS || toy.classes != PLUSH_MODEL_CLASSES)
+        return wrong("PLUSH_MODEL_CHANNELS or PLUSH_MODEL_CLASSES is not that of the model."), NULL;
+    if (toy.channels != PLUSH_HARNESS_CHANNELS || toy.classes != PLUSH_HARNESS_CLASSES)
+        return wrong("The model has other channels or classes than model.plush: put the files of one export together."),
+               NULL;
+    toy.on_answer = on_answer;
+    toy.on_event = on_event;
+    p = feed(p);
+    if (p == NULL)
+        return wrong("plush_push() or toy.answers counts other answers than on_answer saw."), NULL;
+    if (memory[0] != POISON)
+        return wrong("A word before the toy's memory was written to."), NULL;
+    for (i = 1u + room / 4u; i < sizeof memory / sizeof memory[0]; i++)
+        if (memory[i] != POISON)
+            return wrong("A word after the toy's memory was written to."), NULL;
+    return p;
+}
+
+int main(void)
+{
+#ifdef PLUSH_HARNESS_IMAGE
+    const uint8_t *model = image;
+    uint32_t bytes = (uint32_t)(image_end - image);
+#else
+    const uint8_t *model = plush_model;
+    uint32_t bytes = PLUSH_MODEL_BYTES;
+#endif
+    const uint8_t *p = cases;
+
+    if (PLUSH_MODEL_MEMORY_BYTES > 4u * PLUSH_MODEL_MEMORY_WORDS)
+        return wrong("PLUSH_MODEL_MEMORY_WORDS is less than PLUSH_MODEL_MEMORY_BYTES.");
+    while (p != NULL && p < cases_end)
+        p = run(p, model, bytes);
 #ifdef PLUSH_HARNESS_BOTH
     if (bytes != PLUSH_MODEL_BYTES || memcmp(image, plush_model, PLUSH_MODEL_BYTES) != 0)
         return wrong("plush_model.c does not hold the bytes of plush_model.bin.");
 #endif
-    if (due != rows || toy.answers != rows)
-        return wrong("plush_push() or toy.answers counts other answers than on_answer saw.");
-    if (memory[0] != POISON)
-        return wrong("A word before the toy's memory was written to.");
-    for (i = 0; i < GUARD_WORDS; i++)
-        if (memory[1u + PLUSH_MODEL_MEMORY_WORDS + i] != POISON)
-            return wrong("A word after the toy's memory was written to.");
     return 0;
 }

@@ -1,11 +1,11 @@
 /*
  * PlushSense: what a soft toy feels, in whole numbers. See plushsense.h for how to use it.
  *
- * From top to bottom: small arithmetic - reading the model - the clock (frames to even samples) - inputs - layers -
- * pooling, dense layer, decision - the five functions that others call.
+ * From top to bottom: small arithmetic - reading the model - layers - pooling, dense layer, probabilities - events -
+ * health - inputs, samples and frames - the functions that others call.
  *
  * Every rule here is stated in PlushSense's Python too (windows/clock, windows/features, models/fixed,
- * models/integer), which defines what is right.
+ * models/integer, models/events, models/gate, models/health), which defines what is right.
  */
 #include "plushsense.h"
 
@@ -27,6 +27,49 @@
 #define MOST_INPUT_SHIFT 16u
 #define MOST_MULTIPLIER 32767u
 #define MOST_INPUT_BIAS (INT32_C(1) << 30)
+#define MOST_HEALTH_MS 60000u
+
+/* What stands where in the plan of events, each of 16 bits. */
+enum {
+    ENTER = 0,
+    LEAVE = 2,
+    ENTER_AFFECT = 4,
+    LEAVE_AFFECT = 6,
+    SURE = 8,
+    KNOWN = 10,
+    LEAST = 12,
+    SWITCH = 14,
+    END = 16,
+    HOLD = 18,
+    REST = 20,
+    WAIT = 22,
+    EVENT_BYTES = 24
+};
+
+/* And in that of health; after the times, whether there are limits. */
+enum { FAULT_MS = 0, STILL_MS = 2, RECOVER_MS = 4, LIMITS = 6, HEALTH_BYTES = 8 };
+
+/* In the gate's plan: a rule without its terms (terms, affect, gesture, within, deaf), and a term (signal, sign, times,
+ * 0, threshold). */
+#define RULE_BYTES 6u
+#define TERM_BYTES 8u
+#define SIGN_ABOVE 1u
+#define SIGN_BELOW 255u
+#define GATE_HELD (INT32_C(1) << 20)
+#define MOST_GATE_SIGNALS 32u
+#define MOST_GATE_RULES 16u
+#define MOST_GATE_TERMS 8u
+#define MOST_GATE_LAG 16u
+#define MOST_GATE_SHIFT 24u
+#define MOST_GATE_WEIGHT 15u
+#define MOST_GATE_SIZE (UINT32_C(32) << 20) /* 16 times a deviation of 2^21 over a floor of 1 */
+
+/* What the gate remembers of a signal: baseline and noise with 8 more bits; the size has the deviation's sign. */
+enum { BASELINE, NOISE, SIZE, SIGNAL_WORDS };
+
+/* How a class is told: its affect, and whether it is idle. */
+#define TOLD_AFFECT 3u
+#define TOLD_IDLE 4u
 
 /* ---- Small arithmetic ------------------------------------------------------------------------------------------ */
 
@@ -57,6 +100,14 @@ static int32_t within(int32_t v, int32_t low, int32_t high)
     return v < low ? low : v > high ? high : v;
 }
 
+/* The setting `known` of a plan of events. */
+static int32_t known_least(const uint8_t *plan)
+{
+    int32_t bits = (int32_t)le16(plan + KNOWN);
+
+    return bits < 32768 ? bits : bits - 65536;
+}
+
 static uint32_t half(uint32_t shift)
 {
     return (UINT32_C(1) << shift) >> 1;
@@ -76,6 +127,16 @@ static uint32_t part_of(uint32_t distance, uint32_t into, uint32_t by, uint32_t 
         rest %= by;
     }
     return quotient + (rest + add) / by;
+}
+
+static int same(const int32_t *one, const int32_t *other, uint32_t n)
+{
+    while (n > 0 && *one == *other) {
+        one++;
+        other++;
+        n--;
+    }
+    return n == 0;
 }
 
 static uint64_t square(int32_t v)
@@ -261,17 +322,114 @@ static int read_dense_and_names(plush_toy *toy, source *from)
 
     toy->dense = next_scales(from, toy->classes);
     toy->dense_weights = next_bytes(from, (uint32_t)toy->classes * toy->features);
-    if (toy->dense == NULL || toy->dense_weights == NULL)
+    toy->classes_told = next_bytes(from, toy->classes);
+    if (toy->dense == NULL || toy->dense_weights == NULL || toy->classes_told == NULL)
         return 0;
     toy->names = from->at;
-    for (i = 0; i < toy->classes; i++) {
-        const uint8_t *affect = next_bytes(from, 1);
-
-        if (affect == NULL || *affect > PLUSH_AFFECT_NEGATIVE || next_text(from) == NULL)
+    for (i = 0; i < toy->classes; i++)
+        if (toy->classes_told[i] > (TOLD_IDLE | TOLD_AFFECT) || next_text(from) == NULL)
             return 0;
-    }
     toy->title = next_text(from);
     return toy->title != NULL;
+}
+
+static int read_event_plan(plush_toy *toy, source *from)
+{
+    const uint8_t *p = next_bytes(from, EVENT_BYTES);
+    uint32_t at;
+
+    toy->event_plan = p;
+    if (p == NULL || le16(p + LEAST) == 0 || le16(p + SWITCH) == 0 || le16(p + END) == 0)
+        return 0;
+    for (at = ENTER; at <= SURE; at += 2)
+        if (le16(p + at) > PLUSH_ONE + 1)
+            return 0;
+    return known_least(p) >= -LOGIT_LIMIT && known_least(p) <= LOGIT_LIMIT;
+}
+
+static int read_health_plan(plush_toy *toy, source *from)
+{
+    const uint8_t *p = next_bytes(from, HEALTH_BYTES);
+    uint32_t i;
+
+    toy->health_plan = p;
+    if (p == NULL || le16(p + FAULT_MS) > MOST_HEALTH_MS || le16(p + STILL_MS) > MOST_HEALTH_MS ||
+        le16(p + RECOVER_MS) > MOST_HEALTH_MS || p[LIMITS] > 1 || p[LIMITS + 1] != 0)
+        return 0;
+    toy->limits = NULL;
+    if (p[LIMITS] == 0)
+        return 1;
+    toy->limits = next_bytes(from, 8u * toy->channels);
+    if (toy->limits == NULL)
+        return 0;
+    for (i = 0; i < toy->channels; i++)
+        if (as_signed(le32(toy->limits + 8 * i)) > as_signed(le32(toy->limits + 8 * i + 4)))
+            return 0;
+    return 1;
+}
+
+/* The gate's signals: what is watched, and how. */
+static int read_signal(plush_toy *toy, source *from)
+{
+    const uint8_t *head = next_bytes(from, 2);
+    const uint8_t *parts = head == NULL ? NULL : next_bytes(from, head[1]);
+    const uint8_t *how = parts == NULL ? NULL : next_bytes(from, 8); /* lag, shift, baseline, noise, floor */
+    uint32_t n, floor;
+
+    if (how == NULL || head[0] > 1 || head[1] == 0 || (head[0] == 0 && head[1] != 1))
+        return 0;
+    for (n = 0; n < head[1]; n++)
+        if (parts[n] >= toy->inputs)
+            return 0;
+    floor = le32(how + 4);
+    if (how[0] == 0 || how[0] > MOST_GATE_LAG || how[1] > MOST_GATE_SHIFT || how[2] == 0 || how[2] > MOST_GATE_WEIGHT ||
+        how[3] == 0 || how[3] > MOST_GATE_WEIGHT || floor == 0 || floor > (uint32_t)GATE_HELD)
+        return 0;
+    if (head[0] == 1 && how[0] > toy->gate_past)
+        toy->gate_past = how[0];
+    return 1;
+}
+
+static int read_rule(plush_toy *toy, source *from)
+{
+    const uint8_t *rule = next_bytes(from, RULE_BYTES);
+    uint32_t n;
+
+    if (rule == NULL || rule[0] == 0 || rule[0] > MOST_GATE_TERMS || rule[1] > PLUSH_AFFECT_NEGATIVE ||
+        (rule[2] >= toy->classes && rule[2] != PLUSH_NO_GESTURE))
+        return 0;
+    for (n = 0; n < rule[0]; n++) {
+        const uint8_t *term = next_bytes(from, TERM_BYTES);
+
+        if (term == NULL || term[0] >= toy->gate_signals ||
+            (term[1] != 0 && term[1] != SIGN_ABOVE && term[1] != SIGN_BELOW) || term[2] == 0 || term[3] != 0 ||
+            le32(term + 4) == 0 || le32(term + 4) > MOST_GATE_SIZE)
+            return 0;
+    }
+    toy->gate_terms = (uint16_t)(toy->gate_terms + rule[0]);
+    return 1;
+}
+
+static int read_gate_plan(plush_toy *toy, source *from)
+{
+    const uint8_t *head = next_bytes(from, 2);
+    uint32_t n;
+
+    if (head == NULL || head[0] > MOST_GATE_SIGNALS || head[1] > MOST_GATE_RULES || (head[1] == 0 && head[0] != 0))
+        return 0;
+    toy->gate_signals = head[0];
+    toy->gate_rules = head[1];
+    toy->gate_past = 1;
+    toy->gate_terms = 0;
+    toy->gate_plan = from->at;
+    for (n = 0; n < head[0]; n++)
+        if (!read_signal(toy, from))
+            return 0;
+    toy->gate_first_rule = from->at;
+    for (n = 0; n < head[1]; n++)
+        if (!read_rule(toy, from))
+            return 0;
+    return 1;
 }
 
 /* Reads a model that check() found good; says whether all that stands in it holds together. */
@@ -292,7 +450,8 @@ static int read_model(plush_toy *toy, const uint8_t *model)
         toy->features = toy->layer[i].filters;
         span += toy->layer[i].rows - 1u;
     }
-    return read_dense_and_names(toy, &from) && toy->span == span && from.left == 0;
+    return toy->span == span && read_dense_and_names(toy, &from) && read_event_plan(toy, &from) &&
+           read_health_plan(toy, &from) && read_gate_plan(toy, &from) && from.left == 0;
 }
 
 /* A piece of the memory; only reckoned while there is none. */
@@ -302,6 +461,17 @@ static void *take(uint8_t *memory, uint32_t *used, uint32_t bytes)
 
     *used += fill_up(bytes);
     return piece;
+}
+
+/* Whether health asks for the frame before. */
+static int last_matters(const plush_toy *toy)
+{
+    return toy->limits != NULL || le16(toy->health_plan + STILL_MS) != 0;
+}
+
+static int has_gate(const plush_toy *toy)
+{
+    return toy->gate_rules != 0;
 }
 
 /* Hands out the memory of a model that was read. Returns the bytes of it. */
@@ -321,9 +491,21 @@ static uint32_t share_out(plush_toy *toy, uint8_t *memory)
     toy->sums = (uint16_t *)take(memory, &used, UINT32_C(2) * toy->features * toy->blocks);
     toy->total = (uint32_t *)take(memory, &used, 4u * toy->features);
     toy->logits = (int32_t *)take(memory, &used, 4u * toy->classes);
-    toy->smooth = (int32_t *)take(memory, &used, 4u * toy->classes);
+    toy->smooth = (int32_t *)take(memory, &used, 4u * (toy->classes + 1u));
+    if (has_gate(toy)) {
+        uint32_t start;
+
+        toy->gate_inputs = (int32_t *)take(memory, &used, UINT32_C(4) * toy->inputs * (toy->gate_past + 1u));
+        start = used;
+        toy->gate_state = (int32_t *)take(memory, &used, 4u * SIGNAL_WORDS * toy->gate_signals);
+        toy->gate_hold = (uint16_t *)take(memory, &used, 2u * toy->gate_terms);
+        toy->gate_in_row = (uint8_t *)take(memory, &used, toy->gate_terms);
+        toy->gate_bytes = (uint16_t)(used - start);
+    }
     toy->valid = (uint8_t *)take(memory, &used, toy->channels);
-    toy->last = (uint8_t *)take(memory, &used, toy->features);
+    toy->top = (uint8_t *)take(memory, &used, toy->features);
+    toy->memory_bytes = used; /* what a restart forgets: health has its own rules */
+    toy->last = (int32_t *)take(memory, &used, last_matters(toy) ? 4u * toy->channels : 0);
     return used;
 }
 
@@ -520,11 +702,11 @@ static void network_sample(plush_toy *toy)
     for (i = 0; i < toy->layers; i++) {
         plush_layer *layer = &toy->layer[i];
 
-        advance(layer, i + 1u < toy->layers ? next_row(layer + 1) : toy->last);
+        advance(layer, i + 1u < toy->layers ? next_row(layer + 1) : toy->top);
     }
     for (f = 0; f < toy->features; f++) {
-        sums[f] = (uint16_t)(sums[f] + toy->last[f]);
-        toy->total[f] += toy->last[f];
+        sums[f] = (uint16_t)(sums[f] + toy->top[f]);
+        toy->total[f] += toy->top[f];
     }
 }
 
@@ -544,17 +726,14 @@ static const uint16_t fine[64] = {
     54330, 54119, 53908, 53697, 53488, 53280, 53072, 52865, 52659, 52454, 52249, 52045, 51842, 51640, 51439, 51238
 };
 
-/* Where a class's affect stands, and after it its label. */
-static const uint8_t *affect_and_name(const plush_toy *toy, uint32_t gesture)
+static uint32_t affect_of(const plush_toy *toy, uint32_t gesture)
 {
-    const uint8_t *p = toy->names;
+    return toy->classes_told[gesture] & TOLD_AFFECT;
+}
 
-    for (; gesture > 0; gesture--) {
-        p++;
-        while (*p++ != 0) {
-        }
-    }
-    return p;
+static int is_idle(const plush_toy *toy, uint32_t gesture)
+{
+    return (toy->classes_told[gesture] & TOLD_IDLE) != 0;
 }
 
 static void dense(plush_toy *toy)
@@ -580,9 +759,20 @@ static uint32_t exponential(int32_t distance)
     return distance < 4096 ? ((uint32_t)coarse[distance >> 6] * fine[distance & 63]) >> 16 : 0;
 }
 
-static void decide(plush_toy *toy)
+/* What a number of a step becomes when it is smoothed: an exponential mean, in steps of 2^-12 of the number. */
+static int32_t smoothed(const plush_toy *toy, int32_t mean, int32_t now)
 {
-    int32_t highest = -LOGIT_LIMIT;
+    /* (now - mean) * weight / 2^15, in two halves so that 32 bits will do */
+    int32_t d = now - mean, high = shift_down(d, 16);
+    uint32_t low = (uint32_t)d & 0xffffu;
+
+    return toy->started ? mean + high * 2 * toy->smoothing + (int32_t)((low * toy->smoothing + 16384u) >> 15) : now;
+}
+
+/* Smoothed probabilities, and with them how known the touch looks. Returns the best class. */
+static uint32_t decide(plush_toy *toy)
+{
+    int32_t highest = -LOGIT_LIMIT, *known = toy->smooth + toy->classes;
     uint32_t total = 0, best = 0, k;
 
     for (k = 0; k < toy->classes; k++)
@@ -592,23 +782,259 @@ static void decide(plush_toy *toy)
         total += exponential(highest - toy->logits[k]);
     for (k = 0; k < toy->classes; k++) {
         uint32_t e = exponential(highest - toy->logits[k]);
-        int32_t now = (int32_t)(((e << 15) + (total >> 1)) / total) * 4096;
 
-        if (toy->started) {
-            /* (now - mean) * weight / 2^15, in two halves so that 32 bits will do */
-            int32_t d = now - toy->smooth[k], high = shift_down(d, 16);
-            uint32_t low = (uint32_t)d & 0xffffu;
-
-            now = toy->smooth[k] + high * 2 * toy->smoothing + (int32_t)((low * toy->smoothing + 16384u) >> 15);
-        }
-        toy->smooth[k] = now;
-        if (now > toy->smooth[best])
+        toy->smooth[k] = smoothed(toy, toy->smooth[k], (int32_t)(((e << 15) + (total >> 1)) / total) * 4096);
+        if (toy->smooth[k] > toy->smooth[best])
             best = k;
     }
+    *known = smoothed(toy, *known, highest * 4096);
     toy->started = 1;
     toy->answer.gesture = (uint8_t)best;
-    toy->answer.affect = (plush_affect)*affect_and_name(toy, best);
+    toy->answer.affect = (plush_affect)affect_of(toy, best);
     toy->answer.confidence = (uint16_t)(toy->smooth[best] >> 12);
+    toy->answer.known = (int16_t)shift_down(*known, 12);
+    return best;
+}
+
+/* ---- Events ---------------------------------------------------------------------------------------------------- */
+
+static uint32_t setting(const plush_toy *toy, uint32_t which)
+{
+    return le16(toy->event_plan + which);
+}
+
+/* No setting asks for more than 16 bits can count. */
+static void count_up(uint16_t *count)
+{
+    if (*count < UINT16_MAX)
+        ++*count;
+}
+
+static uint32_t share_of(const plush_toy *toy, uint32_t gesture)
+{
+    return (uint32_t)toy->smooth[gesture] >> 12;
+}
+
+/* The share of all classes of an affect together; idle ones are nobody's. */
+static uint32_t mass_of(const plush_toy *toy, uint32_t affect)
+{
+    uint32_t sum = 0, k;
+
+    for (k = 0; k < toy->classes; k++)
+        if (toy->classes_told[k] == affect)
+            sum += share_of(toy, k);
+    return sum;
+}
+
+static plush_kind kind_of(const plush_toy *toy, uint32_t best)
+{
+    uint32_t sure = setting(toy, SURE), members = 0, affects = 0, k;
+
+    if (toy->answer.known < known_least(toy->event_plan))
+        return PLUSH_UNKNOWN;
+    if (is_idle(toy, best))
+        return PLUSH_IDLE;
+    for (k = 0; k < toy->classes; k++)
+        if (share_of(toy, k) >= sure) {
+            members++;
+            affects |= UINT32_C(1) << (is_idle(toy, k) ? 0u : affect_of(toy, k));
+        }
+    if (members == 1)
+        return PLUSH_SURE_GESTURE;
+    if (affects == 1u << PLUSH_AFFECT_POSITIVE || affects == 1u << PLUSH_AFFECT_NEUTRAL ||
+        affects == 1u << PLUSH_AFFECT_NEGATIVE)
+        return PLUSH_SURE_AFFECT;
+    return PLUSH_UNSURE;
+}
+
+static int going_on(const plush_toy *toy)
+{
+    return toy->event.what == PLUSH_BEGUN || toy->event.what == PLUSH_NAMED;
+}
+
+static void tell(plush_toy *toy, plush_what what, uint32_t since, uint32_t ms)
+{
+    toy->event.what = what;
+    toy->event.since_ms = since;
+    toy->event.ms = ms;
+    if (toy->on_event != NULL)
+        toy->on_event(toy, toy->user);
+}
+
+static void begin_event(plush_toy *toy, uint32_t affect, uint32_t gesture, plush_source by, uint32_t since,
+                        uint32_t ms)
+{
+    toy->event.number++;
+    toy->event.affect = (plush_affect)affect;
+    toy->event.gesture = (uint8_t)gesture;
+    toy->event.source = by;
+    toy->lasted = toy->away = toy->wait = 0;
+    tell(toy, PLUSH_BEGUN, since, ms);
+}
+
+static void end_event(plush_toy *toy, uint32_t since, uint32_t ms)
+{
+    toy->resting = (uint16_t)setting(toy, REST);
+    tell(toy, PLUSH_ENDED, since, ms);
+}
+
+/* The signal is gone: what is going on ends, all but the count of events is forgotten. */
+static void lose(plush_toy *toy, uint32_t ms)
+{
+    if (going_on(toy))
+        end_event(toy, ms, ms);
+    toy->started = 0;
+    toy->resting = 0;
+    toy->wanted = toy->wanted_for = toy->named_for = 0;
+    toy->named = PLUSH_NO_GESTURE;
+}
+
+/* A step in which nothing spoke for the event. */
+static void miss(plush_toy *toy, uint32_t ms)
+{
+    if (toy->away == 0)
+        toy->away_ms = ms;
+    count_up(&toy->away);
+    if (toy->away >= setting(toy, END) && toy->lasted >= setting(toy, HOLD))
+        end_event(toy, toy->away_ms, ms);
+}
+
+/* A step without an answer, while the network is warming. */
+static void blind_step(plush_toy *toy, uint32_t ms)
+{
+    if (!going_on(toy))
+        return;
+    count_up(&toy->lasted);
+    if (toy->wait > 0)
+        toy->wait--;
+    else
+        miss(toy, ms);
+}
+
+/* The affect whose classes together are wanted, or none. */
+static uint32_t affect_alone(const plush_toy *toy)
+{
+    uint32_t most = mass_of(toy, PLUSH_AFFECT_POSITIVE), affect = PLUSH_AFFECT_POSITIVE, other;
+
+    for (other = PLUSH_AFFECT_NEUTRAL; other <= PLUSH_AFFECT_NEGATIVE; other++) {
+        uint32_t mass = mass_of(toy, other);
+
+        if (mass > most) {
+            most = mass;
+            affect = other;
+        }
+    }
+    return most >= setting(toy, ENTER_AFFECT) ? affect : 0u;
+}
+
+/* How many steps in a row the same was wanted. */
+static void count_wanted(plush_toy *toy, uint32_t said, uint32_t affect, uint32_t ms)
+{
+    uint32_t wanted = affect != PLUSH_AFFECT_NONE ? affect : said != PLUSH_NO_GESTURE ? 4 + said : 0;
+
+    if (wanted != toy->wanted) {
+        toy->wanted = (uint16_t)wanted;
+        toy->wanted_for = 0;
+        toy->wanted_ms = ms;
+    }
+    if (wanted != 0)
+        count_up(&toy->wanted_for);
+    if (said != toy->named) {
+        toy->named = (uint8_t)said;
+        toy->named_for = 0;
+    }
+    if (said != PLUSH_NO_GESTURE)
+        count_up(&toy->named_for);
+}
+
+/* A gesture that was wanted for long enough to give its name to an event. */
+static uint32_t long_enough(const plush_toy *toy, uint32_t said)
+{
+    return toy->named_for >= setting(toy, LEAST) ? said : PLUSH_NO_GESTURE;
+}
+
+static void closed_step(plush_toy *toy, uint32_t said, uint32_t affect, uint32_t ms)
+{
+    if (toy->resting > 0)
+        toy->resting--;
+    else if ((said != PLUSH_NO_GESTURE || affect != PLUSH_AFFECT_NONE) && toy->wanted_for >= setting(toy, LEAST))
+        begin_event(toy, affect, long_enough(toy, said), PLUSH_NETWORK, toy->wanted_ms, ms);
+}
+
+/* Whether something else than the event was wanted for long enough to take its place. */
+static int another(const plush_toy *toy, uint32_t said, uint32_t affect)
+{
+    const plush_event *event = &toy->event;
+    int its_affect = affect == event->affect;
+
+    if ((affect == PLUSH_AFFECT_NONE || its_affect) && (said == PLUSH_NO_GESTURE || said == event->gesture))
+        return 0;
+    if (event->gesture == PLUSH_NO_GESTURE && its_affect) /* it has no gesture yet: this one may become its own */
+        return 0;
+    return (said != PLUSH_NO_GESTURE && its_affect ? toy->named_for : toy->wanted_for) >= setting(toy, SWITCH) &&
+           toy->lasted >= setting(toy, HOLD);
+}
+
+/* Whether the step still shows what the event is. */
+static int stays(const plush_toy *toy, uint32_t best)
+{
+    const plush_event *event = &toy->event;
+
+    if (is_idle(toy, best) && share_of(toy, best) >= setting(toy, ENTER))
+        return 0;
+    if (event->gesture != PLUSH_NO_GESTURE)
+        return share_of(toy, event->gesture) >= setting(toy, LEAVE);
+    /* Begun by the gate, it may have nothing to be recognised by. */
+    return event->affect != PLUSH_AFFECT_NONE && mass_of(toy, event->affect) >= setting(toy, LEAVE_AFFECT);
+}
+
+static void open_step(plush_toy *toy, uint32_t best, uint32_t said, uint32_t affect, uint32_t ms)
+{
+    plush_event *event = &toy->event;
+    int locked = toy->wait > 0;
+
+    count_up(&toy->lasted);
+    if (locked)
+        toy->wait--;
+    if (event->gesture == PLUSH_NO_GESTURE && long_enough(toy, said) != PLUSH_NO_GESTURE &&
+        (event->affect == PLUSH_AFFECT_NONE || event->affect == affect)) {
+        event->gesture = (uint8_t)said;
+        event->affect = (plush_affect)affect;
+        toy->away = 0;
+        tell(toy, PLUSH_NAMED, event->since_ms, ms);
+    } else if (locked || toy->suspect) {
+        return;
+    } else if (another(toy, said, affect)) {
+        end_event(toy, ms, ms);
+        begin_event(toy, affect, long_enough(toy, said), PLUSH_NETWORK, ms, ms);
+    } else if (stays(toy, best)) {
+        toy->away = 0;
+    } else {
+        miss(toy, ms);
+    }
+}
+
+/* A step of which the network has said all it has to say. */
+static void event_step(plush_toy *toy, uint32_t best, uint32_t ms)
+{
+    uint32_t said = PLUSH_NO_GESTURE, affect = PLUSH_AFFECT_NONE;
+
+    toy->answer.kind = kind_of(toy, best);
+    if (!toy->suspect) {
+        if (toy->answer.kind == PLUSH_UNKNOWN || toy->answer.kind == PLUSH_IDLE) {
+            /* nothing is wanted */
+        } else if (toy->answer.confidence >= setting(toy, ENTER)) {
+            said = best;
+            affect = affect_of(toy, best);
+        } else {
+            affect = affect_alone(toy);
+        }
+        count_wanted(toy, said, affect, ms);
+    }
+    if (going_on(toy))
+        open_step(toy, best, said, affect, ms);
+    else
+        closed_step(toy, said, affect, ms);
 }
 
 /* A step is complete: the answer, and room for the next block of the pooling. */
@@ -618,10 +1044,12 @@ static void answer(plush_toy *toy, uint32_t ms)
     uint32_t f;
 
     toy->answer.ms = ms;
-    toy->answer.state = toy->warm >= toy->span ? PLUSH_TRACKING : PLUSH_WARMING;
-    if (toy->answer.state == PLUSH_TRACKING) {
+    if (toy->warm >= toy->span) {
+        toy->answer.state = PLUSH_TRACKING;
         dense(toy);
-        decide(toy);
+        event_step(toy, decide(toy), ms);
+    } else {
+        blind_step(toy, ms);
     }
     toy->filled = 0;
     toy->block = (uint16_t)(toy->block + 1u < toy->blocks ? toy->block + 1u : 0u);
@@ -635,6 +1063,201 @@ static void answer(plush_toy *toy, uint32_t ms)
         toy->on_answer(toy, toy->user);
 }
 
+/* ---- The gate -------------------------------------------------------------------------------------------------- */
+
+/* The inputs `back` samples before those that are being read. */
+static int32_t *past_inputs(const plush_toy *toy, uint32_t back)
+{
+    uint32_t rows = toy->gate_past + 1u, at = toy->gate_newest + rows - back;
+
+    return toy->gate_inputs + (at < rows ? at : at - rows) * toy->inputs;
+}
+
+/* An input as a signal sees it. */
+static int32_t gate_input(int32_t x, uint32_t shift)
+{
+    return within(shift_down(x, shift), -GATE_HELD, GATE_HELD);
+}
+
+/* How much inputs have changed since `lag` samples ago. */
+static int32_t jerk(const plush_toy *toy, const uint8_t *signal, uint32_t lag, uint32_t shift)
+{
+    const int32_t *now = past_inputs(toy, 0), *before = past_inputs(toy, lag);
+    int32_t sum = 0;
+    uint32_t n;
+
+    for (n = 0; n < signal[1]; n++) {
+        uint32_t i = signal[2 + n];
+        int32_t d = gate_input(now[i], shift) - gate_input(before[i], shift);
+
+        sum += d < 0 ? -d : d;
+    }
+    return sum < GATE_HELD ? sum : GATE_HELD;
+}
+
+/* Baseline, noise and size of a signal after one more sample; returns where the next signal stands. */
+static const uint8_t *follow(const plush_toy *toy, const uint8_t *signal, int32_t *state)
+{
+    const uint8_t *how = signal + 2 + signal[1]; /* lag, shift, baseline, noise, floor */
+    int32_t value = 0, deviation, size, level;
+
+    if (signal[0] == 0)
+        value = gate_input(past_inputs(toy, 0)[signal[2]], how[1]);
+    else if (toy->gate_seen >= how[0])
+        value = jerk(toy, signal, how[0], how[1]);
+    if (toy->gate_seen == 0)
+        state[BASELINE] = value * 256;
+    deviation = value - shift_down(state[BASELINE], 8);
+    size = deviation < 0 ? -deviation : deviation;
+    level = (state[NOISE] >> 8) + (int32_t)le32(how + 4);
+    state[SIZE] = (int32_t)((uint32_t)size * 16 / (uint32_t)level);
+    if (deviation < 0)
+        state[SIZE] = -state[SIZE];
+    state[BASELINE] += shift_down(value * 256 - state[BASELINE], how[2]);
+    if (size > 4 * level)
+        size = 4 * level;
+    state[NOISE] += shift_down(size * 256 - state[NOISE], how[3]);
+    return how + 8;
+}
+
+/* Whether a term holds after one more sample; `row` counts those in a row, `left` those for which it goes on. */
+static int holds(const uint8_t *term, int32_t size, uint32_t longer, uint8_t *row, uint16_t *left)
+{
+    int32_t threshold = (int32_t)le32(term + 4);
+
+    if ((term[1] != SIGN_BELOW && size >= threshold) || (term[1] != SIGN_ABOVE && -size >= threshold)) {
+        if (*row < term[2])
+            ++*row;
+        if (*row == term[2])
+            *left = (uint16_t)(longer + 1);
+    } else {
+        *row = 0;
+    }
+    if (*left == 0)
+        return 0;
+    --*left;
+    return 1;
+}
+
+/* The first rule that fires, or NULL. */
+static const uint8_t *judge(const plush_toy *toy)
+{
+    const uint8_t *rule = toy->gate_first_rule, *fired = NULL;
+    uint8_t *row = toy->gate_in_row;
+    uint16_t *left = toy->gate_hold;
+    uint32_t r, n;
+
+    for (r = 0; r < toy->gate_rules; r++) {
+        const uint8_t *term = rule + RULE_BYTES;
+        int every = 1;
+
+        for (n = rule[0]; n > 0; n--, term += TERM_BYTES)
+            every &= holds(term, toy->gate_state[SIGNAL_WORDS * term[0] + SIZE], rule[3], row++, left++);
+        if (every && fired == NULL)
+            fired = rule;
+        rule = term;
+    }
+    return fired;
+}
+
+/* One sample's inputs, where past_inputs(toy, 0) is. An event that the gate begins. */
+static void gate_sample(plush_toy *toy, uint32_t ms)
+{
+    const uint8_t *signal = toy->gate_plan, *rule;
+    int deaf = toy->gate_deaf > 0;
+    uint32_t n;
+
+    if (deaf)
+        toy->gate_deaf--;
+    if (toy->suspect) {
+        toy->gate_seen = 0;
+        memset(toy->gate_state, 0, toy->gate_bytes);
+        return;
+    }
+    if (toy->gate_seen > 0 && same(past_inputs(toy, 0), past_inputs(toy, 1), toy->inputs))
+        return;
+    for (n = 0; n < toy->gate_signals; n++)
+        signal = follow(toy, signal, toy->gate_state + SIGNAL_WORDS * n);
+    if (toy->gate_seen < toy->gate_past)
+        toy->gate_seen++;
+    toy->gate_newest = (uint8_t)(toy->gate_newest < toy->gate_past ? toy->gate_newest + 1u : 0u);
+    rule = judge(toy);
+    if (rule == NULL || deaf)
+        return;
+    toy->gate_deaf = (uint16_t)le16(rule + 4);
+    if (going_on(toy) && (toy->event.affect == rule[1] || toy->event.source == PLUSH_GATE)) {
+        toy->away = 0;
+    } else {
+        if (going_on(toy))
+            end_event(toy, ms, ms);
+        begin_event(toy, rule[1], rule[2], PLUSH_GATE, ms, ms);
+    }
+    toy->wait = (uint16_t)setting(toy, WAIT);
+}
+
+/* ---- Health ---------------------------------------------------------------------------------------------------- */
+
+/* Whether a value lies between two that stand in the model. */
+static int lies_in(const uint8_t *range, int32_t value)
+{
+    return value >= as_signed(le32(range)) && value <= as_signed(le32(range + 4));
+}
+
+/* What was wrong is wrong anew, as after a gap; but a fault goes on until it has recovered. */
+static void forget_health(plush_toy *toy)
+{
+    toy->suspect = toy->compared = toy->wrong = toy->good = 0;
+}
+
+/* Whether a value that came is wrong: out of its range, or stuck beyond what touches reach. */
+static int is_wrong(const plush_toy *toy, uint32_t channel, int32_t value)
+{
+    if (!lies_in(toy->ranges + 8 * channel, value))
+        return 1;
+    return toy->limits != NULL && toy->compared && value == toy->last[channel] &&
+           !lies_in(toy->limits + 8 * channel, value);
+}
+
+/* Looks at a frame before anything is made of it. Returns 1 when a fault begins or ends with it. */
+static int examine(plush_toy *toy, uint32_t ms, const int32_t *values)
+{
+    uint32_t fault_ms = le16(toy->health_plan + FAULT_MS), frozen_ms = le16(toy->health_plan + STILL_MS), quiet, i;
+    int wrong = 0, still;
+
+    for (i = 0; i < toy->channels && !wrong; i++)
+        wrong = is_wrong(toy, i, values[i]);
+    if (wrong && !toy->wrong)
+        toy->wrong_ms = ms;
+    toy->wrong = (uint8_t)wrong;
+    still = toy->compared && frozen_ms != 0 && same(toy->last, values, toy->channels);
+    if (!still)
+        toy->moved_ms = ms;
+    quiet = ms - toy->moved_ms;
+    if (last_matters(toy)) {
+        memcpy(toy->last, values, 4u * toy->channels);
+        toy->compared = 1;
+    }
+    toy->suspect = (uint8_t)(wrong || (still && quiet >= (frozen_ms + 1) / 2));
+    if (!toy->faulty) {
+        toy->faulty = (uint8_t)((wrong && fault_ms != 0 && ms - toy->wrong_ms >= fault_ms) ||
+                                (still && quiet >= frozen_ms));
+        toy->faults += toy->faulty;
+        toy->good = 0;
+        return toy->faulty;
+    }
+    if (toy->suspect) {
+        toy->good = 0;
+        return 0;
+    }
+    if (!toy->good)
+        toy->good_ms = ms;
+    toy->good = 1;
+    if (ms - toy->good_ms < le16(toy->health_plan + RECOVER_MS))
+        return 0;
+    toy->faulty = toy->good = 0;
+    return 1;
+}
+
 /* ---- Samples and frames ---------------------------------------------------------------------------------------- */
 
 /* What the network reads of toy->sample, into the first ring. */
@@ -642,6 +1265,7 @@ static void read_inputs(plush_toy *toy)
 {
     const uint8_t *p = toy->input_plan;
     uint8_t *row = next_row(&toy->layer[0]);
+    int32_t *seen = has_gate(toy) ? past_inputs(toy, 0) : NULL;
     uint32_t i, n;
 
     for (i = 0; i < toy->inputs; i++, p += 12) {
@@ -658,6 +1282,8 @@ static void read_inputs(plush_toy *toy)
                 sum += square(toy->sample[*part++]);
             x = as_signed(square_root(sum << 8)); /* with 4 fraction bits */
         }
+        if (seen != NULL)
+            *seen++ = x;
         p = part;
         offset = as_signed(le32(p));
         limit = (int32_t)(UINT32_MAX >> (17 - p[10]));
@@ -673,6 +1299,8 @@ static void read_inputs(plush_toy *toy)
 static uint32_t push_sample(plush_toy *toy, uint32_t ms)
 {
     read_inputs(toy);
+    if (has_gate(toy))
+        gate_sample(toy, ms);
     network_sample(toy);
     toy->answer.sample++;
     if (toy->warm < toy->span)
@@ -708,9 +1336,7 @@ static int hold(plush_toy *toy, const int32_t *values)
     int all = 1;
 
     for (i = 0; i < toy->channels; i++) {
-        const uint8_t *range = toy->ranges + 8 * i;
-
-        if (values[i] >= as_signed(le32(range)) && values[i] <= as_signed(le32(range + 4))) {
+        if (lies_in(toy->ranges + 8 * i, values[i])) {
             toy->held[i] = values[i];
             toy->valid[i] = 1;
         } else {
@@ -720,6 +1346,31 @@ static int hold(plush_toy *toy, const int32_t *values)
             all = 0;
     }
     return all;
+}
+
+static void say_nothing(plush_toy *toy, plush_state state)
+{
+    uint32_t ms = toy->answer.ms;
+
+    memset(&toy->answer, 0, sizeof toy->answer);
+    toy->answer.ms = ms;
+    toy->answer.state = state;
+}
+
+/* What was remembered of frames and of the network is dropped; what health knows stays. */
+static void forget(plush_toy *toy)
+{
+    uint32_t phase;
+
+    memset(toy->memory, 0, toy->memory_bytes);
+    toy->heard = toy->running = 0;
+    toy->block = toy->gate_deaf = 0;
+    toy->gate_seen = toy->gate_newest = 0;
+    toy->warm = toy->answer.sample = 0;
+    say_nothing(toy, toy->faulty ? PLUSH_FAULT : PLUSH_WARMING);
+    /* So that a step ends with the very sample that fills the span. */
+    phase = toy->span % toy->step;
+    toy->filled = (uint16_t)(phase == 0 ? 0 : toy->step - phase);
 }
 
 /* ---- What others call ------------------------------------------------------------------------------------------ */
@@ -752,28 +1403,24 @@ plush_status plush_begin(plush_toy *toy, const uint8_t *model, uint32_t model_by
         return status;
     }
     toy->memory = memory;
-    toy->memory_bytes = share_out(toy, (uint8_t *)memory);
+    share_out(toy, (uint8_t *)memory);
     plush_restart(toy);
     return PLUSH_OK;
 }
 
 void plush_restart(plush_toy *toy)
 {
-    uint32_t phase;
-
     if (toy->memory == NULL) /* plush_begin() has not said PLUSH_OK */
         return;
-    memset(toy->memory, 0, toy->memory_bytes);
-    toy->heard = toy->running = toy->started = 0;
-    toy->block = 0;
-    toy->warm = toy->answer.sample = 0;
-    toy->answer.state = PLUSH_WARMING;
-    toy->answer.gesture = 0;
-    toy->answer.affect = PLUSH_AFFECT_NONE;
-    toy->answer.confidence = 0;
-    /* So that a step ends with the very sample that fills the span. */
-    phase = toy->span % toy->step;
-    toy->filled = (uint16_t)(phase == 0 ? 0 : toy->step - phase);
+    lose(toy, toy->seen_ms);
+    forget_health(toy);
+    forget(toy);
+}
+
+void plush_silence(plush_toy *toy)
+{
+    if (toy->memory != NULL)
+        lose(toy, toy->seen_ms);
 }
 
 uint32_t plush_push(plush_toy *toy, uint32_t ms, const int32_t *values)
@@ -782,12 +1429,23 @@ uint32_t plush_push(plush_toy *toy, uint32_t ms, const int32_t *values)
 
     if (toy->memory == NULL) /* plush_begin() has not said PLUSH_OK */
         return 0;
-    if (toy->heard && (ms < toy->seen_ms || ms - toy->seen_ms > toy->gap / toy->units_per_ms)) {
-        toy->restarts++;
-        plush_restart(toy);
+    if (ms < toy->seen_ms || ms - toy->seen_ms > toy->gap / toy->units_per_ms) {
+        lose(toy, toy->seen_ms);
+        forget_health(toy);
+        if (toy->heard) { /* not in a fault, nor with the very first frame */
+            toy->restarts++;
+            forget(toy);
+        }
     }
-    toy->heard = 1;
     toy->seen_ms = ms;
+    if (examine(toy, ms, values)) {
+        if (toy->faulty)
+            lose(toy, ms);
+        forget(toy);
+    }
+    if (toy->faulty)
+        return 0;
+    toy->heard = 1;
     if (toy->running)
         memcpy(toy->before, toy->held, 4u * toy->channels);
     if (!hold(toy, values))
@@ -812,7 +1470,14 @@ uint32_t plush_push(plush_toy *toy, uint32_t ms, const int32_t *values)
 
 const char *plush_gesture_name(const plush_toy *toy, uint8_t gesture)
 {
-    return gesture < toy->classes ? (const char *)affect_and_name(toy, gesture) + 1 : "";
+    const uint8_t *p = toy->names;
+
+    if (gesture >= toy->classes)
+        return "";
+    for (; gesture > 0; gesture--)
+        while (*p++ != 0) {
+        }
+    return (const char *)p;
 }
 
 const char *plush_model_title(const plush_toy *toy)

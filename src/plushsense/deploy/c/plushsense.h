@@ -5,9 +5,12 @@
  *     static plush_toy toy;
  *
  *     plush_begin(&toy, plush_model, PLUSH_MODEL_BYTES, memory, sizeof memory);
+ *     toy.on_event = react;                                      // void react(const plush_toy *toy, void *user)
  *     ...
- *     if (plush_push(&toy, milliseconds, readings) > 0 && toy.answer.state == PLUSH_TRACKING)
- *         react_to(toy.answer.gesture, toy.answer.affect);
+ *     plush_push(&toy, milliseconds, readings);                  // every reading of the sensors
+ *
+ * React to events (toy->event in on_event): one for each touch, with a beginning, at times a name that comes later, and
+ * an end. An answer (toy.answer), by contrast, is what the network makes of one step, sure or not.
  *
  * C99 or C++; no heap, no recursion, no floating point, nothing of the C library but <stdint.h> and <string.h>.
  * Every toy keeps all it remembers in its own plush_toy and its own memory, so that several can run side by side.
@@ -16,7 +19,11 @@
  * Missed ticks. Readings carry the time at which they were taken, and only that time counts: reading late, or several
  * at once, changes no answer. Readings that are missing for up to the model's gap (100 ms as a rule) are bridged by
  * interpolation, and every answer that fell due meanwhile is given, in order. After a longer gap, or when the clock
- * runs backwards (also when it wraps after 2^32 ms), everything remembered is dropped: the toy is warming again.
+ * runs backwards (also when it wraps after 2^32 ms), everything remembered is dropped: the toy is warming again. What
+ * was going on ends then, with the next reading; if none may ever come, call plush_silence() when you miss it.
+ *
+ * Sensors that cannot be believed (values out of range, stuck at an end, all frozen) are a fault: the event that is
+ * going on ends, readings are passed over (PLUSH_FAULT), and after a while of good ones everything begins again.
  */
 #ifndef PLUSHSENSE_H
 #define PLUSHSENSE_H
@@ -27,9 +34,10 @@
 extern "C" {
 #endif
 
-#define PLUSH_IMAGE_VERSION 1
+#define PLUSH_IMAGE_VERSION 2
 #define PLUSH_MAX_LAYERS 4
 #define PLUSH_ONE 32768 /* a confidence or probability of 1 */
+#define PLUSH_NO_GESTURE 255
 
 /* What plush_begin says. */
 typedef enum {
@@ -40,7 +48,8 @@ typedef enum {
     PLUSH_MEMORY_TOO_SMALL = 4 /* give plush_memory_bytes() bytes, aligned for uint32_t */
 } plush_status;
 
-typedef enum { PLUSH_WARMING = 0, PLUSH_TRACKING = 1 } plush_state;
+/* PLUSH_FAULT: the sensors cannot be believed; there are no answers until they have recovered. */
+typedef enum { PLUSH_WARMING = 0, PLUSH_TRACKING = 1, PLUSH_FAULT = 2 } plush_state;
 
 typedef enum {
     PLUSH_AFFECT_NONE = 0,
@@ -48,6 +57,36 @@ typedef enum {
     PLUSH_AFFECT_NEUTRAL = 2,
     PLUSH_AFFECT_NEGATIVE = 3
 } plush_affect;
+
+/* What an answer is worth. */
+typedef enum {
+    PLUSH_IDLE = 0,    /* nobody does anything */
+    PLUSH_UNKNOWN = 1, /* a touch, but none that the network knows */
+    PLUSH_UNSURE = 2,
+    PLUSH_SURE_AFFECT = 3,  /* sure of the affect, not of the gesture */
+    PLUSH_SURE_GESTURE = 4
+} plush_kind;
+
+/* What happened to an event. */
+typedef enum {
+    PLUSH_NOTHING = 0, /* there was no event yet */
+    PLUSH_BEGUN = 1,   /* its affect is sure; its gesture too, unless that is PLUSH_NO_GESTURE */
+    PLUSH_NAMED = 2,   /* now its gesture is sure */
+    PLUSH_ENDED = 3
+} plush_what;
+
+typedef enum { PLUSH_NETWORK = 0, PLUSH_GATE = 1 } plush_source;
+
+/* The newest thing that happened to an event: it is going on unless `what` is PLUSH_NOTHING or PLUSH_ENDED. */
+typedef struct {
+    plush_what what;
+    uint32_t number;     /* of the event, from 1; wraps */
+    plush_affect affect;
+    uint8_t gesture;     /* class index, or PLUSH_NO_GESTURE */
+    plush_source source; /* who began it: the network, or the gate, which notices blows within a few samples */
+    uint32_t since_ms;   /* when it was first wanted; of an end, when it was first missed */
+    uint32_t ms;         /* when this was said: the time of the newest sample, rounded down */
+} plush_event;
 
 /* An answer. While warming, only `ms`, `state` and `sample` mean anything; the rest is 0. */
 typedef struct {
@@ -57,6 +96,8 @@ typedef struct {
     uint8_t gesture;     /* class index; see plush_gesture_name() */
     plush_affect affect;
     uint16_t confidence; /* smoothed probability of the gesture, in steps of 1/32768 */
+    plush_kind kind;
+    int16_t known;       /* how known the touch looks: the highest logit, smoothed, in steps of 1/256 */
 } plush_answer;
 
 /* One layer of the network. */
@@ -74,16 +115,21 @@ typedef struct {
     uint32_t *tap_sums;     /* for each of the next `dilation` samples: sum of the activations already under its taps */
 } plush_layer;
 
-/* A toy: everything about one stream. Fields from `answer` to `invalid` may be read, none may be written. */
+/* A toy: everything about one stream. Fields from `answer` to `suspect` may be read, none may be written. */
 typedef struct plush_toy {
-    plush_answer answer;     /* the newest one */
+    plush_answer answer;     /* the newest one; its `state` is that of the toy at any time */
+    plush_event event;       /* the newest thing that happened to an event */
     uint32_t answers;        /* how many there were; wraps, like all counts */
     uint32_t restarts;       /* gaps and clock resets */
     uint32_t invalid;        /* values out of their valid range, for which the last valid one stood in */
+    uint32_t faults;         /* how often sensors could not be believed */
+    uint8_t suspect;         /* the newest frame is in doubt: no event begins on it */
 
-    /* Called with every answer, also when one frame completes several; may be NULL. Set it after plush_begin(). It may
-     * read the toy, but call no function that changes it (plush_push, plush_restart, plush_begin). */
+    /* Called with every answer, and with everything that happens to an event, also when one frame completes several;
+     * may be NULL. Set them after plush_begin(). They may read the toy, but call no function that changes it
+     * (plush_push, plush_silence, plush_restart, plush_begin). A step's event comes before its answer. */
     void (*on_answer)(const struct plush_toy *toy, void *user);
+    void (*on_event)(const struct plush_toy *toy, void *user);
     void *user;
 
     /* The model, as it was read. `channels` and `layout` may be read, too: `layout` stands for the names, units, steps
@@ -94,7 +140,10 @@ typedef struct plush_toy {
     uint16_t smoothing, layout;
     void *memory;
     uint32_t memory_bytes;
-    const uint8_t *ranges, *input_plan, *dense, *dense_weights, *names, *title;
+    const uint8_t *ranges, *input_plan, *dense, *dense_weights, *classes_told, *names, *title;
+    const uint8_t *event_plan, *health_plan, *limits, *gate_plan, *gate_first_rule;
+    uint8_t gate_signals, gate_rules, gate_past;
+    uint16_t gate_terms, gate_bytes;
     plush_layer layer[PLUSH_MAX_LAYERS];
 
     /* Clock: all in the model's own units of time, reckoned from the newest frame, so that nothing grows. */
@@ -104,15 +153,34 @@ typedef struct plush_toy {
     uint8_t *valid;          /* of each channel: whether it has had a valid value */
     int32_t *held, *before, *sample;
 
+    /* The gate: the inputs of the newest samples, what it knows of each signal, and of each term of a rule. */
+    uint8_t gate_seen, gate_newest;
+    uint16_t gate_deaf;
+    int32_t *gate_inputs, *gate_state;
+    uint16_t *gate_hold;
+    uint8_t *gate_in_row;
+
+    /* Health. */
+    uint8_t faulty, compared; /* there is a fault; there was a frame to compare with */
+    uint8_t wrong, good;      /* some channel is wrong since `wrong_ms`; all is good since `good_ms` */
+    uint32_t wrong_ms, good_ms, moved_ms;
+    int32_t *last;           /* the values of the frame before, as they came */
+
     /* Pooling and smoothing. */
     uint16_t filled, block;
-    uint8_t *last;           /* the last layer's newest activations */
+    uint8_t *top;            /* the last layer's newest activations */
     uint16_t *sums;          /* blocks x features */
     uint32_t *total;         /* of each feature: its sum over all blocks */
     uint32_t warm;           /* samples, up to the span */
     uint8_t started;         /* the smoothing has begun */
     int32_t *logits;         /* of each class, in steps of 1/256 */
-    int32_t *smooth;         /* of each class: probability in steps of 2^-27 */
+    int32_t *smooth;         /* of each class: probability in steps of 2^-27; after them the highest logit in 2^-20 */
+
+    /* Events: what is wanted (an affect, or 4 + a gesture of none), for how many steps, since when; the same of a
+     * gesture; how long the event lasted, is missed, waits for its name; how long none may begin. */
+    uint16_t wanted, wanted_for, named_for, lasted, away, wait, resting;
+    uint8_t named;
+    uint32_t wanted_ms, away_ms;
 } plush_toy;
 
 /* Bytes of memory that a toy with this model needs; 0 when these bytes are no usable model. */
@@ -129,7 +197,11 @@ plush_status plush_begin(plush_toy *toy, const uint8_t *model, uint32_t model_by
  * the layout. Returns how many answers fell due, mostly 0 or 1; the newest is in toy->answer. */
 uint32_t plush_push(plush_toy *toy, uint32_t ms, const int32_t *values);
 
-/* Forgets the past, as after a gap; the counts stay. */
+/* No reading came for a while (your program knows best how long that is): what is going on ends. The next reading goes
+ * on where the last one was, or begins again after a gap. */
+void plush_silence(plush_toy *toy);
+
+/* Forgets the past, as after a gap: what is going on ends; the counts stay, and so does a fault. */
 void plush_restart(plush_toy *toy);
 
 /* The label of a class, and of the model (its architecture and filters). */

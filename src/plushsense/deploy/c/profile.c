@@ -129,11 +129,12 @@ int main(void)
 
 #else
 
-/* A row for each step: instructions of inputs, network, dense layer, decision, and the rest of what an answer takes. */
+/* A row for each step: instructions of health, inputs, gate, network, dense layer, probabilities, events, and the rest of
+ * what an answer takes. */
 static void count_stages(const int32_t *row, const int32_t *end)
 {
-    uint32_t inputs = 0, network = 0, last, decision, rest, then;
-    uint32_t samples = 0;
+    uint32_t health = 0, inputs = 0, gate = 0, network = 0, last, decision, events, rest, then;
+    uint32_t samples = 0, best;
 
     for (; row != end; row += ROW) {
         if (toy.answer.state != PLUSH_TRACKING) {
@@ -142,8 +143,16 @@ static void count_stages(const int32_t *row, const int32_t *end)
         }
         memcpy(toy.sample, row + 1, 4u * PLUSH_MODEL_CHANNELS);
         then = target_instructions();
+        examine(&toy, (uint32_t)row[0], row + 1);
+        health += since(then);
+        then = target_instructions();
         read_inputs(&toy);
         inputs += since(then);
+        if (has_gate(&toy)) {
+            then = target_instructions();
+            gate_sample(&toy, (uint32_t)row[0]);
+            gate += since(then);
+        }
         then = target_instructions();
         network_sample(&toy);
         network += since(then);
@@ -153,17 +162,23 @@ static void count_stages(const int32_t *row, const int32_t *end)
         dense(&toy);
         last = since(then);
         then = target_instructions();
-        decide(&toy);
+        best = decide(&toy);
         decision = since(then);
         then = target_instructions();
+        event_step(&toy, best, (uint32_t)row[0]);
+        events = since(then);
+        then = target_instructions();
         answer(&toy, (uint32_t)row[0]);
-        rest = since(then) - last - decision;
+        rest = since(then) - last - decision - events;
+        put(health);
         put(inputs);
+        put(gate);
         put(network);
         put(last);
         put(decision);
+        put(events);
         put(rest);
-        inputs = network = samples = 0;
+        health = inputs = gate = network = samples = 0;
     }
 }
 

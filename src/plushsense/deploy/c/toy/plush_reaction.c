@@ -1,21 +1,21 @@
 /*
- * From answers to eyes and sound: see plush_reaction.h.
+ * From events to eyes and sound: see plush_reaction.h.
  *
- * The rules. An affect is believed from LEAST_CONFIDENCE on. What is shown stays for its hold time at least, so that
- * the toy does not flicker; then it follows. Warming (after the start, a gap, a clock reset) and silence (no answer for
- * QUIET_MS: the sensors have stopped) look alike: blue, breathing. A gesture whose affect nobody told has a colour of
- * its own and no sound.
+ * The rules. An event shows its affect as soon as it begins, long before its gesture may be sure, until it ends. What is
+ * shown stays for its hold time at least, so that the toy does not flicker; then it follows. Between events the eyes
+ * glimmer. Warming (after the start, a gap, a clock reset) and silence (no answer for QUIET_MS: the sensors have stopped)
+ * look alike: blue, breathing; sensors that cannot be believed: violet, breathing. An event whose affect nobody told has
+ * its gesture's own colour and no sound.
  */
 #include "plush_reaction.h"
 
-#define LEAST_CONFIDENCE (PLUSH_ONE / 2)
 #define QUIET_MS 500u
 #define BLINK_MS 300u
 
 /* What can be shown; from GESTURE on: GESTURE + class, of an affect that nobody told. */
-enum { WARMING, POSITIVE, NEUTRAL, NEGATIVE, GESTURE };
+enum { WARMING, FAULT, CALM, POSITIVE, NEUTRAL, NEGATIVE, GESTURE };
 
-static const uint16_t hold_ms[] = {0, 1500, 500, 2500, 1000};
+static const uint16_t hold_ms[] = {0, 0, 0, 1500, 500, 2500, 1000};
 
 /* A sound: notes of NOTE_MS each, ended by 0; it plays once, when its affect begins. */
 #define NOTE_MS 120u
@@ -57,14 +57,16 @@ static void colour(uint32_t gesture, uint32_t classes, plush_look *look)
     }
 }
 
-/* What the newest answer asks for; what is shown already, where it is not sure. */
+/* What the toy asks for now. */
 static uint16_t wanted(const plush_reaction *reaction, const plush_toy *toy, uint32_t ms)
 {
-    if (toy->answer.state == PLUSH_WARMING || ms - reaction->answered_ms > QUIET_MS)
+    if (toy->answer.state == PLUSH_FAULT)
+        return FAULT;
+    if (ms - reaction->answered_ms > QUIET_MS)
         return WARMING;
-    if (toy->answer.confidence < LEAST_CONFIDENCE)
-        return reaction->shown == WARMING ? NEUTRAL : reaction->shown;
-    switch (toy->answer.affect) {
+    if (toy->event.what != PLUSH_BEGUN && toy->event.what != PLUSH_NAMED)
+        return toy->answer.state == PLUSH_WARMING ? WARMING : CALM;
+    switch (toy->event.affect) {
     case PLUSH_AFFECT_POSITIVE:
         return POSITIVE;
     case PLUSH_AFFECT_NEUTRAL:
@@ -74,7 +76,7 @@ static uint16_t wanted(const plush_reaction *reaction, const plush_toy *toy, uin
     case PLUSH_AFFECT_NONE:
         break;
     }
-    return (uint16_t)(GESTURE + toy->answer.gesture);
+    return toy->event.gesture == PLUSH_NO_GESTURE ? NEUTRAL : (uint16_t)(GESTURE + toy->event.gesture);
 }
 
 void plush_react(plush_reaction *reaction, const plush_toy *toy, uint32_t ms, plush_look *look)
@@ -98,6 +100,12 @@ void plush_react(plush_reaction *reaction, const plush_toy *toy, uint32_t ms, pl
     switch (reaction->shown) {
     case WARMING:
         look->blue = breathing(ms, 2000);
+        break;
+    case FAULT:
+        look->red = look->blue = breathing(ms, 2000);
+        break;
+    case CALM:
+        look->red = look->green = look->blue = 10;
         break;
     case POSITIVE:
         look->green = 255;

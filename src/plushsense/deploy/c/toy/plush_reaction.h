@@ -1,5 +1,5 @@
 /*
- * From answers to eyes and sound: what this example shows, in one place. Yours to change.
+ * From events to eyes and sound: what this example shows, in one place. Yours to change.
  */
 #ifndef PLUSH_REACTION_H
 #define PLUSH_REACTION_H
