@@ -183,15 +183,17 @@ class StreamReader(ABC):
         period, clock = self.layout.period_us, self._clock
         device_us = int(frame.device_ms) * 1000
         due: list[Decision] = []
-        if clock.breaks(frame.device_ms):
+        gap_us = device_us - self._seen_us
+        if self._zero_us is not None and (gap_us < 0 or gap_us > self.layout.gap_ms * 1000):
+            # Also in a fault, when the clock sees no frames.
             ended = self._machine.lost(self._seen_us - (self._zero_us or 0))
             if ended:
                 due.append(self._gone("warming", ended))
             self._health.clear()
         if self._zero_us is None:
             self._zero_us = device_us
-        elif device_us < self._seen_us:
-            self._zero_us += device_us - self._seen_us - period
+        elif gap_us < 0:
+            self._zero_us += gap_us - period
         self._seen_us = device_us
         health = self._health.push(int(frame.device_ms), frame.values)
         if health == "fault":

@@ -32,8 +32,9 @@ from plushsense.windows.features import inputs
 class Part:
     """Even samples without a break.
 
-    ``start_us`` the time of sample 0 since the stream's first frame, ``ends_us`` that of the last frame; ``inputs``
-    (T, I) raw; ``suspect`` (T,); ``logits`` (n, K) in steps of 1/256, of every step from the one that fills the span.
+    ``start_us`` the time of sample 0 since the stream's first frame, ``ends_us`` that at which it was over: of the last
+    frame, or of the one with which a fault began; ``inputs`` (T, I) raw; ``suspect`` (T,); ``logits`` (n, K) in steps
+    of 1/256, of every step from the one that fills the span.
     """
 
     start_us: int
@@ -84,11 +85,8 @@ def trace_of(frames: Frames, model: Bundle | IntegerModel, health: HealthPlan | 
         health = model.rules.health if isinstance(model, IntegerModel) else DecideSpec.from_dict(model.decision).health
     layout = model.layout
     parts: list[Part] = []
-    faults = 0
-    for zero_ms, first, last, suspects in _stretches(frames, Health(health, layout), layout.gap_ms, layout.period_us):
-        if last is None:
-            faults += 1
-            continue
+    follower = Health(health, layout)
+    for zero_us, first, last, end, suspects in _stretches(frames, follower, layout.gap_ms, layout.period_us):
         for segment in resample(frames.slice(first, last), layout):
             values = inputs(segment.data, layout)
             stepper = network.stepper()
@@ -100,31 +98,31 @@ def trace_of(frames: Frames, model: Bundle | IntegerModel, health: HealthPlan | 
             logits = np.array(due).reshape(len(due), len(model.gestures))
             parts.append(
                 Part(
-                    segment.start_us - zero_ms * 1000,
-                    (int(frames.device_ms[last - 1]) - zero_ms) * 1000,
+                    segment.start_us - zero_us,
+                    int(frames.device_ms[end]) * 1000 - zero_us,
                     values,
                     suspects[segment.row_of],
                     logits.astype(np.int64) if integer else whole_logits(logits),
                 )
             )
     first_ms = int(frames.device_ms[0]) if len(frames) else 0
-    return Trace(network.arch, layout.period_us, model.gestures, first_ms, tuple(parts), faults)
+    return Trace(network.arch, layout.period_us, model.gestures, first_ms, tuple(parts), follower.faults)
 
 
 def _stretches(
     frames: Frames, health: Health, gap_ms: int, period_us: int
-) -> Iterator[tuple[int, int, int | None, NDArray[np.bool_]]]:
-    """Rows without a break or a fault: (device time in ms at which the stream's time is 0, first row, last row
-    exclusive, suspect of each row); a last row of None tells of a fault."""
+) -> Iterator[tuple[int, int, int, int, NDArray[np.bool_]]]:
+    """Rows without a break or a fault: (device time in us at which the stream's time is 0, first row, last row
+    exclusive, the row with which it was over, suspect of each row)."""
     ms = frames.device_ms.astype(np.int64)
     if not len(ms):
         return
     step = np.diff(ms)
     edges = [0, *(np.flatnonzero((step < 0) | (step > gap_ms)) + 1).tolist(), len(ms)]
-    zero = int(ms[0])
+    zero_us = int(ms[0]) * 1000
     for first, last in itertools.pairwise(edges):
         if first and ms[first] < ms[first - 1]:
-            zero += int(ms[first] - ms[first - 1]) - period_us // 1000
+            zero_us += int(ms[first] - ms[first - 1]) * 1000 - period_us
         health.clear()
         suspects = np.zeros(last - first, dtype=bool)
         begin = None if health.fault else 0
@@ -134,13 +132,12 @@ def _stretches(
             suspects[at] = health.suspect
             if said == "fault":
                 if begin is not None and at > begin:
-                    yield zero, first + begin, first + at, suspects[begin:at]
+                    yield zero_us, first + begin, first + at, first + at, suspects[begin:at]
                 begin = None
-                yield zero, first + at, None, suspects
             elif said == "recovered":
                 begin = at
         if begin is not None and last - first > begin:
-            yield zero, first + begin, last, suspects[begin:]
+            yield zero_us, first + begin, last, last - 1, suspects[begin:]
 
 
 def gate_hits(part: Part, plan: GatePlan) -> list[tuple[int, int]]:

@@ -19,12 +19,14 @@ A step, in this order:
 5. In an event: it gets its gesture once, when one of its affect was wanted for ``least`` steps. Another gesture or
    affect that was wanted for ``switch`` steps in a row, after at least ``hold`` steps, ends it and begins the next.
    It ends after ``end`` steps in a row in which its gesture (without one: its affect's classes together) stood below
-   ``leave`` (``leave_affect``), or an idle class reached ``enter``; never sooner than after ``hold`` steps.
+   ``leave`` (``leave_affect``), or the best class was an idle one and reached ``enter``; never sooner than after
+   ``hold`` steps.
 
 The gate speaks between steps (`EventMachine.gate`): its event begins at once and cannot be ended or replaced for
-``wait`` steps, in which the network may name it. A gate that fires during an event of its own affect prolongs that.
+``wait`` steps, in which the network may name it. A gate that fires during an event of its own affect, or one that the
+gate began, prolongs that, which begins the ``wait`` anew.
 While the network is warming there are blind steps, in which nothing speaks for an event (`EventMachine.blind_step`).
-A suspect step (see ``models/health``) neither counts nor breaks a row, and begins and names nothing.
+A suspect step (see ``models/health``) neither counts nor breaks a row, and begins, names and ends nothing.
 """
 
 from __future__ import annotations
@@ -100,7 +102,8 @@ class Update:
 
     ``number`` counts events from 1; ``affect`` a code of `AFFECT_CODES`; ``gesture`` a class index or `NO_GESTURE`;
     ``source`` `CNN` or `GATE`, who began it; ``since`` the time of the step in which it was first wanted (an end: in
-    which it was first missed), ``now`` the time at which this is said.
+    which it was first missed), ``now`` the time at which this is said. Where one event takes another's place, and when
+    the signal is lost, both are ``now``.
     """
 
     kind: int
@@ -279,7 +282,7 @@ class EventMachine:
             self.gesture, self.affect = said, affect
             self._away = 0
             return [Update(NAMED, self.number, affect, said, self.source, self.since, now)]
-        if locked:
+        if locked or suspect:
             return []
         another = (affect and affect != self.affect) or (said not in (NO_GESTURE, self.gesture))
         if another and self.gesture == NO_GESTURE and affect == self.affect:
@@ -297,7 +300,7 @@ class EventMachine:
         if stays:
             self._away = 0
             return []
-        return [] if suspect else self._miss(now)
+        return self._miss(now)
 
     def _begin(self, affect: int, gesture: int, source: int, since: int, now: int) -> Update:
         self.number += 1

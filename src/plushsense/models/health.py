@@ -6,9 +6,10 @@ This room defines it; ``deploy/c/plushsense.c`` repeats it. It sees every frame 
   ``low`` to ``high``, what the sensor showed people's touch to reach: a sensor at its end stop.
 - The toy is *still* while every channel repeats the frame before. Real sensors tremble; a hung one does not.
 - A frame is *suspect* while a channel is wrong, or the toy was still for ``still_ms`` / 2. Nothing begins on it.
-- A *fault* begins when a channel was wrong, or the toy still, for ``fault_ms`` or ``still_ms`` without a break. Then
-  frames are not read, until for ``recover_ms`` no channel was wrong and the toy was not still; after that everything
+- A *fault* begins when in every frame for ``fault_ms`` some channel was wrong (not always the same one), or the toy was
+  still for ``still_ms``. Then frames are not read, until for ``recover_ms`` none was suspect; after that everything
   begins again.
+- After a gap or a reset of the clock all times are counted anew (`Health.clear`), also within a fault.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ _INT32 = -(1 << 31), (1 << 31) - 1
 @dataclass(frozen=True)
 class HealthPlan:
     """The settings of `Health`; ``low`` and ``high`` (C,) of each measured channel, empty: not known, so that a value
-    may stay wherever it is valid. A time of 0 switches its rule off.
+    may stay wherever it is valid. ``fault_ms`` or ``still_ms`` of 0 switches its rule off; with a ``recover_ms`` of 0
+    the first good frame is believed.
 
     Raises:
         BundleError: for a value out of its range.
@@ -90,7 +92,7 @@ class Health:
         """Forget the past, as after a gap: what was wrong is wrong anew, but a fault goes on until it has recovered."""
         self.suspect = False
         self._last: list[int] | None = None
-        self._wrong: list[int | None] = [None] * len(self._valid)  # since when
+        self._wrong: int | None = None  # since when, in every frame
         self._still: int | None = None
         self._good: int | None = None
 
@@ -98,28 +100,25 @@ class Health:
         """One frame at a time ``ms`` that does not run backwards (`clear` first): ``"fault"`` when a fault begins with
         it, ``"recovered"`` when one ends, else ``""``. `fault` and `suspect` say how things stand."""
         plan, last = self.plan, self._last
-        any_wrong, broken = False, False
-        for i, value in enumerate(values):
-            valid, usual = self._valid[i], self._usual[i]
-            wrong = not valid[0] <= value <= valid[1] or (
-                last is not None and value == last[i] and not usual[0] <= value <= usual[1]
+        wrong = any(
+            not low <= value <= high or (last is not None and value == before and not least <= value <= most)
+            for value, before, (low, high), (least, most) in zip(
+                values, last or values, self._valid, self._usual, strict=True
             )
-            if not wrong:
-                self._wrong[i] = None
-                continue
-            any_wrong = True
-            since = self._wrong[i]
-            if since is None:
-                self._wrong[i] = since = ms
-            broken = broken or (plan.fault_ms > 0 and ms - since >= plan.fault_ms)
+        )
+        if not wrong:
+            self._wrong = None
+        elif self._wrong is None:
+            self._wrong = ms
+        broken = self._wrong is not None and plan.fault_ms > 0 and ms - self._wrong >= plan.fault_ms
         still = last is not None and plan.still_ms > 0 and list(values) == last
         if not still:
             self._still = ms
         quiet = ms - (self._still if self._still is not None else ms)
         self._last = list(values)
-        self.suspect = any_wrong or (still and 2 * quiet >= plan.still_ms)
+        self.suspect = wrong or (still and 2 * quiet >= plan.still_ms)
         if self.fault:
-            if any_wrong or still:
+            if self.suspect:
                 self._good = None
             elif self._good is None:
                 self._good = ms
