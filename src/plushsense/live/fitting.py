@@ -18,6 +18,7 @@ from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.recfile import Frames
 from plushsense.dataset.store import Dataset, RecordingInfo
 from plushsense.live.decide import DecideSpec
+from plushsense.live.gate import fit_gate
 from plushsense.live.limits import fit_health
 from plushsense.live.stream import whole_logits
 from plushsense.live.trace import trace_of
@@ -64,6 +65,7 @@ def fit_decisions(
     *,
     coverage: float = COVERAGE,
     known_share: float = KNOWN_SHARE,
+    false_alarms_per_hour: float = 1.0,
     training: Iterable[str] = (),
     spec: DecideSpec | None = None,
     keep: Collection[str] = (),
@@ -76,6 +78,7 @@ def fit_decisions(
       labelled steps (least ambiguous sets: Sadinle, Lei and Wasserman 2019), people and their recordings counting
       alike; the finite-sample correction counts recordings, since steps of one are no new evidence.
     - ``known``: the smoothed highest logit that ``known_share`` of the same steps reach.
+    - Gate: thresholds that fire so often on all that is not energetic (`live/gate`), on everybody's streams.
     - Health: limits with which no sensor of anybody on the training side is at fault.
 
     A labelled step stands in the second half of its recording: before, the network mostly sees something else.
@@ -100,6 +103,10 @@ def fit_decisions(
     health = fit_health(dataset, everybody, spec.health)
     if "health" not in keep:
         spec = replace(spec, health=health.plan)
+    gate: dict[str, Any] | None = None
+    if "gate" not in keep:
+        fitted = fit_gate(dataset, bundle.gestures, everybody, false_alarms_per_hour=false_alarms_per_hour)
+        spec, gate = replace(spec, gate=fitted.plan), fitted.report
     heard = streams_heard(bundle, dataset, people, spec)
     said: dict[str, Any] = {
         "people": len(people),
@@ -136,6 +143,8 @@ def fit_decisions(
         "end_stops": list(health.widened),
         "longest_still_ms": health.still_ms,
     }
+    if gate is not None:
+        said["gate"] = gate
     return replace(spec, fitted=said)
 
 
@@ -149,7 +158,6 @@ def _round(value: float) -> float | None:
 
 def _answers(labelled: Labelled, spec: DecideSpec, coverage: float, known_share: float, steps: bool) -> dict[str, Any]:
     by_person = left_out_coverage(labelled, coverage)
-    n = len(by_person) or 1
     people = len(set(labelled.person.tolist()))
     return {
         "on": "steps in the second half of a recording" if steps else "windows, not smoothed",
@@ -158,7 +166,6 @@ def _answers(labelled: Labelled, spec: DecideSpec, coverage: float, known_share:
         # What other people's threshold gave each of them: the figure to expect of a new person.
         "coverage_left_out": _round(float(np.mean(by_person))) if by_person else None,
         "coverage_left_out_worst": _round(min(by_person)) if by_person else None,
-        "coverage_left_out_people": len(by_person) and n,
         # A share of new people that so few can vouch for, whatever the threshold: n / (n + 1).
         "people_bound": _round(people / (people + 1)),
         "classes_in_set": _round(float((labelled.shares >= spec.sure * ONE).sum(axis=1).mean())),
@@ -191,7 +198,7 @@ def streams_heard(bundle: Bundle, dataset: Dataset, subjects: Iterable[str], spe
 def stream_times_us(frames: Frames, period_us: int) -> Ints:
     """(T,) the time of every row as a `StreamReader` counts it: from the first, and on over a reset of the clock."""
     step = np.diff(frames.device_ms.astype(np.int64), prepend=frames.device_ms[:1]) * 1000
-    return np.cumsum(np.where(step < 0, period_us // 1000 * 1000, step))
+    return np.cumsum(np.where(step < 0, period_us, step))
 
 
 def truths_of(

@@ -22,6 +22,7 @@ _STILL_MOST_MS = 10_000
 _INT32 = -(1 << 31), (1 << 31) - 1
 
 Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -52,8 +53,8 @@ def fit_health(dataset: Dataset, subjects: Iterable[str], plan: HealthPlan | Non
     """Limits with which the sensors of ``subjects`` are never at fault.
 
     A channel's limits are the 0.1 % and 99.9 % quantiles of its valid values, and a tenth of the range between
-    further out. Where somebody's value repeated beyond them for half of ``fault_ms``, they are moved to hold it: that
-    sensor has an end stop that people reach. ``still_ms`` is twice the longest time in which every channel
+    further out. Where somebody's values repeated beyond them for half of ``fault_ms``, they are moved to hold them:
+    that sensor has an end stop that people reach. ``still_ms`` is twice the longest time in which every channel
     repeated, at least 500 ms; when that is more than 10 s, the toy really is still, and the rule is off.
 
     Args:
@@ -65,28 +66,31 @@ def fit_health(dataset: Dataset, subjects: Iterable[str], plan: HealthPlan | Non
     if not parts:
         return HealthFit(plan, 0, 0.0, (), 0)
     values = np.concatenate([f.values for f in parts])
-    low, high, widened = [], [], []
-    for c, name in enumerate(layout.names):
-        a, b = int(layout.valid_min_int[c]), int(layout.valid_max_int[c])
+    valid = np.stack([np.maximum(layout.valid_min_int, _INT32[0]), np.minimum(layout.valid_max_int, _INT32[1])])
+    valid = valid.astype(np.int64)
+    low, high = (edge.copy() for edge in valid)
+    for c in range(values.shape[1]):
         mine = values[:, c]
-        valid = mine[(mine >= a) & (mine <= b)]
-        if not len(valid):
-            low.append(max(a, _INT32[0]))
-            high.append(min(b, _INT32[1]))
-            continue
-        first, last = np.quantile(valid, (_RARE, 1 - _RARE))
-        margin = _MARGIN * (last - first)
-        under, over = max(a, int(np.floor(first - margin))), min(b, int(np.ceil(last + margin)))
-        reached = [v for f in parts for v in _held(f, c, under, over, (a, b), plan.fault_ms / _SAFETY, layout.gap_ms)]
-        if reached:
-            widened.append(name)
-            under, over = min(under, *reached), max(over, *reached)
-        low.append(max(under, _INT32[0]))
-        high.append(min(over, _INT32[1]))
+        mine = mine[(mine >= valid[0, c]) & (mine <= valid[1, c])]
+        if len(mine):
+            first, last = np.quantile(mine, (_RARE, 1 - _RARE))
+            margin = _MARGIN * (last - first)
+            low[c] = max(low[c], int(np.floor(first - margin)))
+            high[c] = min(high[c], int(np.ceil(last + margin)))
+    usual = low.copy(), high.copy()
+    for frames in parts:
+        for rows, wrong in _held(frames, usual, valid, plan.fault_ms / _SAFETY, layout.gap_ms):
+            low = np.minimum(low, np.where(wrong, rows, low).min(axis=0))
+            high = np.maximum(high, np.where(wrong, rows, high).max(axis=0))
+    moved = (low != usual[0]) | (high != usual[1])
+    widened = [name for name, other in zip(layout.names, moved.tolist(), strict=True) if other]
     still = max(_longest(f.device_ms, _repeats(f.values, f.device_ms, layout.gap_ms)) for f in parts)
     still_ms = max(_STILL_MS, _SAFETY * still)
     fitted = replace(
-        plan, low=tuple(low), high=tuple(high), still_ms=still_ms if still_ms <= min(_STILL_MOST_MS, MOST_MS) else 0
+        plan,
+        low=tuple(low.tolist()),
+        high=tuple(high.tolist()),
+        still_ms=still_ms if still_ms <= min(_STILL_MOST_MS, MOST_MS) else 0,
     )
     return HealthFit(fitted, len(values), _seconds(parts, layout), tuple(widened), still)
 
@@ -116,11 +120,16 @@ def _longest(ms: NDArray[np.int64], repeats: Bools) -> int:
 
 
 def _held(
-    frames: Frames, c: int, low: int, high: int, valid: tuple[int, int], longest_ms: float, gap_ms: int
-) -> list[int]:
-    """The valid values beyond ``low`` to ``high`` at which a channel stood for ``longest_ms``."""
-    column = frames.values[:, c]
-    beyond = ((column < low) | (column > high)) & (column >= valid[0]) & (column <= valid[1])
-    wrong = beyond & _repeats(column[:, None], frames.device_ms, gap_ms)
-    runs = [(a, b) for a, b in _runs(wrong) if frames.device_ms[b] - frames.device_ms[a] >= longest_ms]
-    return [int(v) for a, b in runs for v in (column[a : b + 1].min(), column[a : b + 1].max())]
+    frames: Frames, usual: tuple[Ints, Ints], valid: Ints, longest_ms: float, gap_ms: int
+) -> Iterator[tuple[Ints, NDArray[np.bool_]]]:
+    """The frames (n, C) of each stretch of ``longest_ms`` with some channel wrong all along, and where in them
+    a channel repeated a valid value beyond the ``usual``."""
+    x, ms = frames.values, frames.device_ms
+    step = np.diff(ms, prepend=ms[:1])
+    invalid = (x < valid[0]) | (x > valid[1])
+    again = np.zeros(x.shape, dtype=bool)
+    again[1:] = (x[1:] == x[:-1]) & ((step[1:] >= 0) & (step[1:] <= gap_ms))[:, None]
+    beyond = again & ((x < usual[0]) | (x > usual[1])) & ~invalid
+    for a, b in _runs((invalid | beyond).any(axis=1)):
+        if ms[b] - ms[a] >= longest_ms:
+            yield x[a : b + 1], beyond[a : b + 1]
