@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, DatasetError
+from plushsense.core.gestures import GestureSet
 from plushsense.core.recfile import Frames
 from plushsense.dataset.store import Dataset, RecordingInfo
 from plushsense.live.decide import DecideSpec
@@ -173,9 +174,19 @@ def _answers(labelled: Labelled, spec: DecideSpec, coverage: float, known_share:
     }
 
 
-def streams_heard(bundle: Bundle, dataset: Dataset, subjects: Iterable[str], spec: DecideSpec) -> list[Heard]:
+def streams_heard(
+    bundle: Bundle,
+    dataset: Dataset,
+    subjects: Iterable[str],
+    spec: DecideSpec,
+    gestures: GestureSet | None = None,
+) -> list[Heard]:
     """The streams of some people as the network hears them, with what was marked in them; without those in which
-    nothing is. Of more than an hour, people get an equal share."""
+    nothing is. Of more than an hour, people get an equal share.
+
+    Args:
+        gestures: those whose indices the truths are; the network's own when left out.
+    """
     people = set(subjects)
     marked: dict[str, list[RecordingInfo]] = {}
     for r in dataset.recordings:
@@ -189,7 +200,7 @@ def streams_heard(bundle: Bundle, dataset: Dataset, subjects: Iterable[str], spe
         frames = dataset.read_stream(stream.id)
         frames = frames.slice(0, min(len(frames), left[stream.subject]))
         left[stream.subject] -= len(frames)
-        truths = truths_of(frames, marked[stream.id], bundle, dataset)
+        truths = truths_of(frames, marked[stream.id], gestures or bundle.gestures, dataset.layout.period_us)
         if any(t.gesture != OTHER for t in truths):
             out.append(Heard(stream.subject, trace_of(frames, bundle, spec.health), truths))
     return out
@@ -202,17 +213,16 @@ def stream_times_us(frames: Frames, period_us: int) -> Ints:
 
 
 def truths_of(
-    frames: Frames, recordings: Sequence[RecordingInfo], bundle: Bundle, dataset: Dataset
+    frames: Frames, recordings: Sequence[RecordingInfo], gestures: GestureSet, period_us: int
 ) -> tuple[Truth, ...]:
-    """What was marked in a stream, in order of time; excluded recordings, and gestures that the network does not
-    know, are `OTHER`."""
-    times = stream_times_us(frames, dataset.layout.period_us)
+    """What was marked in a stream, in order of time; excluded recordings, and other gestures, are `OTHER`."""
+    times = stream_times_us(frames, period_us)
     out = []
     for r in recordings:
         first, last = r.stream_row + r.start, r.stream_row + r.stop
         if last <= len(times) and first < last:
-            known = not r.excluded and r.gesture in bundle.gestures.labels
-            gesture = bundle.gestures.index(r.gesture) if known else OTHER
+            known = not r.excluded and r.gesture in gestures.labels
+            gesture = gestures.index(r.gesture) if known else OTHER
             out.append(Truth(int(times[first]), int(times[last - 1]), gesture))
     return tuple(sorted(out, key=lambda t: t.start_us))
 

@@ -85,7 +85,7 @@ def decided(decision: Mapping[str, Any]) -> list[str]:
         return []
     people = "1 person" if fitted["people"] == 1 else f"{fitted['people']} people"
     events, answers = fitted["events"], fitted.get("answers")
-    said = f"Decisions fitted on {people} who were held back"
+    said = f"Decisions fitted on {people} who {'was' if fitted['people'] == 1 else 'were'} held back"
     if "cost" in events:
         said += (
             f" ({fitted['gestures']} gestures in {60 * fitted['hours']:.0f} min of streams): an event's cost "
@@ -95,9 +95,7 @@ def decided(decision: Mapping[str, Any]) -> list[str]:
         said += "; no stream of theirs, so events keep the defaults"
     out = [said + "."]
     if answers:
-        line = (
-            f"Sets of {answers['classes_in_set']:.1f} classes hold the true one in {100 * answers['coverage']:g} %"
-        )
+        line = f"Sets of {answers['classes_in_set']:.1f} classes hold the true one in {100 * answers['coverage']:g} %"
         if answers["coverage_left_out"] is not None:
             line += f" (person by person, with the others' threshold: {100 * answers['coverage_left_out']:.1f} %)"
         out.append(line + f" of the {answers['on']}.")
