@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.gestures import GestureSet, plain_label
+from plushsense.core.gestures import GestureSet
 from plushsense.dataset.store import Dataset, RecordingInfo
 from plushsense.windows.clock import Segment, resample
 from plushsense.windows.cut import recordings_in_time
@@ -50,8 +50,8 @@ class Material:
 def material_of(dataset: Dataset, gestures: GestureSet, subjects: Collection[str]) -> Material:
     """The streams of ``subjects``, and their recordings that lie in no stream.
 
-    Energetic is what the data set's own gestures or ``gestures`` call so. Free choice, labels of no gesture,
-    excluded recordings and those that nobody stopped in time are nobody's guess: left out.
+    What is energetic ``gestures`` say. Free choice, labels that are not among them, excluded recordings and those
+    that nobody stopped in time are left out: nobody knows what they hold.
     """
     layout = dataset.layout
     people = set(subjects)
@@ -62,7 +62,7 @@ def material_of(dataset: Dataset, gestures: GestureSet, subjects: Collection[str
     stretches: list[Stretch] = []
 
     def kind(r: RecordingInfo) -> int:
-        found = gestures.find(r.gesture) or dataset.gestures.find(r.gesture)
+        found = gestures.find(r.gesture)
         if r.id not in in_time or found is None or found.free_choice:
             return LEFT_OUT
         if found.energetic:
@@ -103,8 +103,3 @@ def material_of(dataset: Dataset, gestures: GestureSet, subjects: Collection[str
             frames = dataset.read(r)
             add(r.subject, resample(frames, layout), [(0, len(frames), r)], LEFT_OUT)
     return Material(tuple(stretches), tuple(trials), tuple(calm), layout.rate_hz)
-
-
-def energetic_labels(dataset: Dataset, gestures: GestureSet) -> set[str]:
-    """Plain labels of all that is energetic, in the classes or in the data set."""
-    return {plain_label(g.label) for s in (gestures, dataset.gestures) for g in s.gestures if g.energetic}

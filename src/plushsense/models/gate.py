@@ -137,10 +137,10 @@ class Gate:
     def __init__(self, plan: GatePlan) -> None:
         self.plan = plan
         self._longest = max((s.lag for s in plan.signals if s.kind == JERK), default=1)
-        self._signals = [
-            (at, s.inputs[0] if s.kind == LEVEL else -1, s.inputs, s.lag, s.shift, s.baseline, s.noise, s.floor)
-            for at, s in enumerate(plan.signals)
-        ]
+        self._signals = []
+        for at, s in enumerate(plan.signals):
+            several, lag = s.inputs if len(s.inputs) > 1 else (), s.lag if s.kind == JERK else 0
+            self._signals.append((at, s.inputs[0], several, lag, s.shift, s.baseline, s.noise, s.floor))
         self._rules = [
             (at, [(t.signal, t.threshold, t.sign, t.times) for t in rule.terms], rule.within + 1)
             for at, rule in enumerate(plan.rules)
@@ -185,17 +185,25 @@ class Gate:
         return fired
 
     def _follow(self, now: list[int]) -> None:
+        # Written out, and the usual case first: this runs for every sample of every toy.
         past, baseline, noise = self._past, self._baseline, self._noise
-        for at, single, several, lag, shift, slow, slower, floor in self._signals:
-            if single >= 0:
-                value = _held(now[single] >> shift)
-            elif len(past) >= lag:
-                before, value = past[-lag], 0
-                for i in several:
-                    value += abs(_held(now[i] >> shift) - _held(before[i] >> shift))
-                value = min(value, HELD)
-            else:
+        for at, one, several, lag, shift, slow, slower, floor in self._signals:
+            if lag == 0:
+                value = now[one] >> shift
+                if not -HELD <= value <= HELD:
+                    value = _held(value)
+            elif len(past) < lag:
                 value = 0
+            else:
+                before, value = past[-lag], 0
+                for i in several or (one,):
+                    a, b = now[i] >> shift, before[i] >> shift
+                    if -HELD <= a <= HELD and -HELD <= b <= HELD:
+                        value += a - b if a > b else b - a
+                    else:
+                        value += abs(_held(a) - _held(b))
+                if value > HELD:
+                    value = HELD
             high = value << EXTRA_BITS
             if not past:
                 baseline[at] = high
@@ -206,8 +214,9 @@ class Gate:
             self.deviations[at] = deviation
             self.sizes[at] = (size << THRESHOLD_BITS) // level
             baseline[at] = base + ((high - base) >> slow)
-            most = NOISE_CLIP * level
-            noise[at] += (((size if size < most else most) << EXTRA_BITS) - noise[at]) >> slower
+            if size > NOISE_CLIP * level:
+                size = NOISE_CLIP * level
+            noise[at] += ((size << EXTRA_BITS) - noise[at]) >> slower
 
     def _judge(self) -> int:
         sizes, deviations, fired = self.sizes, self.deviations, -1
