@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+
 import plushsense as ps
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.dataset.importers import import_recordings
@@ -32,7 +33,7 @@ def test_train_fits_decisions_on_those_who_validate(cli: Cli, dataset: Dataset, 
     # Who they are stands in the provenance alone, which an export takes out.
     assert not any(f'"{code}"' in json.dumps(bundle.decision) for code in dataset.subjects)
     ran = cli("train", dataset.path, *SMALL, "--out", tmp_path / "plain.plush", "--no-fit-decisions")
-    assert ps.load(tmp_path / "plain.plush").decision == DecideSpec().to_dict()
+    assert ps.load(tmp_path / "plain.plush").decision["fitted"] == {}
     assert "Decisions fitted" not in ran.out
 
 
@@ -48,7 +49,7 @@ def test_given_settings_stay_and_train_says_what_it_did(cli: Cli, dataset: Datas
 def test_where_nobody_is_held_back_the_defaults_stay_and_train_says_so(dataset: Dataset) -> None:
     said: list[str] = []
     trained = ps.train(dataset, preset="search", epochs=1, filters=(4, 4, 4), warn=said.append)
-    assert trained.bundle.decision == DecideSpec().to_dict()
+    assert DecideSpec.from_dict(trained.bundle.decision) == DecideSpec()
     assert any("decision settings are the defaults" in line for line in said)
 
 

@@ -37,7 +37,10 @@ def told(fold, withheld, rows, covered=(0.8,), known=1.0):
 
 
 FIRST = told(
-    "1", "", [("a", "P1", "a", 4.0), ("b", "P1", "c", 1.0), ("c", "P1", "c", 3.0), ("other", "P1", "c", 2.0)], (0.7, 0.9)
+    "1",
+    "",
+    [("a", "P1", "a", 4.0), ("b", "P1", "c", 1.0), ("c", "P1", "c", 3.0), ("other", "P1", "c", 2.0)],
+    (0.7, 0.9),
 )
 SECOND = told("2", "", [("a", "P2", "a", 5.0), ("b", "P2", "a", 2.0)], (1.0,))
 
@@ -62,7 +65,12 @@ def test_known_answers_make_the_curve_and_what_was_never_to_be_known_is_held_aga
 
 
 def test_a_withheld_gesture_is_held_against_those_the_network_knows():
-    without_c = told("1", "c", [("a", "P1", "a", 4.0), ("b", "P1", "b", 2.0), ("c", "P1", "a", 3.0), ("x", "P1", "a", 9.0)], known=3.5)
+    without_c = told(
+        "1",
+        "c",
+        [("a", "P1", "a", 4.0), ("b", "P1", "b", 2.0), ("c", "P1", "a", 3.0), ("x", "P1", "a", 9.0)],
+        known=3.5,
+    )
     again = told("2", "c", [("a", "P2", "a", 4.0), ("c", "P2", "b", 3.0)], known=3.5)
     without_a = told("1", "a", [("a", "P1", "b", 1.0), ("b", "P1", "b", 2.0)], known=None)
     table = summarise([FIRST, SECOND, without_c, again, without_a], 0.9, 0.95).to_dict()

@@ -142,11 +142,11 @@ def abstaining(
         "training": placed(config.training).key(),
         "shares": [coverage, known_share],
     }
-    left = ["", *(g for g in gestures.labels if withhold and len(gestures) > 2)]
+    # Fold by fold, so that a run that is stopped has heard of every gesture.
+    without = [(fold, label) for fold in folds for label in gestures.labels if withhold and len(gestures) > 2]
     jobs = [
         Job(job_id({**key, "fold": fold_print(fold), "withheld": label}), (fold, label))
-        for label in left
-        for fold in folds
+        for fold, label in [*((fold, "") for fold in folds), *without]
     ]
     done = resumed = 0
 

@@ -93,7 +93,11 @@ def lines(found: dict[str, Any]) -> list[str]:
         out += ["", "gestures that the network was never meant to know (free choice and the rarer ones):"]
         out += _unknown({"": found["free_choice"]})
     if found["withheld"]:
-        out += ["", "each gesture withheld from the training (AUROC against the known ones, over folds):", *_unknown(found["withheld"])]
+        out += [
+            "",
+            "each gesture withheld from the training (AUROC against the known ones, over folds):",
+            *_unknown(found["withheld"]),
+        ]
         mean = found["withheld_mean"]
         out.append("mean over gestures: " + ", ".join(f"{name} {_spread(s)}" for name, s in mean.items()))
     return out
