@@ -87,16 +87,16 @@ STROKE = Truth(10 * S, 12 * S, 1)
     [
         ([], 1.0),
         ([said(1, 10)], 0.0),
-        ([said(1, 11)], 0.1),
-        ([said(1, 12.9)], 0.29),
+        ([said(1, 11)], 0.2),
+        ([said(1, 12.9)], 0.58),
         ([said(1, 13.1)], 1.25),  # too late to be its own: missed, and one of which nobody knows
-        ([said(1, 10, named_s=11)], 0.1),
-        ([said(NO_GESTURE, 11)], 0.35),
+        ([said(1, 10, named_s=11)], 0.2),
+        ([said(NO_GESTURE, 11)], 0.45),
         ([said(NO_GESTURE, 11, affect=NEGATIVE)], 2.0),
         ([said(2, 10)], 0.3),
         ([said(3, 10)], 0.5),
         ([said(4, 10, affect=NEGATIVE)], 2.0),
-        ([said(4, 10, affect=NEGATIVE), said(1, 11)], 0.1 + 0.1 + 1.0),
+        ([said(4, 10, affect=NEGATIVE), said(1, 11)], 0.2 + 0.1 + 1.0),
         ([said(1, 10), said(1, 11)], 0.0 + 0.1),
         ([said(1, 9.8)], 0.0),
         ([said(1, 5, 11.5)], 0.0 + 0.25),  # it went on from before: right, though it began where nobody knows

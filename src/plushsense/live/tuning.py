@@ -54,7 +54,7 @@ class Costs:
     """
 
     missed: float = 1.0
-    late_s: float = 0.1
+    late_s: float = 0.2
     unnamed: float = 0.25
     family: float = 0.3
     same: float = 0.5
