@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 COMMAND = [sys.executable, "-m", "plushsense.apps.cli.main"]
-KEYS = ["t_s", "gesture", "affect", "confidence", "source", "state"]
+KEYS = ["t_s", "gesture", "affect", "confidence", "source", "state", "answer", "events"]
 
 
 @pytest.fixture(scope="module")
@@ -94,8 +94,10 @@ def test_from_a_real_stream(bundle: Path, real_data: Path) -> None:
     assert summary["restarts"] == 2, "the device clock of this session was reset twice"
     assert abs(summary["decisions_per_s"] - 20) < 0.1
     states = [d["state"] for d in decisions]
-    again = [pair for pair in pairwise(states) if pair == ("tracking", "warming")]
-    assert len(again) == 2, "after each restart it is warming again"
+    for pair in (("tracking", "no signal"), ("no signal", "warming")):
+        assert list(pairwise(states[:-1])).count(pair) == 2, (
+            "at each restart the signal is lost, then it is warming again"
+        )
 
 
 def test_the_default_layout_is_the_bundles(bundle: Path) -> None:
@@ -123,3 +125,47 @@ def test_a_bundle_of_before_says_what_to_do(plush_bundle: Path) -> None:
     done = subprocess.run([*COMMAND, *words], capture_output=True, text=True, check=False, timeout=60)
     assert done.returncode == 2
     assert "no calibration" in done.stderr and "Traceback" not in done.stderr
+
+
+def spoilt(tmp_path: Path) -> str:
+    """A replay of a stream with a gap of 10 s and a sensor that sends garbage for a second."""
+    from plushsense.core.recfile import Frames, write_recording
+    from plushsense.core.signal import load_layout
+
+    draw = np.random.default_rng(0)
+    times = 1000 + 10 * np.arange(2000)
+    times[1500:] += 10_000
+    values = draw.integers(0, 500, (2000, 13))
+    values[800:900, 3] = -30_000
+    path = tmp_path / "tap_1700000000000_2000.csv"
+    write_recording(path, Frames(values, times, times + 1_700_000_000_000), load_layout("plush-15"))
+    return f"replay://{path.as_posix()}?speed=0"
+
+
+def test_events_only_and_text_for_people(plush_bundle: Path, tmp_path: Path) -> None:
+    words = ("--device", spoilt(tmp_path), "--model", str(plush_bundle))
+    every, summary = live(*words)
+    assert (summary["faults"], summary["no_signal"]) == (1, 2), "the gap, and the end of the file within an event"
+    few, _ = live(*words, "--events")
+    state, wanted = None, []
+    for line in every:
+        if line["events"] or line["state"] != state:
+            wanted.append(line)
+        state = line["state"]
+    assert few == wanted and len(few) < len(every) / 2
+    done = subprocess.run(
+        [*COMMAND, "live", *words, "--text"], capture_output=True, text=True, check=False, timeout=120
+    )
+    text = done.stdout.splitlines()
+    assert len([t for t in text if "no signal" in t]) == 2
+    assert len([t for t in text if "sensor fault" in t]) == 1
+    begun = [e for line in every for e in line["events"] if e["what"] == "begun"]
+    ended = [e for line in every for e in line["events"] if e["what"] == "ended"]
+    assert summary["events"] == len(begun) == len(ended) > 0
+    assert len([t for t in text if "end of" in t]) == len(ended)
+    first = begun[0]
+    assert any(f"{first['t_s']:9.2f} s  1 {first['affect']}" in t for t in text)
+    both = subprocess.run(
+        [*COMMAND, "live", *words, "--text", "--events"], capture_output=True, text=True, check=False, timeout=60
+    )
+    assert both.returncode == 2 and "Traceback" not in both.stderr

@@ -2,29 +2,18 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from plushsense.core.gestures import Gesture, GestureSet
 from plushsense.core.recfile import Frames
 from plushsense.core.signal import load_layout
-from plushsense.models.arch import Arch
-from plushsense.models.bundle import Bundle
-from plushsense.models.reference import random_weights
-from plushsense.windows.features import Scaler
 
-GESTURES = GestureSet(
-    "four",
-    (Gesture("tap", "positive"), Gesture("hold", "neutral"), Gesture("hit", "negative"), Gesture("other")),
-)
+sys.path.insert(0, str(Path(__file__).parent))
 
-
-def make_bundle(padding: str = "stream", layout: str = "accel-3", **decision) -> Bundle:
-    """A model with weights of no meaning; the step is not a divisor of the span."""
-    chosen = load_layout(layout)
-    arch = Arch.parse("5d1_4d3", (6, 5), channels=chosen.n_inputs, classes=4, padding=padding, window=48, step=5)
-    scaler = Scaler(np.linspace(-50, 60, chosen.n_inputs), np.linspace(0.01, 0.02, chosen.n_inputs))
-    return Bundle(arch, random_weights(arch, 3), chosen, scaler, GESTURES, decision=decision)
+from troubles import make_bundle
 
 
 def make_frames(layout: str = "accel-3", seed: int = 0) -> Frames:

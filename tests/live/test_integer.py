@@ -55,8 +55,8 @@ def of_live(model: IntegerModel, frames: list[Frame]) -> np.ndarray:
         if row and frame.device_ms < frames[row - 1].device_ms:
             zero += (frame.device_ms - frames[row - 1].device_ms) - model.layout.period_us / 1000
         for d in classifier.push(frame):
-            if d.state == "warming" and d.events:
-                continue  # an event that ended with the signal, between two steps
+            if d.state == "no signal":
+                continue  # said between two steps
             at_ms = d.t_s * 1000 + zero
             assert abs(at_ms * 1000 - round(at_ms * 1000)) < 1e-3, "times are whole microseconds"
             known = d.state == "tracking"

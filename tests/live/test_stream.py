@@ -24,9 +24,9 @@ def played(frames):
 
 
 def decisions(classifier, frames):
-    """Those of the steps: an event that ends with the signal is said between them."""
+    """Those of the steps: that the signal was lost is said between them."""
     every = [decision for frame in played(frames) for decision in classifier.push(frame)]
-    return [d for d in every if not (d.state == "warming" and d.events)]
+    return [d for d in every if d.state != "no signal"]
 
 
 def expected(bundle, frames):

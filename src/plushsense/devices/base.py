@@ -90,6 +90,10 @@ class Device(ABC):
         url: as it was opened.
         layout: of the frames.
         counters: live.
+        wait_s: for how long `read` waits at most; 0 looks only whether something is there, as for many toys in turn.
+        arrived_s: when the bytes of the last frames were there, before they were parsed, on `time.perf_counter`'s
+            clock; of a source that keeps time itself (a replay, a virtual toy), when the first of them was due. None
+            where nothing was told.
     """
 
     def __init__(self, url: str, layout: Layout) -> None:
@@ -97,10 +101,12 @@ class Device(ABC):
         self.layout = layout
         self.counters = Counters()
         self.closed = False
+        self.wait_s = 0.1
+        self.arrived_s: float | None = None
 
     @abstractmethod
     def read(self) -> list[Frame] | None:
-        """The frames that arrived since the last call, waiting at most about 0.1 s; None at the end.
+        """The frames that arrived since the last call, waiting at most about ``wait_s``; None at the end.
 
         Raises:
             DeviceError: when the toy went away.

@@ -7,6 +7,7 @@ import contextlib
 import queue
 import re
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
@@ -95,7 +96,7 @@ class BleDevice(Device):
         self._target = target
         self._backends = backends or Backends()
         self._parser = LineParser(layout, self.counters, joining=True)
-        self._heard: queue.SimpleQueue[tuple[int, bytes] | None] = queue.SimpleQueue()
+        self._heard: queue.SimpleQueue[tuple[float, int, bytes] | None] = queue.SimpleQueue()
         self._over: asyncio.Event | None = None
         self._loop = bluetooth_loop()
         opened: Future[None] = Future()
@@ -107,12 +108,12 @@ class BleDevice(Device):
             raise
 
     def read(self) -> list[Frame] | None:
-        """What has arrived, waiting at most 0.1 s."""
+        """What has arrived, waiting at most ``wait_s``."""
         frames: list[Frame] = []
         wait = True
         while not self.closed:
             try:
-                heard = self._heard.get(timeout=0.1) if wait else self._heard.get_nowait()
+                heard = self._heard.get(timeout=self.wait_s) if wait else self._heard.get_nowait()
             except queue.Empty:
                 return frames
             if heard is None:
@@ -123,10 +124,15 @@ class BleDevice(Device):
                     return frames
                 self._parser.finish()
                 raise DeviceError(f"'{self.url}' went away (disconnected): was it switched off or out of reach?")
-            host, data = heard
+            at, host, data = heard
+            if wait:
+                self.arrived_s = at
             frames += [Frame(host, line.device_ms, line.values) for line in self._parser.feed(data)]
             wait = False
         return None
+
+    def _hear(self, _: Any, data: bytearray) -> None:
+        self._heard.put((time.perf_counter(), now_ms(), bytes(data)))
 
     def _shut(self) -> None:
         self._loop.call_soon_threadsafe(self._end)
@@ -178,7 +184,7 @@ class BleDevice(Device):
             ) from None
         try:
             characteristic = self._characteristic(list(client.services))
-            await client.start_notify(characteristic, lambda _, data: self._heard.put((now_ms(), bytes(data))))
+            await client.start_notify(characteristic, self._hear)
             opened.set_result(None)
             await over.wait()
         finally:

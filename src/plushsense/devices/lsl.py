@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import threading
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -142,17 +143,18 @@ class LslDevice(Device):
         )
 
     def read(self) -> list[Frame] | None:
-        """What has arrived, waiting at most 0.1 s."""
+        """What has arrived, waiting at most ``wait_s``."""
         with self._lock:
             if self.closed:
                 return None
             try:
-                first, stamp = self._inlet.pull_sample(timeout=0.1)
+                first, stamp = self._inlet.pull_sample(timeout=self.wait_s)
                 if first is None:
                     return []
                 samples, stamps = self._inlet.pull_chunk(timeout=0.0, max_samples=512)
             except RuntimeError:
                 raise DeviceError(f"'{self.url}' went away: has its program ended, or is it out of reach?") from None
+        self.arrived_s = time.perf_counter()
         host = now_ms()
         frames = [
             frame

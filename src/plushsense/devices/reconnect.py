@@ -45,7 +45,7 @@ class ReconnectingDevice(Device):
     """Frames of a toy that is opened again, every 0.5 s, whenever it went away after it once was there.
 
     Counters go on over all connections; ``lost`` counts within each of them, and what a gap swallowed is in ``gaps``.
-    While the toy is away `read` returns no frames, each time after about 0.1 s.
+    While the toy is away `read` returns no frames, each time after about ``wait_s``.
 
     Args:
         url: for messages.
@@ -86,7 +86,7 @@ class ReconnectingDevice(Device):
         self._count()
 
     def read(self) -> list[Frame] | None:
-        """What has arrived, waiting at most about 0.1 s; an empty list while the toy is away.
+        """What has arrived, waiting at most about ``wait_s``; an empty list while the toy is away.
 
         Raises:
             DeviceError: when it did not come back within ``for_s``.
@@ -97,7 +97,9 @@ class ReconnectingDevice(Device):
         if inner is None:
             return self._wait()
         try:
+            inner.wait_s = self.wait_s
             frames = inner.read()
+            self.arrived_s = inner.arrived_s
         except DeviceError as cause:
             if self.closed:
                 return None
@@ -164,7 +166,7 @@ class ReconnectingDevice(Device):
                 found.close()
 
     def _wait(self) -> list[Frame] | None:
-        if not self._awake.wait(0.1):
+        if not self._awake.wait(self.wait_s):
             waited = time.monotonic() - self._waiting_since
             if self._for_s is not None and waited >= self._for_s:
                 self.close()

@@ -42,9 +42,9 @@ class ReplayDevice(Device):
         self._garbage = np.any((result.frames.values < low) | (result.frames.values > high), axis=1)
 
     def read(self) -> list[Frame] | None:
-        """The frames that are due, waiting at most about 0.1 s; None at the end of the file."""
+        """The frames that are due, waiting at most about ``wait_s``; None at the end of the file."""
         frames: list[Frame] = []
-        until = time.monotonic() + 0.1
+        until = time.monotonic() + self.wait_s
         while len(frames) < _BLOCK and not self.closed:
             if self._at >= len(self._frames):
                 return frames or None
@@ -60,6 +60,8 @@ class ReplayDevice(Device):
                     break
                 continue
             self._wait_s = None
+            if not frames:
+                self.arrived_s = time.perf_counter() + wait
             host = now_ms() if self._frames.host_ms is None else int(self._frames.host_ms[self._at])
             frames.append(Frame(host, device_ms, tuple(self._frames.values[self._at].tolist())))
             self.counters.frames += 1

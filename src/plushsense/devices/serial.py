@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+import time
 from pathlib import Path
 
 import serial as pyserial
@@ -45,15 +46,18 @@ class SerialDevice(Device):
         self._parser = LineParser(layout, self.counters, joining=True)
 
     def read(self) -> list[Frame] | None:
-        """What has arrived, waiting at most 0.1 s."""
+        """What has arrived, waiting at most 0.1 s, or not at all with a ``wait_s`` of 0."""
         try:
             waiting = self._port.in_waiting
+            if not waiting and self.wait_s <= 0.0:
+                return []
             data = self._port.read(max(1, min(waiting, 65536)))
         except _FAULTS as cause:  # pyserial also trips over its own closed port
             if self.closed:
                 return None
             self._parser.finish()
             raise DeviceError(f"'{self.url}' went away ({_reason(cause)}): was it unplugged or switched off?") from None
+        self.arrived_s = time.perf_counter()
         host = now_ms()
         return [Frame(host, line.device_ms, line.values) for line in self._parser.feed(data)]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import re
 import socket
+import time
 
 from plushsense.core.errors import DeviceError
 from plushsense.core.signal import Layout
@@ -35,13 +36,15 @@ class TcpDevice(Device):
             reason = "no answer" if silent else getattr(cause, "strerror", None) or cause
             raise DeviceError(f"'{url}' cannot be reached: {reason}.") from None
         _notice_silence(self._socket)
-        self._socket.settimeout(0.1)
         self._parser = LineParser(layout, self.counters)
 
     def read(self) -> list[Frame] | None:
-        """What has arrived, waiting at most 0.1 s; None when the other side closed in order."""
+        """What has arrived, waiting at most ``wait_s``; None when the other side closed in order."""
         try:
+            self._socket.settimeout(self.wait_s)
             data = self._socket.recv(65536)
+        except BlockingIOError:
+            return []
         except OSError as cause:
             if self.closed:
                 return None
@@ -49,6 +52,7 @@ class TcpDevice(Device):
                 return []
             self._parser.finish()
             raise DeviceError(f"'{self.url}' went away: {cause.strerror or cause}.") from None
+        self.arrived_s = time.perf_counter()
         if not data:
             self._parser.finish()
             return None

@@ -58,6 +58,11 @@ class BothEngines:
         return self.integer.faults
 
     @property
+    def in_event(self) -> bool:
+        """As of the deployed model."""
+        return self.integer.in_event
+
+    @property
     def time_s(self) -> float:
         """As of the deployed model."""
         return self.integer.time_s

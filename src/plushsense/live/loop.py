@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from plushsense.core.errors import ConfigError
-from plushsense.devices.base import Device
+from plushsense.devices.base import Device, Frame
 from plushsense.live.integer import BothEngines
 from plushsense.live.stream import Decision, StreamReader, check_layout
 
 _KEPT = 72_000  # latencies kept: the last hour at 20 decisions a second
+SILENCE_S = 0.75
+"""Host time after which a device that sends no frame has no signal; wireless links stall for shorter."""
 
 
 @dataclass(frozen=True)
@@ -29,8 +32,12 @@ class Summary:
         restarts: gaps and clock resets after which everything began again.
         invalid: values outside their valid range.
         counters: of the device (frames, lost, malformed, garbage, reconnects).
-        latency_ms: p50 and p95 of the time from the device handing a frame over to its decision, over the
-            last hour; a replay that does not wait hands over hundreds at once, and they stand in a queue.
+        latency_ms: p50, p95 and p99 of the time from the arrival of the bytes, before they are parsed, to the decision,
+            over the last hour; a replay that does not wait hands over hundreds at once, and they stand in a queue.
+        late: decisions that came more than a step after the bytes.
+        events: how many began.
+        no_signal: how often nothing was heard, or the clock had a gap or was reset.
+        faults: how often sensors could not be believed.
     """
 
     decisions: int
@@ -42,6 +49,10 @@ class Summary:
     invalid: int
     counters: dict[str, int]
     latency_ms: dict[str, float | None]
+    late: int = 0
+    events: int = 0
+    no_signal: int = 0
+    faults: int = 0
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, ready for JSON."""
@@ -55,62 +66,106 @@ class Summary:
             "invalid": self.invalid,
             "counters": dict(self.counters),
             "latency_ms": dict(self.latency_ms),
+            "late": self.late,
+            "events": self.events,
+            "no_signal": self.no_signal,
+            "faults": self.faults,
         }
 
 
 class Run(Iterator[Decision]):
-    """A live run: iterate for decisions; `summary` tells at any time how it went."""
+    """A live run: iterate for decisions; `summary` tells at any time how it went.
 
-    def __init__(self, device: Device, classifier: StreamReader | BothEngines, seconds: float | None) -> None:
+    A device that sends no frame for ``silence_s`` gives one decision of the state ``no signal``, and its event ends; so
+    does an event that is going on when the device ends.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        classifier: StreamReader | BothEngines,
+        seconds: float | None,
+        silence_s: float = SILENCE_S,
+    ) -> None:
         self.device = device
         self.classifier = classifier
-        self._seconds = seconds
-        self._begun = time.perf_counter()
-        self._decisions = self._warming = 0
+        self._seconds, self._silence_s = seconds, silence_s
+        self._begun = self._heard = time.perf_counter()
+        self._silent = False
+        self._decisions = self._warming = self._late = self._events = self._no_signal = 0
         self._latencies: list[float] = []
-        self._flow = self._decide()
+        self._due: deque[Decision] = deque()
+        self.over = False
 
     def __iter__(self) -> Run:
         return self
 
     def __next__(self) -> Decision:
-        return next(self._flow)
+        while not self._due:
+            if self.over:
+                raise StopIteration
+            self._due.extend(self.poll())
+        return self._due.popleft()
 
-    def _decide(self) -> Iterator[Decision]:
-        limit = self._seconds
-        heard = time.perf_counter()
-        while not self.device.closed:
-            frames = self.device.read()
-            if frames is None:
-                return
-            arrived = time.perf_counter()
-            if not frames and limit is not None and arrived - heard >= limit:
-                return
-            heard = arrived if frames else heard
-            for frame in frames:
-                decisions = self.classifier.push(frame)
-                if limit is not None and self.classifier.time_s >= limit:
-                    return
-                for decision in decisions:
-                    self._note(decision, time.perf_counter() - arrived)
-                    yield decision
+    def poll(self) -> list[Decision]:
+        """Read the device once, and decide; `over` says whether that was the end. For many runs in turn."""
+        frames = None if self.device.closed else self.device.read()
+        now = time.perf_counter()
+        if frames is None:
+            self.over = True
+            return [self._noted(self.classifier.silence())] if self.classifier.in_event else []
+        if not frames:
+            return self._hear_nothing(now)
+        arrived = self.device.arrived_s
+        arrived = now if arrived is None else arrived
+        decided = self._read(frames, arrived)
+        # Only now: what the reading of frames takes is not the toy's silence.
+        self._heard, self._silent = time.perf_counter(), False
+        return decided
 
-    def _note(self, decision: Decision, latency_s: float) -> None:
+    def _hear_nothing(self, now: float) -> list[Decision]:
+        quiet = now - self._heard
+        if self._seconds is not None and quiet >= self._seconds:
+            self.over = True
+        if self._silent or quiet < self._silence_s:
+            return []
+        self._silent = True
+        return [self._noted(self.classifier.silence())]
+
+    def _read(self, frames: list[Frame], arrived: float) -> list[Decision]:
+        decided: list[Decision] = []
+        for frame in frames:
+            decisions = self.classifier.push(frame)
+            if self._seconds is not None and self.classifier.time_s >= self._seconds:
+                self.over = True
+                break
+            for decision in decisions:
+                self._note_latency(time.perf_counter() - arrived)
+                decided.append(self._noted(decision))
+        return decided
+
+    def _noted(self, decision: Decision) -> Decision:
         self._decisions += 1
         self._warming += decision.state == "warming"
+        self._no_signal += decision.state == "no signal"
+        self._events += sum(event.what == "begun" for event in decision.events)
+        return decision
+
+    def _note_latency(self, latency_s: float) -> None:
+        self._late += latency_s > self.classifier.step_s
         if len(self._latencies) < _KEPT:
             self._latencies.append(latency_s)
         else:
             self._latencies[self._decisions % _KEPT] = latency_s
 
+    @property
+    def latencies_s(self) -> list[float]:
+        """From bytes to decision, of the last hour, in no order."""
+        return list(self._latencies)
+
     def summary(self) -> Summary:
         """How it went so far."""
         seconds = self.classifier.time_s
-        p50, p95 = (
-            (round(float(v) * 1000.0, 3) for v in np.percentile(self._latencies, (50, 95)))
-            if self._latencies
-            else (None, None)
-        )
         return Summary(
             self._decisions,
             self._warming,
@@ -120,11 +175,29 @@ class Run(Iterator[Decision]):
             self.classifier.restarts,
             self.classifier.invalid,
             self.device.counters.to_dict(),
-            {"p50": p50, "p95": p95},
+            percentiles_ms(self._latencies),
+            self._late,
+            self._events,
+            self._no_signal,
+            self.classifier.faults,
         )
 
 
-def run(device: Device, classifier: StreamReader | BothEngines, *, seconds: float | None = None) -> Run:
+def percentiles_ms(latencies_s: Sequence[float]) -> dict[str, float | None]:
+    """p50, p95 and p99 in milliseconds; None where there is nothing."""
+    if not latencies_s:
+        return {"p50": None, "p95": None, "p99": None}
+    p50, p95, p99 = (round(float(v) * 1000.0, 3) for v in np.percentile(latencies_s, (50, 95, 99)))
+    return {"p50": p50, "p95": p95, "p99": p99}
+
+
+def run(
+    device: Device,
+    classifier: StreamReader | BothEngines,
+    *,
+    seconds: float | None = None,
+    silence_s: float = SILENCE_S,
+) -> Run:
     """Run a model on an open device.
 
     Args:
@@ -132,6 +205,7 @@ def run(device: Device, classifier: StreamReader | BothEngines, *, seconds: floa
         classifier: it begins a new stream.
         seconds: stop after so much device time (so that a replay at any speed ends at the same place), or
             when the device has said nothing for so long; None runs until the device ends.
+        silence_s: host time without a frame after which there is no signal.
 
     Raises:
         ConfigError: when the device's channels are not those of the model, or ``seconds`` is not positive.
@@ -141,4 +215,4 @@ def run(device: Device, classifier: StreamReader | BothEngines, *, seconds: floa
         raise ConfigError(f"seconds is {seconds!r}; give a positive duration, or leave it out to run until the end.")
     check_layout(device.layout, classifier.layout)
     classifier.reset()
-    return Run(device, classifier, seconds)
+    return Run(device, classifier, seconds, silence_s)

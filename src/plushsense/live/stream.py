@@ -125,8 +125,9 @@ class StreamReader(ABC):
     """Reads the frames of one toy: health, clock, derived channels, gate, events here; the network is the subclass's.
 
     Decisions come every ``step`` even samples, counted so that the first answer falls on the sample that
-    fills the span; between them when the gate fires, when an event ends with the signal, and when sensors fail. After
-    a gap beyond the layout's ``gap_ms``, a reset of the device clock or a sensor fault everything restarts.
+    fills the span; between them when the gate fires, when the signal was lost, and when sensors fail. After a gap
+    beyond the layout's ``gap_ms`` or a reset of the device clock (``no signal``, said with the first frame after it,
+    at the time of the last one before) and after a sensor fault everything restarts. In a fault nothing is decided.
     """
 
     def __init__(self, arch: Arch, layout: Layout, gestures: GestureSet, rules: Rules, smoothing: int) -> None:
@@ -155,6 +156,11 @@ class StreamReader(ABC):
         return self._health.faults
 
     @property
+    def in_event(self) -> bool:
+        """Whether an event is going on."""
+        return self._machine.open
+
+    @property
     def time_s(self) -> float:
         """Device time of the newest frame, in seconds since the stream's first."""
         return 0.0 if self._zero_us is None else (self._seen_us - self._zero_us) / 1e6
@@ -166,6 +172,7 @@ class StreamReader(ABC):
         self._machine.reset()
         self._zero_us: int | None = None
         self._seen_us = 0
+        self._silent = False
         self._restart()
 
     def _restart(self) -> None:
@@ -176,6 +183,7 @@ class StreamReader(ABC):
 
     def silence(self) -> Decision:
         """Nothing was heard for a while: what was going on ends. The next frame goes on, or restarts after a gap."""
+        self._silent = True
         return self._gone("no signal", self._machine.lost(self._seen_us - (self._zero_us or 0)))
 
     def push(self, frame: Frame) -> list[Decision]:
@@ -186,9 +194,9 @@ class StreamReader(ABC):
         gap_us = device_us - self._seen_us
         if self._zero_us is not None and (gap_us < 0 or gap_us > self.layout.gap_ms * 1000):
             # Also in a fault, when the clock sees no frames.
-            ended = self._machine.lost(self._seen_us - (self._zero_us or 0))
-            if ended:
-                due.append(self._gone("warming", ended))
+            ended = self._machine.lost(self._seen_us - self._zero_us)
+            if not (self._health.fault or self._silent):
+                due.append(self._gone("no signal", ended))
             self._health.clear()
         if self._zero_us is None:
             self._zero_us = device_us
@@ -201,10 +209,13 @@ class StreamReader(ABC):
         if health:
             clock.forget()
             self._restart()
+        silent, self._silent = self._silent, False
         if self._health.fault:
+            if silent and not due:
+                due.append(self._gone("sensor fault", []))  # it goes on
             return due
         suspect = self._health.suspect
-        samples = clock.push(frame.device_ms, frame.values)
+        samples = clock.rows(frame.device_ms, frame.values)
         if clock.restarted:
             self._restart()
         for later, sample in zip(range(len(samples) - 1, -1, -1), samples, strict=True):

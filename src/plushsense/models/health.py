@@ -75,11 +75,12 @@ class Health:
     def __init__(self, plan: HealthPlan, layout: Layout) -> None:
         self.plan = plan
         self._valid = [(int(a), int(b)) for a, b in zip(layout.valid_min_int, layout.valid_max_int, strict=True)]
-        self._usual = list(zip(plan.low, plan.high, strict=True)) or [_INT32] * len(self._valid)
-        if len(self._usual) != len(self._valid):
+        usual = list(zip(plan.low, plan.high, strict=True)) or self._valid
+        if len(usual) != len(self._valid):
             raise BundleError(
-                f"The health limits are of {len(self._usual)} channels, the layout has {len(self._valid)}: train again."
+                f"The health limits are of {len(usual)} channels, the layout has {len(self._valid)}: train again."
             )
+        self._inside = [(max(a, c), min(b, d)) for (a, b), (c, d) in zip(self._valid, usual, strict=True)]
         self.reset()
 
     def reset(self) -> None:
@@ -100,22 +101,25 @@ class Health:
         """One frame at a time ``ms`` that does not run backwards (`clear` first): ``"fault"`` when a fault begins with
         it, ``"recovered"`` when one ends, else ``""``. `fault` and `suspect` say how things stand."""
         plan, last = self.plan, self._last
-        wrong = any(
-            not low <= value <= high or (last is not None and value == before and not least <= value <= most)
-            for value, before, (low, high), (least, most) in zip(
-                values, last or values, self._valid, self._usual, strict=True
-            )
-        )
+        wrong = False
+        for i, (value, (low, high)) in enumerate(zip(values, self._inside, strict=True)):
+            # Mostly this one comparison is all there is to do.
+            if not low <= value <= high and (
+                not self._valid[i][0] <= value <= self._valid[i][1] or (last is not None and value == last[i])
+            ):
+                wrong = True
+                break
         if not wrong:
             self._wrong = None
         elif self._wrong is None:
             self._wrong = ms
         broken = self._wrong is not None and plan.fault_ms > 0 and ms - self._wrong >= plan.fault_ms
-        still = last is not None and plan.still_ms > 0 and list(values) == last
+        now = list(values)
+        still = last is not None and plan.still_ms > 0 and now == last
         if not still:
             self._still = ms
         quiet = ms - (self._still if self._still is not None else ms)
-        self._last = list(values)
+        self._last = now
         self.suspect = wrong or (still and 2 * quiet >= plan.still_ms)
         if self.fault:
             if self.suspect:

@@ -87,6 +87,10 @@ class Clock:
         ``restarted`` then says whether the frame began a new segment: what remembers the past must be reset before it
         reads these samples.
         """
+        return [np.array(row, dtype=np.int64) for row in self.rows(device_ms, values)]
+
+    def rows(self, device_ms: int, values: Sequence[int]) -> list[list[int]]:
+        """`push` in plain integers: a live stream cannot afford array set-up a sample."""
         time = int(device_ms) * 1000
         self.restarted = self.breaks(device_ms)
         self._seen_us = time
@@ -94,8 +98,8 @@ class Clock:
             self.restarts += 1
             self._forget()
         held = self._held
-        for i, value in enumerate(values):
-            if self._low[i] <= value <= self._high[i]:
+        for i, (value, low, high) in enumerate(zip(values, self._low, self._high, strict=True)):
+            if low <= value <= high:
                 held[i] = int(value)
             else:
                 self.invalid += 1
@@ -104,7 +108,7 @@ class Clock:
             return []
         if self._last is None:
             self._start, self._made, self._last = time, 1, (time, now)
-            return [np.array(now, dtype=np.int64)]
+            return [now]
         before, old = self._last
         self._last = (time, now)
         made = []
@@ -113,12 +117,11 @@ class Clock:
             due = self._start + self._made * self._period
             while due <= time:
                 into = 2 * (due - before)
-                made.append(
-                    np.array(
-                        [a + ((b - a) * into + between) // (2 * between) for a, b in zip(old, now, strict=True)],
-                        dtype=np.int64,
-                    )
-                )
+                if into == 2 * between:
+                    made.append(now)  # the frame itself
+                else:
+                    twice = 2 * between
+                    made.append([a + ((b - a) * into + between) // twice for a, b in zip(old, now, strict=True)])
                 due += self._period
             self._made += len(made)
         return made

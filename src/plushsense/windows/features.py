@@ -58,10 +58,10 @@ class SampleInputs:
 
     def __call__(self, sample: Sequence[int] | NDArray[np.int64]) -> list[int]:
         """The F inputs of one sample (C,)."""
-        values = [int(v) for v in sample]
+        values = sample if type(sample) is list else [int(v) for v in sample]
         shift = 2 * MAGNITUDE_FRACTION_BITS
         return [
-            values[part] if isinstance(part, int) else math.isqrt(sum(values[i] ** 2 for i in part) << shift)
+            values[part] if isinstance(part, int) else math.isqrt(sum([values[i] ** 2 for i in part]) << shift)
             for part in self._plan
         ]
 

@@ -13,8 +13,15 @@ from plushsense.apps.cli.output import say
 if TYPE_CHECKING:
     from plushsense.live.decide import DecideSpec
     from plushsense.live.integer import BothEngines
-    from plushsense.live.stream import StreamReader
+    from plushsense.live.stream import Decision, Event, State, StreamReader
     from plushsense.models.bundle import Bundle
+
+STATES = {
+    "warming": "getting to know what goes on (only the gate answers yet)",
+    "tracking": "reading",
+    "no signal": "no signal",
+    "sensor fault": "sensor fault: what the sensors say cannot be believed",
+}
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -45,6 +52,13 @@ def add(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="time constant of the smoothing, seconds; 0: off (default: the bundle's)",
     )
+    shown = parser.add_mutually_exclusive_group()
+    shown.add_argument(
+        "--events",
+        action="store_true",
+        help="only the lines with an event, no signal, a fault, or that all is well again",
+    )
+    shown.add_argument("--text", action="store_true", help="the same as sentences for people, not JSON")
     parser.add_argument(
         "--reconnect", action="store_true", help="wait for a toy that goes away, and go on when it is back"
     )
@@ -69,8 +83,17 @@ def run(args: argparse.Namespace) -> int:
         )
         live = run_loop(device, classifier, seconds=args.seconds)
         try:
+            state: State | None = None
             for decision in live:
-                sys.stdout.write(json.dumps(decision.to_dict(), ensure_ascii=False) + "\n")
+                if args.text or args.events:
+                    news, state = decision.state != state, decision.state
+                    if not (news or decision.events):
+                        continue
+                if args.text:
+                    lines = told(decision, news)
+                else:
+                    lines = [json.dumps(decision.to_dict(), ensure_ascii=False)]
+                sys.stdout.write("".join(f"{line}\n" for line in lines))
                 sys.stdout.flush()
         except KeyboardInterrupt:
             pass
@@ -90,3 +113,20 @@ def classifier_of(bundle: Bundle, decide: DecideSpec | None, engine: str) -> Str
         return StreamClassifier(bundle, decide)
     integer = IntegerClassifier(integer_model(bundle, decide))
     return integer if engine == "int8" else BothEngines(integer, StreamClassifier(bundle, decide))
+
+
+def told(decision: Decision, news: bool) -> list[str]:
+    """Lines for people: the state when it is new, and what happened to events."""
+    lines = [f"{event.t_s:9.2f} s  {_event(event)}" for event in decision.events]
+    if news:
+        lines.append(f"{decision.t_s:9.2f} s  {STATES[decision.state]}")
+    return lines
+
+
+def _event(event: Event) -> str:
+    affect = "" if event.affect == "none" else event.affect
+    what = ": ".join(part for part in (affect, event.gesture) if part) or "something"
+    if event.what == "ended":
+        return f"  end of {event.number}, {what}"
+    by = " (gate)" if event.source == "gate" and event.what == "begun" else ""
+    return f"{event.number} {what}{by}" if event.what == "begun" else f"{event.number} it is {what}"

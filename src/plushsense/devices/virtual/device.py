@@ -56,8 +56,8 @@ class VirtualDevice(Device):
         return cue
 
     def read(self) -> list[Frame] | None:
-        """The frames that are due, waiting at most about 0.1 s; None after ``seconds``."""
-        until = time.monotonic() + 0.1
+        """The frames that are due, waiting at most about ``wait_s``; None after ``seconds``."""
+        until = time.monotonic() + self.wait_s
         data = bytearray()
         count = 0
         while count < _BLOCK and not self.closed:
@@ -81,6 +81,8 @@ class VirtualDevice(Device):
                     break
                 continue
             self._next = None
+            if not data:
+                self.arrived_s = time.perf_counter() + wait
             count += 1
             data += line.data
             if line.begins is not None:

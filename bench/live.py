@@ -1,0 +1,269 @@
+"""What a live step costs: bytes to event, beside `continual-inference` on the same network, and a hundred toys at once.
+
+    pip install continual-inference      (brings PyTorch; without it its rows are left out)
+    python bench/live.py [--bundle BUNDLE] [--rounds 15] [--toys 100 --seconds 30] [--json]
+
+1. Bytes to event: lines of the virtual toy through the wire parser, health, clock, derived channels, gate, network and
+   events, float and int8, one toy on one thread. A step's time goes from the bytes of its last frame to the decision.
+2. Against continual-inference, the PyTorch library of networks that keep their state: the same weights in both, checked
+   to give the same logits; five samples a step (it computes an answer at every sample, by `forward_step` and, in one
+   call, `forward_steps`), in turn, round by round; a ratio is taken within its round. It has no dilation in time: the
+   taps of a dilated layer are spread over a longer kernel, with zeros between, which costs it 2.8 times as many
+   multiply-accumulates for the default network. So a network without dilation stands beside it.
+3. Toys at 100 Hz in one process and one thread, in real time. A decision is late when it comes more than one step after
+   its frame was due. The virtual toys' own lines are computed in the same process.
+
+Without `--bundle` the weights are made up: costs hardly depend on them. What the virtual toy plays is a simulation.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import json
+import os
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from plushsense.core.gestures import load_gestures
+from plushsense.core.signal import Layout, load_layout
+from plushsense.deploy.calibration import calibrated, integer_model
+from plushsense.devices.base import Frame
+from plushsense.devices.opening import open_device
+from plushsense.devices.virtual.stream import ToySpec, ToyStream
+from plushsense.devices.wire import LineParser
+from plushsense.live.integer import IntegerClassifier
+from plushsense.live.many import run_many
+from plushsense.live.stream import StreamClassifier, StreamReader
+from plushsense.models.arch import NORM_EPSILON, Arch
+from plushsense.models.bundle import Bundle
+from plushsense.models.reference import random_weights
+from plushsense.windows.clock import Clock
+from plushsense.windows.features import SampleInputs, Scaler
+
+STEPS = 200  # a round
+UNDILATED = "14_19_19"
+
+
+def lines_of(layout: Layout, count: int) -> list[bytes]:
+    """What a virtual toy sends, as bytes."""
+    stream = iter(ToyStream(ToySpec(person=7, seed=3, lost=0.0, garbled=0.0, glitch=0.0), layout))
+    return [next(stream).data for _ in range(count)]
+
+
+def samples_of(layout: Layout, lines: list[bytes]) -> np.ndarray:
+    """(T, I) what a network reads of them."""
+    parser, clock, inputs = LineParser(layout), Clock(layout), SampleInputs(layout)
+    frames = [frame for line in lines for frame in parser.feed(line)]
+    return np.array([inputs(row) for frame in frames for row in clock.rows(frame.device_ms, frame.values)])
+
+
+def made_up(layout: Layout, symbol: str = "14d1_19d2_19d4") -> Bundle:
+    """A network of random weights, calibrated on the virtual toy so that it runs in whole numbers too."""
+    gestures = load_gestures("plush-18")
+    arch = Arch.parse(symbol, (8, 12, 16), channels=layout.n_inputs, classes=len(gestures))
+    x = samples_of(layout, lines_of(layout, 6000)).T
+    windows = np.stack([x[:, at : at + arch.span] for at in range(0, x.shape[1] - arch.span, 60)]).astype(np.int32)
+    return calibrated(Bundle(arch, random_weights(arch, 1), layout, Scaler.fit(windows), gestures), windows)
+
+
+def bytes_to_event(reader: StreamReader, lines: list[bytes]) -> dict[str, Any]:
+    """Milliseconds of the steps with an answer, by the clock on the wall and of the processor alone (what is left when
+    other programs want it too); microseconds of the processor a frame."""
+    parser = LineParser(reader.layout)
+    wall, own = [], []
+    began = time.process_time()
+    for line in lines:
+        arrived, worked = time.perf_counter(), time.process_time()
+        said = [d for f in parser.feed(line) for d in reader.push(Frame(0, f.device_ms, f.values))]
+        if any(d.answer is not None for d in said):
+            own.append(time.process_time() - worked)
+            wall.append(time.perf_counter() - arrived)
+    each = (time.process_time() - began) / len(lines)
+    return {"steps": len(wall), "ms": spread(wall), "processor_ms": spread(own), "us_a_frame": round(1e6 * each, 1)}
+
+
+def spread(seconds: list[float]) -> dict[str, float]:
+    """In milliseconds."""
+    p50, p95, p99 = (round(1000 * float(v), 3) for v in np.percentile(seconds, (50, 95, 99)))
+    return {"p50": p50, "p95": p95, "p99": p99, "longest": round(1000 * max(seconds), 3)}
+
+
+def theirs(bundle: Bundle) -> tuple[Any, Any]:
+    """The same network of continual-inference's layers, and PyTorch."""
+    import continual as co
+    import torch
+    from torch import nn
+
+    torch.set_num_threads(1)
+    arch, weights = bundle.arch, {name: torch.from_numpy(np.array(w)) for name, w in bundle.weights.items()}
+    layers: list[Any] = []
+    for i, layer in enumerate(arch.layers):
+        conv = co.Conv1d(arch.inputs[i], layer.filters, layer.reach + 1)
+        norm = nn.BatchNorm1d(layer.filters, eps=NORM_EPSILON)
+        with torch.no_grad():
+            conv.weight.zero_()
+            conv.weight[:, :, :: layer.dilation].copy_(weights[f"conv{i}.weight"])
+            conv.bias.copy_(weights[f"conv{i}.bias"])
+            norm.weight.copy_(weights[f"norm{i}.gain"])
+            norm.bias.copy_(weights[f"norm{i}.shift"])
+            norm.running_mean.copy_(weights[f"norm{i}.mean"])
+            norm.running_var.copy_(weights[f"norm{i}.var"])
+        layers += [conv, nn.ReLU(), norm]
+    dense = co.Linear(arch.filters[-1], arch.classes, channel_dim=1)
+    with torch.no_grad():
+        dense.weight.copy_(weights["dense.weight"])
+        dense.bias.copy_(weights["dense.bias"])
+    return co.Sequential(*layers, co.AvgPool1d(arch.pool, stride=1), dense).eval(), torch
+
+
+def beside(bundle: Bundle, lines: list[bytes], rounds: int) -> dict[str, Any]:
+    """Microseconds a step of ours and theirs, ratios within a round, and how far the logits are apart."""
+    arch, step = bundle.arch, bundle.arch.step
+    raw = samples_of(bundle.layout, lines)
+    whole, scaled = raw.astype(np.int64), bundle.scaler.apply_sample(raw)
+    first = arch.span + step - arch.span % step
+    blocks = [slice(at, at + step) for at in range(first, first + STEPS * step, step)]
+    stepper, integer = bundle.network().stepper(), integer_model(bundle).network.stepper()
+    ways: dict[str, tuple[Callable[[], object], Callable[[slice], Any]]] = {
+        "ours, float (NumPy)": (
+            lambda: (stepper.reset(), stepper.push(scaled[: blocks[0].start])),
+            lambda at: stepper.push(scaled[at]),
+        ),
+        "ours, int8 (NumPy)": (
+            lambda: (integer.reset(), integer.push(whole[: blocks[0].start])),
+            lambda at: integer.push(whole[at]),
+        ),
+    }
+    apart = None
+    if importlib.util.find_spec("continual") is not None:
+        net, torch = theirs(bundle)
+        x = torch.from_numpy(np.ascontiguousarray(scaled.T[None]))
+
+        def begin() -> None:
+            net.clean_state()
+            net.forward_steps(x[:, :, : blocks[0].start])
+
+        def one_by_one(at: slice) -> Any:
+            for t in range(at.start, at.stop):
+                last = net.forward_step(x[:, :, t])
+            return last
+
+        ways["continual-inference, forward_step"] = begin, one_by_one
+        ways["continual-inference, forward_steps"] = begin, lambda at: net.forward_steps(x[:, :, at])
+        apart = 0.0
+        with torch.inference_mode():
+            stepper.reset()
+            begin()
+            mine = np.array(stepper.push(scaled[: blocks[-1].stop]))
+            shift = (arch.span - 1) % step  # ours answers every step, theirs every sample
+            begin()
+            for at in blocks:
+                out = net.forward_steps(x[:, :, at])[0].numpy().T
+                for t in range(at.start, at.stop):
+                    if t % step == shift:
+                        wanted = mine[(t + 1 - arch.span) // step]
+                        apart = max(apart, float(np.abs(out[t - at.start] - wanted).max()))
+            if not apart < 1e-3:
+                raise SystemExit(f"The two networks do not answer alike: their logits are {apart} apart.")
+            times = timed(ways, blocks, rounds)
+    else:
+        times = timed(ways, blocks, rounds)
+    ours = times["ours, float (NumPy)"]
+    rows = []
+    for name, mine_s in times.items():
+        ratios = sorted(a / b for a, b in zip(mine_s, ours, strict=True))
+        rows.append(
+            {
+                "name": name,
+                "us_a_step": round(1e6 * statistics.median(mine_s), 1),
+                "times_slower": [round(r, 2) for r in (ratios[0], statistics.median(ratios), ratios[-1])],
+            }
+        )
+    return {"network": arch.symbol, "rows": rows, "logits_apart": apart}
+
+
+def timed(ways: dict[str, Any], blocks: list[slice], rounds: int) -> dict[str, list[float]]:
+    """Seconds a step, of each way in each round; the first round warms up and does not count."""
+    times: dict[str, list[float]] = {name: [] for name in ways}
+    for _ in range(rounds + 1):
+        for name, (begin, push) in ways.items():
+            begin()
+            began = time.perf_counter()
+            for at in blocks:
+                push(at)
+            times[name].append((time.perf_counter() - began) / len(blocks))
+    return {name: found[1:] for name, found in times.items()}
+
+
+def many(bundle: Bundle, toys: int, seconds: float) -> dict[str, Any]:
+    """Virtual toys in real time, in this thread."""
+    urls = [f"virtual://?person={n + 1}&seed={n + 1}&seconds={seconds}" for n in range(toys)]
+    devices = [open_device(url, bundle.layout) for url in urls]
+    live = run_many([(device, StreamClassifier(bundle)) for device in devices])
+    for _ in live:
+        pass
+    return live.summary().to_dict()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--bundle", type=Path)
+    parser.add_argument("--rounds", type=int, default=15)
+    parser.add_argument("--frames", type=int, default=30_000, help="of part 1")
+    parser.add_argument("--toys", type=int, default=100, help="of part 3; 0: leave it out")
+    parser.add_argument("--seconds", type=float, default=30.0)
+    parser.add_argument("--json", action="store_true")
+    args = parser.parse_args()
+    bundle = Bundle.load(args.bundle) if args.bundle else made_up(load_layout("plush-15"))
+    step_ms = bundle.arch.step * bundle.layout.period_us / 1000
+    report: dict[str, Any] = {"network": bundle.arch.symbol, "step_ms": step_ms}
+    lines = lines_of(bundle.layout, args.frames)
+    report["bytes_to_event"] = {
+        "float": bytes_to_event(StreamClassifier(bundle), lines),
+        "int8": bytes_to_event(IntegerClassifier(integer_model(bundle)), lines),
+    }
+    report["network_only"] = [
+        beside(one, lines_of(one.layout, one.arch.span + (STEPS + 12) * one.arch.step), args.rounds)
+        for one in (bundle, made_up(bundle.layout, UNDILATED))
+    ]
+    report["many"] = many(bundle, args.toys, args.seconds) if args.toys else None
+    report["load"] = [round(v, 2) for v in os.getloadavg()] if hasattr(os, "getloadavg") else None
+    report["cores"] = os.cpu_count()
+    if args.json:
+        print(json.dumps(report))
+        return
+    print(f"{report['network']}, a step of {step_ms:g} ms; load {report['load']} on {report['cores']} cores\n")
+    for engine, one in report["bytes_to_event"].items():
+        for clock, of in (("ms", "on the wall"), ("processor_ms", "of the processor")):
+            ms = one[clock]
+            print(
+                f"bytes to event, {engine:<6} p50 {ms['p50']} ms, p95 {ms['p95']} ms, p99 {ms['p99']} ms, longest "
+                f"{ms['longest']} ms {of}, {one['steps']} steps"
+            )
+        print(f"{'':<22} {one['us_a_frame']} µs of the processor a frame")
+    for one in report["network_only"]:
+        title = f"{one['network']} alone, five samples a step"
+        print(f"\n{title:<44}{'µs a step':>10}   times ours, float (min, median, max)")
+        for row in one["rows"]:
+            low, middle, high = row["times_slower"]
+            print(f"{row['name']:<44}{row['us_a_step']:>10}   {low} {middle} {high}")
+        apart = one["logits_apart"]
+        print("continual-inference is not here" if apart is None else f"logits at most {apart:.1e} apart")
+    if report["many"]:
+        one = report["many"]
+        ms = one["latency_ms"]
+        print(
+            f"\n{one['toys']} virtual toys at 100 Hz in one thread for {one['wall_s']} s: {one['decisions']} "
+            f"decisions, {one['late']} late; p50 {ms['p50']} ms, p99 {ms['p99']} ms, longest {ms['max']} ms; "
+            f"{100 * one['busy']:.0f} % of a core"
+        )
+
+
+if __name__ == "__main__":
+    main()
