@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +30,8 @@ from plushsense.evaluation.folds import WindowFold, fold_windows
 from plushsense.evaluation.predictions import gather
 from plushsense.evaluation.scores import FoldRecord
 from plushsense.evaluation.scores import scores as score_predictions
+from plushsense.live.decide import DecideSpec
+from plushsense.live.fitting import fit_decisions as fit_on_people
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.runs.journal import Journal
@@ -42,6 +44,7 @@ if TYPE_CHECKING:
 
 # Of the held-back windows, the share on which float and 8 bits have to say the same; below it training says so.
 _AGREEMENT = 0.95
+_WHOLE_PEOPLE = "validation-subjects"
 
 EpochProgress = Callable[[int, int, dict[str, Any]], None]
 
@@ -101,6 +104,7 @@ def train(
     arch: str | None = None,
     filters: Sequence[int] | str | None = None,
     quantize_aware: int = 0,
+    fit_decisions: bool = True,
     progress: EpochProgress | None = None,
     warn: Warn = silent,
     **settings: Any,
@@ -115,6 +119,8 @@ def train(
         config: resolved settings; or give ``arch``, ``filters`` and settings such as ``preset="loso"``,
             ``context="loop"``, ``epochs=20``, ``seed=1``, ``classes="all"``, ``padding``, ``norm``.
         quantize_aware: epochs of fine-tuning for 8 bits after the training (see `training.quantized`); 0: none.
+        fit_decisions: also fit how decisions are made, on the people who validate (see `live.fitting`). Settings of
+            the configuration's table ``live`` that are not the defaults stay.
         progress: called with (epoch, epochs at most, the epoch's row).
         warn: called with one sentence for everything that was left out, and when 8 bits change many answers.
     """
@@ -195,7 +201,23 @@ def train(
         },
         calibration=kept,
     )
+    if fit_decisions:
+        bundle = _with_decisions(bundle, dataset, config.live, warn)
     return Trained(bundle, fitted.history, scores)
+
+
+def _with_decisions(bundle: Bundle, dataset: Dataset, given: DecideSpec, warn: Warn) -> Bundle:
+    """The bundle with decision settings fitted on the people who validated; as it is, where there are none."""
+    if bundle.provenance["split"] != _WHOLE_PEOPLE:
+        warn("decision settings are the defaults: they are fitted on whole people who were held back, and none was")
+        return bundle
+    validated, trained = (
+        set(bundle.provenance[key]) - {NOBODY, UNKNOWN_SUBJECT} for key in ("validation_subjects", "subjects")
+    )
+    plain = DecideSpec()
+    keep = {f.name for f in fields(DecideSpec) if getattr(given, f.name) != getattr(plain, f.name)}
+    decided = fit_on_people(bundle, dataset, validated, training=trained, spec=given, keep=keep)
+    return replace(bundle, decision=decided.to_dict())
 
 
 @dataclass(frozen=True)
@@ -222,7 +244,7 @@ def _divide(windows: WindowSet, config: RunConfig) -> _Division:
     people = set(windows.subject.tolist()) - {NOBODY, UNKNOWN_SUBJECT}
     if len(people) >= 3:
         split = parse_split(f"by-subject:{min(len(people), round(1 / VALIDATION_SHARE))}")
-        kind, said = "validation-subjects", f"people who were not trained on{stopped}: "
+        kind, said = _WHOLE_PEOPLE, f"people who were not trained on{stopped}: "
     else:
         recordings = len(np.unique(windows.recording))
         split = parse_split(f"by-recording:{max(2, min(recordings // 2, round(1 / VALIDATION_SHARE)))}")

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from plushsense.apps.cli.evaluate import figure
 from plushsense.apps.cli.output import emit
@@ -23,6 +25,12 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="fine-tune for 8 bits after the training, for so many epochs (default 0: off; training says when it "
         "would be worth it)",
     )
+    parser.add_argument(
+        "--no-fit-decisions",
+        dest="fit_decisions",
+        action="store_false",
+        help="leave out how decisions are made: the default settings instead of those that suit the people held back",
+    )
     add_settings(parser)
 
 
@@ -31,14 +39,26 @@ def run(args: argparse.Namespace) -> int:
 
     if Path(args.out).exists() and not args.force:
         raise ConfigError(f"'{args.out}' is already there: choose another --out, or --force to replace it.")
-    done = train(args.dataset, settings(args), quantize_aware=args.quantize_aware, progress=epochs_shown(), warn=warn)
+    done = train(
+        args.dataset,
+        settings(args),
+        quantize_aware=args.quantize_aware,
+        fit_decisions=args.fit_decisions,
+        progress=epochs_shown(),
+        warn=warn,
+    )
     bundle = done.save(args.out)
     scores = done.scores
     int8 = scores["int8"]
     mark = "  [SIMULATION]" if scores["simulated"] else ""
     emit(
         args,
-        {"bundle": str(bundle), "history": done.history, "scores": scores},
+        {
+            "bundle": str(bundle),
+            "history": done.history,
+            "scores": scores,
+            "decision": done.bundle.decision,
+        },
         [
             f"{bundle}: {done.bundle.arch.symbol}, {done.bundle.arch.parameters:,} parameters, "
             f"epoch {scores['best_epoch']} of {len(done.history)} kept{mark}",
@@ -52,6 +72,31 @@ def run(args: argparse.Namespace) -> int:
                 if int8
                 else []
             ),
+            *decided(done.bundle.decision),
         ],
     )
     return 0
+
+
+def decided(decision: Mapping[str, Any]) -> list[str]:
+    """How decisions are made, and on whom that was fitted, as text."""
+    fitted = decision.get("fitted")
+    if not fitted:
+        return []
+    people = "1 person" if fitted["people"] == 1 else f"{fitted['people']} people"
+    events, answers = fitted["events"], fitted.get("answers")
+    said = f"Decisions fitted on {people} who {'was' if fitted['people'] == 1 else 'were'} held back"
+    if "cost" in events:
+        said += (
+            f" ({fitted['gestures']} gestures in {60 * fitted['hours']:.0f} min of streams): an event's cost "
+            f"{figure(events['cost_before'])} with the defaults, {figure(events['cost'])} now"
+        )
+    else:
+        said += "; no stream of theirs, so events keep the defaults"
+    out = [said + "."]
+    if answers:
+        line = f"Sets of {answers['classes_in_set']:.1f} classes hold the true one in {100 * answers['coverage']:g} %"
+        if answers["coverage_left_out"] is not None:
+            line += f" (person by person, with the others' threshold: {100 * answers['coverage_left_out']:.1f} %)"
+        out.append(line + f" of the {answers['on']}.")
+    return out

@@ -1,0 +1,326 @@
+"""Decision settings from people whose data the network's weights were not fitted on.
+
+Everything that stands between the network and what a toy says is fitted here, and on the training side only: event
+settings by a search over traces (`live/tuning`), the conformal threshold and what counts as known from the same
+people's recordings, the sensors' limits (`live/limits`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import ConfigError, DatasetError
+from plushsense.core.gestures import GestureSet
+from plushsense.core.recfile import Frames
+from plushsense.dataset.store import Dataset, RecordingInfo
+from plushsense.live.decide import DecideSpec
+from plushsense.live.gate import fit_gate
+from plushsense.live.limits import fit_health
+from plushsense.live.stream import whole_logits
+from plushsense.live.trace import trace_of
+from plushsense.live.tuning import OTHER, Costs, Heard, Hearing, Truth, tune
+from plushsense.models.bundle import Bundle
+from plushsense.models.events import ONE
+from plushsense.models.fixed import SMOOTH_EXTRA_BITS, Ints, smoothing_weight, softmax
+from plushsense.windows.cut import WindowSpec, cut_windows
+
+COVERAGE = 0.9
+KNOWN_SHARE = 0.95
+# The search hears at most so much, people alike: it takes about 15 s then.
+MOST_HEARD_S = 3600.0
+
+
+@dataclass(frozen=True, eq=False)
+class Labelled:
+    """Steps (or windows) of which the truth is known, (n,) each.
+
+    ``shares`` (n, K) in steps of 2^-15, ``highest`` logit in steps of 1/256, both smoothed; ``truth`` the class;
+    ``person`` and ``recording`` who and what it was.
+    """
+
+    shares: Ints
+    highest: Ints
+    truth: Ints
+    person: NDArray[np.str_]
+    recording: Ints
+
+    @property
+    def of_truth(self) -> Ints:
+        """(n,) the share of the true class."""
+        return self.shares[np.arange(len(self.truth)), self.truth]
+
+    def take(self, at: NDArray[np.bool_]) -> Labelled:
+        """The steps at which ``at`` is true."""
+        return Labelled(*(getattr(self, f.name)[at] for f in fields(self)))
+
+
+def fit_decisions(
+    bundle: Bundle,
+    dataset: Dataset,
+    subjects: Iterable[str],
+    *,
+    coverage: float = COVERAGE,
+    known_share: float = KNOWN_SHARE,
+    false_alarms_per_hour: float = 1.0,
+    training: Iterable[str] = (),
+    spec: DecideSpec | None = None,
+    keep: Collection[str] = (),
+    prices: Costs | None = None,
+) -> DecideSpec:
+    """All decision settings, with ``fitted`` saying on what.
+
+    - Events: those that cost least in the streams of ``subjects`` (`tuning.tune`).
+    - ``sure``: the split-conformal threshold at which the set of classes holds the true one in ``coverage`` of the
+      labelled steps (least ambiguous sets: Sadinle, Lei and Wasserman 2019), people and their recordings counting
+      alike; the finite-sample correction counts recordings, since steps of one are no new evidence.
+    - ``known``: the smoothed highest logit that ``known_share`` of the same steps reach.
+    - Gate: thresholds that fire so often on all that is not energetic (`live/gate`), on everybody's streams.
+    - Health: limits with which no sensor of anybody on the training side is at fault.
+
+    A labelled step stands in the second half of its recording: before, the network mostly sees something else.
+
+    Args:
+        subjects: people on the training side whom the weights were not fitted on.
+        training: people whom they were fitted on: with the others they show what sensors can reach.
+        spec: where the search begins; ``keep`` names its settings that stay.
+        prices: what an event costs that should not have been, or was late.
+
+    Raises:
+        ConfigError: for a coverage or a share that is none.
+        DatasetError: when ``subjects`` is nobody.
+    """
+    for name, value in (("coverage", coverage), ("known_share", known_share)):
+        if not 0.5 <= value < 1.0:
+            raise ConfigError(f"{name} is {value!r}; accepted are shares from 0.5 to under 1.")
+    spec, people = spec or DecideSpec(), sorted(set(subjects))
+    if not people:
+        raise DatasetError("Decision settings are fitted on people who were held back, and there is none.")
+    everybody = sorted({*people, *training})
+    health = fit_health(dataset, everybody, spec.health)
+    if "health" not in keep:
+        spec = replace(spec, health=health.plan)
+    gate: dict[str, Any] | None = None
+    if "gate" not in keep:
+        fitted = fit_gate(dataset, bundle.gestures, everybody, false_alarms_per_hour=false_alarms_per_hour)
+        spec, gate = replace(spec, gate=fitted.plan), fitted.report
+    heard = streams_heard(bundle, dataset, people, spec)
+    said: dict[str, Any] = {
+        "people": len(people),
+        "streams": len(heard),
+        "hours": round(sum(h.trace.seconds for h in heard) / 3600, 3),
+        "gestures": sum(_is_gesture(bundle, t) for h in heard for t in h.truths),
+        "simulated": dataset.head.simulated,
+    }
+    if heard:
+        if "known" not in keep:
+            spec = replace(spec, known=known_threshold(labelled_steps(bundle, heard, spec), known_share))
+        tuned = tune(heard, spec, bundle.gestures, prices, keep)
+        spec = tuned.spec
+        labelled = labelled_steps(bundle, heard, spec)
+        said["events"] = {
+            "on": "streams",
+            "cost": _round(tuned.cost),
+            "cost_before": _round(tuned.cost_before),
+            "tried": tuned.tried,
+            "moved": {name: list(values) for name, values in tuned.moved.items()},
+        }
+    else:
+        labelled = labelled_windows(bundle, dataset, people)
+        said["events"] = {"on": "nothing: nobody who was held back has a stream", "moved": {}}
+    if len(labelled.truth):
+        if "known" not in keep:
+            spec = replace(spec, known=known_threshold(labelled, known_share))
+        if "sure" not in keep:
+            spec = replace(spec, sure=sure_threshold(labelled, coverage))
+        said["answers"] = _answers(labelled, spec, coverage, known_share, bool(heard))
+    said["health"] = {
+        "people": len(everybody),
+        "hours": round(health.seconds / 3600, 3),
+        "end_stops": list(health.widened),
+        "longest_still_ms": health.still_ms,
+    }
+    if gate is not None:
+        said["gate"] = gate
+    return replace(spec, fitted=said)
+
+
+def _is_gesture(bundle: Bundle, truth: Truth) -> bool:
+    return truth.gesture != OTHER and not bundle.gestures.gestures[truth.gesture].idle
+
+
+def _round(value: float) -> float | None:
+    return round(value, 4) if np.isfinite(value) else None
+
+
+def _answers(labelled: Labelled, spec: DecideSpec, coverage: float, known_share: float, steps: bool) -> dict[str, Any]:
+    by_person = left_out_coverage(labelled, coverage)
+    people = len(set(labelled.person.tolist()))
+    return {
+        "on": "steps in the second half of a recording" if steps else "windows, not smoothed",
+        "coverage": coverage,
+        "recordings": len(np.unique(labelled.recording)),
+        # What other people's threshold gave each of them: the figure to expect of a new person.
+        "coverage_left_out": _round(float(np.mean(by_person))) if by_person else None,
+        "coverage_left_out_worst": _round(min(by_person)) if by_person else None,
+        # A share of new people that so few can vouch for, whatever the threshold: n / (n + 1).
+        "people_bound": _round(people / (people + 1)),
+        "classes_in_set": _round(float((labelled.shares >= spec.sure * ONE).sum(axis=1).mean())),
+        "known_share": known_share,
+    }
+
+
+def streams_heard(
+    bundle: Bundle,
+    dataset: Dataset,
+    subjects: Iterable[str],
+    spec: DecideSpec,
+    gestures: GestureSet | None = None,
+) -> list[Heard]:
+    """The streams of some people as the network hears them, with what was marked in them; without those in which
+    nothing is. Of more than an hour, people get an equal share.
+
+    Args:
+        gestures: those whose indices the truths are; the network's own when left out.
+    """
+    people = set(subjects)
+    marked: dict[str, list[RecordingInfo]] = {}
+    for r in dataset.recordings:
+        if r.stream_row >= 0:
+            marked.setdefault(r.stream, []).append(r)
+    streams = [s for s in dataset.streams if s.subject in people and s.id in marked]
+    share_s = MOST_HEARD_S / max(len({s.subject for s in streams}), 1)
+    left = {s.subject: round(share_s * dataset.layout.rate_hz) for s in streams}
+    out = []
+    for stream in streams:
+        frames = dataset.read_stream(stream.id)
+        frames = frames.slice(0, min(len(frames), left[stream.subject]))
+        left[stream.subject] -= len(frames)
+        truths = truths_of(frames, marked[stream.id], gestures or bundle.gestures, dataset.layout.period_us)
+        if any(t.gesture != OTHER for t in truths):
+            out.append(Heard(stream.subject, trace_of(frames, bundle, spec.health), truths))
+    return out
+
+
+def stream_times_us(frames: Frames, period_us: int) -> Ints:
+    """(T,) the time of every row as a `StreamReader` counts it: from the first, and on over a reset of the clock."""
+    step = np.diff(frames.device_ms.astype(np.int64), prepend=frames.device_ms[:1]) * 1000
+    return np.cumsum(np.where(step < 0, period_us, step))
+
+
+def truths_of(
+    frames: Frames, recordings: Sequence[RecordingInfo], gestures: GestureSet, period_us: int
+) -> tuple[Truth, ...]:
+    """What was marked in a stream, in order of time; excluded recordings, and other gestures, are `OTHER`."""
+    times = stream_times_us(frames, period_us)
+    out = []
+    for r in recordings:
+        first, last = r.stream_row + r.start, r.stream_row + r.stop
+        if last <= len(times) and first < last:
+            known = not r.excluded and r.gesture in gestures.labels
+            gesture = gestures.index(r.gesture) if known else OTHER
+            out.append(Truth(int(times[first]), int(times[last - 1]), gesture))
+    return tuple(sorted(out, key=lambda t: t.start_us))
+
+
+def labelled_steps(bundle: Bundle, heard: Sequence[Heard], spec: DecideSpec) -> Labelled:
+    """The steps in the second half of each recording that the network knows, smoothed as ``spec`` has it."""
+    weight = smoothing_weight(spec.smoothing_s, bundle.arch.step * bundle.layout.period_us / 1e6)
+    rows: list[Ints] = []
+    truth: list[int] = []
+    person: list[str] = []
+    recording: list[int] = []
+    number = 0
+    for h in heard:
+        means = Hearing(h, type(spec.gate)()).means(weight)
+        times = [h.trace.step_times_us(part) for part in h.trace.parts]
+        for t in h.truths:
+            if t.gesture == OTHER:
+                continue
+            number += 1
+            for mean, at in zip(means, times, strict=True):
+                mine = mean[(at >= (t.start_us + t.stop_us) // 2) & (at <= t.stop_us)] >> SMOOTH_EXTRA_BITS
+                rows.append(mine)
+                truth += [t.gesture] * len(mine)
+                person += [h.person] * len(mine)
+                recording += [number] * len(mine)
+    values = np.concatenate(rows) if rows else np.zeros((0, len(bundle.gestures) + 1), dtype=np.int64)
+    return Labelled(values[:, :-1], values[:, -1], _ints(truth), np.array(person, dtype=np.str_), _ints(recording))
+
+
+def labelled_windows(bundle: Bundle, dataset: Dataset, subjects: Iterable[str]) -> Labelled:
+    """The windows of some people's recordings; for data without streams."""
+    people = set(subjects)
+    mine = [r for r in dataset.recordings if r.subject in people]
+    known = {field.name for field in fields(WindowSpec)}
+    spec = WindowSpec(**{k: v for k, v in bundle.windowing.items() if k in known})
+    span_s = bundle.arch.span / bundle.layout.rate_hz
+    spec = replace(spec, span_s=span_s if span_s > spec.window_s else 0.0)
+    try:
+        windows = cut_windows(Dataset(dataset.path, dataset.head, mine, dataset.streams), spec, bundle.gestures)
+    except DatasetError:
+        empty = np.zeros((0, len(bundle.gestures)), dtype=np.int64)
+        return Labelled(empty, _ints(()), _ints(()), np.zeros(0, dtype=np.str_), _ints(()))
+    logits = whole_logits(bundle.network().forward(bundle.scaler.apply(windows.x)))
+    shares = np.array([softmax(row) for row in logits], dtype=np.int64)
+    return Labelled(shares, logits.max(axis=1), windows.y, windows.subject, windows.recording)
+
+
+def _ints(values: Sequence[int]) -> Ints:
+    return np.array(values, dtype=np.int64)
+
+
+def weights_of(labelled: Labelled) -> NDArray[np.float64]:
+    """(n,) weights that sum to 1: people count alike, and of a person the recordings."""
+    weight = np.zeros(len(labelled.truth))
+    people = np.unique(labelled.person)
+    for person in people:
+        mine = labelled.person == person
+        recordings = np.unique(labelled.recording[mine])
+        for recording in recordings:
+            at = mine & (labelled.recording == recording)
+            weight[at] = 1.0 / (len(people) * len(recordings) * at.sum())
+    return weight
+
+
+def _lower(scores: Ints, labelled: Labelled, share: float) -> int:
+    """The largest threshold that ``share`` of the weight reaches, corrected for the number of recordings."""
+    n = len(np.unique(labelled.recording))
+    under = max(0.0, ((1.0 - share) * (n + 1) - 1.0) / n)
+    order = np.argsort(scores, kind="stable")
+    before = np.cumsum(weights_of(labelled)[order]) - weights_of(labelled)[order]
+    at = int(np.flatnonzero(before <= under + 1e-12)[-1])
+    return int(scores[order[at]])
+
+
+def sure_threshold(labelled: Labelled, coverage: float) -> float:
+    """The conformal threshold on smoothed probabilities at a coverage, in whole steps of 2^-15."""
+    return _lower(labelled.of_truth, labelled, coverage) / ONE
+
+
+def known_threshold(labelled: Labelled, share: float) -> float | None:
+    """The smoothed highest logit that a share of the labelled steps reach; None without any."""
+    return _lower(labelled.highest, labelled, share) / 256 if len(labelled.truth) else None
+
+
+def left_out_coverage(labelled: Labelled, coverage: float) -> list[float]:
+    """Of each person, the share of steps whose set holds the truth with the threshold of the others; recordings
+    count alike. Empty for one person."""
+    people = np.unique(labelled.person)
+    if len(people) < 2:
+        return []
+    out = []
+    for person in people:
+        mine = labelled.take(labelled.person == person)
+        threshold = sure_threshold(labelled.take(labelled.person != person), coverage)
+        out.append(covered(mine, threshold))
+    return out
+
+
+def covered(labelled: Labelled, threshold: float) -> float:
+    """The share of steps whose set holds the truth; people and recordings count alike."""
+    return float((weights_of(labelled) * (labelled.of_truth >= threshold * ONE)).sum())

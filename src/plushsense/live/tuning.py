@@ -1,0 +1,365 @@
+"""Which event settings suit people best: what an event costs, and a search over traces.
+
+A stream is read by the network once (`live/trace`); here its events are made anew for every setting that is tried,
+by the very machine that a toy has. What a setting does not change is computed once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.gestures import GestureSet
+from plushsense.live.decide import DecideSpec
+from plushsense.live.trace import Part, Trace, gate_hits
+from plushsense.models.events import AFFECT_CODES, BEGUN, ENDED, NAMED, NO_GESTURE, EventMachine, Update
+from plushsense.models.fixed import SMOOTH_EXTRA_BITS, Ints, smooth, smoothing_weight, softmax
+from plushsense.models.gate import GatePlan
+from plushsense.models.rules import Rules
+
+OTHER = -1
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """A known stretch of a stream: a class index, or `OTHER` for what the network does not know."""
+
+    start_us: int
+    stop_us: int
+    gesture: int
+
+
+@dataclass(frozen=True, eq=False)
+class Heard:
+    """One person's stream as the network heard it, and what was really going on."""
+
+    person: str
+    trace: Trace
+    truths: tuple[Truth, ...]
+
+
+@dataclass(frozen=True)
+class Costs:
+    """What goes wrong costs, in gestures that were missed.
+
+    A gesture costs its best event: ``missed`` without one; ``late_s`` for every second until it was named, at most 3;
+    ``unnamed`` when only its affect was said; when it was taken for another, ``family`` for one of its family,
+    ``same`` for one of its affect, ``other`` where no affect is told, ``affect`` for one of another affect. Every
+    further event of it costs ``again``, and half its error. An event where nothing was going on costs ``idle``, one in
+    a stretch of which nobody knows what went on ``unmarked``: people also practise.
+    """
+
+    missed: float = 1.0
+    late_s: float = 0.2
+    unnamed: float = 0.25
+    family: float = 0.3
+    same: float = 0.5
+    other: float = 1.0
+    affect: float = 2.0
+    again: float = 0.1
+    idle: float = 1.0
+    unmarked: float = 0.25
+    early_us: int = 250_000
+    grace_us: int = 1_000_000
+
+
+@dataclass(slots=True)
+class Spoken:
+    """One event as it was heard; ``named_us`` is when its gesture was said."""
+
+    begun_us: int
+    affect: int
+    gesture: int
+    named_us: int
+    ended_us: int = 0
+
+
+def spoken(updates: Sequence[Update]) -> list[Spoken]:
+    """Events from what happened to them."""
+    out: list[Spoken] = []
+    for u in updates:
+        if u.kind == BEGUN:
+            out.append(Spoken(u.now, u.affect, u.gesture, u.now))
+        elif u.kind == NAMED:
+            out[-1].gesture, out[-1].affect, out[-1].named_us = u.gesture, u.affect, u.now
+        elif u.kind == ENDED:
+            out[-1].ended_us = u.now
+    return out
+
+
+class Hearing(EventMachine):
+    """`replay` of one trace for many settings: the same updates, far sooner."""
+
+    def __init__(self, heard: Heard, gate: GatePlan) -> None:
+        super().__init__(Rules().events, 1, heard.trace.gestures)
+        self.heard, self.rules = heard, gate.rules
+        self._hits = [dict(gate_hits(part, gate)) for part in heard.trace.parts]
+        self._raw = [self._shares(part) for part in heard.trace.parts]
+        self._smoothed: dict[int, list[Ints]] = {}
+
+    @staticmethod
+    def _shares(part: Part) -> Ints:
+        """(n, K + 1) probabilities and highest logit of every step."""
+        rows = [np.append(softmax(row), row.max()) for row in part.logits]
+        return np.array(rows, dtype=np.int64).reshape(len(rows), part.logits.shape[1] + 1)
+
+    def means(self, weight: int) -> list[Ints]:
+        """(n, K + 1) of each part, smoothed, with all bits that the machine keeps."""
+        if weight not in self._smoothed:
+            out = []
+            for raw in self._raw:
+                mean, rows = None, np.empty_like(raw)
+                for i, row in enumerate(raw):
+                    rows[i] = mean = smooth(mean, row, weight)
+                out.append(rows)
+            self._smoothed[weight] = out
+        return self._smoothed[weight]
+
+    def updates(self, spec: DecideSpec) -> list[Update]:
+        """What `replay` makes of the trace; the gate is the one that this was made with."""
+        trace = self.heard.trace
+        step_s = trace.arch.step * trace.period_us / 1e6
+        self.plan = spec.rules(step_s).events
+        self.reset()
+        said: list[Update] = []
+        means = self.means(smoothing_weight(spec.smoothing_s, step_s))
+        for part, mean, fired in zip(trace.parts, means, self._hits, strict=True):
+            said += self._part(part, mean, fired)
+            said += self.lost(part.ends_us)
+        return said
+
+    def _part(self, part: Part, mean: Ints, fired: Mapping[int, int]) -> list[Update]:
+        trace, plan = self.heard.trace, self.plan
+        step, span, period = trace.arch.step, trace.arch.span, trace.period_us
+        rows = mean[:, :-1] >> SMOOTH_EXTRA_BITS
+        best = mean[:, :-1].argmax(axis=1) if len(mean) else np.zeros(0, dtype=np.int64)
+        share = rows[np.arange(len(rows)), best]
+        idle, affects = np.array(self._idle), np.array(self._affects)
+        speaks = (mean[:, -1] >> SMOOTH_EXTRA_BITS >= plan.known) & ~idle[best]
+        named = speaks & (share >= plan.enter)
+        masses = np.stack([rows[:, (affects == a) & ~idle].sum(axis=1) for a in (1, 2, 3)], axis=1)
+        felt = speaks & ~named & (masses.max(axis=1, initial=0) >= plan.enter_affect)
+        gesture = np.where(named, best, NO_GESTURE).tolist()
+        affect = np.where(named, affects[best], np.where(felt, masses.argmax(axis=1) + 1, 0)).tolist()
+        quiet = (~named & ~felt).tolist()
+        shares, bests = rows.tolist(), best.tolist()
+        suspect = part.suspect[span - 1 :: step].tolist()
+        said: list[Update] = []
+        phase = span % step
+        steps = range((phase or step) - 1, len(part.inputs), step)
+        for at in sorted({*steps, *fired}) if fired else steps:
+            now = part.start_us + at * period
+            if at in fired:
+                rule = self.rules[fired[at]]
+                said += self.gate(rule.affect, rule.gesture, now)
+            if (at + 1) % step != phase:
+                continue
+            i = (at + 1 - span) // step
+            if i < 0:
+                said += self.blind_step(now)
+            elif suspect[i]:
+                said += self._one(shares[i], bests[i], NO_GESTURE, 0, now, True)
+            elif quiet[i] and not self.open and self._wanted < 0 and self._gesture == NO_GESTURE:
+                self._resting -= self._resting > 0
+            else:
+                self._count(gesture[i], affect[i], now)
+                said += self._one(shares[i], bests[i], gesture[i], affect[i], now, False)
+        return said
+
+    def _one(self, shares: list[int], best: int, said: int, affect: int, now: int, suspect: bool) -> list[Update]:
+        if self.open:
+            return self._open_step(shares, best, said, affect, now, suspect)
+        return self._closed_step(said, affect, now)
+
+
+def costs(heard: Heard, events: Sequence[Spoken], gestures: GestureSet, prices: Costs) -> NDArray[np.float64]:
+    """What the events of a stream cost, (n,): a number for each of its n gestures, in order of time; an event where
+    there was none counts with the nearest."""
+    idle = [g.idle for g in gestures.gestures]
+    mine = [t for t in heard.truths if t.gesture != OTHER and not idle[t.gesture]]
+    silent = [t for t in heard.truths if t.gesture != OTHER and idle[t.gesture]]
+    others = [t for t in heard.truths if t.gesture == OTHER]
+    if not mine:
+        return np.zeros(0)
+    starts = np.array([t.start_us for t in mine])
+    answers: list[list[Spoken]] = [[] for _ in mine]
+    total = np.zeros(len(mine))
+    for event in events:
+        at = _place(event, mine, prices)
+        if at is not None:
+            answers[at].append(event)
+            continue
+        nearest = int(np.abs(starts - event.begun_us).argmin())
+        if _within(event, silent, prices.early_us, 0):
+            total[nearest] += prices.idle
+        elif not _within(event, others, prices.early_us, prices.grace_us):
+            total[nearest] += prices.unmarked
+    for at, (truth, heard_as) in enumerate(zip(mine, answers, strict=True)):
+        # An event that goes on from before and is right needs no other one.
+        going_on = [
+            e
+            for e in events
+            if e.gesture == truth.gesture
+            and e.begun_us < truth.start_us - prices.early_us
+            and 2 * (min(e.ended_us, truth.stop_us) - truth.start_us) >= truth.stop_us - truth.start_us
+        ]
+        each = [_price(e, truth, gestures, prices) for e in heard_as]
+        if going_on:
+            each.insert(0, (True, 0.0))
+        if not each:
+            total[at] += prices.missed
+            continue
+        first = min(range(len(each)), key=lambda i: each[i][1])
+        total[at] += each[first][1]
+        total[at] += sum(
+            prices.again + (0.0 if right else cost / 2) for i, (right, cost) in enumerate(each) if i != first
+        )
+    return total
+
+
+def _within(event: Spoken, truths: Sequence[Truth], early_us: int, grace_us: int) -> bool:
+    return any(t.start_us - early_us <= event.begun_us <= t.stop_us + grace_us for t in truths)
+
+
+def _place(event: Spoken, truths: Sequence[Truth], prices: Costs) -> int | None:
+    """The gesture that an event belongs to: of those around its beginning its own, else the latest."""
+    around = [
+        i for i, t in enumerate(truths) if t.start_us - prices.early_us <= event.begun_us <= t.stop_us + prices.grace_us
+    ]
+    own = [i for i in around if truths[i].gesture == event.gesture]
+    near = own or around
+    return near[-1] if near else None
+
+
+def _price(event: Spoken, truth: Truth, gestures: GestureSet, prices: Costs) -> tuple[bool, float]:
+    """Whether an event was right, and what it costs as the answer to a gesture."""
+    real = gestures.gestures[truth.gesture]
+    late = prices.late_s * min(max(event.named_us - truth.start_us, 0) / 1e6, 3.0)
+    if event.gesture == truth.gesture:
+        return True, late
+    if event.gesture == NO_GESTURE:
+        told = event.affect in (0, AFFECT_CODES[real.affect])
+        return told, prices.unnamed + late if told else prices.affect
+    as_which = gestures.gestures[event.gesture]
+    if as_which.family == real.family:
+        return False, prices.family + late
+    if as_which.affect != real.affect:
+        return False, prices.affect
+    return False, (prices.other if real.affect == "none" else prices.same) + late
+
+
+# What is tried, in this order, twice. The first are those that matter most.
+TRIED: dict[str, tuple[float, ...]] = {
+    "enter": (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9),
+    "least_s": (0.05, 0.1, 0.2, 0.3, 0.5),
+    "smoothing_s": (0.1, 0.2, 0.3, 0.5, 0.8),
+    "rest_s": (0.0, 0.2, 0.5, 1.0),
+    "switch_s": (0.1, 0.3, 0.5, 1.0),
+    "end_s": (0.1, 0.3, 0.6, 1.0),
+    "leave": (0.1, 0.2, 0.3, 0.4, 0.5),
+    "hold_s": (0.0, 0.2, 0.5),
+}
+TRIED_AFFECT: dict[str, tuple[float, ...]] = {
+    "enter_affect": (0.6, 0.7, 0.8, 0.9, 0.95),
+    "leave_affect": (0.2, 0.4, 0.6),
+}
+TRIED_GATE: dict[str, tuple[float, ...]] = {"wait_s": (0.5, 1.0, 1.5, 2.5)}
+_BLOCK = 10  # gestures in a row whose costs are taken for one number
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """``spec`` and what it costs a gesture, beside the settings that the search began with; ``tried`` settings."""
+
+    spec: DecideSpec
+    cost: float
+    cost_before: float
+    tried: int
+    moved: dict[str, tuple[float, float]]
+
+
+def tune(
+    heard: Sequence[Heard],
+    spec: DecideSpec,
+    gestures: GestureSet,
+    prices: Costs | None = None,
+    keep: Collection[str] = (),
+) -> Tuned:
+    """The event settings that cost the least a gesture, people counting alike.
+
+    One setting after the other is moved to its best value, twice over all, and only where the gain is more than its
+    standard error over blocks of 10 gestures and at least half of the people gain: of few people one learns little,
+    and what they cannot tell stays as it is.
+
+    Args:
+        spec: where the search begins; gate, health, ``known`` and ``sure`` are kept.
+        keep: settings that are not tried.
+    """
+    prices = prices or Costs()
+    hearings = [Hearing(h, spec.gate) for h in heard]
+    gate = bool(spec.gate.rules)
+    knobs = TRIED | (TRIED_AFFECT if gestures.tells_affect else {}) | (TRIED_GATE if gate else {})
+    knobs = {name: values for name, values in knobs.items() if name not in keep}
+    known: dict[tuple[Any, ...], list[NDArray[np.float64]]] = {}
+
+    def cost(candidate: DecideSpec) -> list[NDArray[np.float64]]:
+        key = tuple(getattr(candidate, name) for name in knobs)
+        if key not in known:
+            known[key] = [costs(h.heard, spoken(h.updates(candidate)), gestures, prices) for h in hearings]
+        return known[key]
+
+    people = [h.person for h in heard]
+    now = before = cost(spec)
+    moved: dict[str, tuple[float, float]] = {}
+    for _ in range(2):
+        changed = False
+        for name, values in knobs.items():
+            best, best_gain = None, 0.0
+            for value in values:
+                if value == getattr(spec, name) or (name == "leave" and value > spec.enter):
+                    continue
+                candidate = moved_to(spec, name, value)
+                gain, error, share = compared(now, cost(candidate), people)
+                if gain > max(best_gain, error) and share >= 0.5:
+                    best, best_gain = candidate, gain
+            if best is not None:
+                moved[name] = (moved.get(name, (getattr(spec, name), 0.0))[0], getattr(best, name))
+                spec, now, changed = best, cost(best), True
+        if not changed:
+            break
+    return Tuned(spec, _mean(now, people), _mean(before, people), len(known), moved)
+
+
+def moved_to(spec: DecideSpec, name: str, value: float) -> DecideSpec:
+    """The spec with one setting changed; what is over is never above what begins."""
+    values: dict[str, Any] = {name: value}
+    if name == "enter":
+        values["leave"] = min(spec.leave, value)
+    return replace(spec, **values)
+
+
+def _mean(each: Sequence[NDArray[np.float64]], people: Sequence[str]) -> float:
+    by_person = _by_person(each, people)
+    return float(np.mean([c.mean() for c in by_person])) if by_person else float("nan")
+
+
+def _by_person(each: Sequence[NDArray[np.float64]], people: Sequence[str]) -> list[NDArray[np.float64]]:
+    out = [np.concatenate([c for c, p in zip(each, people, strict=True) if p == who]) for who in dict.fromkeys(people)]
+    return [c for c in out if len(c)]
+
+
+def compared(
+    before: Sequence[NDArray[np.float64]], after: Sequence[NDArray[np.float64]], people: Sequence[str]
+) -> tuple[float, float, float]:
+    """Mean gain a gesture of ``after`` over ``before`` (costs of each stream), its standard error over blocks of
+    gestures, and the share of people who do not lose by it."""
+    gains = [a - b for a, b in zip(_by_person(before, people), _by_person(after, people), strict=True)]
+    if not gains:
+        return 0.0, float("inf"), 0.0
+    blocks = np.array([g[at : at + _BLOCK].mean() for g in gains for at in range(0, len(g), _BLOCK)])
+    error = float(blocks.std(ddof=1) / np.sqrt(len(blocks))) if len(blocks) > 1 else float("inf")
+    return float(np.mean([g.mean() for g in gains])), error, float(np.mean([g.mean() >= 0 for g in gains]))
