@@ -76,7 +76,6 @@ def test_evaluated_anywhere_is_scored_on_the_real_past(dataset: Dataset) -> None
 
 def test_the_ranges_of_a_network_trained_anywhere_come_from_its_own_windows(dataset: Dataset) -> None:
     from plushsense.apps.calibrating import training_windows
-
     from plushsense.windows.anywhere import AnywhereSpec, cut_anywhere
     from plushsense.windows.cut import WindowSpec
 
