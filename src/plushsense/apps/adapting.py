@@ -30,7 +30,6 @@ from plushsense.live.personal import (
     Judged,
     Personal,
     PersonalSpec,
-    adapted_to,
     judge,
     personalise,
     undone,
@@ -120,7 +119,7 @@ def adapt(
     if use is not None and use < spec.least:
         raise ConfigError(f"--use {use} is too few: accepted are {spec.least} and more recordings of each gesture.")
     given = bundle if isinstance(bundle, Bundle) else Bundle.load(Path(bundle))
-    if (before := adapted_to(given)) is not None:
+    if (before := given.adapted_to) is not None:
         warn(f"the bundle is adapted to {before}: it is adapted anew, from what it was before")
     with tempfile.TemporaryDirectory(prefix="plushsense-") as place:
         dataset = _dataset(recordings, given, Path(place))
@@ -135,7 +134,9 @@ def adapt(
         first = _first(windows, times, use)
         test = windows.take(np.flatnonzero(~first))
         if not len(test):
-            raise BadInput(f"No recording of {person} is left to test on: there are at most {use} of each gesture; use fewer.")
+            raise BadInput(
+                f"No recording of {person} is left to test on: there are at most {use} of each gesture; use fewer."
+            )
         keep = purge(windows.stream, windows.window_rows, test.stream, test.recording_rows)
         adapting = windows.take(np.flatnonzero(first & keep))
     done = personalise(given, adapting.x, adapting.y, adapting.recording, subject=person, spec=spec)

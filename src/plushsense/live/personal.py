@@ -11,8 +11,8 @@ recordings what it was. Without that, touches that were not shown would be taken
 would no longer mean what the decision settings were fitted on.
 
 How strong the pull is, and whether to move at all, is decided by the person's own recordings, each read by a layer
-that was moved without it. Where that does not read them clearly better than the trained layer does, or the recordings
-cannot be told apart even so (wrong labels, for one), the bundle stays as it is. NumPy only: this runs beside the toy.
+that was moved without it. Unless more of them are then read right, and their log loss clearly falls, the bundle stays
+as it is; also where they cannot be told apart even so (wrong labels, for one). NumPy only: this runs beside the toy.
 """
 
 from __future__ import annotations
@@ -31,7 +31,6 @@ from plushsense.models.reference import softmax
 Floats = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-KEPT = "personal"
 _DENSE = ("dense.weight", "dense.bias")
 _LEAST_PROBABILITY = 1e-9
 _ITERATIONS = 320  # of the weakest pull: 1e-4 of a logit from the optimum on makeability
@@ -138,7 +137,7 @@ def personalise(
         BadInput: when fewer than two gestures, or than half of the bundle's, have ``spec.least`` recordings.
     """
     spec = spec or PersonalSpec()
-    original = undone(bundle) if adapted_to(bundle) is not None else bundle
+    original = undone(bundle) if bundle.personal else bundle
     examples = Examples(original.network().features(original.scaler.apply(x)), y, recording)
     weight, bias = (np.asarray(original.weights[name], dtype=np.float64) for name in _DENSE)
     kept = examples.take(np.isin(y, enough(y, recording, spec.least)))
@@ -168,7 +167,7 @@ def personalise(
     if after.right < (guess + (1.0 - guess) * spec.told_apart) * after.recordings:
         reason = f"the recordings cannot be told apart, so their labels or the sensors may be wrong: {figures}"
         return Personal(bundle, False, reason, strength, before, after, used, without)
-    if fell.mean() <= least or after.right < before.right:
+    if fell.mean() <= least or after.right <= before.right:
         reason = f"it would not clearly help: {figures}"
         return Personal(bundle, False, reason, strength, before, after, used, without)
     moved = fitted(weight, bias, kept, strength)
@@ -278,14 +277,7 @@ def _together(logits: Floats) -> Floats:
 def _with_dense(bundle: Bundle, weight: Floats, bias: Floats, table: Mapping[str, Any]) -> Bundle:
     dense = {"dense.weight": weight.astype(np.float32), "dense.bias": bias.astype(np.float32)}
     before = {name: np.asarray(bundle.weights[name]).tolist() for name in _DENSE}
-    kept = {KEPT: {**table, "original": before}}
-    return replace(bundle, weights={**bundle.weights, **dense}, provenance={**bundle.provenance, **kept})
-
-
-def adapted_to(bundle: Bundle) -> str | None:
-    """The code of the person that a bundle was adapted to; None: to nobody."""
-    table = bundle.provenance.get(KEPT)
-    return str(table.get("subject", "?")) if isinstance(table, Mapping) else None
+    return replace(bundle, weights={**bundle.weights, **dense}, personal={**table, "original": before})
 
 
 def undone(bundle: Bundle) -> Bundle:
@@ -294,16 +286,19 @@ def undone(bundle: Bundle) -> Bundle:
     Raises:
         BundleError: for a bundle that was not adapted, or no longer holds what it was.
     """
-    table = bundle.provenance.get(KEPT)
-    if not isinstance(table, Mapping):
+    if not bundle.personal:
         raise BundleError("The bundle was not adapted to anybody: there is nothing to undo.")
-    before = table.get("original")
+    before = bundle.personal.get("original")
     try:
         dense = {name: np.array(before[name], dtype=np.float32) for name in _DENSE}  # type: ignore[index]
     except (TypeError, KeyError, ValueError):
         raise BundleError(
-            "The bundle does not hold what it was before it was adapted (an export keeps that to itself): give the "
-            "bundle that plushsense adapt wrote."
+            "The bundle does not hold what it was before it was adapted (an export leaves that out): give the bundle "
+            "that plushsense adapt wrote."
         ) from None
-    provenance = {key: value for key, value in bundle.provenance.items() if key != KEPT}
-    return replace(bundle, weights={**bundle.weights, **dense}, provenance=provenance)
+    return replace(bundle, weights={**bundle.weights, **dense}, personal={})
+
+
+def for_strangers(personal: Mapping[str, Any]) -> dict[str, Any]:
+    """A bundle's ``personal`` for an export: that it was adapted and how well that did, not to whom."""
+    return {key: value for key, value in personal.items() if key not in ("subject", "original")}

@@ -76,11 +76,11 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _undo(args: argparse.Namespace, out: Path) -> int:
-    from plushsense.live.personal import adapted_to, undone
+    from plushsense.live.personal import undone
     from plushsense.models.bundle import Bundle
 
     bundle = Bundle.load(args.bundle)
-    subject = adapted_to(bundle)
+    subject = bundle.adapted_to
     undone(bundle).save(out)
     emit(
         args, {"bundle": str(out), "undone": True, "subject": subject}, f"{out}: as before it was adapted to {subject}"
