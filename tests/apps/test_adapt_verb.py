@@ -174,3 +174,15 @@ def test_people_left_out(cli: Cli, make_session: Make, tmp_path: Path) -> None:
     assert again.status == 0 and "trained for" not in again.err and "macro-F1 gain" in again.out
     assert cli("adapt", "--evaluate", made.path, "--split", "by-recording:2").status == 2
     assert cli("adapt", "model.plush", "--evaluate", made.path).status == 2
+
+
+def test_an_export_says_that_it_is_adapted_and_not_to_whom(
+    cli: Cli, bundle: Path, stranger: Path, tmp_path: Path
+) -> None:
+    mine, out = tmp_path / "mine.plush", tmp_path / "out"
+    assert cli("adapt", bundle, stranger, "--out", mine).status == 0
+    assert cli("export", mine, out).status == 0
+    assert "Adapted to one person" in (out / "README.md").read_text(encoding="utf-8")
+    assert not [path for path in out.rglob("*") if path.is_file() and b"S99" in path.read_bytes()]
+    ran = cli("adapt", out / "model.plush", "--undo", "--out", tmp_path / "back.plush")
+    assert ran.status == 2 and "an export leaves that out" in ran.err
