@@ -74,6 +74,12 @@ def session(folder: Path, seed: int) -> None:
 
 
 @pytest.fixture(scope="session")
+def make_session() -> Callable[[Path, int], None]:
+    """``session``, for a test that needs people of its own."""
+    return session
+
+
+@pytest.fixture(scope="session")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recordings")
     for person in range(5):

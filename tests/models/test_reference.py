@@ -198,6 +198,14 @@ def test_random_weights_are_alive_and_repeatable() -> None:
     assert 0.3 < logits.std() < 10 and np.abs(logits - logits[0]).max() > 0.05
 
 
+def test_features_are_what_the_dense_layer_reads() -> None:
+    arch = Arch.parse("14d1_19d2_19d4", (8, 12, 16))
+    network = Network(arch, random_weights(arch, 1))
+    x = np.random.default_rng(0).normal(size=(3, 11, 250))
+    assert network.features(x).shape == (3, 16)
+    assert (network.classify(network.features(x)) == network.forward(x)).all()
+
+
 def test_no_pytorch_on_the_way() -> None:
     code = "import sys, plushsense.models.bundle; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

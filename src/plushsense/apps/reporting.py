@@ -119,7 +119,8 @@ def write_report(
         card(
             b.arch,
             rate_hz=b.layout.rate_hz,
-            name=str(b.provenance.get("name", f"{b.arch.symbol} trained on {b.provenance.get('dataset', '?')}")),
+            name=str(b.provenance.get("name", f"{b.arch.symbol} trained on {b.provenance.get('dataset', '?')}"))
+            + (f", adapted to {b.adapted_to}" if b.personal else ""),
             provenance=dict(b.provenance),
         )
         for b in bundles

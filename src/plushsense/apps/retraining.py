@@ -85,7 +85,8 @@ def trained_on(folder: Path, subject: str, places: Iterable[Path]) -> list[Train
     out = []
     for path in _bundles(places):
         try:
-            provenance = Bundle.load(path).provenance
+            bundle = Bundle.load(path)
+            provenance = bundle.provenance
         except BundleError as cause:
             out.append(TrainedOn(str(path), False, f"cannot be read, so nobody knows: {cause}"))
             continue
@@ -98,6 +99,9 @@ def trained_on(folder: Path, subject: str, places: Iterable[Path]) -> list[Train
                 out.append(TrainedOn(str(path), False, said))
             continue
         if subject not in {who for each in people for who in each}:
+            if bundle.adapted_to == subject:
+                said = "adapted to this code: remove it, or take that back with  plushsense adapt BUNDLE --undo"
+                out.append(TrainedOn(str(path), False, said))
             continue
         if certain := theirs[0] == content:
             said = "trained on this person: train it again without them, and remove it"

@@ -16,6 +16,7 @@ from typing import Any
 from plushsense.core.errors import BadInput
 from plushsense.core.gestures import NOBODY
 from plushsense.deploy.golden import write_golden
+from plushsense.live.personal import for_strangers
 from plushsense.models.bundle import Bundle
 from plushsense.models.image import HEAD_BYTES, IntegerModel, head, layout_check, memory_bytes
 
@@ -115,7 +116,7 @@ def _write(model: IntegerModel, bundle: Bundle, folder: Path) -> dict[str, Any]:
     library = files("plushsense.deploy") / "c"
     for name in LIBRARY:
         (folder / name).write_bytes((library / name).read_bytes())
-    bundle = replace(bundle, provenance=without_people(bundle.provenance))
+    bundle = replace(bundle, provenance=without_people(bundle.provenance), personal=for_strangers(bundle.personal))
     image = model.to_bytes()
     facts = _facts(model, bundle, len(image))
     (folder / IMAGE).write_bytes(image)
@@ -158,6 +159,7 @@ def _facts(model: IntegerModel, bundle: Bundle, model_bytes: int) -> dict[str, A
         "memory_bytes": memory_bytes(model),
         "simulated": bool(bundle.provenance.get("simulated", False)),
         "provenance": bundle.provenance,
+        **({"personal": bundle.personal} if bundle.personal else {}),
         "code_version": version("plushsense"),
     }
 

@@ -89,6 +89,7 @@ def handbook(bundle: Bundle, facts: Mapping[str, Any]) -> str:
             "## How good it is",
             "",
             *_scores(bundle.provenance, simulated),
+            *_personal(bundle.personal),
             "",
             _USE.format(image=IMAGE, gap=facts["gap_ms"], channels=len(facts["channels"])),
             "## What this folder holds",
@@ -251,6 +252,20 @@ def _affect_said(facts: Mapping[str, Any]) -> list[str]:
 
 def _people(found: object) -> int | None:
     return found if isinstance(found, int) else len(found) if isinstance(found, list) else None
+
+
+def _personal(personal: Mapping[str, Any]) -> list[str]:
+    if not personal:
+        return []
+    found = personal.get("leave_one_recording_out") or {}
+    before, after = (found.get(when) or {} for when in ("before", "after"))
+    many, right, was = after.get("recordings", "?"), after.get("right", "?"), before.get("right", "?")
+    return [
+        "",
+        "**Adapted to one person**: the last layer was moved by a minute of somebody's gestures, and any figures above",
+        f"are of the network before. Of {many} recordings of that person, each read by a layer moved without it,",
+        f"{right} are read right, before {was}. For other people it may be worse.",
+    ]
 
 
 def _scores(provenance: Mapping[str, Any], simulated: bool) -> list[str]:

@@ -42,7 +42,8 @@ class Bundle:
     ``windowing``, ``decision`` and ``provenance`` are plain values for JSON: how the windows were cut, how
     live decisions are smoothed, where the weights come from (data set hash, subjects, code version, split,
     scores). ``calibration`` says what 8 bits have to hold in a deployed network (``deploy/quantize``): ranges of the
-    training windows, nobody's samples. It may be empty, and is in bundles of before.
+    training windows, nobody's samples. It may be empty, and is in bundles of before. ``personal`` says to whom the
+    dense layer was adapted, and what it was before (`plushsense.live.personal`); empty: to nobody.
 
     Raises:
         BundleError: when the parts do not fit each other.
@@ -57,6 +58,7 @@ class Bundle:
     decision: dict[str, Any] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
     calibration: dict[str, Any] = field(default_factory=dict)
+    personal: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_weights(self.arch, self.weights)
@@ -75,8 +77,13 @@ class Bundle:
         filters = "/".join(str(f) for f in self.arch.filters)
         return (
             f"Bundle({self.arch.symbol} {filters} {self.arch.padding}, {len(self.gestures)} gestures, "
-            f"layout {self.layout.name})"
+            f"layout {self.layout.name}{f', adapted to {self.adapted_to}' if self.personal else ''})"
         )
+
+    @property
+    def adapted_to(self) -> str | None:
+        """The code of the person to whom it was adapted, "somebody" where that is not told; None: to nobody."""
+        return str(self.personal.get("subject", "somebody")) if self.personal else None
 
     def network(self) -> Network:
         """The network in NumPy, ready to answer."""
@@ -157,6 +164,7 @@ class Bundle:
                 content["decision"],
                 content["provenance"],
                 content.get("calibration", {}),
+                content.get("personal", {}),
             )
             implied = bundle._implied()
             changed = [key for key in implied if content.get(key) != implied[key]]
@@ -195,6 +203,7 @@ class Bundle:
                 "decision": self.decision,
                 "provenance": self.provenance,
                 **({"calibration": self.calibration} if self.calibration else {}),
+                **({"personal": self.personal} if self.personal else {}),
                 **self._implied(),
             }
         )

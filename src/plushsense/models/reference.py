@@ -136,11 +136,19 @@ class Network:
         Raises:
             BadInput: for windows of another shape, or shorter than the span.
         """
+        return self.classify(self.features(x))
+
+    def features(self, x: NDArray[np.floating[Any]]) -> Floats:
+        """What the dense layer reads of scaled windows (N, C, T): means over time (N, F).
+
+        Raises:
+            BadInput: as `forward`.
+        """
         check_windows(self.arch, x.shape)
         z: Floats = np.ascontiguousarray(x[:, :, x.shape[2] - self.arch.span :].transpose(0, 2, 1), dtype=np.float64)
         for block in self.blocks:
             z = _through(z, block, self.arch)
-        return self.classify(z.mean(axis=1))
+        return np.asarray(z.mean(axis=1))
 
     def rectified(self, x: NDArray[np.floating[Any]]) -> list[Floats]:
         """What each layer's ReLU gives, before normalisation, of scaled windows (N, C, T): [(N, T', F)]; `stream`."""

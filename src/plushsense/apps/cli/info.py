@@ -42,5 +42,7 @@ def _bundle(args: argparse.Namespace) -> int:
         gestures=list(bundle.gestures.labels),
         provenance=bundle.provenance,
     )
+    if bundle.personal:
+        result["adapted"] = {key: value for key, value in bundle.personal.items() if key != "original"}
     emit(args, result, [f"{key:<20}{value}" for key, value in result.items()])
     return 0

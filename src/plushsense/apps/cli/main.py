@@ -43,6 +43,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "verify": ("verify", "prove that the C of an export gives the same answers, here and on emulated chips"),
     "profile": ("profiling", "what an export costs on a chip: instructions, bytes, stack, and an estimate of the time"),
     "live": ("live", "read a toy and say what it feels, 20 times a second"),
+    "adapt": ("adapt", "adapt a bundle to one person from a minute of their gestures, where that helps; undo"),
     "toy": ("toy", "a virtual toy that speaks the wire format over a pty or TCP"),
     "simulate": ("simulate", "recordings of virtual people, as the authors' recorder would leave them"),
 }
@@ -64,6 +65,7 @@ STOPPED = {
     "forget": "the same command finishes what was begun",
     "publish": "there is no zip; a folder that was written whole can be proved with  plushsense publish --check OUT",
     "train": "no bundle was written",
+    "adapt": "no bundle was written; of --evaluate, trained networks are kept",
     "report": "no page was written",
     "export": "nothing was written",
     "verify": "nothing was changed",
