@@ -48,6 +48,12 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--reconnect", action="store_true", help="wait for a toy that goes away, and go on when it is back"
     )
+    parser.add_argument(
+        "--reactions",
+        metavar="NAME|FILE",
+        help="say what the toy does about it, too: standard, gentle (roughness is never answered with a show), or a "
+        "TOML file of your own",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -55,9 +61,11 @@ def run(args: argparse.Namespace) -> int:
     from plushsense.live.decide import DecideSpec
     from plushsense.live.integer import BothEngines
     from plushsense.live.loop import run as run_loop
+    from plushsense.live.react import Reactor, load_reactions
     from plushsense.models.bundle import Bundle
 
     bundle = Bundle.load(args.model)
+    reactor = Reactor(load_reactions(args.reactions, bundle.gestures)) if args.reactions else None
     decide = DecideSpec.from_dict(bundle.decision)
     if args.smoothing is not None:
         decide = replace(decide, smoothing_s=args.smoothing)
@@ -70,7 +78,8 @@ def run(args: argparse.Namespace) -> int:
         live = run_loop(device, classifier, seconds=args.seconds)
         try:
             for decision in live:
-                sys.stdout.write(json.dumps(decision.to_dict(), ensure_ascii=False) + "\n")
+                told = {"reactions": [r.to_dict() for r in reactor.push(decision)]} if reactor else {}
+                sys.stdout.write(json.dumps(decision.to_dict() | told, ensure_ascii=False) + "\n")
                 sys.stdout.flush()
         except KeyboardInterrupt:
             pass
