@@ -69,7 +69,7 @@ def group_of(gesture: Gesture) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Heard:
-    """What a system said about a stream: ``events`` in order; of a network also each step's (time in s, best class, share)."""
+    """What a system said about a stream: ``events`` in order; a network's steps as (time in s, best class, share)."""
 
     events: tuple[Event, ...]
     answers: tuple[tuple[float, int, float], ...] = ()
@@ -328,7 +328,8 @@ def run(
 
 
 def summary(outcomes: Sequence[Outcome]) -> dict[str, Any]:
-    """Some trials of one system in figures; shares are of all ``trials``, times of those that were answered.
+    """Some trials of one system in figures; shares are of all ``trials``, times of those that were answered, and
+    ``called_negative`` is of those that were not negative (``gentle``).
 
     ``called`` counts what was said first, by the words of ``Outcome.judged``.
     """
@@ -337,6 +338,7 @@ def summary(outcomes: Sequence[Outcome]) -> dict[str, Any]:
     named = sorted(o.gesture_s for o in outcomes if o.gesture_s is not None)
     likely = [o.likelihood for o in outcomes if o.likelihood is not None]
     quick = sum(r <= QUICK_S for r in reactions)
+    gentle = [o for o in outcomes if o.affect != "negative"]
     return {
         "trials": n,
         "activated": len(reactions),
@@ -349,8 +351,9 @@ def summary(outcomes: Sequence[Outcome]) -> dict[str, Any]:
         "gesture_activation": _share(len(named), n),
         "gesture_s": _times(named),
         "likelihood": round(mean(likely), 4) if likely else None,
-        "called_negative": sum(o.negative for o in outcomes),
-        "negative": _share(sum(o.negative for o in outcomes), n),
+        "gentle": len(gentle),
+        "called_negative": sum(o.negative for o in gentle),
+        "negative": _share(sum(o.negative for o in gentle), len(gentle)),
         "called": {word: sum(o.judged == word for o in outcomes) for word in JUDGED},
         "from_gate": sum(o.source == "gate" for o in outcomes),
     }

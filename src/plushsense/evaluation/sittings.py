@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, DatasetError, nearest
-from plushsense.core.gestures import NOBODY
+from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.recfile import Frames
 from plushsense.core.signal import Layout
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
@@ -167,11 +167,13 @@ def recorded_people(dataset: Dataset, asked: Sequence[str] | None, provenance: M
     return list(dict.fromkeys(asked))
 
 
-def recorded_sittings(dataset: Dataset, people: Sequence[str]) -> tuple[list[Sitting], list[Left]]:
-    """Each person's streams with the recordings that were located in them, onset at the trimmed start mark.
+def recorded_sittings(
+    dataset: Dataset, people: Sequence[str], gestures: GestureSet
+) -> tuple[list[Sitting], list[Left]]:
+    """Each person's streams with the recordings of ``gestures`` that were located in them, onset at the start mark.
 
-    A person with several streams has a sitting for each. Who has none, or none with a recording in it, is left out
-    with a reason; so are recordings of labels without a stream.
+    A person with several streams has a sitting for each. Who has none, or none with such a recording in it, is left
+    out with a reason.
 
     Raises:
         DatasetError: when nobody is left.
@@ -186,7 +188,7 @@ def recorded_sittings(dataset: Dataset, people: Sequence[str]) -> tuple[list[Sit
         found = 0
         for stream in streams:
             mine = [r for r in dataset.used if r.stream == stream.id and r.stream_row >= 0]
-            mine = sorted((r for r in mine if dataset.gestures.find(r.gesture)), key=lambda r: r.stream_row)
+            mine = sorted((r for r in mine if gestures.find(r.gesture)), key=lambda r: r.stream_row)
             if not mine:
                 continue
             frames = dataset.read_stream(stream.id)
@@ -194,7 +196,7 @@ def recorded_sittings(dataset: Dataset, people: Sequence[str]) -> tuple[list[Sit
             made: dict[str, int] = {}
             trials = []
             for r in mine:
-                label = dataset.gestures.get(r.gesture).label
+                label = gestures.get(r.gesture).label
                 made[label] = made.get(label, 0) + 1
                 first, last = (min(r.stream_row + row, len(times) - 1) for row in (r.start, r.stop - 1))
                 trials.append(Trial(label, made[label], float(times[first]), float(times[first]), float(times[last])))

@@ -42,6 +42,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "verify": ("verify", "prove that the C of an export gives the same answers, here and on emulated chips"),
     "profile": ("profiling", "what an export costs on a chip: instructions, bytes, stack, and an estimate of the time"),
     "live": ("live", "read a toy and say what it feels, 20 times a second"),
+    "protocol": ("protocol", "the paper's real-time protocol: who answers which touch, and how soon"),
     "toy": ("toy", "a virtual toy that speaks the wire format over a pty or TCP"),
     "simulate": ("simulate", "recordings of virtual people, as the authors' recorder would leave them"),
 }
@@ -63,6 +64,7 @@ STOPPED = {
     "publish": "there is no zip; a folder that was written whole can be proved with  plushsense publish --check OUT",
     "train": "no bundle was written",
     "report": "no page was written",
+    "protocol": "nothing was written",
     "export": "nothing was written",
     "verify": "nothing was changed",
 }
