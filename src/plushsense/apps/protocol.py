@@ -172,6 +172,8 @@ def _told(made: dict[str, Any], bundle: Bundle, engine: str, ruled: bool) -> dic
         said.append(NO_RULES)
     if not settings.fitted:
         said.append("The event settings of this bundle were not fitted: they are the defaults.")
+    if not provenance.get("subjects"):
+        said.append("This bundle does not say on whom it was trained: that it never met these people is not known.")
     if provenance.get("simulated") is True and not made["simulated"]:
         said.append("This network was trained on a virtual toy: on a real one its figures mean nothing yet.")
     said += [f"{entry['who']} {entry['why']}, and was left out." for entry in made["left"]]

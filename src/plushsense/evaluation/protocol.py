@@ -33,6 +33,7 @@ GROUPS = {
     "hug": "Hug",
     "energetic": "Blows and pulls",
     "neutral": "Holding",
+    "fast": "Energetic gestures",
     "other": "Other gestures",
 }
 _GROUP_OF = {
@@ -42,6 +43,8 @@ _GROUP_OF = {
     "neck scratch": "fine",
     "tail scratch": "fine",
     "tail tap": "taps",
+    "tail hit": "energetic",
+    "tail pull": "energetic",
     "hold strong": "hug",
     "hold in hands": "neutral",
 }
@@ -61,10 +64,8 @@ Heuristic = Callable[[Frames], Sequence[Event]]
 
 
 def group_of(gesture: Gesture) -> str:
-    """The protocol's group of a gesture, as the paper's section 4.6 has them."""
-    if gesture.energetic:
-        return "energetic"
-    return _GROUP_OF.get(gesture.family.casefold(), "other")
+    """The protocol's group of a gesture, as the paper's section 4.6 has them; gestures of other toys have two."""
+    return _GROUP_OF.get(gesture.family.casefold(), "fast" if gesture.energetic else "other")
 
 
 @dataclass(frozen=True, eq=False)
@@ -383,10 +384,10 @@ def confusions(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
 
 
 def _strays(between: Sequence[Between]) -> dict[str, Any]:
-    """What was said between the trials, a sum over all streams; reactions are those that a toy would show."""
+    """What was said between the trials, a sum over all streams; reactions are all but neutral events."""
     hours = sum(b.hours for b in between)
     counts = {name: sum(getattr(b, name) for b in between) for name in ("positive", "neutral", "negative", "none")}
-    reactions = counts["positive"] + counts["negative"]
+    reactions = counts["positive"] + counts["negative"] + counts["none"]
     return {
         "hours": round(hours, 4),
         **counts,

@@ -84,7 +84,13 @@ def known_people(provenance: Mapping[str, Any]) -> set[str]:
 
 
 def virtual_sittings(
-    numbers: Sequence[int], seed: int, repetitions: int, layout: Layout, world: World = WORLD
+    numbers: Sequence[int],
+    seed: int,
+    repetitions: int,
+    layout: Layout,
+    *,
+    gestures: Sequence[str] = GESTURES,
+    world: World = WORLD,
 ) -> Iterator[Sitting]:
     """The paper's protocol, played by virtual people: 17 gestures, each some times in a row, as they come over the air.
 
@@ -102,7 +108,7 @@ def virtual_sittings(
         session = Session(draw_person(number, seed, world), seed, _SESSION, world)
         rng = np.random.default_rng([seed, number, _SESSION])
         episodes = [session.idle(4.0)]
-        for label in GESTURES:
+        for label in gestures:
             episodes.append(session.handle())
             episodes.append(session.idle(float(rng.uniform(*_IDLE_S))))
             episodes.append(session.perform(label, repetitions))

@@ -57,7 +57,7 @@ def table_rows(result: Mapping[str, Any]) -> list[dict[str, Any]]:
                 "title": row["title"] if row["group"] != seen else "",
                 "trials": str(row["trials"]) if row["group"] != seen else "",
                 "system": _SHORT[row["system"]],
-                **_cells(row, row["group"] == "energetic"),
+                **_cells(row, row["group"] in ("energetic", "fast")),
                 "paper": (paper.activation or DASH, paper.reaction or DASH, paper.likelihood or DASH),
                 "first": row["group"] != seen,
             }
@@ -82,7 +82,7 @@ def _cells(row: Mapping[str, Any], energetic: bool) -> dict[str, str]:
 def gesture_rows(result: Mapping[str, Any]) -> list[dict[str, Any]]:
     """A row a gesture and system, as finished text."""
     rows = []
-    energetic = {o["gesture"] for o in result["outcomes"] if o["group"] == "energetic"}
+    energetic = {o["gesture"] for o in result["outcomes"] if o["group"] in ("energetic", "fast")}
     seen = None
     for row in result["by_gesture"]:
         rows.append(
@@ -134,7 +134,7 @@ def between_rows(result: Mapping[str, Any]) -> list[dict[str, str]]:
         {
             "system": _SHORT[row["system"]],
             "minutes": f"{60 * row['hours']:.0f}",
-            **{name: str(row[name]) for name in ("positive", "neutral", "negative")},
+            **{name: str(row[name]) for name in ("positive", "neutral", "negative", "none")},
             "reactions": words.number(row["reactions_per_hour"], 1),
             "negatives": words.number(row["negative_per_hour"], 1),
         }
