@@ -51,8 +51,8 @@ _LIKELIHOOD = (
 COUNTED = (
     _ANSWERED,
     "Reaction time counts from the onset: when the hand touches, and of a blow or pull when the blow or jerk itself "
-    "comes, 0.15 to 0.6 s after the hand began. Before it there is little to react to; a sooner answer has a negative "
-    "time.",
+    "comes, 0.15 to 0.6 s after the hand began. A sooner answer has a negative time: a tail that is grasped can be "
+    "felt before the jerk.",
     _LIKELIHOOD,
 )
 COUNTED_RECORDED = (

@@ -408,7 +408,7 @@ def aims(result: Mapping[str, Any]) -> list[dict[str, Any]]:
 
     blows = of("hybrid", group=("energetic",))
     kind = of("hybrid", affect=("positive", "neutral"))
-    answered = [o["reaction_s"] for o in of("hybrid", affect=("positive",)) if o["reaction_s"] is not None]
+    answered = [o["reaction_s"] for o in kind if o["reaction_s"] is not None]
     fine = of("rules", group=("fine",))
     quick = sum(o["reaction_s"] is not None and o["reaction_s"] <= QUICK_S for o in blows)
     time_s = round(median(answered), 3) if answered else None
@@ -422,7 +422,7 @@ def aims(result: Mapping[str, Any]) -> list[dict[str, Any]]:
             most=True,
         ),
         {
-            "aim": "Hybrid: median reaction to positive gestures under 1.5 s",
+            "aim": "Hybrid: median reaction to gentle gestures under 1.5 s",
             "measured": time_s,
             "unit": "s",
             "part": None,
