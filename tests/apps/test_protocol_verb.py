@@ -67,7 +67,7 @@ def test_five_strangers_three_systems_one_page(capsys, model, tmp_path):
     assert "SIMULATED" in page.split("</h1>")[0]
     assert "≈ 0.83" in page
     assert NO_GATE in page
-    for name, rows in (("trials.csv", 34), ("table.csv", 7)):
+    for name, rows in (("trials.csv", 34), ("table.csv", 7 + 17)):
         with (out / name).open(encoding="utf-8", newline="") as file:
             table = list(csv.DictReader(file))
         assert len(table) == rows

@@ -74,6 +74,16 @@ def test_the_table_stands_beside_the_paper():
     assert [len(line) for line in report.text_lines(result())] == [11] * 6
 
 
+def test_the_csv_holds_numbers_of_groups_and_gestures():
+    rows = report.csv_rows(result())
+    assert [(r["of"], r["name"], r["system"]) for r in rows[:1] + rows[-1:]] == [
+        ("group", "Energetic", "hybrid"), ("gesture", "Tail hit 1", "hybrid"),
+    ]  # fmt: skip
+    assert (rows[0]["reaction_median_s"], rows[0]["within_200_ms"], rows[0]["said_first_family"]) == (0.013, 44, 3)
+    assert next(r for r in rows if r["name"] == "Fine" and r["system"] == "rules")["paper_answered"] == "≈ 6 %"
+    assert {r["simulated"] for r in rows} == {"yes"}
+
+
 def test_aims_say_met_or_not():
     assert [(r["measured"], r["met"]) for r in report.aim_rows(result())] == [
         ("97.8 % (44/45)", "NOT met"), ("1.40 s", "met"), ("—", "not measured"),

@@ -207,24 +207,21 @@ def _place(out: Path) -> Path:
 
 def _write(result: dict[str, Any], out: Path) -> list[str]:
     from plushsense.reports.html import put_page
-    from plushsense.reports.protocol import page, text_lines
+    from plushsense.reports.protocol import csv_rows, page
 
     made = page(result)  # first: without the extra nothing is written by halves
     out.mkdir(parents=True, exist_ok=True)
-    outcomes = result["outcomes"]
     mark = {"simulated": "yes" if result["simulated"] else "no"}
-    trials = [[*o.values(), *mark.values()] for o in outcomes]
-    head, *rows = text_lines(result)
-    write_atomically(out / TRIALS, _csv([*outcomes[0], *mark], trials))
-    write_atomically(out / TABLE, _csv([*head, *mark], [[*row, *mark.values()] for row in rows]))
+    write_atomically(out / TRIALS, _csv([outcome | mark for outcome in result["outcomes"]]))
+    write_atomically(out / TABLE, _csv(csv_rows(result)))
     put_page(out / PAGE, made)
     write_atomically(out / RESULT, json.dumps(result, ensure_ascii=False, indent=1, allow_nan=False) + "\n")
     return [str(out / name) for name in (PAGE, TABLE, TRIALS, RESULT)]
 
 
-def _csv(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+def _csv(rows: Sequence[dict[str, Any]]) -> str:
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(head)
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
     writer.writerows(rows)
     return text.getvalue()

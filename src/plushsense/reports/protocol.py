@@ -158,6 +158,31 @@ def aim_rows(result: Mapping[str, Any]) -> list[dict[str, str]]:
     return rows
 
 
+def csv_rows(result: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The figures of every group and gesture by each system, as numbers, with what the paper prints of the same."""
+    rows = []
+    for kind, key in (("rows", "group"), ("by_gesture", "gesture")):
+        for row in result[kind]:
+            paper = PAPER.get((row[key], row["system"]), Printed())
+            rows.append(
+                {
+                    "of": key,
+                    "name": row["title"] if key == "group" else row["gesture"],
+                    "system": row["system"],
+                    **{k: row[k] for k in ("trials", "activated", "activation", "named", "gesture_activation")},
+                    "reaction_median_s": row["reaction_s"]["median"],
+                    "reaction_p90_s": row["reaction_s"]["p90"],
+                    **{k: row[k] for k in ("within_200_ms", "likelihood", "gentle", "called_negative")},
+                    **{f"said_first_{word}": n for word, n in row["called"].items()},
+                    "paper_answered": paper.activation,
+                    "paper_time": paper.reaction,
+                    "paper_likelihood": paper.likelihood,
+                    "simulated": "yes" if result["simulated"] else "no",
+                }
+            )
+    return rows
+
+
 def text_lines(result: Mapping[str, Any]) -> list[tuple[str, ...]]:
     """The main table as cells for a plain table; its head first."""
     head = (
