@@ -29,7 +29,6 @@ from plushsense.evaluation.sittings import (
     virtual_sittings,
 )
 from plushsense.live.decide import DecideSpec
-from plushsense.live.stream import check_layout
 from plushsense.models.bundle import Bundle
 
 RESULT, TRIALS, TABLE, PAGE = "protocol.json", "trials.csv", "table.csv", "protocol.html"
@@ -140,7 +139,11 @@ def _recorded(
     progress: Progress | None,
 ) -> dict[str, Any]:
     """The same on sessions that were recorded."""
-    check_layout(dataset.layout, bundle.layout)
+    if dataset.layout.channels != bundle.layout.channels:
+        raise ConfigError(
+            f"'{dataset.head.name}' was recorded with layout '{dataset.layout.name}', but the network reads "
+            f"'{bundle.layout.name}': take a network that was made for it."
+        )
     people = recorded_people(dataset, subjects, bundle.provenance)
     sittings, left = recorded_sittings(dataset, people, bundle.gestures)
     made = scoring.run(sittings, asked, heuristic, progress, len(sittings))

@@ -178,7 +178,7 @@ def recorded_sittings(
 ) -> tuple[list[Sitting], list[Left]]:
     """Each person's streams with the recordings of ``gestures`` that were located in them, onset at the start mark.
 
-    A person with several streams has a sitting for each. Who has none, or none with such a recording in it, is left
+    The toy at rest is no trial. A person with several streams has a sitting for each. Who has none, or none with such a recording in it, is left
     out with a reason.
 
     Raises:
@@ -194,7 +194,8 @@ def recorded_sittings(
         found = 0
         for stream in streams:
             mine = [r for r in dataset.used if r.stream == stream.id and r.stream_row >= 0]
-            mine = sorted((r for r in mine if gestures.find(r.gesture)), key=lambda r: r.stream_row)
+            known = [r for r in mine if (g := gestures.find(r.gesture)) is not None and not g.idle]
+            mine = sorted(known, key=lambda r: r.stream_row)
             if not mine:
                 continue
             frames = dataset.read_stream(stream.id)
