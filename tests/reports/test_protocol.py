@@ -16,7 +16,8 @@ TIMES = {"median": 0.013, "p90": 0.2}
 
 def row(group, system, **more):
     figures = {
-        "trials": 45, "activated": 44, "named": 40, "activation": 0.9778, "gesture_activation": 0.8889, "reaction_s": TIMES, "within_200_ms": 44, "likelihood": 0.834,
+        "trials": 45, "activated": 44, "named": 40, "activation": 0.9778, "gesture_activation": 0.8889,
+        "reaction_s": TIMES, "within_200_ms": 44, "likelihood": 0.834,
         "gentle": 45, "called_negative": 1, "called": {"right": 40, "family": 3, "affect": 0, "wrong": 1, "unnamed": 1},
     }  # fmt: skip
     return {"group": group, "title": group.title(), "system": system} | figures | more

@@ -178,8 +178,8 @@ def recorded_sittings(
 ) -> tuple[list[Sitting], list[Left]]:
     """Each person's streams with the recordings of ``gestures`` that were located in them, onset at the start mark.
 
-    The toy at rest is no trial. A person with several streams has a sitting for each. Who has none, or none with such a recording in it, is left
-    out with a reason.
+    The toy at rest is no trial. A person with several streams has a sitting for each. Who has none, or none with such
+    a recording in it, is left out with a reason.
 
     Raises:
         DatasetError: when nobody is left.
