@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from plushsense.apps.oldrules import recorded_rules, virtual_rules
 from plushsense.apps.places import check_folder
 from plushsense.apps.preparation import opened
 from plushsense.core.errors import ConfigError
@@ -73,7 +74,7 @@ def protocol(
     session: str | os.PathLike[str] | None = None,
     subjects: Sequence[str] | None = None,
     engine: str = "float",
-    heuristic: scoring.Heuristic | None = None,
+    rules: bool = True,
     out: str | os.PathLike[str] | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
@@ -85,7 +86,7 @@ def protocol(
         dataset, session: recorded sessions instead: a data set, or a folder as a recorder leaves it.
         subjects: some of its people; default: all whom the network never met.
         engine: ``float``, or ``int8``: the deployed network's own arithmetic.
-        heuristic: the old rules; None: they are not asked.
+        rules: ask the old heuristic, too; it is tuned first, on people who are not scored.
         out: folder for the JSON, two CSV and the HTML page; None: nothing is written.
 
     Raises:
@@ -103,17 +104,18 @@ def protocol(
     asked = integer_model(bundle) if engine == "int8" else bundle
     made: dict[str, Any]
     if dataset is not None:
-        made = _recorded(opened(dataset), bundle, asked, subjects, heuristic, progress)
+        made = _recorded(opened(dataset), bundle, asked, subjects, rules, progress)
     elif session is not None:
         with tempfile.TemporaryDirectory() as work:
             folder = Path(work) / "session"
             import_recordings(
                 Path(session), folder, layout=bundle.layout, gestures=bundle.gestures, name=Path(session).resolve().name
             )
-            made = _recorded(opened(folder), bundle, asked, subjects, heuristic, progress)
+            made = _recorded(opened(folder), bundle, asked, subjects, rules, progress)
     else:
         numbers = virtual_numbers(people, first, bundle.provenance)
         sittings = virtual_sittings(numbers, seed, repetitions, bundle.layout)
+        heuristic, tuned = virtual_rules(seed, bundle.layout, bundle.gestures) if rules else (None, NO_RULES)
         made = scoring.run(sittings, asked, heuristic, progress, len(numbers))
         whom = f"{people} virtual, number {numbers[0]} to {numbers[-1]} of the population of seed {seed}"
         made |= {
@@ -121,10 +123,11 @@ def protocol(
             "simulated": True,
             "left": [],
             "people_said": whom,
+            "rules_said": tuned,
             "aims": scoring.aims(made),
             "counted": list(COUNTED),
         }
-    result = _told(made, bundle, engine, heuristic is not None)
+    result = _told(made, bundle, engine)
     if place is not None:
         result["files"] = _write(result, place)
     return result
@@ -135,7 +138,7 @@ def _recorded(
     bundle: Bundle,
     asked: Any,
     subjects: Sequence[str] | None,
-    heuristic: scoring.Heuristic | None,
+    rules: bool,
     progress: Progress | None,
 ) -> dict[str, Any]:
     """The same on sessions that were recorded."""
@@ -146,6 +149,7 @@ def _recorded(
         )
     people = recorded_people(dataset, subjects, bundle.provenance)
     sittings, left = recorded_sittings(dataset, people, bundle.gestures)
+    heuristic, tuned = recorded_rules(dataset, bundle.gestures, people) if rules else (None, NO_RULES)
     made = scoring.run(sittings, asked, heuristic, progress, len(sittings))
     virtual = dataset.head.simulated
     what = "recorded sessions of a simulation" if virtual else "recorded sessions"
@@ -155,6 +159,7 @@ def _recorded(
         "left": [_left(entry) for entry in left],
         "people_said": f"{len({s.who.partition(',')[0] for s in sittings})} of {len(dataset.subjects)}: "
         + ", ".join(s.who for s in sittings),
+        "rules_said": tuned,
         "aims": [],
         "counted": list(COUNTED_RECORDED),
     }
@@ -164,15 +169,14 @@ def _left(entry: Left) -> dict[str, str]:
     return {"who": entry.who, "why": entry.why}
 
 
-def _told(made: dict[str, Any], bundle: Bundle, engine: str, ruled: bool) -> dict[str, Any]:
+def _told(made: dict[str, Any], bundle: Bundle, engine: str) -> dict[str, Any]:
     """The result with what a reader has to know of the network and the settings."""
     settings = DecideSpec.from_dict(bundle.decision)
     provenance = bundle.provenance
     said = []
     if not settings.gate.rules:
         said.append(NO_GATE)
-    if not ruled:
-        said.append(NO_RULES)
+    said.append(made.pop("rules_said"))
     if not settings.fitted:
         said.append("The event settings of this bundle were not fitted: they are the defaults.")
     if not provenance.get("subjects"):

@@ -54,6 +54,7 @@ def run(args: argparse.Namespace) -> int:
         session=args.session,
         subjects=listed(args.subjects) if args.subjects else None,
         engine=args.engine,
+        rules=not args.no_rules,
         out=args.out,
         progress=bar("people"),
     )
