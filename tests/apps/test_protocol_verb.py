@@ -53,7 +53,7 @@ def test_five_strangers_three_systems_one_page(capsys, model, tmp_path):
     pytest.importorskip("jinja2")
     pytest.importorskip("matplotlib")
     out = tmp_path / "out"
-    words = ("--model", model, "--people", 2, "--repetitions", 1, "--out", out)
+    words = ("--model", model, "--people", 2, "--repetitions", 1, "--no-rules", "--out", out)
     status, text, err = said(capsys, *words, "--json")
     assert status == 0, err
     result = json.loads(text)
@@ -90,6 +90,7 @@ def test_recorded_sessions_give_the_same_table_under_their_own_heading(capsys, s
     result = json.loads(text)
     assert result["heading"].startswith("The paper's real-time protocol on recorded sessions of a simulation: raw")
     assert (result["trials"], result["people"], result["aims"]) == (4, ["P01", "P02"], [])
+    assert any("nobody is left to tune the old rules on" in sentence for sentence in result["said"])
     (sessions / "SIMULATION.txt").rename(tmp_path / "SIMULATION.txt")
     try:
         (sessions / "P02" / "fulldatastream.csv").rename(tmp_path / "away.csv")
@@ -102,6 +103,30 @@ def test_recorded_sessions_give_the_same_table_under_their_own_heading(capsys, s
     assert result["simulated"] is False
     assert result["people"] == ["P01"]
     assert "P02 has no session stream, only single recordings, and was left out." in result["said"]
+
+
+def test_the_old_rules_are_tuned_on_people_who_are_not_scored(capsys, sessions, tmp_path):
+    stranger = str(bundle(simulated=False, dataset="elsewhere", subjects=["A"]).save(tmp_path / "m.plush"))
+    status, text, err = said(capsys, "--model", stranger, "--session", sessions, "--subjects", "P02", "--json")
+    assert status == 0, err
+    result = json.loads(text)
+    assert "The old rules were tuned on 1 people who are not scored here." in result["said"]
+    rows = {(row["group"], row["system"]): row for row in result["rows"]}
+    assert rows["energetic", "rules"]["activated"] == 1, "an abrupt blow is what they are for"
+    assert rows["energetic", "rules"]["named"] == 0
+
+
+def test_virtual_rules_are_tuned_on_another_population():
+    from plushsense.apps.oldrules import virtual_rules
+    from plushsense.evaluation.sittings import virtual_sittings
+
+    layout, gestures = load_layout("plush-15"), load_gestures("plush-18")
+    ask, tuned = virtual_rules(1, layout, gestures, people=1)
+    assert tuned == "The old rules were tuned on 1 other virtual people, of another population."
+    sitting = next(iter(virtual_sittings([1001], 1, 2, layout, gestures=("Tail hit 2",))))
+    begun = [e for e in ask(sitting.frames) if e.what == "begun" and e.affect == "negative"]
+    for trial in sitting.trials:
+        assert any(-0.02 <= e.t_s - trial.onset_s < 0.2 for e in begun)
 
 
 def test_what_does_not_fit_is_one_sentence(capsys, model, sessions, tmp_path):

@@ -71,6 +71,7 @@ def test_the_table_stands_beside_the_paper():
     assert by["Energetic", "Hybrid"]["quick"] == "97.8 % (44/45)"
     assert by["Energetic", "Hybrid"]["negative"] == "", "a blow is rightly called negative"
     assert by["Fine", "Rules"]["quick"] == ""
+    assert by["Fine", "Rules"]["named"] == "—", "rules name no gesture"
     assert (by["Taps", "Network"]["median"], by["Taps", "Network"]["likelihood"]) == ("—", "—")
     assert [len(line) for line in report.text_lines(result())] == [11] * 6
 

@@ -21,19 +21,17 @@ OTHERS = 4
 _ELSEWHERE = 1_000_003  # added to the seed: another population
 
 
-def virtual_rules(seed: int, layout: Layout, gestures: GestureSet) -> tuple[Heuristic, str]:
+def virtual_rules(seed: int, layout: Layout, gestures: GestureSet, people: int = OTHERS) -> tuple[Heuristic, str]:
     """Tuned on virtual people of another population; with a sentence that says so."""
     with tempfile.TemporaryDirectory() as work:
         raw, folder = Path(work) / "raw", Path(work) / "ds"
-        simulate(raw, OTHERS, (seed + _ELSEWHERE) % 2**31, 2, at_rest=0, layout=layout)
+        simulate(raw, people, (seed + _ELSEWHERE) % 2**31, 2, at_rest=0, layout=layout)
         dataset = import_recordings(raw, folder, layout=layout, gestures=gestures, name="others").dataset
         plan, _ = fit_heuristic(dataset, gestures, dataset.subjects)
-    return _asks(plan, layout), f"The old rules were tuned on {OTHERS} other virtual people, of another population."
+    return _asks(plan, layout), f"The old rules were tuned on {people} other virtual people, of another population."
 
 
-def recorded_rules(
-    dataset: Dataset, gestures: GestureSet, scored: Collection[str]
-) -> tuple[Heuristic | None, str]:
+def recorded_rules(dataset: Dataset, gestures: GestureSet, scored: Collection[str]) -> tuple[Heuristic | None, str]:
     """Tuned on the people of a data set who are not scored; None, with the reason, where that cannot be."""
     others: Sequence[str] = [code for code in dataset.subjects if code not in scored]
     if not others:

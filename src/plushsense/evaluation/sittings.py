@@ -103,7 +103,12 @@ def virtual_sittings(
     for name, value, low, high in (("repetitions", repetitions, 1, 100), ("seed", seed, 0, 2**31)):
         if not low <= value <= high:
             raise ConfigError(f"{name} is {value}; a whole number from {low} to {high} is accepted.")
-    columns = channel_columns(layout)
+    return _play(numbers, seed, repetitions, channel_columns(layout), gestures, world)
+
+
+def _play(
+    numbers: Sequence[int], seed: int, repetitions: int, columns: list[int], gestures: Sequence[str], world: World
+) -> Iterator[Sitting]:
     for number in numbers:
         session = Session(draw_person(number, seed, world), seed, _SESSION, world)
         rng = np.random.default_rng([seed, number, _SESSION])

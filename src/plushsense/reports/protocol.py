@@ -70,7 +70,7 @@ def _cells(row: Mapping[str, Any], energetic: bool) -> dict[str, str]:
     n = row["trials"]
     return {
         "answered": percent(row["activated"], n),
-        "named": percent(row["named"], n),
+        "named": DASH if row["system"] == "rules" else percent(row["named"], n),
         "median": seconds(row["reaction_s"]["median"]),
         "p90": seconds(row["reaction_s"]["p90"]),
         "quick": percent(row["within_200_ms"], n) if energetic else "",
@@ -91,7 +91,7 @@ def gesture_rows(result: Mapping[str, Any]) -> list[dict[str, Any]]:
                 "first": row["gesture"] != seen,
                 "system": _SHORT[row["system"]],
                 **_cells(row, row["gesture"] in energetic),
-                "called": _called(row["called"]),
+                "called": DASH if row["system"] == "rules" else _called(row["called"]),
             }
         )
         seen = row["gesture"]

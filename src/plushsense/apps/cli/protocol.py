@@ -36,6 +36,9 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="float (default), or int8: the toy's own arithmetic",
     )
     parser.add_argument(
+        "--no-rules", action="store_true", help="leave out the old heuristic, which has to be tuned first"
+    )
+    parser.add_argument(
         "--out", metavar="DIR", help="folder for protocol.html, table.csv, trials.csv and protocol.json"
     )
 
