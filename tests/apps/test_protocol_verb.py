@@ -110,7 +110,7 @@ def test_the_old_rules_are_tuned_on_people_who_are_not_scored(capsys, sessions, 
     status, text, err = said(capsys, "--model", stranger, "--session", sessions, "--subjects", "P02", "--json")
     assert status == 0, err
     result = json.loads(text)
-    assert "The old rules were tuned on 1 people who are not scored here." in result["said"]
+    assert ["Old rules", "Tuned on people who are not scored here: 1."] in result["about"]
     rows = {(row["group"], row["system"]): row for row in result["rows"]}
     assert rows["energetic", "rules"]["activated"] == 1, "an abrupt blow is what they are for"
     assert rows["energetic", "rules"]["named"] == 0
@@ -122,7 +122,7 @@ def test_virtual_rules_are_tuned_on_another_population():
 
     layout, gestures = load_layout("plush-15"), load_gestures("plush-18")
     ask, tuned = virtual_rules(1, layout, gestures, people=1)
-    assert tuned == "The old rules were tuned on 1 other virtual people, of another population."
+    assert tuned == "Tuned on 1 other virtual people, of another population."
     sitting = next(iter(virtual_sittings([1001], 1, 2, layout, gestures=("Tail hit 2",))))
     begun = [e for e in ask(sitting.frames) if e.what == "begun" and e.affect == "negative"]
     for trial in sitting.trials:

@@ -28,7 +28,7 @@ def virtual_rules(seed: int, layout: Layout, gestures: GestureSet, people: int =
         simulate(raw, people, (seed + _ELSEWHERE) % 2**31, 2, at_rest=0, layout=layout)
         dataset = import_recordings(raw, folder, layout=layout, gestures=gestures, name="others").dataset
         plan, _ = fit_heuristic(dataset, gestures, dataset.subjects)
-    return _asks(plan, layout), f"The old rules were tuned on {people} other virtual people, of another population."
+    return _asks(plan, layout), f"Tuned on {people} other virtual people, of another population."
 
 
 def recorded_rules(dataset: Dataset, gestures: GestureSet, scored: Collection[str]) -> tuple[Heuristic | None, str]:
@@ -40,7 +40,7 @@ def recorded_rules(dataset: Dataset, gestures: GestureSet, scored: Collection[st
         plan, _ = fit_heuristic(dataset, gestures, others)
     except ConfigError as cause:
         return None, f"The old rules cannot be tuned: {cause}"
-    return _asks(plan, dataset.layout), f"The old rules were tuned on {len(others)} people who are not scored here."
+    return _asks(plan, dataset.layout), f"Tuned on people who are not scored here: {len(others)}."
 
 
 def _asks(plan: HeuristicPlan, layout: Layout) -> Heuristic:

@@ -176,7 +176,10 @@ def _told(made: dict[str, Any], bundle: Bundle, engine: str) -> dict[str, Any]:
     said = []
     if not settings.gate.rules:
         said.append(NO_GATE)
-    said.append(made.pop("rules_said"))
+    ruled = any(row["system"] == "rules" for row in made["systems"])
+    tuned = made.pop("rules_said")
+    if not ruled:
+        said.append(tuned)
     if not settings.fitted:
         said.append("The event settings of this bundle were not fitted: they are the defaults.")
     if not provenance.get("subjects"):
@@ -197,6 +200,8 @@ def _told(made: dict[str, Any], bundle: Bundle, engine: str) -> dict[str, Any]:
         ["Gate", f"{len(settings.gate.rules)} rule(s)" if settings.gate.rules else "none"],
         ["Event settings", "fitted" if settings.fitted else "defaults, not fitted"],
     ]
+    if ruled:
+        about.append(["Old rules", tuned])
     return made | {"said": said, "about": about, "engine": engine}
 
 
