@@ -34,9 +34,9 @@ STRANGERS = range(101, 106)
 
 @pytest.fixture(scope="module")
 def virtual(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    """Eight virtual people, each gesture twice."""
+    """Twelve virtual people, each gesture twice."""
     folder = tmp_path_factory.mktemp("gate")
-    ps.simulate(folder / "raw", people=8, repetitions=2, dataset=folder / "DS")
+    ps.simulate(folder / "raw", people=12, repetitions=2, dataset=folder / "DS")
     return open_dataset(folder / "DS")
 
 
@@ -115,7 +115,7 @@ def test_the_sizes_of_many_at_once_are_the_gates(virtual: Dataset) -> None:
 
 def test_it_finds_the_blows_it_was_fitted_on(fitted: GateFit) -> None:
     report = fitted.report
-    assert report["people"] == 8 and report["recordings"] == 48
+    assert report["people"] == 12 and report["recordings"] == 72
     assert report["recall"] >= 0.95
     assert report["false_alarms_per_hour"] <= 2.0
     for rule in fitted.plan.rules:
@@ -136,20 +136,21 @@ def test_strangers_blows_are_answered_at_once_and_caresses_are_not_called_blows(
     [
         dataclasses.replace(WORLD, humidity_session=0.5),
         dataclasses.replace(WORLD, humidity_session=0.02, humidity_drift=0.006),
+        dataclasses.replace(WORLD, humidity_gain=0.4),
         dataclasses.replace(WORLD, hand_child=(0.58, 0.06), hand_teen=(0.72, 0.06), hand_adult=(0.82, 0.07)),
         dataclasses.replace(WORLD, hand_child=(0.9, 0.06), hand_teen=(1.12, 0.06), hand_adult=(1.28, 0.07)),
     ],
-    ids=["damp and dry days", "the same day", "small hands", "large hands"],
+    ids=["damp and dry days", "the same day", "damp skin", "small hands", "large hands"],
 )
 def test_neither_humidity_nor_the_hand_matters_much(fitted: GateFit, world: World) -> None:
     quick, gentle, _ = on_strangers(fitted.plan, world)
-    assert quick >= 0.9
+    assert quick >= 0.85
     assert gentle <= 0.03
 
 
 def test_a_lower_rate_allows_fewer_false_alarms(virtual: Dataset) -> None:
-    few = fit_gate(virtual, virtual.gestures, virtual.subjects, false_alarms_per_hour=0.1).report
-    many = fit_gate(virtual, virtual.gestures, virtual.subjects, false_alarms_per_hour=60.0).report
+    few = fit_gate(virtual, virtual.gestures, virtual.subjects[:5], false_alarms_per_hour=0.1).report
+    many = fit_gate(virtual, virtual.gestures, virtual.subjects[:5], false_alarms_per_hour=60.0).report
     assert few["false_alarms_per_hour"] <= many["false_alarms_per_hour"]
     assert few["recall"] <= many["recall"]
 
@@ -157,14 +158,14 @@ def test_a_lower_rate_allows_fewer_false_alarms(virtual: Dataset) -> None:
 def test_one_energetic_gesture_is_named(virtual: Dataset) -> None:
     calm = [dataclasses.replace(g, energetic=g.label == "Tail hit 2") for g in virtual.gestures.gestures]
     chosen = GestureSet("one", tuple(g for g in calm if g.label not in ("Tail hit 1", "Tail pull")))
-    fit = fit_gate(virtual, chosen, virtual.subjects)
+    fit = fit_gate(virtual, chosen, virtual.subjects[:5])
     assert fit.plan.rules and {r.gesture for r in fit.plan.rules} == {chosen.index("Tail hit 2")}
     assert set(fit.report["recall_by_gesture"]) == {"Tail hit 2"}
 
 
 def test_gestures_without_affect_give_rules_without_one(virtual: Dataset) -> None:
     plain = [dataclasses.replace(g, affect="none") for g in virtual.gestures.gestures]
-    fit = fit_gate(virtual, GestureSet("plain", tuple(plain)), virtual.subjects)
+    fit = fit_gate(virtual, GestureSet("plain", tuple(plain)), virtual.subjects[:5])
     assert {rule.affect for rule in fit.plan.rules} == {AFFECT_CODES["none"]}
 
 
@@ -195,5 +196,7 @@ def test_on_real_people(real_data: Path, tmp_path: Path) -> None:
     for stretch in others.stretches:
         gate = Gate(fit.plan)
         fired = [gate.push(row) >= 0 for row in stretch.x.tolist()]
-        gate_at_rest += sum(f and c >= 0 and others.calm[c][1] == "At Rest" for f, c in zip(fired, stretch.calm))
+        gate_at_rest += sum(
+            f and c >= 0 and others.calm[c][1] == "At Rest" for f, c in zip(fired, stretch.calm, strict=True)
+        )
     assert gate_at_rest == 0
