@@ -62,6 +62,12 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--reconnect", action="store_true", help="wait for a toy that goes away, and go on when it is back"
     )
+    parser.add_argument(
+        "--reactions",
+        metavar="NAME|FILE",
+        help="say what the toy does about it, too: standard, gentle (roughness is never answered with a show), or a "
+        "TOML file of your own",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -69,9 +75,11 @@ def run(args: argparse.Namespace) -> int:
     from plushsense.live.decide import DecideSpec
     from plushsense.live.integer import BothEngines
     from plushsense.live.loop import run as run_loop
+    from plushsense.live.react import Reactor, load_reactions
     from plushsense.models.bundle import Bundle
 
     bundle = Bundle.load(args.model)
+    reactor = Reactor(load_reactions(args.reactions, bundle.gestures)) if args.reactions else None
     decide = DecideSpec.from_dict(bundle.decision)
     if args.smoothing is not None:
         decide = replace(decide, smoothing_s=args.smoothing)
@@ -85,14 +93,16 @@ def run(args: argparse.Namespace) -> int:
         try:
             state: State | None = None
             for decision in live:
+                reactions = reactor.push(decision) if reactor else []
                 if args.text or args.events:
                     news, state = decision.state != state, decision.state
-                    if not (news or decision.events):
+                    if not (news or decision.events or reactions):
                         continue
                 if args.text:
                     lines = told(decision, news)
                 else:
-                    lines = [json.dumps(decision.to_dict(), ensure_ascii=False)]
+                    more = {"reactions": [r.to_dict() for r in reactions]} if reactor else {}
+                    lines = [json.dumps(decision.to_dict() | more, ensure_ascii=False)]
                 sys.stdout.write("".join(f"{line}\n" for line in lines))
                 sys.stdout.flush()
         except KeyboardInterrupt:

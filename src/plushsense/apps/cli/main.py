@@ -44,6 +44,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "profile": ("profiling", "what an export costs on a chip: instructions, bytes, stack, and an estimate of the time"),
     "live": ("live", "read a toy and say what it feels, 20 times a second"),
     "adapt": ("adapt", "adapt a bundle to one person from a minute of their gestures, where that helps; undo"),
+    "protocol": ("protocol", "the paper's real-time protocol: who answers which touch, and how soon"),
     "toy": ("toy", "a virtual toy that speaks the wire format over a pty or TCP"),
     "simulate": ("simulate", "recordings of virtual people, as the authors' recorder would leave them"),
 }
@@ -67,6 +68,7 @@ STOPPED = {
     "train": "no bundle was written",
     "adapt": "no bundle was written; of --evaluate, trained networks are kept",
     "report": "no page was written",
+    "protocol": "nothing was written",
     "export": "nothing was written",
     "verify": "nothing was changed",
 }

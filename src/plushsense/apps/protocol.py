@@ -1,0 +1,239 @@
+"""The paper's real-time protocol with a bundle: on virtual strangers, or on recorded sessions of real ones."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from plushsense.apps.oldrules import recorded_rules, virtual_rules
+from plushsense.apps.places import check_folder
+from plushsense.apps.preparation import opened
+from plushsense.core.errors import ConfigError
+from plushsense.core.gestures import NOBODY
+from plushsense.dataset.importers import import_recordings
+from plushsense.dataset.store import Dataset, write_atomically
+from plushsense.deploy.calibration import integer_model
+from plushsense.evaluation import protocol as scoring
+from plushsense.evaluation.sittings import (
+    FIRST_STRANGER,
+    Left,
+    Progress,
+    recorded_people,
+    recorded_sittings,
+    virtual_numbers,
+    virtual_sittings,
+)
+from plushsense.live.decide import DecideSpec
+from plushsense.models.bundle import Bundle
+
+RESULT, TRIALS, TABLE, PAGE = "protocol.json", "trials.csv", "table.csv", "protocol.html"
+ENGINES = ("float", "int8")
+
+NO_GATE = (
+    "This bundle has no gate, so there is no hybrid: network and hybrid would be the same. Blows wait for the network."
+)
+NO_RULES = "The old heuristic was not asked: there are no figures of rules only."
+_ANSWERED = (
+    "Answered: an event of the gesture's affect began between 0.3 s before the hand touched and 2 s after it left. "
+    "Named: so the right gesture was, in any event of the trial. Shares are of all trials, times of those that were "
+    "answered."
+)
+_LIKELIHOOD = (
+    "Likelihood: mean over the trials of the highest smoothed probability of what was said first. Called negative: an "
+    "event of negative affect began while the hand worked or within 0.3 s after; blows and pulls are not counted there."
+)
+COUNTED = (
+    _ANSWERED,
+    "Reaction time counts from the onset: when the hand touches, and of a blow or pull when the blow or jerk itself "
+    "comes, 0.15 to 0.6 s after the hand began. A sooner answer has a negative time: a tail that is grasped can be "
+    "felt before the jerk.",
+    _LIKELIHOOD,
+)
+COUNTED_RECORDED = (
+    _ANSWERED,
+    "Reaction time counts from the recording's start mark, as it was trimmed; untrimmed recordings begin with some "
+    "waiting, which makes reactions look slower than they were.",
+    _LIKELIHOOD,
+)
+
+
+def protocol(
+    model: Bundle | str | os.PathLike[str],
+    *,
+    people: int = 5,
+    first: int = FIRST_STRANGER,
+    seed: int = 1,
+    repetitions: int = 3,
+    dataset: Dataset | str | os.PathLike[str] | None = None,
+    session: str | os.PathLike[str] | None = None,
+    subjects: Sequence[str] | None = None,
+    engine: str = "float",
+    rules: bool = True,
+    out: str | os.PathLike[str] | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Run the protocol, score rules, network and hybrid, and write table, trials and page.
+
+    Args:
+        model: a bundle; its own decision settings, gate and all, are used.
+        people, first, seed, repetitions: of the virtual people: numbers from ``first`` on, of the population ``seed``.
+        dataset, session: recorded sessions instead: a data set, or a folder as a recorder leaves it.
+        subjects: some of its people; default: all whom the network never met.
+        engine: ``float``, or ``int8``: the deployed network's own arithmetic.
+        rules: ask the old heuristic, too; it is tuned first, on people who are not scored.
+        out: folder for the JSON, two CSV and the HTML page; None: nothing is written.
+
+    Raises:
+        ConfigError: for people on whom the network was trained, sizes that cannot be, a folder that is taken.
+        DatasetError: where nobody has a session stream with recordings in it.
+    """
+    bundle = model if isinstance(model, Bundle) else Bundle.load(Path(model))
+    if engine not in ENGINES:
+        raise ConfigError(f"The engine is '{engine}'; accepted are {', '.join(ENGINES)}.")
+    if dataset is not None and session is not None:
+        raise ConfigError("A data set and a session were given: give one of them.")
+    if subjects is not None and dataset is None and session is None:
+        raise ConfigError("Subjects are people of a data set or session; of virtual people give their number.")
+    place = None if out is None else _place(Path(out))
+    asked = integer_model(bundle) if engine == "int8" else bundle
+    made: dict[str, Any]
+    if dataset is not None:
+        made = _recorded(opened(dataset), bundle, asked, subjects, rules, progress)
+    elif session is not None:
+        with tempfile.TemporaryDirectory() as work:
+            folder = Path(work) / "session"
+            import_recordings(
+                Path(session), folder, layout=bundle.layout, gestures=bundle.gestures, name=Path(session).resolve().name
+            )
+            made = _recorded(opened(folder), bundle, asked, subjects, rules, progress)
+    else:
+        numbers = virtual_numbers(people, first, bundle.provenance)
+        sittings = virtual_sittings(numbers, seed, repetitions, bundle.layout)
+        heuristic, tuned = virtual_rules(seed, bundle.layout, bundle.gestures) if rules else (None, NO_RULES)
+        made = scoring.run(sittings, asked, heuristic, progress, len(numbers))
+        whom = f"{people} virtual, number {numbers[0]} to {numbers[-1]} of the population of seed {seed}"
+        made |= {
+            "heading": "The paper's real-time protocol, SIMULATED",
+            "simulated": True,
+            "left": [],
+            "people_said": whom,
+            "rules_said": tuned,
+            "aims": scoring.aims(made),
+            "counted": list(COUNTED),
+        }
+    result = _told(made, bundle, engine)
+    if place is not None:
+        result["files"] = _write(result, place)
+    return result
+
+
+def _recorded(
+    dataset: Dataset,
+    bundle: Bundle,
+    asked: Any,
+    subjects: Sequence[str] | None,
+    rules: bool,
+    progress: Progress | None,
+) -> dict[str, Any]:
+    """The same on sessions that were recorded."""
+    if dataset.layout.channels != bundle.layout.channels:
+        raise ConfigError(
+            f"'{dataset.head.name}' was recorded with layout '{dataset.layout.name}', but the network reads "
+            f"'{bundle.layout.name}': take a network that was made for it."
+        )
+    people = recorded_people(dataset, subjects, bundle.provenance)
+    sittings, left = recorded_sittings(dataset, people, bundle.gestures)
+    heuristic, tuned = recorded_rules(dataset, bundle.gestures, people) if rules else (None, NO_RULES)
+    made = scoring.run(sittings, asked, heuristic, progress, len(sittings))
+    virtual = dataset.head.simulated
+    what = "recorded sessions of a simulation" if virtual else "recorded sessions"
+    return made | {
+        "heading": f"The paper's real-time protocol on {what}: {dataset.head.name}",
+        "simulated": virtual,
+        "left": [_left(entry) for entry in left],
+        "people_said": f"{len({s.who.partition(',')[0] for s in sittings})} of {len(dataset.subjects)}: "
+        + ", ".join(s.who for s in sittings),
+        "rules_said": tuned,
+        "aims": [],
+        "counted": list(COUNTED_RECORDED),
+    }
+
+
+def _left(entry: Left) -> dict[str, str]:
+    return {"who": entry.who, "why": entry.why}
+
+
+def _told(made: dict[str, Any], bundle: Bundle, engine: str) -> dict[str, Any]:
+    """The result with what a reader has to know of the network and the settings."""
+    settings = DecideSpec.from_dict(bundle.decision)
+    provenance = bundle.provenance
+    said = []
+    if not settings.gate.rules:
+        said.append(NO_GATE)
+    ruled = any(row["system"] == "rules" for row in made["systems"])
+    tuned = made.pop("rules_said")
+    if not ruled:
+        said.append(tuned)
+    if not settings.fitted:
+        said.append("The event settings of this bundle were not fitted: they are the defaults.")
+    if not provenance.get("subjects"):
+        said.append("This bundle does not say on whom it was trained: that it never met these people is not known.")
+    if provenance.get("simulated") is True and not made["simulated"]:
+        said.append("This network was trained on a virtual toy: on a real one its figures mean nothing yet.")
+    said += [f"{entry['who']} {entry['why']}, and was left out." for entry in made["left"]]
+    filters = "/".join(map(str, bundle.arch.filters))
+    who = len(set(provenance.get("subjects", ())) - {NOBODY})
+    trained = f"{provenance.get('dataset', 'unknown data')}, {who} people"
+    times = [o["repetition"] for o in made["outcomes"]]
+    about = [
+        ["People", made.pop("people_said")],
+        ["Trials", f"{made['trials']}: {made['gestures']} gestures, up to {max(times, default=0)} times each a person"],
+        ["Network", f"{bundle.arch.symbol}, filters {filters}, {bundle.arch.padding}; span {_span(bundle):.2f} s"],
+        ["Trained on", trained],
+        ["Arithmetic", "8 bits, the toy's own" if engine == "int8" else "floating point"],
+        ["Gate", f"{len(settings.gate.rules)} rule(s)" if settings.gate.rules else "none"],
+        ["Event settings", "fitted" if settings.fitted else "defaults, not fitted"],
+    ]
+    if ruled:
+        about.append(["Old rules", tuned])
+    return made | {"said": said, "about": about, "engine": engine}
+
+
+def _span(bundle: Bundle) -> float:
+    return bundle.arch.span / bundle.layout.rate_hz
+
+
+def _place(out: Path) -> Path:
+    """A new or empty folder, or one that holds an older protocol."""
+    check_folder(out, "A protocol")
+    if out.is_dir() and any(out.iterdir()) and not (out / RESULT).is_file():
+        raise ConfigError(f"'{out}' holds something that is not a protocol: give a new or empty folder.")
+    return out
+
+
+def _write(result: dict[str, Any], out: Path) -> list[str]:
+    from plushsense.reports.html import put_page
+    from plushsense.reports.protocol import csv_rows, page
+
+    made = page(result)  # first: without the extra nothing is written by halves
+    out.mkdir(parents=True, exist_ok=True)
+    mark = {"simulated": "yes" if result["simulated"] else "no"}
+    write_atomically(out / TRIALS, _csv([outcome | mark for outcome in result["outcomes"]]))
+    write_atomically(out / TABLE, _csv(csv_rows(result)))
+    put_page(out / PAGE, made)
+    write_atomically(out / RESULT, json.dumps(result, ensure_ascii=False, indent=1, allow_nan=False) + "\n")
+    return [str(out / name) for name in (PAGE, TABLE, TRIALS, RESULT)]
+
+
+def _csv(rows: Sequence[dict[str, Any]]) -> str:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
