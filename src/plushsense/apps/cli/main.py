@@ -34,6 +34,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "arch": ("arch", "count a network: parameters, receptive field, multiply-accumulates, state"),
     "train": ("train", "train one network and save it as a bundle"),
     "evaluate": ("evaluate", "how good it is, on people it never met"),
+    "stream-eval": ("stream_eval", "whole streams against what really happened: events, false events, how soon"),
     "baselines": ("baselines", "classical programs, LSTMs and our network side by side, and what a leaky split hides"),
     "sweep": ("sweep", "train and compare every network of a grid, and go on after whatever stopped it"),
     "search": ("search", "the best network within limits of size, for a share of what a whole sweep costs"),
@@ -50,6 +51,7 @@ VERBS: dict[str, tuple[str, str]] = {
 STOPPED = {
     "demo": "what was finished is kept, and the same command goes on from there",
     "evaluate": "finished folds are kept, and the same command goes on from there",
+    "stream-eval": "finished folds are kept, and the same command goes on from there",
     "sweep": "finished trainings are kept, and the same command goes on from there",
     "search": "finished trainings are kept, and the same command goes on from there",
     "baselines": "finished folds are kept, and the same command goes on from there",
