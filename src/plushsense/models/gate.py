@@ -1,19 +1,23 @@
 """The gate: threshold rules that notice an energetic event within a few samples, in whole numbers only.
 
-This room defines when a toy's gate fires; ``deploy/c/plushsense.c`` repeats it. It reads the network's inputs, raw, one
-even sample at a time, and works from the first samples on, while the network is still warming.
+This room defines when a toy's gate fires; ``deploy/c/plushsense.c`` repeats it, in 32 bits. It reads the network's
+inputs, raw, one even sample at a time, and works from the first samples on, while the network is still warming.
 
-- A *signal* is made of one input, or of several: ``level`` is the input itself; ``jerk`` the sum over the inputs of the
-  absolute change from ``lag`` samples ago. Each is shifted down by ``shift`` bits and held within ± 2^20.
+- Inputs are shifted down by a signal's ``shift`` bits and held within ± 2^20. A *signal* is made of one of them, or of
+  several: ``level`` is the input itself; ``jerk`` the sum over the inputs of the absolute change from ``lag`` samples
+  ago (0 while there are not so many), held within 2^20 again.
 - Its *baseline* is an exponential mean with the weight 2^-baseline, its *noise* that of the deviation from the
   baseline with the weight 2^-noise; a deviation counts there with at most 4 times noise plus floor, so that one blow
   does not deafen the gate. Both begin with the signal's first value, and a noise of 0. They are kept with 8 more bits.
-- A *term* of a rule holds while the deviation (``sign`` 1: above the baseline only, -1: below only, 0: either way) is
-  at least ``threshold`` / 16 times noise plus ``floor`` for ``times`` samples in a row, and ``within`` samples longer.
-- A *rule* fires when all its terms hold; then it is deaf for ``deaf`` samples. The first rule that fires speaks.
+- Its *size* is 16 times the deviation, without its sign, divided by noise plus ``floor`` and rounded down.
+- A *term* of a rule holds when the size was at least ``threshold`` for ``times`` samples in a row (``sign`` 1: above
+  the baseline only, -1: below only, 0: either way), and ``within`` samples longer.
+- A *rule* fires when all its terms hold. The first rule that fires speaks; then the gate is deaf for its ``deaf``
+  samples, while signals and terms go on.
 
-Samples that repeat the one before exactly, and suspect ones, break every row and hold nothing: a sensor that jumps and
-stays exactly there is broken, not hit (see ``models/health``).
+A sample whose inputs all repeat the one before is not read (a hung toy is not hit); it only shortens the deafness. At a
+suspect sample (see ``models/health``) everything but the deafness begins anew: a sensor that jumps to its end stop and
+back is broken, not hit.
 """
 
 from __future__ import annotations
@@ -29,6 +33,7 @@ HELD = 1 << 20
 EXTRA_BITS = 8
 THRESHOLD_BITS = 4
 NOISE_CLIP = 4
+MOST_SIZE = 2 * HELD << THRESHOLD_BITS  # of a deviation of 2^21 over a floor of 1
 MOST_SIGNALS, MOST_RULES, MOST_TERMS, MOST_LAG = 32, 16, 8, 16
 
 
@@ -47,7 +52,7 @@ class Signal:
 
 @dataclass(frozen=True)
 class Term:
-    """``signal`` (an index) deviates by ``threshold`` / 16 times noise plus floor."""
+    """``signal`` (an index) has a size of at least ``threshold``, a sixteenth of noise plus floor each."""
 
     signal: int
     threshold: int
@@ -98,7 +103,7 @@ class GatePlan:
             _within("deaf", rule.deaf, 0, 65535)
             for term in rule.terms:
                 _within("signal of a term", term.signal, 0, len(self.signals) - 1)
-                _within("threshold", term.threshold, 0, 65535)
+                _within("threshold", term.threshold, 1, MOST_SIZE)
                 _within("sign", term.sign, -1, 1)
                 _within("times", term.times, 1, 255)
 
@@ -127,83 +132,113 @@ def _within(what: str, value: int, low: int, high: int) -> None:
 
 
 class Gate:
-    """Follows one stream of inputs."""
+    """Follows one stream of inputs. ``sizes`` and ``deviations`` tell of each signal at the last sample read."""
 
     def __init__(self, plan: GatePlan) -> None:
         self.plan = plan
+        self._longest = max((s.lag for s in plan.signals if s.kind == JERK), default=1)
+        self._signals = []
+        for at, s in enumerate(plan.signals):
+            several, lag = s.inputs if len(s.inputs) > 1 else (), s.lag if s.kind == JERK else 0
+            self._signals.append((at, s.inputs[0], several, lag, s.shift, s.baseline, s.noise, s.floor))
+        self._rules = [
+            (at, [(t.signal, t.threshold, t.sign, t.times) for t in rule.terms], rule.within + 1)
+            for at, rule in enumerate(plan.rules)
+        ]
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything: after a gap, a clock reset, a fault."""
+        """Begin a new stream: after a gap, a clock reset, a fault."""
+        self._deaf = 0
+        self._forget()
+
+    def _forget(self) -> None:
         n = len(self.plan.signals)
-        self._past: list[Sequence[int]] = []  # the newest last, as many as the longest lag needs
+        self._past: list[list[int]] = []  # the newest last, as many as the longest lag needs
         self._baseline = [0] * n
         self._noise = [0] * n
-        self._begun = [False] * n
-        self.deviation = [0] * n
-        self.level = [1] * n
+        self.deviations, self.sizes = [0] * n, [0] * n
         self._rows = [[0] * len(rule.terms) for rule in self.plan.rules]
         self._holds = [[0] * len(rule.terms) for rule in self.plan.rules]
-        self._deaf = [0] * len(self.plan.rules)
-        self._longest = max((s.lag for s in self.plan.signals if s.kind == JERK), default=1)
 
     def push(self, inputs: Sequence[int], suspect: bool = False) -> int:
         """One sample's inputs (I,): the index of the rule that fires, or -1."""
-        plan = self.plan
-        if not plan.rules:
+        if not self._rules:
             return -1
-        past = self._past
-        suspect = suspect or (bool(past) and list(past[-1]) == list(inputs))
-        for at, signal in enumerate(plan.signals):
-            self._follow(at, signal, inputs)
-        past.append(inputs)
+        deaf = self._deaf > 0
+        if deaf:
+            self._deaf -= 1
+        if suspect:
+            self._forget()
+            return -1
+        now, past = list(inputs), self._past
+        if past and past[-1] == now:
+            return -1
+        self._follow(now)
+        past.append(now)
         if len(past) > self._longest:
             del past[0]
-        fired = -1
-        for at, rule in enumerate(plan.rules):
-            if self._holding(at, rule, suspect) and self._deaf[at] == 0 and fired < 0:
-                fired = at
-                self._deaf[at] = rule.deaf
-            elif self._deaf[at] > 0:
-                self._deaf[at] -= 1
+        fired = self._judge()
+        if deaf or fired < 0:
+            return -1
+        self._deaf = self.plan.rules[fired].deaf
         return fired
 
-    def _follow(self, at: int, signal: Signal, inputs: Sequence[int]) -> None:
-        if signal.kind == LEVEL:
-            value = inputs[signal.inputs[0]]
-        elif len(self._past) >= signal.lag:
-            before = self._past[-signal.lag]
-            value = sum(abs(inputs[i] - before[i]) for i in signal.inputs)
-        else:
-            value = 0
-        value = max(-HELD, min(HELD, value >> signal.shift))
-        if not self._begun[at]:
-            self._begun[at] = True
-            self._baseline[at] = value << EXTRA_BITS
-        base = self._baseline[at]
-        deviation = value - (base >> EXTRA_BITS)
-        level = (self._noise[at] >> EXTRA_BITS) + signal.floor
-        self.deviation[at], self.level[at] = deviation, level
-        self._baseline[at] = base + (((value << EXTRA_BITS) - base) >> signal.baseline)
-        size = min(abs(deviation), NOISE_CLIP * level)
-        self._noise[at] += ((size << EXTRA_BITS) - self._noise[at]) >> signal.noise
+    def _follow(self, now: list[int]) -> None:
+        # Written out, and the usual case first: this runs for every sample of every toy.
+        past, baseline, noise = self._past, self._baseline, self._noise
+        for at, one, several, lag, shift, slow, slower, floor in self._signals:
+            if lag == 0:
+                value = now[one] >> shift
+                if not -HELD <= value <= HELD:
+                    value = _held(value)
+            elif len(past) < lag:
+                value = 0
+            else:
+                before, value = past[-lag], 0
+                for i in several or (one,):
+                    a, b = now[i] >> shift, before[i] >> shift
+                    if -HELD <= a <= HELD and -HELD <= b <= HELD:
+                        value += a - b if a > b else b - a
+                    else:
+                        value += abs(_held(a) - _held(b))
+                if value > HELD:
+                    value = HELD
+            high = value << EXTRA_BITS
+            if not past:
+                baseline[at] = high
+            base = baseline[at]
+            deviation = value - (base >> EXTRA_BITS)
+            size = -deviation if deviation < 0 else deviation
+            level = (noise[at] >> EXTRA_BITS) + floor
+            self.deviations[at] = deviation
+            self.sizes[at] = (size << THRESHOLD_BITS) // level
+            baseline[at] = base + ((high - base) >> slow)
+            if size > NOISE_CLIP * level:
+                size = NOISE_CLIP * level
+            noise[at] += ((size << EXTRA_BITS) - noise[at]) >> slower
 
-    def _holding(self, at: int, rule: Rule, suspect: bool) -> bool:
-        rows, holds = self._rows[at], self._holds[at]
-        every = True
-        for n, term in enumerate(rule.terms):
-            deviation, level = self.deviation[term.signal], self.level[term.signal]
-            size = deviation if term.sign > 0 else -deviation if term.sign < 0 else abs(deviation)
-            if suspect:
-                rows[n] = holds[n] = 0
-            elif size > 0 and (size << THRESHOLD_BITS) >= term.threshold * level:
-                rows[n] = min(rows[n] + 1, 255)
-            else:
-                rows[n] = 0
-            if rows[n] >= term.times:
-                holds[n] = rule.within + 1
-            if holds[n] == 0:
-                every = False
-            else:
-                holds[n] -= 1
-        return every
+    def _judge(self) -> int:
+        sizes, deviations, fired = self.sizes, self.deviations, -1
+        for at, terms, hold in self._rules:
+            rows, holds = self._rows[at], self._holds[at]
+            every = True
+            for n, (signal, threshold, sign, times) in enumerate(terms):
+                if sizes[signal] >= threshold and (sign == 0 or (deviations[signal] > 0) == (sign > 0)):
+                    if rows[n] < times:
+                        rows[n] += 1
+                    if rows[n] == times:
+                        holds[n] = hold
+                else:
+                    rows[n] = 0
+                if holds[n]:
+                    holds[n] -= 1
+                else:
+                    every = False
+            if every and fired < 0:
+                fired = at
+        return fired
+
+
+def _held(value: int) -> int:
+    return value if -HELD <= value <= HELD else HELD if value > 0 else -HELD

@@ -218,6 +218,11 @@ def _not_too_long(wanted: list[RecordingInfo], spec: WindowSpec) -> tuple[list[R
     return kept, left_out
 
 
+def recordings_in_time(wanted: list[RecordingInfo], spec: WindowSpec | None = None) -> list[RecordingInfo]:
+    """Those that somebody stopped in time, by the rule of `WindowSpec.longest_factor`."""
+    return _not_too_long(wanted, spec or WindowSpec())[0]
+
+
 def _assemble(cuts: list[tuple[RecordingInfo, _Cut]], gestures: GestureSet, dataset: Dataset) -> WindowSet:
     ids = tuple(sorted({r.id for r, _ in cuts}))
     number = {identity: i for i, identity in enumerate(ids)}

@@ -44,12 +44,14 @@ class Canvas:
         near: (n,) how near a hand is, 0 to 1, for the proximity electrode.
         shake: (n, 3) acceleration without gravity, in g.
         down: (n, 3) direction of gravity, of length 1.
+        struck: samples at which somebody strikes or jerks the toy: when a rough gesture is felt.
     """
 
     def __init__(self, n: int, down: Floats) -> None:
         self.press: Floats = np.zeros((n, len(ZONES)))
         self.near: Floats = np.zeros(n)
         self.shake: Floats = np.zeros((n, 3))
+        self.struck: list[int] = []
         self.down: Floats = np.tile(down / np.linalg.norm(down), (n, 1))
 
     def __len__(self) -> int:

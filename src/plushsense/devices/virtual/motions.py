@@ -133,6 +133,7 @@ def _hit(canvas: Canvas, trial: Trial, rng: np.random.Generator, world: World) -
     size = world.hit_shake_g[0] * who.hit * trial.force**0.5
     size *= 1.0 if trial.in_hands else 0.5 + 0.5 * world.table_shake
     blow = np.array([0.7, 0.3, -1.0]) * (1.0 + 0.25 * rng.standard_normal(3))
+    canvas.struck.append(trial.at + at)
     canvas.knock(trial.at + at, blow, size, 7.0 + 5.0 * rng.random(), 0.05 + 0.03 * rng.random())
     rock = np.array([1.0, 0.5, 0.3]) * (1.0 + 0.3 * rng.standard_normal(3))
     canvas.knock(trial.at + at, rock, 0.16 * size, 1.8 + 1.6 * rng.random(), 0.28)
@@ -148,6 +149,7 @@ def _pull(canvas: Canvas, trial: Trial, rng: np.random.Generator, world: World) 
     at = round(trial.n * (0.25 + 0.25 * rng.random()))
     size = world.pull_shake_g[0] * math.exp(world.pull_shake_g[1] * rng.standard_normal()) * who.hit
     jerk = np.array([-1.0, 0.3, 0.4]) * (1.0 + 0.25 * rng.standard_normal(3))
+    canvas.struck.append(trial.at + at)
     canvas.knock(trial.at + at, jerk, size, 2.5 + 2.5 * rng.random(), 0.14 + 0.08 * rng.random())
 
 

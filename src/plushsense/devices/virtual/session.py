@@ -33,13 +33,15 @@ _POSTURES = np.array([(0, 0, 1.0), (0, 0, -1.0), (0, 1.0, 0.1), (0, -1.0, 0.1), 
 @dataclass(frozen=True)
 class Mark:
     """One performed gesture, in samples of the session: the hand works from ``start`` to ``stop``; a recorder that
-    somebody starts and stops by hand would hold ``record_start`` to ``record_stop``."""
+    somebody starts and stops by hand would hold ``record_start`` to ``record_stop``. ``struck`` is when a rough
+    gesture's blow or jerk comes, after the hand has reached out; None for any other."""
 
     label: str
     record_start: int
     start: int
     stop: int
     record_stop: int
+    struck: int | None = None
 
 
 @dataclass(frozen=True)
@@ -134,7 +136,10 @@ class Session:
                 self._hands.steady(canvas, plan)
             MOTIONS[family](canvas, trial, rng, world)
         at = self.samples
-        marks = [Mark(label, at + p.record_start, at + p.at, at + p.at + p.n, at + p.record_stop) for p in plans]
+        marks = []
+        for p in plans:
+            blow = next((at + s for s in canvas.struck if p.at <= s < p.at + p.n), None)
+            marks.append(Mark(label, at + p.record_start, at + p.at, at + p.at + p.n, at + p.record_stop, blow))
         return self._sense(canvas, tuple(marks))
 
     def idle(self, seconds: float) -> Episode:

@@ -1,0 +1,155 @@
+"""Choosing a gate's rule: two terms and their thresholds, by what they find and how often they would be wrong."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Ints32 = NDArray[np.int32]
+Whole = NDArray[np.int64]
+
+_SHARES = (0.5, 1, 2, 4, 7, 10, 15, 20, 30, 40, 50, 65, 80)
+"""Thresholds of the first term that are tried: percentiles of the trials' heights."""
+_COMMON = 0.05
+"""A first term that holds in more of the calm samples than this is no term."""
+_SHORTLIST = 40
+_PER_SECOND = 0.1
+"""What an answer a second sooner is worth, as a share of the trials."""
+
+
+@dataclass(frozen=True, eq=False)
+class Heights:
+    """How far candidates stand out, for how long a term asks: rows of samples, a column a candidate.
+
+    ``calm`` (n, S) of what is not energetic, in ``chunks`` (n,), stretches of one alarm at most; ``rough`` (m, S) of
+    the ``trials`` (m,), ``delays`` (m,) samples after each trial's begin. Both sorted by chunk and trial. ``least``
+    (S,) is the lowest threshold of a first term; calm samples below all of them are not here. ``apart`` (S, S):
+    which two candidates may be the terms of one rule.
+    """
+
+    calm: Ints32
+    chunks: Whole
+    rough: Ints32
+    trials: Whole
+    delays: Whole
+    least: Whole
+    apart: NDArray[np.bool_]
+
+    @classmethod
+    def of(
+        cls, calm: Ints32, chunks: Whole, rough: Ints32, trials: Whole, delays: Whole, apart: NDArray[np.bool_]
+    ) -> Heights:
+        """All samples of what is calm, of which those are kept that a rule could speak in."""
+        least = np.ones(rough.shape[1], dtype=np.int64)
+        if len(calm):
+            rank = min(len(calm) - 1, int(len(calm) * (1.0 - _COMMON)))
+            for column in range(len(least)):
+                least[column] = max(1, np.partition(calm[:, column], rank)[rank] + 1)
+        if len(trials):
+            least = np.maximum(least, _highest(rough, trials)[0].min(axis=0))
+        loud = (calm >= least).any(axis=1)
+        return cls(calm[loud], chunks[loud], rough, trials, delays, least, apart)
+
+    def without(self, found: Found) -> Heights:
+        """What is left when a rule already speaks there."""
+        calm = ~np.isin(self.chunks, self.chunks[found.holds(self.calm)])
+        rough = ~np.isin(self.trials, self.trials[found.holds(self.rough)])
+        left = self.rough[rough], self.trials[rough], self.delays[rough]
+        return Heights(self.calm[calm], self.chunks[calm], *left, self.least, self.apart)
+
+
+@dataclass(frozen=True)
+class Found:
+    """A rule: columns and their thresholds (one or two), and what it does to the trials it was chosen on."""
+
+    terms: tuple[tuple[int, int], ...]
+    hits: int
+    alarms: int
+    delay: float
+
+    def holds(self, heights: Ints32) -> NDArray[np.bool_]:
+        """(n,) where it holds."""
+        return np.logical_and.reduce([heights[:, column] >= threshold for column, threshold in self.terms])
+
+
+def best_rule(heights: Heights, alarms: int, rate_hz: float) -> Found | None:
+    """The rule that finds most trials, and soonest, with at most ``alarms`` chunks in which it is wrong.
+
+    Thresholds stand in the middle (in decibels) between what the alarms ask for and what would begin to cost trials.
+    """
+    n_trials = len(np.unique(heights.trials))
+    if n_trials == 0:
+        return None
+    tops, _ = _highest(heights.rough, heights.trials)
+    tried: list[tuple[int, int, int, int]] = []
+    for first in range(heights.rough.shape[1]):
+        for threshold in np.unique(np.percentile(tops[:, first], _SHARES).astype(np.int64)):
+            if threshold < heights.least[first]:
+                continue
+            loud = heights.calm[:, first] >= threshold
+            needed = _needed(heights.calm[loud], heights.chunks[loud], alarms)
+            strong = heights.rough[:, first] >= threshold
+            reached, _ = _highest(heights.rough[strong], heights.trials[strong])
+            hits = (reached >= needed).sum(axis=0)
+            tried += [(int(hits[s]), first, int(threshold), int(s)) for s in np.flatnonzero(heights.apart[first])]
+    tried.sort(key=lambda r: -r[0])
+    best: tuple[float, Found] | None = None
+    seen: set[tuple[int, int]] = set()
+    for _, first, threshold, second in tried:
+        if (first, second) in seen:
+            continue
+        seen.add((first, second))
+        if len(seen) > _SHORTLIST:
+            break
+        found = _settle(heights, first, threshold, second, alarms)
+        if found is not None:
+            worth = found.hits / n_trials - _PER_SECOND * found.delay / rate_hz
+            if best is None or worth > best[0]:
+                best = worth, found
+    return best[1] if best else None
+
+
+def _settle(heights: Heights, first: int, threshold: int, second: int, alarms: int) -> Found | None:
+    """Both thresholds in the middle of what they may be, one after the other, and once more."""
+    terms = {first: threshold, second: 1} if first != second else {first: threshold}
+    for column in (second, first, second):
+        calm, rough = (
+            np.logical_and.reduce([h[:, c] >= t for c, t in terms.items() if c != column] or [np.ones(len(h), bool)])
+            for h in (heights.calm, heights.rough)
+        )
+        needed = int(_needed(heights.calm[calm][:, [column]], heights.chunks[calm], alarms)[0])
+        if column == first:
+            needed = max(needed, int(heights.least[first]))
+        reached, _ = _highest(heights.rough[rough][:, [column]], heights.trials[rough])
+        passing = reached[reached >= needed]
+        if not len(passing):
+            return None
+        middle = round((needed * float(np.percentile(passing, 1))) ** 0.5)
+        terms[column] = max(needed, min(int(passing.min()), middle))
+    found = Found(tuple(terms.items()), 0, 0, 0.0)
+    wrong, right = found.holds(heights.calm), found.holds(heights.rough)
+    trials, at = np.unique(heights.trials[right], return_index=True)
+    if not len(trials):
+        return None
+    delay = float(np.median(heights.delays[right][at]))
+    return Found(found.terms, len(trials), len(np.unique(heights.chunks[wrong])), delay)
+
+
+def _highest(heights: Ints32, groups: Whole) -> tuple[Ints32, Whole]:
+    """Of each group of rows, which lie together, the highest in each column."""
+    if not len(groups):
+        return heights[:0], groups[:0]
+    starts = np.flatnonzero(np.append(True, np.diff(groups) != 0))
+    return np.maximum.reduceat(heights, starts, axis=0), groups[starts]
+
+
+def _needed(calm: Ints32, chunks: Whole, alarms: int) -> Whole:
+    """The lowest threshold of each column that is reached in at most ``alarms`` chunks; at least 1."""
+    tops, _ = _highest(calm, chunks)
+    if len(tops) <= alarms:
+        return np.ones(calm.shape[1], dtype=np.int64)
+    return np.maximum(
+        1, np.partition(tops, len(tops) - 1 - alarms, axis=0)[len(tops) - 1 - alarms].astype(np.int64) + 1
+    )
