@@ -47,6 +47,44 @@ def test_the_papers_preset_is_mirrored_loops(dataset: Dataset) -> None:
     assert bundle.windowing["context"] == "loop"
 
 
+def test_trained_anywhere_knows_idleness_and_is_scored_on_gestures(dataset: Dataset) -> None:
+    said: list[str] = []
+    kwargs = {"epochs": 1, "filters": (4, 4, 4), "pool_s": 0.5}
+    trained = ps.train(dataset, context="anywhere", every_s=0.5, idle_share=0.25, warn=said.append, **kwargs)
+    bundle = trained.bundle
+    assert bundle.gestures.labels == ("Fast", "Rest", "Slow", "Idle")
+    assert bundle.gestures.get("Idle").idle
+    assert "added a class for what happens between gestures: Idle" in said
+    assert bundle.arch.pool == 50
+    assert bundle.provenance["context"]["anywhere"] > 50
+    assert (bundle.windowing["context"], bundle.windowing["anywhere"]["idle_share"]) == ("anywhere", 0.25)
+    inside, watching = (set(bundle.provenance[k]) for k in ("subjects", "validation_subjects"))
+    assert inside & watching == set() and inside | watching == set(dataset.subjects)
+    ordinary = ps.train(dataset, **kwargs)
+    assert trained.scores["windows"] == ordinary.scores["windows"], "gestures with their real past, nothing else"
+
+
+def test_evaluated_anywhere_is_scored_on_the_real_past(dataset: Dataset) -> None:
+    kwargs = {"split": "by-subject:2", "epochs": 1, "filters": (4, 4, 4), "workers": 1}
+    one = ps.evaluate(dataset, context="anywhere", **kwargs)
+    assert (one.train_context, one.context) == ("anywhere", "stream")
+    other = ps.evaluate(dataset, train_context="anywhere", **kwargs)
+    assert other.table["accuracy"] == one.table["accuracy"]
+    with pytest.raises(ConfigError, match="divides windows"):
+        ps.evaluate(dataset, context="anywhere", **{**kwargs, "split": "windows:2"})
+
+
+def test_the_ranges_of_a_network_trained_anywhere_come_from_its_own_windows(dataset: Dataset) -> None:
+    from plushsense.apps.calibrating import training_windows
+    from plushsense.windows.anywhere import AnywhereSpec, cut_anywhere
+    from plushsense.windows.cut import WindowSpec
+
+    bundle = ps.train(dataset, context="anywhere", every_s=0.5, epochs=1, filters=(4, 4, 4)).bundle
+    cut = cut_anywhere(dataset, WindowSpec(context="anywhere"), bundle.gestures, AnywhereSpec(every_s=0.5))
+    mine = cut.x[np.isin(cut.subject, bundle.provenance["subjects"])]
+    assert np.array_equal(training_windows(bundle, dataset), mine)
+
+
 def test_a_long_receptive_field_gets_the_past_it_needs(dataset: Dataset) -> None:
     bundle = ps.train(dataset, arch="14d1_39d2_41d4", filters=(2, 2, 2), epochs=1).bundle
     assert bundle.arch.span == 499

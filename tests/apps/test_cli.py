@@ -185,6 +185,8 @@ BAD = [
     (["evaluate", "{ds}", "--split", "by-subjct:5"], "Did you mean 'by-subject:5'?"),
     (["evaluate", "{ds}", "--split", "by-subject:50"], "there are 5"),
     (["evaluate", "{ds}", "--context", "strem"], "Did you mean 'stream'?"),
+    (["train", "{ds}", "--context", "anyware", "--out", "{tmp}/x.plush"], "Did you mean 'anywhere'?"),
+    (["baselines", "{ds}", "--context", "anywhere", "--models", "quick"], "choose the context stream or loop"),
     (["train", "{ds}", "--classes", "Slwo,Fast"], "Did you mean 'Slow'?"),
     (["train", "{ds}", "--preset", "lso"], "Did you mean 'loso'?"),
     (["live", "--device", "virtual://", "--model", "{half}"], "is damaged"),
@@ -348,6 +350,8 @@ WRONG = [
     ("windows", "span_s = 3.0", "follows from the network"),
     ("windows", "windows_s = 3.0", "Did you mean 'window_s'?"),
     ("live", "smoothing_s = 'x'", "a number"),
+    ("anywhere", "idle_share = 1", "not including, 1"),
+    ("anywhere", "idel_share = 0.2", "Did you mean 'idle_share'?"),
 ]
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from plushsense import __version__
 from plushsense.apps.config import RunConfig, from_settings
-from plushsense.apps.preparation import Warn, choose_classes, opened, silent, windows_for
+from plushsense.apps.preparation import Warn, classes_for, opened, silent, windows_for
 from plushsense.apps.reporting import check_place, save_evaluation
 from plushsense.core.errors import ConfigError
 from plushsense.core.gestures import NOBODY
@@ -35,7 +35,7 @@ from plushsense.models.bundle import Bundle
 from plushsense.runs.journal import Journal
 from plushsense.scoring.splits import VALIDATION_SHARE, Split, parse_split
 from plushsense.training.spec import TrainSpec
-from plushsense.windows.cut import WindowSet
+from plushsense.windows.cut import ANYWHERE, WindowSet
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -122,16 +122,19 @@ def train(
     config = config or from_settings(arch=arch, filters=filters, **settings)
     if quantize_aware < 0:
         raise ConfigError(f"quantize_aware is {quantize_aware}: accepted are 0 (off) and more epochs.")
-    gestures = choose_classes(dataset, config.evaluation.classes, warn)
+    gestures = classes_for(dataset, config.evaluation.classes, config.windows.context, warn)
     network = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
     if quantize_aware:
         refuse_undeployable(network)
-    windows = windows_for(dataset, network, config.windows, gestures, warn)
-    division = _divide(windows, config)
+    windows = windows_for(dataset, network, config.windows, gestures, warn, config.anywhere)
+    scored = windows
+    if config.scored_on != config.windows:
+        scored = windows_for(dataset, network, config.scored_on, gestures)
+    division = _divide(windows, config, scored)
     train_at, test_at = division.train, division.fold.test
     from plushsense.training.fit import fit, predict
 
-    fitted = fit(windows.take(train_at), windows.take(division.watch), network, config.training, progress)
+    fitted = fit(windows.take(train_at), scored.take(division.watch), network, config.training, progress)
     weights, scaler = fitted.weights, fitted.scaler
     kept = calibration(network, weights, scaler, windows.x[train_at])
     if quantize_aware:
@@ -140,12 +143,12 @@ def train(
         mine = windows.take(train_at)
         tuned = fine_tune(mine, network, weights, scaler, kept, config.training, quantize_aware, progress)
         weights = tuned.weights
-    test = windows.take(test_at)
+    test = scored.take(test_at)
     probabilities = predict(network, weights, scaler, test, config.training.device)
-    predictions = gather(windows, [(division.fold.name, test_at)], [probabilities])
+    predictions = gather(scored, [(division.fold.name, test_at)], [probabilities])
     sizes = (len(train_at), len(division.watch), len(test_at))
     record = FoldRecord(division.fold.name, division.fold.subjects, sizes, len(fitted.history), fitted.seconds)
-    figures = score_predictions(predictions, [record], windows.affects, division.split.apart)
+    figures = score_predictions(predictions, [record], scored.affects, division.split.apart)
     scores = {
         "split": division.kind,
         "leaky": division.split.leaky,
@@ -160,8 +163,8 @@ def train(
     }
     if kept:
         integer = quantize(network, weights, scaler, Ranges.from_dict(kept))
-        deployed = gather(windows, [(division.fold.name, test_at)], [integer_probabilities(integer, test.x)])
-        after = score_predictions(deployed, [record], windows.affects, division.split.apart)
+        deployed = gather(scored, [(division.fold.name, test_at)], [integer_probabilities(integer, test.x)])
+        after = score_predictions(deployed, [record], scored.affects, division.split.apart)
         same = float((deployed.predicted == predictions.predicted).mean())
         scores["int8"] = {"accuracy": after["accuracy"]["mean"], "macro_f1": after["macro_f1"]["mean"]}
         scores["int8"] |= {"agreement": same}
@@ -176,14 +179,14 @@ def train(
         layout=dataset.layout,
         scaler=scaler,
         gestures=gestures,
-        windowing=config.to_dict()["windows"],
+        windowing=_windowing(config),
         decision=config.live.to_dict(),
         provenance={
             "dataset": dataset.head.name,
             "dataset_hash": dataset.hash,
             "simulated": dataset.head.simulated,
             "subjects": sorted({str(s) for s in windows.subject[train_at]}),
-            "validation_subjects": sorted({str(s) for s in windows.subject[division.watch]}),
+            "validation_subjects": sorted({str(s) for s in scored.subject[division.watch]}),
             "split": division.kind,
             "context": _context_said(windows),
             "preset": config.preset,
@@ -210,13 +213,17 @@ class _Division:
     watch: NDArray[np.int64]
 
 
-def _divide(windows: WindowSet, config: RunConfig) -> _Division:
-    """Hold some people back; of fewer than three, some recordings. Nothing that is scored is trained on."""
+def _divide(windows: WindowSet, config: RunConfig, scored: WindowSet | None = None) -> _Division:
+    """Hold some people back; of fewer than three, some recordings. Nothing that is scored is trained on.
+
+    ``watch`` and ``test`` are of ``scored``: the same recordings, cut in another way (the same when left out).
+    """
+    scored = windows if scored is None else scored
     seed = config.evaluation.seed
     stopped = "" if config.training.patience is None else " but decided when to stop"
     if config.preset == "search":
         split = parse_split("windows:holdout")
-        fold = fold_windows(windows, windows, split, seed)[0]
+        fold = fold_windows(windows, scored, split, seed)[0]
         said = "15 % of the windows, drawn at random: leaky, windows of one recording stand on both sides"
         return _Division(split, split.text, said, fold, fold.train, fold.validation)
     people = set(windows.subject.tolist()) - {NOBODY, UNKNOWN_SUBJECT}
@@ -228,11 +235,18 @@ def _divide(windows: WindowSet, config: RunConfig) -> _Division:
         split = parse_split(f"by-recording:{max(2, min(recordings // 2, round(1 / VALIDATION_SHARE)))}")
         kind = "validation-recordings"
         said = f"recordings that were not trained on{stopped}; of the people who were, so flattering"
-    fold = fold_windows(windows, windows, split, seed)[0]
+    fold = fold_windows(windows, scored, split, seed)[0]
     if split.apart:
         said += ", ".join(fold.subjects)
     rest = np.sort(np.concatenate([fold.train, fold.validation]))
     return _Division(split, kind, said, fold, rest, fold.test)
+
+
+def _windowing(config: RunConfig) -> dict[str, Any]:
+    """How windows were cut, as a bundle keeps it."""
+    tables = config.to_dict()
+    anywhere = {"anywhere": tables["anywhere"]} if config.windows.context == ANYWHERE else {}
+    return {**tables["windows"], **anywhere}
 
 
 def evaluate(
@@ -270,15 +284,13 @@ def evaluate(
     parse_split(config.evaluation.split)
     if out is not None:
         check_place(Path(out), config, dataset, replace=overwrite)
-    gestures = choose_classes(dataset, config.evaluation.classes, warn)
+    gestures = classes_for(dataset, config.evaluation.classes, config.trained_on.context, warn)
     network = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
     if int8:
         refuse_undeployable(network)
-    score = windows_for(dataset, network, config.windows, gestures, warn)
-    train_context = config.evaluation.train_context
-    fit_on = score
-    if train_context not in (None, config.windows.context):
-        fit_on = windows_for(dataset, network, replace(config.windows, context=str(train_context)), gestures)
+    score = fit_on = windows_for(dataset, network, config.scored_on, gestures, warn)
+    if config.trained_on != config.scored_on:
+        fit_on = windows_for(dataset, network, config.trained_on, gestures, anywhere=config.anywhere)
     from plushsense.training.fit import placed
 
     result = crossvalidate(

@@ -34,7 +34,7 @@ from plushsense.models.reference import Network
 from plushsense.runs.journal import Journal, job_id
 from plushsense.scoring.splits import parse_split
 from plushsense.training.spec import TrainSpec
-from plushsense.windows.cut import WindowSet
+from plushsense.windows.cut import ANYWHERE, WindowSet
 from plushsense.windows.features import Scaler
 
 SPLITS = ("leave-one-subject-out", "windows:5")
@@ -185,6 +185,8 @@ def baselines(
     """
     dataset = opened(dataset)
     config = config or from_settings(**settings)
+    if config.windows.context == ANYWHERE:
+        raise ConfigError("Programs are compared on windows of gestures: choose the context stream or loop.")
     names = chosen(models)
     identity = comparison_id(dataset, config, splits, models, features, pca)
     asked = [parse_split(text).text for text in splits]

@@ -15,6 +15,7 @@ from plushsense.dataset.store import Dataset
 from plushsense.deploy.calibration import calibrated
 from plushsense.deploy.quantize import refuse_undeployable
 from plushsense.models.bundle import Bundle
+from plushsense.windows.anywhere import AnywhereSpec
 from plushsense.windows.cut import WindowSpec
 
 # Splits that hold whole people back: their windows are told from the others by the person.
@@ -70,7 +71,8 @@ def training_windows(
         warn(f"'{dataset.head.name}' has not the content that the bundle was trained on: the ranges are of what it has")
     known = {field.name for field in fields(WindowSpec)}
     spec = WindowSpec(**{k: v for k, v in bundle.windowing.items() if k in known})
-    windows = windows_for(dataset, bundle.arch, spec, bundle.gestures, warn)
+    anywhere = AnywhereSpec(**bundle.windowing.get("anywhere", {}))
+    windows = windows_for(dataset, bundle.arch, spec, bundle.gestures, warn, anywhere)
     mine = np.flatnonzero(np.isin(windows.subject, sorted(people)))
     if not len(mine):
         raise BundleError(

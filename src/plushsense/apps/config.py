@@ -1,6 +1,7 @@
 """One run's settings: which network, trained how, on which windows, scored by which split. A TOML file can hold them.
 
     [windows]     window_s, step_s, context, longest_factor
+    [anywhere]    every_s, onset_s, after_s, settle_s, idle_share, busy_share
     [model]       arch, filters, padding, norm, step_s, pool_s
     [training]    preset, epochs, batch, learning_rate, halve_every, patience, seed, turn_deg, …
     [evaluation]  split, classes, train_context, workers, seed
@@ -28,7 +29,8 @@ from plushsense.models.arch import DEFAULT_FILTERS, DEFAULT_SYMBOL, Arch
 from plushsense.models.symbol import parse_filters
 from plushsense.scoring.splits import parse_split
 from plushsense.training.spec import CONTEXT, PADDING, PRESETS, TrainSpec, preset
-from plushsense.windows.cut import CONTEXTS, WindowSpec
+from plushsense.windows.anywhere import AnywhereSpec
+from plushsense.windows.cut import ANYWHERE, TRAIN_CONTEXTS, WindowSpec
 
 SHARED, ALL = "shared", "all"
 
@@ -84,9 +86,10 @@ class EvaluationSpec:
             if value < 0:
                 raise ConfigError(f"{name} is {value}: accepted are whole numbers from 0 up.")
         context = self.train_context
-        if context is not None and context not in CONTEXTS:
+        if context is not None and context not in TRAIN_CONTEXTS:
             raise ConfigError(
-                f"Unknown train_context '{context}': accepted are {', '.join(CONTEXTS)}.{nearest(context, CONTEXTS)}"
+                f"Unknown train_context '{context}': accepted are {', '.join(TRAIN_CONTEXTS)}."
+                f"{nearest(context, TRAIN_CONTEXTS)}"
             )
 
     @property
@@ -105,6 +108,17 @@ class RunConfig:
     training: TrainSpec = field(default_factory=TrainSpec)
     evaluation: EvaluationSpec = field(default_factory=EvaluationSpec)
     live: DecideSpec = field(default_factory=DecideSpec)
+    anywhere: AnywhereSpec = field(default_factory=AnywhereSpec)
+
+    @property
+    def trained_on(self) -> WindowSpec:
+        """The windows to train on."""
+        return replace(self.windows, context=self.evaluation.train_context or self.windows.context)
+
+    @property
+    def scored_on(self) -> WindowSpec:
+        """The windows to score: what is trained anywhere is scored on gestures with their real past."""
+        return replace(self.windows, context="stream") if self.windows.context == ANYWHERE else self.windows
 
     @property
     def padding(self) -> str:
@@ -122,7 +136,9 @@ class RunConfig:
         }
         del evaluation["workers"]
         training = {k: v for k, v in self.training.key().items() if k not in ("device", "threads")}
+        anywhere = {"anywhere": asdict(self.anywhere)} if self.trained_on.context == ANYWHERE else {}
         return {
+            **anywhere,
             "windows": asdict(self.windows),
             "model": asdict(self.model) | {"padding": self.padding},
             "training": training,
@@ -136,6 +152,7 @@ _TABLES: dict[str, type[Any]] = {
     "training": TrainSpec,
     "evaluation": EvaluationSpec,
     "live": DecideSpec,
+    "anywhere": AnywhereSpec,
 }
 
 # Keys of a table that are no fields, and fields that are no keys: the network says how much past it needs.
@@ -235,6 +252,7 @@ def resolve(path: str | Path | None = None, **flags: Mapping[str, Any]) -> RunCo
         replace(training, **tables["training"]),
         EvaluationSpec(**tables["evaluation"]),
         DecideSpec.from_dict(tables["live"]),
+        AnywhereSpec(**tables["anywhere"]),
     )
 
 
@@ -248,6 +266,7 @@ _SETTINGS: dict[str, tuple[str, ...]] = {
     "training": ("preset", "epochs", "batch", "learning_rate", "halve_every", "patience", "device", "turn_deg"),
     "evaluation": ("classes", "train_context", "workers"),
     "live": ("smoothing_s",),
+    "anywhere": ("every_s", "onset_s", "after_s", "settle_s", "idle_share", "busy_share"),
 }
 
 

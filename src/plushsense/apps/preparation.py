@@ -13,7 +13,8 @@ from plushsense.core.gestures import GestureSet
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.store import Dataset
 from plushsense.models.arch import Arch
-from plushsense.windows.cut import WindowSet, WindowSpec, cut_windows, shared_gestures
+from plushsense.windows.anywhere import AnywhereSpec, cut_anywhere, with_idle
+from plushsense.windows.cut import ANYWHERE, WindowSet, WindowSpec, cut_windows, shared_gestures
 
 Warn = Callable[[str], None]
 
@@ -43,10 +44,32 @@ def choose_classes(dataset: Dataset, wanted: str | Sequence[str], warn: Warn = s
     return gestures
 
 
-def windows_for(dataset: Dataset, arch: Arch, spec: WindowSpec, gestures: GestureSet, warn: Warn = silent) -> WindowSet:
+def classes_for(dataset: Dataset, wanted: str | Sequence[str], context: str, warn: Warn = silent) -> GestureSet:
+    """The classes that were asked for, and one for idleness where it is trained anywhere in a stream."""
+    gestures = choose_classes(dataset, wanted, warn)
+    if context != ANYWHERE:
+        return gestures
+    with_one = with_idle(gestures, dataset)
+    if added := [g.label for g in with_one.gestures if g not in gestures.gestures]:
+        warn(f"added a class for what happens between gestures: {added[0]}")
+    return with_one
+
+
+def windows_for(
+    dataset: Dataset,
+    arch: Arch,
+    spec: WindowSpec,
+    gestures: GestureSet,
+    warn: Warn = silent,
+    anywhere: AnywhereSpec | None = None,
+) -> WindowSet:
     """Windows as ``arch`` needs them: with as much past as a decision sees."""
     span_s = arch.span / dataset.layout.rate_hz
-    cut = cut_windows(dataset, replace(spec, span_s=span_s if span_s > spec.window_s else 0.0), gestures)
+    spec = replace(spec, span_s=span_s if span_s > spec.window_s else 0.0)
+    if spec.context == ANYWHERE:
+        cut = cut_anywhere(dataset, spec, gestures, anywhere)
+    else:
+        cut = cut_windows(dataset, spec, gestures)
     for line in cut.left_out:
         warn(f"left out: {line}")
     return cut

@@ -234,9 +234,10 @@ class _Teller:
 
 
 def context_of(windows: WindowSet) -> str:
-    """The kind of context of a set: "stream" where any window has a real past, else "loop" or "inside"."""
+    """The kind of context of a set: "anywhere" or "stream" where any window has a real past, else "loop" or
+    "inside"."""
     present = set(np.unique(windows.context).tolist())
-    return next((kind for kind in ("stream", "loop") if kind in present), "inside")
+    return next((kind for kind in ("anywhere", "stream", "loop") if kind in present), "inside")
 
 
 def _prints(train: WindowSet, score: WindowSet) -> list[str]:

@@ -43,8 +43,8 @@ def row_times_s(frames: Frames, period_us: int) -> NDArray[np.float64]:
         return np.zeros(0)
     step = np.diff(ms)
     # The clock that was set back goes on one sample after the last.
-    step = np.where(step < 0, period_us // 1000, step)
-    return np.asarray(np.concatenate([[0], np.cumsum(step)]) / 1000.0)
+    step_us = np.where(step < 0, period_us, step * 1000)
+    return np.asarray(np.concatenate([[0], np.cumsum(step_us)]) / 1e6)
 
 
 def usual_rows(dataset: Dataset) -> dict[str, float]:

@@ -7,6 +7,8 @@ one window, and where the rest of it comes from is the ``context``:
   too little of it, the recording is looped, and the window says so.
 - ``loop``: the recording repeated from its start, as the paper does (never zero-padded).
 
+To train for work in a stream there is a third one, ``anywhere``: see ``windows/anywhere``, which cuts it.
+
 A recording many times longer than its gesture usually is was not stopped in time: what its rows show is not known, so
 it is left out, and named.
 """
@@ -27,6 +29,8 @@ from plushsense.windows.clock import Segment, resample
 from plushsense.windows.features import inputs
 
 CONTEXTS = ("stream", "loop")
+ANYWHERE = "anywhere"
+TRAIN_CONTEXTS = (*CONTEXTS, ANYWHERE)
 
 
 @dataclass(frozen=True)
@@ -44,10 +48,10 @@ class WindowSpec:
     longest_factor: float = NEVER_STOPPED_FACTOR
 
     def __post_init__(self) -> None:
-        if self.context not in CONTEXTS:
+        if self.context not in TRAIN_CONTEXTS:
             raise ConfigError(
-                f"Unknown context '{self.context}': accepted are {', '.join(CONTEXTS)}."
-                f"{nearest(self.context, CONTEXTS)}"
+                f"Unknown context '{self.context}': accepted are {', '.join(TRAIN_CONTEXTS)}."
+                f"{nearest(self.context, TRAIN_CONTEXTS)}"
             )
         if self.longest_factor != 0.0 and self.longest_factor < 1.0:
             raise ConfigError(f"longest_factor is {self.longest_factor}: accepted are 0 (off) and 1 or more.")
@@ -104,7 +108,7 @@ class WindowSet:
 
 
 @dataclass
-class _Cut:
+class Cut:
     """One window on its way into the set."""
 
     x: NDArray[np.int64]
@@ -116,28 +120,28 @@ def _starts(samples: int, window: int, step: int) -> range:
     return range(0, samples - window + 1, step)
 
 
-def _from_recording(segments: list[Segment], dataset: Dataset, window: int, step: int) -> list[_Cut]:
+def from_recording(segments: list[Segment], dataset: Dataset, window: int, step: int) -> list[Cut]:
     """Full windows of every stretch; if none is long enough, the longest stretch looped."""
     cuts = []
     for segment in segments:
         if len(segment) >= window:
             x = inputs(segment.data, dataset.layout)
-            cuts += [_Cut(x[s : s + window], "inside", (-1, -1)) for s in _starts(len(x), window, step)]
+            cuts += [Cut(x[s : s + window], "inside", (-1, -1)) for s in _starts(len(x), window, step)]
     if not cuts and segments:
         x = inputs(max(segments, key=len).data, dataset.layout)
         repeated = np.tile(x, (-(-window // len(x)), 1))[:window]
-        cuts.append(_Cut(repeated, "loop", (-1, -1)))
+        cuts.append(Cut(repeated, "loop", (-1, -1)))
     return cuts
 
 
 def _from_stream(
     segments: list[Segment], first: int, last: int, window: int, reach: int, step: int, dataset: Dataset
-) -> list[_Cut]:
+) -> list[Cut]:
     """Rows ``first`` to ``last`` of a stream with their real past; nothing where the past is too short.
 
     Where a gap or a clock reset divides the recording, its end is cut as usual, and full windows of the parts before.
     """
-    cuts: list[_Cut] = []
+    cuts: list[Cut] = []
     for segment in (s for s in segments if s.first_row < last and first < s.last_row):
         begin = int(np.searchsorted(segment.row_of, first, side="left"))
         end = int(np.searchsorted(segment.row_of, last, side="left"))
@@ -150,7 +154,7 @@ def _from_stream(
         for e in ends:
             stop = e - (ends[0] - reach)
             rows = (int(segment.row_of[e - reach]), int(segment.row_of[e - 1]) + 1)
-            cuts.append(_Cut(x[stop - reach : stop], "inside" if e - reach >= begin else "stream", rows))
+            cuts.append(Cut(x[stop - reach : stop], "inside" if e - reach >= begin else "stream", rows))
     return cuts
 
 
@@ -171,15 +175,19 @@ def cut_windows(
     """
     spec = spec or WindowSpec()
     gestures = gestures or dataset.gestures
+    if spec.context == ANYWHERE:
+        raise ConfigError(
+            "Windows anywhere in a stream are cut by plushsense.windows.anywhere.cut_anywhere: call that."
+        )
     layout = dataset.layout
     window, step = layout.samples(spec.window_s), layout.samples(spec.step_s)
     reach = max(window, layout.samples(spec.span_s) if spec.span_s else 0)
-    wanted, left_out = _not_too_long([r for r in dataset.used if r.gesture in gestures.labels], spec)
+    wanted, left_out = not_too_long([r for r in dataset.used if r.gesture in gestures.labels], spec)
     wanted.sort(key=lambda r: (r.stream, r.id))
-    cuts: list[tuple[RecordingInfo, _Cut]] = []
+    cuts: list[tuple[RecordingInfo, Cut]] = []
     stream_id, segments = "", list[Segment]()
     for done, recording in enumerate(wanted):
-        mine: list[_Cut] = []
+        mine: list[Cut] = []
         if spec.context == "stream" and recording.stream_row >= 0:
             if recording.stream != stream_id:
                 stream_id = recording.stream
@@ -188,7 +196,7 @@ def cut_windows(
             last = first + recording.stop - recording.start
             mine = _from_stream(segments, first, last, window, reach, step, dataset)
         if not mine:
-            mine = _from_recording(resample(dataset.read(recording), layout), dataset, reach, step)
+            mine = from_recording(resample(dataset.read(recording), layout), dataset, reach, step)
         if not mine:
             left_out.append(f"{recording.id}: no valid sample")
         cuts += [(recording, c) for c in mine]
@@ -199,10 +207,10 @@ def cut_windows(
             f"Data set '{dataset.head.name}' gives no window: {len(wanted)} recordings of "
             f"{len(gestures)} gestures ({', '.join(gestures.labels[:6])}…)."
         )
-    return replace(_assemble(cuts, gestures, dataset), left_out=tuple(left_out))
+    return replace(assemble(cuts, gestures, dataset), left_out=tuple(left_out))
 
 
-def _not_too_long(wanted: list[RecordingInfo], spec: WindowSpec) -> tuple[list[RecordingInfo], list[str]]:
+def not_too_long(wanted: list[RecordingInfo], spec: WindowSpec) -> tuple[list[RecordingInfo], list[str]]:
     """The recordings to cut, and those that nobody stopped. Runs of labels in a stream are as long as they are."""
     durations: dict[str, list[int]] = {}
     for r in wanted:
@@ -220,10 +228,10 @@ def _not_too_long(wanted: list[RecordingInfo], spec: WindowSpec) -> tuple[list[R
 
 def recordings_in_time(wanted: list[RecordingInfo], spec: WindowSpec | None = None) -> list[RecordingInfo]:
     """Those that somebody stopped in time, by the rule of `WindowSpec.longest_factor`."""
-    return _not_too_long(wanted, spec or WindowSpec())[0]
+    return not_too_long(wanted, spec or WindowSpec())[0]
 
 
-def _assemble(cuts: list[tuple[RecordingInfo, _Cut]], gestures: GestureSet, dataset: Dataset) -> WindowSet:
+def assemble(cuts: list[tuple[RecordingInfo, Cut]], gestures: GestureSet, dataset: Dataset) -> WindowSet:
     ids = tuple(sorted({r.id for r, _ in cuts}))
     number = {identity: i for i, identity in enumerate(ids)}
     # Layouts see to it that every input fits 32 bits.

@@ -25,7 +25,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--train-context",
         metavar="CONTEXT",
-        help="context of the windows to train on: stream or loop (default: as those to score)",
+        help="context of the windows to train on: stream, loop or anywhere (default: as those to score)",
     )
     add_work(parser, "folds")
     parser.add_argument(

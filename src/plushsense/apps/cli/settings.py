@@ -37,7 +37,14 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--context",
         help="what a short gesture's window holds before it: stream, the real past, or loop, the gesture over and "
-        "over (default: the preset's; people and loso stream, paper and search loop)",
+        "over (default: the preset's; people and loso stream, paper and search loop); anywhere, to train for live "
+        "work: decisions anywhere in the stream, idleness among them (scored as stream)",
+    )
+    parser.add_argument(
+        "--pool-s",
+        type=float,
+        metavar="S",
+        help="seconds of the signal that a decision averages (default: 2.5 s in all)",
     )
     parser.add_argument(
         "--classes",
@@ -93,7 +100,8 @@ def settings(args: argparse.Namespace, **evaluation: Any) -> RunConfig:
     return resolve(
         args.config,
         windows={"context": args.context},
-        model={"arch": args.arch, "filters": args.filters, "padding": args.padding, "norm": args.norm},
+        model={"arch": args.arch, "filters": args.filters, "padding": args.padding, "norm": args.norm}
+        | {"pool_s": args.pool_s},
         training={
             "preset": args.preset,
             "epochs": args.epochs,

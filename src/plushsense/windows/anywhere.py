@@ -1,0 +1,264 @@
+"""Windows cut anywhere in a session's stream: what a network hears at work, beginnings, ends and idleness included.
+
+A *position* is a sample of the stream at which a network might have to answer; its window is what really came before.
+Positions lie every ``every_s`` along the streams of the data set. What a position is called:
+
+- a gesture, from ``onset_s`` after the beginning of its recording (trim marks count) to ``after_s`` after its end;
+- idle, where no recording is, and no end of one within the last ``settle_s``; and in recordings of an idle gesture;
+- nothing, and left out: just after a beginning, just after an end, in recordings that are not used (excluded, of a
+  gesture that is not a class, not stopped in time), and where two recordings claim it.
+
+People also practise between recordings, and that must not pass for idleness: of the unmarked positions of a stream,
+the liveliest ``busy_share`` is left out, by how much the signals moved in the last second, without a look at labels.
+Of what remains as many are taken, evenly, as make idle windows ``idle_share`` of all.
+
+A recording that no stream holds (or whose stream gives no position of it) is cut as ``windows/cut`` does, and marked.
+A session with such a recording gives no idle positions: somewhere in its stream may be that gesture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import ConfigError, DatasetError
+from plushsense.core.gestures import Gesture, GestureSet
+from plushsense.dataset.store import Dataset, RecordingInfo, StreamInfo
+from plushsense.windows.clock import Segment, resample
+from plushsense.windows.cut import ANYWHERE, Cut, WindowSet, WindowSpec, assemble, from_recording, not_too_long
+from plushsense.windows.features import inputs
+
+IDLE_LABEL = "Idle"
+_LIVELY_S = 1.0
+NOTHING, FREE = -1, -2
+
+
+@dataclass(frozen=True)
+class AnywhereSpec:
+    """Which positions of a stream are trained on, in seconds and shares; the room's own words state the rules."""
+
+    every_s: float = 0.2
+    onset_s: float = 0.3
+    after_s: float = 0.2
+    settle_s: float = 1.0
+    idle_share: float = 0.3
+    busy_share: float = 0.3
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            value = getattr(self, f.name)
+            low, high = (0.0, 1.0) if f.name.endswith("_share") else (0.0, 60.0)
+            if not low <= value <= high or (f.name == "every_s" and value == 0.0):
+                raise ConfigError(f"{f.name} is {value}: accepted is {low:g} to {high:g}.")
+        if self.idle_share >= 1.0:
+            raise ConfigError(f"idle_share is {self.idle_share:g}: accepted is 0 up to, not including, 1.")
+        if self.settle_s < self.after_s:
+            raise ConfigError(
+                f"settle_s is {self.settle_s:g} and after_s {self.after_s:g}: what is still the gesture cannot be idle."
+            )
+
+
+def with_idle(gestures: GestureSet, dataset: Dataset) -> GestureSet:
+    """The classes, with one for idleness where a stream can show it and they hold none: the data set's, or a new one.
+
+    Runs of labels fill their streams: nothing is unmarked there, and nothing is added.
+    """
+    if any(g.idle for g in gestures.gestures) or dataset.layout.is_labelled:
+        return gestures
+    if not any(r.stream_row >= 0 for r in dataset.used):
+        return gestures
+    own = [g for g in dataset.gestures.gestures if g.idle]
+    if own:
+        wanted = {*gestures.labels, own[0].label}
+        return dataset.gestures.subset([label for label in dataset.gestures.labels if label in wanted])
+    affect = "neutral" if gestures.tells_affect else "none"
+    idle = Gesture(IDLE_LABEL, affect, nobody=True, idle=True, description="Nothing happens to the toy")
+    if gestures.find(IDLE_LABEL) is not None:
+        raise DatasetError(
+            f"The gesture '{IDLE_LABEL}' of '{dataset.head.name}' is not marked as idle: "
+            "say  idle = true  in its gesture set, or name it otherwise."
+        )
+    return GestureSet(gestures.name, (*gestures.gestures, idle), gestures.inferred)
+
+
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """A position: the samples of ``segment`` (``x`` as a network reads them) up to ``at`` are heard."""
+
+    x: NDArray[np.int64]
+    segment: Segment
+    at: int
+
+    def cut(self, reach: int) -> Cut:
+        """Its window."""
+        rows = (int(self.segment.row_of[self.at - reach]), int(self.segment.row_of[self.at - 1]) + 1)
+        return Cut(self.x[self.at - reach : self.at], ANYWHERE, rows)
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """What a stream gave: positions in recordings, with the recording; unmarked ones that may pass for idle."""
+
+    held: list[tuple[RecordingInfo, _Place]]
+    free: list[_Place]
+
+
+def cut_anywhere(
+    dataset: Dataset,
+    spec: WindowSpec,
+    gestures: GestureSet,
+    anywhere: AnywhereSpec | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> WindowSet:
+    """Windows at positions along the streams of ``dataset``, for training.
+
+    Args:
+        gestures: the classes (see `with_idle`). Without an idle one, no position outside a recording is taken.
+        progress: called with (streams done, streams in all).
+
+    Returns:
+        Windows whose ``context`` is "anywhere" ("loop" and "inside" for recordings without a stream). Idle windows
+        of a stream count as one recording of the stream's person; no window reaches over a break of the clock.
+
+    Raises:
+        DatasetError: when no window comes out.
+    """
+    anywhere = anywhere or AnywhereSpec()
+    layout = dataset.layout
+    reach = max(layout.samples(spec.window_s), layout.samples(spec.span_s) if spec.span_s else 0)
+    used, left_out = not_too_long([r for r in dataset.used if r.gesture in gestures.labels], spec)
+    idle = next((g for g in gestures.gestures if g.idle), None)
+    adrift = {(r.subject, r.session) for r in dataset.recordings if r.stream_row < 0}
+    moving, resting = list[tuple[RecordingInfo, _Place]](), list[tuple[RecordingInfo, _Place]]()
+    free: list[tuple[RecordingInfo, _Place]] = []
+    for done, stream in enumerate(dataset.streams):
+        found = _positions(dataset, stream, used, reach, anywhere)
+        for recording, place in found.held:
+            (resting if gestures.get(recording.gesture).idle else moving).append((recording, place))
+        if idle is not None and (stream.subject, stream.session) not in adrift:
+            nobody = _unmarked(stream, idle)
+            free += [(nobody, place) for place in found.free]
+        if progress is not None:
+            progress(done + 1, len(dataset.streams))
+    reached = {r.id for r, _ in (*moving, *resting)}
+    cuts: list[tuple[RecordingInfo, Cut]] = []
+    for recording in (r for r in used if r.id not in reached):
+        instead = from_recording(resample(dataset.read(recording), layout), dataset, reach, layout.samples(spec.step_s))
+        if not instead:
+            left_out.append(f"{recording.id}: no valid sample")
+        cuts += [(recording, c) for c in instead]
+    gesturing = len(moving) + sum(not gestures.get(r.gesture).idle for r, _ in cuts)
+    wanted = round(gesturing * anywhere.idle_share / (1.0 - anywhere.idle_share))
+    quiet = _evenly(resting, max(wanted // 2, wanted - len(free)))
+    quiet += _evenly(free, wanted - len(quiet))
+    cuts += [(recording, place.cut(reach)) for recording, place in (*moving, *quiet)]
+    if not cuts:
+        raise DatasetError(
+            f"Data set '{dataset.head.name}' gives no window: {len(used)} recordings of {len(gestures)} gestures."
+        )
+    return replace(assemble(cuts, gestures, dataset), left_out=tuple(left_out))
+
+
+def _evenly(places: Sequence[tuple[RecordingInfo, _Place]], most: int) -> list[tuple[RecordingInfo, _Place]]:
+    """At most so many, from beginning to end in even distances: every stream gives its share."""
+    if len(places) <= most:
+        return list(places)
+    return [places[at] for at in (np.arange(max(0, most)) * len(places) // max(1, most)).tolist()]
+
+
+def _unmarked(stream: StreamInfo, idle: Gesture) -> RecordingInfo:
+    """The unmarked positions of a stream as one recording of nothing; its rows are none, so that it bars none."""
+    name, file = f"{stream.id} (unmarked)", stream.file
+    return RecordingInfo(
+        name, stream.subject, stream.session, idle.label, file, 0, 0, 0, 0, stream.id, 0, 0, 0, 0.0, False, (), ""
+    )
+
+
+def _positions(
+    dataset: Dataset, stream: StreamInfo, used: Sequence[RecordingInfo], reach: int, spec: AnywhereSpec
+) -> _Found:
+    """The positions of one stream and what they are called."""
+    mine = [r for r in used if r.stream == stream.id and r.stream_row >= 0]
+    chosen = {r.id for r in mine}
+    barred = [r for r in dataset.recordings if r.stream == stream.id and r.stream_row >= 0 and r.id not in chosen]
+    held: list[tuple[RecordingInfo, _Place]] = []
+    free: list[_Place] = []
+    lively: list[float] = []
+    segments = resample(dataset.read_stream(stream.id), dataset.layout)
+    whole = [inputs(segment.data, dataset.layout) for segment in segments]
+    spread = np.std(np.concatenate(whole), axis=0) if whole else np.zeros(0)
+    for segment, x in zip(segments, whole, strict=True):
+        if len(segment) < reach:
+            continue
+        said = called(segment, mine, barred, dataset.layout.rate_hz, spec)
+        moved = _moved(x, dataset.layout.samples(_LIVELY_S), spread)
+        for at in range(reach, len(x) + 1, dataset.layout.samples(spec.every_s)):
+            if said[at] >= 0:
+                held.append((mine[said[at]], _Place(x, segment, at)))
+            elif said[at] == FREE:
+                free.append(_Place(x, segment, at))
+                lively.append(float(moved[at - 1]))
+    kept = np.sort(np.argsort(lively, kind="stable")[: len(free) - round(spec.busy_share * len(free))])
+    return _Found(held, [free[at] for at in kept.tolist()])
+
+
+def called(
+    segment: Segment,
+    used: Sequence[RecordingInfo],
+    barred: Sequence[RecordingInfo],
+    rate_hz: float,
+    spec: AnywhereSpec,
+) -> NDArray[np.int64]:
+    """What each position of a stretch is called, (n + 1,): an index into ``used``, `FREE` or `NOTHING`.
+
+    Args:
+        used: recordings of the stream whose gesture is a class; their rows after trimming count.
+        barred: the stream's other recordings, all their rows.
+    """
+    said = np.full(len(segment) + 1, FREE, dtype=np.int64)
+    onset, after, settle = (round(s * rate_hz) for s in (spec.onset_s, spec.after_s, spec.settle_s))
+
+    def samples(first: int, last: int) -> tuple[int, int]:
+        begin, end = np.searchsorted(segment.row_of, (first, last), side="left")
+        return int(begin), int(end)
+
+    def rows(recording: RecordingInfo) -> tuple[int, int]:
+        return recording.stream_row + recording.start, recording.stream_row + recording.stop
+
+    spans = [(number, *samples(*rows(r))) for number, r in enumerate(used)]
+    spans = [(number, begin, end) for number, begin, end in spans if end > begin]
+    # A position counts the samples heard: at ``begin`` none of the recording, at ``end`` all of it.
+    for _, _, end in spans:
+        said[end + 1 : end + settle + 1] = NOTHING
+    for number, _, end in spans:
+        said[end + 1 : end + after + 1] = number
+    for number, begin, end in spans:
+        inside = said[begin + 1 : end + 1]
+        claimed = np.zeros(len(inside), dtype=bool)
+        for other, first, last in spans:
+            if other != number:
+                claimed[max(0, first - begin) : max(0, last - begin)] = True
+        inside[:] = np.where(claimed, NOTHING, number)
+    for _, begin, _ in spans:
+        said[begin + 1 : begin + onset] = NOTHING
+    for r in barred:
+        begin, end = samples(r.stream_row, r.stream_row + r.rows)
+        if end > begin:
+            said[begin + 1 : end + settle + 1] = NOTHING
+    return said
+
+
+def _moved(x: NDArray[np.int64], samples: int, usual: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How much the channels moved in the last ``samples`` of each (T,): their spreads over ``usual`` (F,), averaged."""
+    values = x - x.mean(axis=0)
+    sums = np.vstack([np.zeros(values.shape[1]), np.cumsum(values, axis=0)])
+    squares = np.vstack([np.zeros(values.shape[1]), np.cumsum(values**2, axis=0)])
+    last = np.arange(1, len(x) + 1)
+    first = np.maximum(last - samples, 0)
+    n = (last - first)[:, None]
+    variance = (squares[last] - squares[first]) / n - ((sums[last] - sums[first]) / n) ** 2
+    spread = np.sqrt(np.maximum(variance, 0.0))
+    return np.asarray((spread / np.where(usual > 0, usual, 1.0)).mean(axis=1))
