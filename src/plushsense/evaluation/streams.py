@@ -28,6 +28,7 @@ from plushsense.evaluation.systems import (
     balanced,
     cheapest,
     fewest,
+    gated,
     searched,
     total,
 )
@@ -214,23 +215,30 @@ def scored_fold(dataset: Dataset, fold: PeopleFold, fitted: Fitted, settings: Se
         if network not in fitted.networks:
             continue
         names = [n for n in settings.systems if SYSTEMS[n].network == network]
-        names = [n for n in names if fitted.gate is not None or not SYSTEMS[n].gate]
+        names = [n for n in names if fitted.gate is not None or SYSTEMS[n].gate_to is None]
         if not names:
             continue
         tuning = hear(dataset, fitted.networks[network], fold.validation)
         testing = hear(dataset, fitted.networks[network], fold.test)
+        searches: dict[str, list[Point]] = {}
         for name in names:
-            found[name] = _scored(SYSTEMS[name], tuning, testing, fitted.gate or GatePlan(), settings)
+            system = SYSTEMS[name]
+            base = system.gate_to or name
+            if base not in searches:
+                searches[base] = searched(tuning, SYSTEMS[base], settings.late_s)
+            points = searches[base]
+            if system.gate_to is not None:
+                points = gated(tuning, points, fitted.gate or GatePlan(), settings.late_s)
+            found[name] = _scored(system, points, tuning, testing, settings)
     people = {"train": list(fold.train), "validation": list(fold.validation), "test": list(fold.test)}
     return {"name": fold.name, **people, "systems": {n: found[n] for n in settings.systems if n in found}}
 
 
 def _scored(
-    system: System, tuning: Sequence[Heard], testing: Sequence[Heard], gate: GatePlan, settings: Settings
+    system: System, points: Sequence[Point], tuning: Sequence[Heard], testing: Sequence[Heard], settings: Settings
 ) -> dict[str, Any]:
-    """One system of one fold."""
+    """One system of one fold, with the settings that were tried on those who tune."""
     late_s = settings.late_s
-    points = searched(tuning, system, gate, late_s)
     by_person: dict[str, list[Heard]] = {}
     for h in testing:
         by_person.setdefault(h.truth.subject, []).append(h)

@@ -67,35 +67,36 @@ _STEPS: dict[str, tuple[Any, ...]] = {
 }
 
 
+_WAITS = (0.5, 1.5)
+
+
 def _beside(spec: DecideSpec) -> list[DecideSpec]:
     """The settings that differ from one in a single thing."""
     found = [replace(spec, **{name: value}) for name, values in _STEPS.items() for value in values]
     found += [replace(spec, leave=share * spec.enter, leave_affect=share * spec.enter) for share in (0.3, 0.5, 0.8)]
-    if spec.gate.rules:
-        found += [replace(spec, wait_s=wait_s) for wait_s in (0.5, 1.0, 1.5)]
     return [each for each in found if each != spec]
 
 
 @dataclass(frozen=True)
 class System:
-    """``network``: which of a fold's networks it listens with; ``gate``: whether the gate speaks too; ``rounds`` of
-    looking beside the best settings of the grid."""
+    """``network``: which of a fold's networks it listens with; ``rounds`` of looking beside the best settings of the
+    ``grid``; ``gate_to``: the system to whose best settings a gate is added instead."""
 
     title: str
     network: str
-    gate: bool
     grid: Grid
     rounds: int = 0
+    gate_to: str | None = None
 
 
 SYSTEMS: dict[str, System] = {
-    "argmax": System("plain argmax", WINDOWS, False, _argmax),
-    "smoothed": System("smoothed argmax", WINDOWS, False, _smoothed),
-    "hysteresis": System("hysteresis", WINDOWS, False, _hysteresis, 2),
-    "hybrid": System("hybrid (with gate)", WINDOWS, True, _hysteresis, 2),
-    "anywhere-smoothed": System("stream training, smoothed argmax", ANYWHERE, False, _smoothed),
-    "anywhere": System("stream training, hysteresis", ANYWHERE, False, _hysteresis, 2),
-    "full": System("stream training, hybrid", ANYWHERE, True, _hysteresis, 2),
+    "argmax": System("plain argmax", WINDOWS, _argmax),
+    "smoothed": System("smoothed argmax", WINDOWS, _smoothed),
+    "hysteresis": System("hysteresis", WINDOWS, _hysteresis, 1),
+    "hybrid": System("hybrid (with gate)", WINDOWS, _hysteresis, 1, "hysteresis"),
+    "anywhere-smoothed": System("stream training, smoothed argmax", ANYWHERE, _smoothed),
+    "anywhere": System("stream training, hysteresis", ANYWHERE, _hysteresis, 1),
+    "full": System("stream training, hybrid", ANYWHERE, _hysteresis, 1, "anywhere"),
 }
 REFERENCE = "smoothed"
 
@@ -123,17 +124,26 @@ def tried(heard: Sequence[Heard], specs: Sequence[DecideSpec], late_s: float = L
     return [points[i] for i in range(len(specs))]
 
 
-def searched(heard: Sequence[Heard], system: System, gate: GatePlan, late_s: float = LATE_S) -> list[Point]:
-    """All settings of a system that were tried on these streams."""
-    gestures = heard[0].listener.trace.gestures
-    specs = [replace(s, gate=gate) if system.gate else s for s in system.grid(gestures)]
-    points = tried(heard, specs, late_s)
+def searched(heard: Sequence[Heard], system: System, late_s: float = LATE_S) -> list[Point]:
+    """All settings of a system that were tried on these streams, without a gate."""
+    points = tried(heard, system.grid(heard[0].listener.trace.gestures), late_s)
     for _ in range(system.rounds):
         known = {_key(p.spec) for p in points}
-        near = {_key(p.spec): p.spec for p in (*(fewest(points, t) for t in TARGETS), balanced(points))}
-        more = {_key(s): s for spec in near.values() for s in _beside(spec)}
+        more = {_key(s): s for spec in _best_specs(points) for s in _beside(spec)}
         points += tried(heard, [s for key, s in more.items() if key not in known], late_s)
     return points
+
+
+def gated(heard: Sequence[Heard], points: Sequence[Point], gate: GatePlan, late_s: float = LATE_S) -> list[Point]:
+    """The best of these settings with a gate, and how long its events wait for the network."""
+    specs = [replace(spec, gate=gate, wait_s=wait_s) for spec in _best_specs(points) for wait_s in _WAITS]
+    return tried(heard, specs, late_s)
+
+
+def _best_specs(points: Sequence[Point]) -> list[DecideSpec]:
+    """Of every target the setting that would be taken, and that of the highest F1."""
+    best = (*(fewest(points, target) for target in TARGETS), balanced(points))
+    return list({_key(p.spec): p.spec for p in best}.values())
 
 
 def _key(spec: DecideSpec) -> tuple[object, ...]:

@@ -120,8 +120,7 @@ class Tally:
 
     def kept(self) -> dict[str, Any]:
         """All of it as plain values: what a journal keeps, and `Tally(**kept)` makes again."""
-        table = {f.name: getattr(self, f.name) for f in fields(self)}
-        return table | {"latencies": [round(s, 4) for s in self.latencies]}
+        return {f.name: getattr(self, f.name) for f in fields(self)}
 
 
 Tallies = dict[str, Tally]
@@ -198,7 +197,7 @@ def tally(truths: Sequence[Interval], events: Sequence[Interval], late_s: float 
         row.fragmented_merged += split and joined
         after = min(events[j].start_s for j in np.flatnonzero(same[i]).tolist()) - truth.start_s
         row.early += bool(after < 0)
-        row.latencies.append(max(0.0, float(after)))
+        row.latencies.append(round(max(0.0, float(after)), 4))
     for j, event in enumerate(events):
         row = at(event.label)
         row.events += 1

@@ -26,7 +26,8 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--systems",
         metavar="NAME,...",
-        help="for --split, which to compare: argmax, smoothed, hysteresis (default: all that can be fitted)",
+        help="for --split, which to compare: argmax, smoothed, hysteresis, hybrid, anywhere-smoothed, anywhere, full "
+        "(default: all)",
     )
     parser.add_argument(
         "--late",
