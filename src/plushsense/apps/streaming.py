@@ -157,8 +157,8 @@ def stream_eval(
 
 
 def trained_people(bundle: Bundle, dataset: Dataset) -> set[str]:
-    """Codes on which a bundle was trained or stopped. Those of another data set may be other people: only where both
-    have another name and other content are they taken for such."""
+    """Codes on whom a bundle was trained, or who were held back and tuned it. Those of another data set, of another
+    name and other content, are other people."""
     told = bundle.provenance
     known = told.get("dataset") is None or told.get("dataset") == dataset.head.name
     known = known or told.get("dataset_hash") == dataset.hash
@@ -251,6 +251,8 @@ def recipes_for(
     """
     from plushsense.training.fit import placed
 
+    if config.padding != "stream":
+        raise ConfigError(f"A network with {config.padding} padding cannot follow a stream: use --padding stream.")
     training = placed(config.training)
     wanted, found = config.evaluation.classes, {}
     if WINDOWS in networks:
@@ -268,11 +270,6 @@ def recipes_for(
         if training.halve_every:
             halved = replace(halved, halve_every=-(-training.halve_every // 2))
         found[ANYWHERE] = Recipe(arch, halved, replace(config.windows, context="anywhere"), gestures, config.anywhere)
-    for recipe in found.values():
-        if recipe.arch.padding != "stream":
-            raise ConfigError(
-                f"A network with {recipe.arch.padding} padding cannot follow a stream: use --padding stream."
-            )
     return found
 
 
