@@ -27,7 +27,6 @@ _LOOKS: dict[str, tuple[str, str, str]] = {
     "full": ("#cc79a7", "--", "X"),
 }
 _OTHER = ("#009e73", "-.", "*")
-# Where the shares of hits are known, as `evaluation.stream_scores.LATENCY_SHARES`.
 _MOST_SHOWN_S = 4.0
 HOWS = {
     "plain": "no threshold",
@@ -92,7 +91,7 @@ def latencies(result: Mapping[str, Any]) -> Figure:
             if n:
                 shares = [recall * i / (n - 1) for i in range(n)]
                 axes.plot(
-                    [0.0, *quantiles, _MOST_SHOWN_S],
+                    [0.0, *quantiles, max(quantiles[-1], _MOST_SHOWN_S)],
                     [0.0, *shares, recall],
                     style,
                     color=colour,
