@@ -1,0 +1,318 @@
+"""Events against true intervals: what was noticed, what was said for no reason, how late, and what the errors cost.
+
+After Ward, Lukowicz and Gellersen, *Performance metrics for activity recognition*, ACM TIST 2(1), 2011, article 6,
+event analysis. Everything is asked on one level: gestures, families or affects are labels to this room.
+
+*Overlap.* A truth stands from ``start_s`` to ``stop_s``. An event belongs to its time when it lasts into it, or begins
+in it or at most ``late_s`` after its end (a reaction to a blow of 0.2 s cannot come sooner), but not after the next
+truth of the same label has begun. An event stands from when its label was *said* until its end.
+
+Of each label by itself, with the events and truths of that label that overlap:
+
+========================  =============================================================================================
+of a truth                of an event
+========================  =============================================================================================
+deletion: no event        insertion: no truth
+fragmented: two or more   fragmenting: one of several of its truth, which is its only one
+merged: its event has     merging: several truths, of which none has another event
+another truth too
+fragmented and merged     fragmenting and merging
+correct: none of these    correct: none of these
+========================  =============================================================================================
+
+So every truth and every event is counted once in its column; ``hits`` are truths with an event, ``matched`` events
+with a truth. An event of a wrong label is an insertion and leaves a deletion behind, if nothing else was right. An
+insertion is ``confused`` where it overlaps a truth of another label, else ``outside``. An event without a label (a
+gate that says an affect, asked for gestures) is ``unnamed`` where there is any truth: neither right nor wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+UNNAMED = ""
+LATE_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    """A truth, or an event from when its label was said; ``label`` "" says nothing on this level."""
+
+    start_s: float
+    stop_s: float
+    label: str
+
+
+@dataclass
+class Tally:
+    """Counts of one label, or of several added up; ``latencies`` in seconds, one for each hit.
+
+    ``early``: hits whose event was said before the onset; their latency counts as 0.
+    """
+
+    truths: int = 0
+    hits: int = 0
+    deletions: int = 0
+    fragmented: int = 0
+    merged: int = 0
+    fragmented_merged: int = 0
+    events: int = 0
+    matched: int = 0
+    insertions: int = 0
+    confused: int = 0
+    unnamed: int = 0
+    fragmenting: int = 0
+    merging: int = 0
+    fragmenting_merging: int = 0
+    early: int = 0
+    latencies: list[float] = field(default_factory=list)
+
+    def add(self, other: Tally) -> None:
+        """Count another stream, person or label in."""
+        for f in fields(self):
+            setattr(self, f.name, getattr(self, f.name) + getattr(other, f.name))
+
+    @property
+    def outside(self) -> int:
+        """Insertions where there is no truth of any label."""
+        return self.insertions - self.confused
+
+    @property
+    def recall(self) -> float | None:
+        """Hits of the truths; None without any."""
+        return self.hits / self.truths if self.truths else None
+
+    @property
+    def precision(self) -> float | None:
+        """Matched of the events that said something; None without any."""
+        said = self.events - self.unnamed
+        return self.matched / said if said else None
+
+    @property
+    def f1(self) -> float | None:
+        """Harmonic mean of both: 0 when nothing was said, None without truths and events."""
+        if not self.truths and not self.events:
+            return None
+        recall, precision = self.recall or 0.0, self.precision or 0.0
+        return 2 * recall * precision / (recall + precision) if recall + precision else 0.0
+
+    def latency_s(self) -> dict[str, float | None]:
+        """Median and 90th percentile of the time from onset to the first right event."""
+        return latency_summary(self.latencies)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Counts and what follows from them, ready for JSON; not every latency."""
+        table = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "latencies"}
+        return table | {
+            "outside": self.outside,
+            "fragmentations": self.fragmented + self.fragmented_merged,
+            "merges": self.merged + self.fragmented_merged,
+            "recall": self.recall,
+            "precision": self.precision,
+            "f1": self.f1,
+            "latency_s": self.latency_s(),
+        }
+
+    def kept(self) -> dict[str, Any]:
+        """All of it as plain values: what a journal keeps, and `Tally(**kept)` makes again."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
+
+Tallies = dict[str, Tally]
+
+
+def latency_summary(latencies: Sequence[float]) -> dict[str, float | None]:
+    """``{median, p90}`` in seconds; None without any."""
+    if not latencies:
+        return {"median": None, "p90": None}
+    return {"median": float(np.median(latencies)), "p90": float(np.percentile(latencies, 90))}
+
+
+def pooled(tallies: Iterable[Tally]) -> Tally:
+    """Several tallies as one."""
+    total = Tally()
+    for tally in tallies:
+        total.add(tally)
+    return total
+
+
+def overlaps(truths: Sequence[Interval], events: Sequence[Interval], late_s: float = LATE_S) -> NDArray[np.bool_]:
+    """(T, E) whether an event belongs to the time of a truth, whatever both are called."""
+    if not truths or not events:
+        return np.zeros((len(truths), len(events)), dtype=np.bool_)
+    start = np.array([t.start_s for t in truths])[:, None]
+    until = _until(truths, late_s)[:, None]
+    said = np.array([e.start_s for e in events])
+    end = np.array([e.stop_s for e in events])
+    return np.asarray((said < until) & ((end > start) | (said >= start)))
+
+
+def _until(truths: Sequence[Interval], late_s: float) -> NDArray[np.float64]:
+    """(T,) the time up to which an event may begin that belongs to each truth."""
+    until = np.array([t.stop_s + late_s for t in truths])
+    following: dict[str, float] = {}
+    for at in sorted(range(len(truths)), key=lambda i: truths[i].start_s, reverse=True):
+        t = truths[at]
+        next_s = following.get(t.label, np.inf)
+        until[at] = max(min(until[at], next_s), t.stop_s)
+        following[t.label] = t.start_s
+    return until
+
+
+def tally(truths: Sequence[Interval], events: Sequence[Interval], late_s: float = LATE_S) -> Tallies:
+    """The counts of one stream by label; `pooled` adds them up.
+
+    Args:
+        truths, events: in any order; a truth has a label, an event may have none.
+    """
+    over = overlaps(truths, events, late_s)
+    of_truth = np.array([t.label for t in truths], dtype=np.str_)
+    of_event = np.array([e.label for e in events], dtype=np.str_)
+    same = over & (of_truth[:, None] == of_event[None, :]) & (of_event != UNNAMED)[None, :]
+    per_truth, per_event = same.sum(axis=1), same.sum(axis=0)
+    # A truth is merged when one of its events has another truth too; an event fragments when its truth has another.
+    merged: list[bool] = (same & (per_event > 1)[None, :]).any(axis=1).tolist()
+    fragmenting: list[bool] = (same & (per_truth > 1)[:, None]).any(axis=0).tolist()
+    anything = [bool(n) for n in over.sum(axis=0)]
+    found: Tallies = {}
+
+    def at(label: str) -> Tally:
+        return found.setdefault(label, Tally())
+
+    for i, truth in enumerate(truths):
+        row = at(truth.label)
+        row.truths += 1
+        if not per_truth[i]:
+            row.deletions += 1
+            continue
+        row.hits += 1
+        split, joined = bool(per_truth[i] > 1), merged[i]
+        row.fragmented += split and not joined
+        row.merged += joined and not split
+        row.fragmented_merged += split and joined
+        after = min(events[j].start_s for j in np.flatnonzero(same[i]).tolist()) - truth.start_s
+        row.early += bool(after < 0)
+        row.latencies.append(round(max(0.0, float(after)), 4))
+    for j, event in enumerate(events):
+        row = at(event.label)
+        row.events += 1
+        if event.label == UNNAMED and anything[j]:
+            row.unnamed += 1
+        elif not per_event[j]:
+            row.insertions += 1
+            row.confused += anything[j]
+        else:
+            row.matched += 1
+            split, joined = fragmenting[j], bool(per_event[j] > 1)
+            row.fragmenting += split and not joined
+            row.merging += joined and not split
+            row.fragmenting_merging += split and joined
+    return found
+
+
+def inserted(truths: Sequence[Interval], events: Sequence[Interval], late_s: float = LATE_S) -> list[Interval]:
+    """The insertions that are ``outside``: where there is no truth of any label."""
+    anything = overlaps(truths, events, late_s).sum(axis=0) > 0
+    return [event for event, any_truth in zip(events, anything, strict=True) if not any_truth]
+
+
+@dataclass(frozen=True)
+class Costs:
+    """What an error costs. There is no measurement behind these numbers: a family minds a hug taken for a blow more
+    than one scratch taken for another, and a toy that speaks for no reason more than one that misses something.
+
+    Every event is charged by the truth it fits best: nothing for the first event of the right gesture; ``again`` for
+    every further one; ``family`` for another gesture of the family (also when it only says the right affect);
+    ``confused`` for another family of the same affect, or where no affect is told; ``affect`` for another affect;
+    ``outside`` where there is no truth. Every truth in whose time nothing was said costs ``missed``.
+    """
+
+    again: float = 0.5
+    family: float = 1.0
+    confused: float = 2.0
+    missed: float = 2.0
+    outside: float = 3.0
+    affect: float = 5.0
+
+
+def cost(
+    truths: Sequence[Interval],
+    events: Sequence[Interval],
+    affects: Sequence[str],
+    families: Mapping[str, str],
+    affect_of: Mapping[str, str],
+    weights: Costs | None = None,
+    late_s: float = LATE_S,
+) -> float:
+    """The cost of one stream's errors, 0 for none.
+
+    Args:
+        truths, events: with gestures as labels; an event may have none.
+        affects: the affect that each event said (E,), "none" where it said none.
+        families, affect_of: of each gesture; affect "none" is one that nobody told.
+    """
+    weights = weights or Costs()
+    over = overlaps(truths, events, late_s)
+    total = float(weights.missed * (len(truths) - int(over.any(axis=1).sum() if len(events) else 0)))
+    right: set[int] = set()
+    order = sorted(range(len(events)), key=lambda j: (events[j].start_s, events[j].stop_s, events[j].label))
+    for j in order:
+        there = np.flatnonzero(over[:, j])
+        if not len(there):
+            total += weights.outside
+            continue
+        charges = []
+        for i in there.tolist():
+            truth, event = truths[i], events[j]
+            if event.label == truth.label:
+                charges.append((weights.again if i in right else 0.0, i))
+            elif event.label != UNNAMED and families[event.label] == families[truth.label]:
+                charges.append((weights.family, -1))
+            elif "none" in (affects[j], affect_of[truth.label]):
+                charges.append((weights.confused, -1))
+            elif affects[j] != affect_of[truth.label]:
+                charges.append((weights.affect, -1))
+            else:
+                charges.append((weights.family if event.label == UNNAMED else weights.confused, -1))
+        least, hit = min(charges)
+        total += least
+        if hit >= 0:
+            right.add(hit)
+    return total
+
+
+def uncovered_s(heard: Sequence[tuple[float, float]], covered: Iterable[tuple[float, float]]) -> float:
+    """How much of the stretches ``heard`` (start, stop; they do not overlap) no stretch of ``covered`` covers."""
+    union: list[list[float]] = []
+    for start, stop in sorted(covered):
+        if union and start <= union[-1][1]:
+            union[-1][1] = max(union[-1][1], stop)
+        else:
+            union.append([start, stop])
+    total = sum(stop - start for start, stop in heard)
+    inside = sum(max(0.0, min(stop, b) - max(start, a)) for start, stop in heard for a, b in union)
+    return total - inside
+
+
+def front(points: Sequence[tuple[float, float]]) -> list[int]:
+    """Indices of the points (recall, false events) that no other beats in both, by rising recall."""
+    best: list[int] = []
+    least = float("inf")
+    for at in sorted(range(len(points)), key=lambda i: (-points[i][0], points[i][1], i)):
+        if points[at][1] < least:
+            least = points[at][1]
+            best.append(at)
+    return best[::-1]
+
+
+def at_recall(points: Sequence[tuple[float, float]], recall: float) -> float | None:
+    """False events at a recall on the `front` of ``points``, straight between its points; None beyond its ends."""
+    chosen = [points[i] for i in front(points)]
+    if not chosen or not chosen[0][0] <= recall <= chosen[-1][0]:
+        return None
+    return float(np.interp(recall, [p[0] for p in chosen], [p[1] for p in chosen]))
