@@ -46,12 +46,13 @@ def faults(plan, values):
     return health.faults
 
 
-def test_limits_are_a_tenth_beyond_the_quantiles_of_those_people_only(made):
+def test_limits_are_a_tenth_beyond_what_those_people_only_showed(made):
     mine, other = touched(0), touched(1) * 5
     fit = fit_health(made(mine, other), ["P1"])
-    low, high = np.quantile(mine, (0.001, 0.999), axis=0)
-    assert fit.plan.low == tuple(np.floor(low - 0.1 * (high - low)).astype(int))
-    assert fit.plan.high == tuple(np.ceil(high + 0.1 * (high - low)).astype(int))
+    low, high = mine.min(axis=0), mine.max(axis=0)
+    margin = np.ceil(0.1 * (high - low)).astype(int)
+    assert fit.plan.low == tuple(low - margin)
+    assert fit.plan.high == tuple(high + margin)
     assert fit.widened == ()
     assert fit.frames == 4000
     assert fit.seconds == pytest.approx(39.99)
@@ -63,6 +64,18 @@ def test_a_sensor_stuck_beyond_them_is_a_fault_and_peoples_own_end_stop_is_none(
     hung[100:200, 1] = 30_000
     assert faults(fit_health(made(plain), ["P1"]).plan, hung) == 1
     assert faults(HealthPlan(), hung) == 0
+
+
+def test_where_people_touch_the_end_stop_only_staying_there_is_wrong(made):
+    reaching = touched(0)
+    reaching[1000, 1] = 32_767
+    fit = fit_health(made(reaching), ["P1"])
+    assert fit.plan.high[1] == 32_766
+    assert fit.widened == ()
+    assert faults(fit.plan, reaching) == 0
+    hung = touched(2, 500)
+    hung[100:200, 1] = 32_767
+    assert faults(fit.plan, hung) == 1
 
 
 def test_an_end_stop_that_people_reach_is_believed(made):

@@ -13,9 +13,7 @@ from plushsense.core.signal import Layout
 from plushsense.dataset.store import Dataset
 from plushsense.models.health import MOST_MS, HealthPlan
 
-# Of all frames, the share beyond the limits on either side; and how much further they are set, of the range between.
-_RARE = 0.001
-_MARGIN = 0.1
+_MARGIN = 0.1  # of what people showed
 _SAFETY = 2  # nothing seen may last longer than this part of what makes a fault
 _STILL_MS = 500
 _STILL_MOST_MS = 10_000
@@ -52,10 +50,12 @@ def frames_of(dataset: Dataset, subjects: Iterable[str]) -> Iterator[Frames]:
 def fit_health(dataset: Dataset, subjects: Iterable[str], plan: HealthPlan | None = None) -> HealthFit:
     """Limits with which the sensors of ``subjects`` are never at fault.
 
-    A channel's limits are the 0.1 % and 99.9 % quantiles of its valid values, and a tenth of the range between
-    further out. Where somebody's values repeated beyond them for half of ``fault_ms``, they are moved to hold them:
-    that sensor has an end stop that people reach. ``still_ms`` is twice the longest time in which every channel
-    repeated, at least 500 ms; when that is more than 10 s, the toy really is still, and the rule is off.
+    A channel's limits are the lowest and the highest valid value that anybody showed, and a tenth of the range between
+    further out, for people who touch harder. Where that is no longer within what the sensor can send, people reach its
+    end stop, and the limit is one step inside what they showed: touch stays there for a frame or two, a broken sensor
+    for good. Where somebody's values repeated beyond them for half of ``fault_ms``, they are moved to hold them.
+    ``still_ms`` is twice the longest time in which every channel repeated, at least 500 ms; when that is more than
+    10 s, the toy really is still, and the rule is off.
 
     Args:
         plan: the times to keep (``fault_ms``, ``recover_ms``); the defaults when left out.
@@ -73,10 +73,11 @@ def fit_health(dataset: Dataset, subjects: Iterable[str], plan: HealthPlan | Non
         mine = values[:, c]
         mine = mine[(mine >= valid[0, c]) & (mine <= valid[1, c])]
         if len(mine):
-            first, last = np.quantile(mine, (_RARE, 1 - _RARE))
-            margin = _MARGIN * (last - first)
-            low[c] = max(low[c], int(np.floor(first - margin)))
-            high[c] = min(high[c], int(np.ceil(last + margin)))
+            first, last = int(mine.min()), int(mine.max())
+            margin = int(np.ceil(_MARGIN * (last - first)))
+            inside = 1 if last - first > 1 else 0
+            low[c] = first - margin if first - margin > valid[0, c] else first + inside
+            high[c] = last + margin if last + margin < valid[1, c] else last - inside
     usual = low.copy(), high.copy()
     for frames in parts:
         for rows, wrong in _held(frames, usual, valid, plan.fault_ms / _SAFETY, layout.gap_ms):
