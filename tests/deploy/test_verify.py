@@ -20,9 +20,10 @@ from plushsense.core.errors import BadInput, ToolError
 from plushsense.core.signal import Layout, load_layout
 from plushsense.dataset.importers import import_recordings
 from plushsense.dataset.index import open_dataset
-from plushsense.deploy.faults import RULES, TEXTS
+from plushsense.deploy.faults import TEXTS
 from plushsense.deploy.golden import column
 from plushsense.deploy.package import ARDUINO, package
+from plushsense.deploy.rule_faults import RULES
 from plushsense.deploy.targets import TARGETS
 from plushsense.deploy.vectors import Export
 from plushsense.deploy.verify import Setting, verify
@@ -122,7 +123,9 @@ def test_every_fault_is_caught_on_the_host(c_compiler: str, small: Path, capsys:
     export = Export(small)
     done = verify(export, ["host"], only=plainly, plant=lambda fault: True)
     assert [f.fault for f in done.faults if not f.caught] == [] and done.passed
-    assert {f.kind for f in done.faults} == {"weight", "shift", "index", "rounding", "clamp", "rule", "constant"} | set(RULES)
+    assert {f.kind for f in done.faults} == {"weight", "shift", "index", "rounding", "clamp", "rule", "constant"} | set(
+        RULES
+    )
     assert len(done.faults) == len(TEXTS) + 10
     # By an answer, not because the toy would not begin or crashed.
     assert all("should be" in (f.first or "") and "plush_begin" not in (f.first or "") for f in done.faults)

@@ -123,7 +123,12 @@ def reached(drill: Drill) -> set[str]:
                     found.add("resting")
             if what == ENDED:
                 ended = row[at["ms"]]
-                if after is not None and after[0] == EVENT and after[at["what"]] == BEGUN and after[frame] == row[frame]:
+                if (
+                    after is not None
+                    and after[0] == EVENT
+                    and after[at["what"]] == BEGUN
+                    and after[frame] == row[frame]
+                ):
                     found.add("replaced by the gate" if after[at["source"]] == GATE else "replaced")
                 elif after is not None and after[0] == HEALTH and after[frame] == row[frame] and after[state] == 2:
                     found.add("lost in a fault")

@@ -109,7 +109,16 @@ class _Toy:
     def say(self, kind: int, ms: int, *what: int, logits: Sequence[int] = (), mean: Sequence[int] = ()) -> None:
         counts = self.clock.restarts, self.clock.invalid
         blank = [0] * self.arch.classes
-        row = [kind, self.frame, ms, *what, *[0] * (HEAD - 5 - len(what)), *counts, *(logits or blank), *(mean or blank)]
+        row = [
+            kind,
+            self.frame,
+            ms,
+            *what,
+            *[0] * (HEAD - 5 - len(what)),
+            *counts,
+            *(logits or blank),
+            *(mean or blank),
+        ]
         self.rows.append(row)
 
     def tell(self, updates: Sequence[Update]) -> None:
@@ -260,8 +269,8 @@ class Maker:
                 spoilt = np.array([garbage_channel])
             for channel in spoilt:
                 values[channel] = self._garbage(int(channel))
-            for channel, value in (stuck or {}).items():
-                values[channel] = value
+            for held, value in (stuck or {}).items():
+                values[held] = value
             if rng.random() >= lost:
                 self.put(values)
             if rng.random() >= equal:
