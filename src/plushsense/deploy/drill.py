@@ -16,19 +16,8 @@ from numpy.typing import NDArray
 from plushsense.core.errors import BundleError
 from plushsense.core.gestures import Gesture, GestureSet
 from plushsense.core.recfile import Frames
-from plushsense.deploy.golden import (
-    ANSWER,
-    COLUMNS,
-    EVENT,
-    HEAD,
-    HEALTH,
-    TRACKING,
-    Ints,
-    Maker,
-    answers_of,
-    column,
-    measured,
-)
+from plushsense.deploy.golden import ANSWER, COLUMNS, EVENT, HEAD, HEALTH, TRACKING, Ints, answers_of, column
+from plushsense.deploy.made_frames import Maker, measured
 from plushsense.models.events import ANSWERS, BEGUN, ENDED, GATE, KINDS, NO_GESTURE, ONE, SOURCES, EventPlan
 from plushsense.models.fixed import LOGIT_LIMIT, PROBABILITY_BITS, LogitScale, split_ratio
 from plushsense.models.gate import JERK, LEVEL, Gate, GatePlan, Rule, Signal, Term

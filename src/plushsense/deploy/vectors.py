@@ -17,7 +17,8 @@ from plushsense.dataset.store import Dataset
 from plushsense.deploy.calibration import integer_model
 from plushsense.deploy.drill import drills_of
 from plushsense.deploy.emit import BUNDLE, FACTS, GOLDEN, IMAGE, LIBRARY, MODEL, read_facts
-from plushsense.deploy.golden import COLUMNS, HEAD, TRACKING, answers_of, column, golden_frames, read_golden
+from plushsense.deploy.golden import COLUMNS, HEAD, TRACKING, answers_of, column, read_golden
+from plushsense.deploy.made_frames import golden_frames
 from plushsense.deploy.streams import frames_of
 from plushsense.models.bundle import Bundle
 from plushsense.models.image import IntegerModel, memory_bytes
