@@ -272,7 +272,7 @@ def test_c_that_warns_or_writes_past_its_memory(c_compiler: str, own: Path, caps
     assert done.mismatches == sum(r.vectors for r in done.runs) and "unused" in (done.first or "")
     edit(own / "plushsense.c", "toy->heard = 1; int unused;", "((uint32_t *)toy->memory)[-1] = 0; toy->heard = 1;")
     done = verify(Export(own), ["host"], only=plainly)
-    assert "before the toy's memory" in (done.first or "") and done.mismatches == 1
+    assert "before the toy's memory" in (done.first or "") and done.mismatches >= 1
 
 
 # ---- Recordings, long streams ---------------------------------------------------------------------------------------

@@ -71,8 +71,10 @@ class Drill:
 
 def drills_of(model: IntegerModel, scaler: Scaler) -> list[Drill]:
     """A few drills for a model, one of each of `COURSES`, the same ones each time."""
-    plain = replace(model, rules=Rules(), gestures=_gestures(model))
-    return [_drill(plain, scaler, course, seed) for seed, course in enumerate(COURSES, 1)]
+    return [
+        _drill(replace(model, rules=Rules(), gestures=_gestures(model, course)), scaler, course, seed)
+        for seed, course in enumerate(COURSES, 1)
+    ]
 
 
 def everything() -> set[str]:
@@ -146,8 +148,10 @@ def _logits(rows: NDArray[np.int32]) -> NDArray[np.float64]:
     return rows[told, HEAD : HEAD + classes].astype(np.float64)
 
 
-def _gestures(model: IntegerModel) -> GestureSet:
-    told = [_AFFECTS[k if k < 5 else (0, 2, 4, 0, 2, 1)[k % 6]] for k in range(len(model.gestures))]
+def _gestures(model: IntegerModel, course: _Course) -> GestureSet:
+    # Where events give way, mostly to one of the same affect.
+    more = (0, 2, 4, 0, 2, 1) if course.near else (0, 0, 0, 2, 0, 1)
+    told = [_AFFECTS[k if k < 5 else more[k % 6]] for k in range(len(model.gestures))]
     gestures = tuple(
         Gesture(g.label, affect, idle=idle) for g, (affect, idle) in zip(model.gestures.gestures, told, strict=True)
     )
