@@ -251,8 +251,8 @@ def _calm(
     """Touches for long, now and then a frame in doubt, or silence."""
     make, silences = Maker(model.layout, scaler, rng), []
     make.touches(model.network.arch.span)
-    for _ in range(12):
-        make.touches(170, garbage=0.02 / len(make.mean))
+    for n in range(24):
+        make.touches(170, garbage=(0.08 if n % 2 else 0.01) / len(make.mean))
         silences.append(len(make.rows) - 1)
     return np.array(make.rows, dtype=np.int64), tuple(silences)
 
