@@ -18,7 +18,8 @@ from plushsense.core.errors import BadInput
 from plushsense.core.gestures import GestureSet
 from plushsense.deploy.calibration import integer_model
 from plushsense.deploy.emit import TOY_BYTES, c_names, comment, emit, read_facts, without_people
-from plushsense.deploy.golden import answers_of, column, golden_frames, read_golden
+from plushsense.deploy.golden import answers_of, column, read_golden
+from plushsense.deploy.made_frames import golden_frames
 from plushsense.models.bundle import Bundle
 from plushsense.models.image import IntegerModel, memory_bytes
 

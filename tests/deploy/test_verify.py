@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -20,12 +21,19 @@ from plushsense.core.errors import BadInput, ToolError
 from plushsense.core.signal import Layout, load_layout
 from plushsense.dataset.importers import import_recordings
 from plushsense.dataset.index import open_dataset
-from plushsense.deploy.faults import RULES, TEXTS
-from plushsense.deploy.golden import column
+from plushsense.deploy.calibration import integer_model
+from plushsense.deploy.drill import drills_of, everything, reached
+from plushsense.deploy.faults import TEXTS
+from plushsense.deploy.golden import EVENT, FAULT, HEALTH, column
 from plushsense.deploy.package import ARDUINO, package
+from plushsense.deploy.rule_faults import RULES
 from plushsense.deploy.targets import TARGETS
 from plushsense.deploy.vectors import Export
 from plushsense.deploy.verify import Setting, verify
+from plushsense.live.decide import DecideSpec
+from plushsense.models.events import NO_GESTURE
+from plushsense.models.gate import JERK, GatePlan, Rule, Signal, Term
+from plushsense.models.health import HealthPlan
 from plushsense.models.image import HEAD_BYTES, head
 
 EMULATED = [name for name in TARGETS if name != "host"]
@@ -89,6 +97,39 @@ def test_every_way_to_compile_on_the_host(all_compilers: None, small: Path) -> N
     assert min(rows) > 500 and {r.vectors for r in done.runs} == {sum(rows)}
 
 
+def test_a_last_layer_that_was_adapted_and_rules_that_were_fitted(c_compiler: str, tmp_path: Path) -> None:
+    """As `adapt` and the fitting of settings leave a bundle: other dense weights, re-quantised, and every rule."""
+    plain = bundle_of("plush-15", "9d1_5d2", "4,6")
+    weights = dict(plain.weights)
+    rng = np.random.default_rng(3)
+    weights["dense.weight"] = (weights["dense.weight"] * rng.uniform(-3, 3, (18, 1))).astype(np.float32)
+    weights["dense.bias"] = (weights["dense.bias"] + rng.normal(size=18)).astype(np.float32)
+    blow = Rule((Term(0, 60),), 3, NO_GESTURE)
+    spec = DecideSpec(
+        enter=0.2,
+        leave=0.1,
+        known=-1.0,
+        gate=GatePlan((Signal(JERK, (1, 4, 10), lag=2, floor=20),), (blow,)),
+        health=HealthPlan((-1500,) * 13, (30_000,) * 13, still_ms=400),
+    )
+    bundle = replace(plain, weights=weights, decision=spec.to_dict())
+    export = Export(exported(tmp_path / "out", bundle))
+    assert export.is_own and not np.array_equal(
+        export.model.network.dense.weights, integer_model(plain).network.dense.weights
+    )
+    kinds = column(export.golden.answers, "what", EVENT), column(export.golden.answers, "source", EVENT)
+    assert {1, 3} <= set(kinds[0]) and set(kinds[1]) == {0, 1}, "its own golden vectors tell events, and blows"
+    assert FAULT in column(export.golden.answers, "state", HEALTH)
+    done = verify(export, ["host"], only=plainly)
+    assert done.passed and done.first is None
+
+
+def test_drills_reach_everything(small: Path) -> None:
+    export = Export(small)
+    found = drills_of(export.model, export.bundle.scaler)
+    assert set().union(*map(reached, found)) == everything()
+
+
 MAIN = {
     "paper-11": ("14d1_39d2_41d4", "8,12,16", "plush-15"),
     "default-11": ("14d1_19d2_19d4", "8,12,16", "plush-15"),
@@ -122,7 +163,9 @@ def test_every_fault_is_caught_on_the_host(c_compiler: str, small: Path, capsys:
     export = Export(small)
     done = verify(export, ["host"], only=plainly, plant=lambda fault: True)
     assert [f.fault for f in done.faults if not f.caught] == [] and done.passed
-    assert {f.kind for f in done.faults} == {"weight", "shift", "index", "rounding", "clamp", "rule", "constant"} | set(RULES)
+    assert {f.kind for f in done.faults} == {"weight", "shift", "index", "rounding", "clamp", "rule", "constant"} | set(
+        RULES
+    )
     assert len(done.faults) == len(TEXTS) + 10
     # By an answer, not because the toy would not begin or crashed.
     assert all("should be" in (f.first or "") and "plush_begin" not in (f.first or "") for f in done.faults)
@@ -229,7 +272,7 @@ def test_c_that_warns_or_writes_past_its_memory(c_compiler: str, own: Path, caps
     assert done.mismatches == sum(r.vectors for r in done.runs) and "unused" in (done.first or "")
     edit(own / "plushsense.c", "toy->heard = 1; int unused;", "((uint32_t *)toy->memory)[-1] = 0; toy->heard = 1;")
     done = verify(Export(own), ["host"], only=plainly)
-    assert "before the toy's memory" in (done.first or "") and done.mismatches == 1
+    assert "before the toy's memory" in (done.first or "") and done.mismatches >= 1
 
 
 # ---- Recordings, long streams ---------------------------------------------------------------------------------------

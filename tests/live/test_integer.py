@@ -13,8 +13,9 @@ from hypothesis import given, settings
 sys.path.insert(0, str(Path(__file__).parents[1]))
 sys.path.insert(0, str(Path(__file__).parent))
 
-from c_toy import Seat, compiled
 from troubles import SPECS, STREAMS, calibrate, knowing_bundle, make_bundle, toy_frames
+
+from c_toy import Seat, compiled
 from plushsense.core.gestures import load_gestures
 from plushsense.core.recfile import Frames
 from plushsense.core.signal import load_layout
@@ -35,6 +36,7 @@ from plushsense.models.image import IntegerModel
 from plushsense.models.reference import random_weights
 from plushsense.windows.clock import resample
 from plushsense.windows.features import Scaler, inputs
+
 TROUBLED = calibrate(make_bundle())
 
 
@@ -95,8 +97,8 @@ def of_live(model: IntegerModel, frames: list[Frame]) -> np.ndarray:
 
 
 def equal(library: Any, model: IntegerModel, frames: list[Frame]) -> np.ndarray:
-    """Assert that both say the same, answers and events; the live engine's answers: row, ms, whether it tracks, gesture,
-    affect, confidence, restarts, invalid."""
+    """Assert that both say the same, answers and events; the live engine's answers: row, ms, whether it tracks,
+    gesture, affect, confidence, restarts, invalid."""
     found, wanted = of_live(model, frames), of_the_c(library, model, frames)
     np.testing.assert_array_equal(found, wanted)
     return found[found[:, 0] == ANSWER][:, [1, 2, 3, 4, 5, 6, 8, 9]]

@@ -16,19 +16,8 @@ from numpy.typing import NDArray
 from plushsense.core.errors import BundleError
 from plushsense.core.gestures import Gesture, GestureSet
 from plushsense.core.recfile import Frames
-from plushsense.deploy.golden import (
-    ANSWER,
-    COLUMNS,
-    EVENT,
-    HEAD,
-    HEALTH,
-    TRACKING,
-    Ints,
-    Maker,
-    answers_of,
-    column,
-    measured,
-)
+from plushsense.deploy.golden import ANSWER, COLUMNS, EVENT, HEAD, HEALTH, TRACKING, Ints, answers_of, column
+from plushsense.deploy.made_frames import Maker, measured
 from plushsense.models.events import ANSWERS, BEGUN, ENDED, GATE, KINDS, NO_GESTURE, ONE, SOURCES, EventPlan
 from plushsense.models.fixed import LOGIT_LIMIT, PROBABILITY_BITS, LogitScale, split_ratio
 from plushsense.models.gate import JERK, LEVEL, Gate, GatePlan, Rule, Signal, Term
@@ -82,8 +71,10 @@ class Drill:
 
 def drills_of(model: IntegerModel, scaler: Scaler) -> list[Drill]:
     """A few drills for a model, one of each of `COURSES`, the same ones each time."""
-    plain = replace(model, rules=Rules(), gestures=_gestures(model))
-    return [_drill(plain, scaler, course, seed) for seed, course in enumerate(COURSES, 1)]
+    return [
+        _drill(replace(model, rules=Rules(), gestures=_gestures(model, course)), scaler, course, seed)
+        for seed, course in enumerate(COURSES, 1)
+    ]
 
 
 def everything() -> set[str]:
@@ -123,7 +114,12 @@ def reached(drill: Drill) -> set[str]:
                     found.add("resting")
             if what == ENDED:
                 ended = row[at["ms"]]
-                if after is not None and after[0] == EVENT and after[at["what"]] == BEGUN and after[frame] == row[frame]:
+                if (
+                    after is not None
+                    and after[0] == EVENT
+                    and after[at["what"]] == BEGUN
+                    and after[frame] == row[frame]
+                ):
                     found.add("replaced by the gate" if after[at["source"]] == GATE else "replaced")
                 elif after is not None and after[0] == HEALTH and after[frame] == row[frame] and after[state] == 2:
                     found.add("lost in a fault")
@@ -152,8 +148,10 @@ def _logits(rows: NDArray[np.int32]) -> NDArray[np.float64]:
     return rows[told, HEAD : HEAD + classes].astype(np.float64)
 
 
-def _gestures(model: IntegerModel) -> GestureSet:
-    told = [_AFFECTS[k if k < 5 else (0, 2, 4, 0, 2, 1)[k % 6]] for k in range(len(model.gestures))]
+def _gestures(model: IntegerModel, course: _Course) -> GestureSet:
+    # Where events give way, mostly to one of the same affect.
+    more = (0, 2, 4, 0, 2, 1) if course.near else (0, 0, 0, 2, 0, 1)
+    told = [_AFFECTS[k if k < 5 else more[k % 6]] for k in range(len(model.gestures))]
     gestures = tuple(
         Gesture(g.label, affect, idle=idle) for g, (affect, idle) in zip(model.gestures.gestures, told, strict=True)
     )
@@ -253,8 +251,8 @@ def _calm(
     """Touches for long, now and then a frame in doubt, or silence."""
     make, silences = Maker(model.layout, scaler, rng), []
     make.touches(model.network.arch.span)
-    for _ in range(12):
-        make.touches(170, garbage=0.02 / len(make.mean))
+    for n in range(24):
+        make.touches(170, garbage=(0.08 if n % 2 else 0.01) / len(make.mean))
         silences.append(len(make.rows) - 1)
     return np.array(make.rows, dtype=np.int64), tuple(silences)
 

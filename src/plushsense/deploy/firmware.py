@@ -13,7 +13,7 @@ from typing import Any
 from plushsense.core.errors import LayoutError
 from plushsense.core.signal import DELAY_MS, DEVICE_MS, Channel, Layout
 from plushsense.deploy.emit import c_names, comment
-from plushsense.deploy.golden import measured
+from plushsense.deploy.made_frames import measured
 from plushsense.windows.features import Scaler
 
 TEMPLATES = (

@@ -160,15 +160,15 @@ void frame(uint32_t ms, const int32_t *values)
 }}
 ```
 
-**React to events.** There is one for each touch: it *begins* when its affect is sure (a blow within a few samples, by the
-gate; else by the network), is *named* when its gesture is sure too, if that comes later, and *ends*. `toy.event` is the
-newest thing that happened to one: `what`, `number`, `affect`, `gesture` (`PLUSH_NO_GESTURE` while unnamed), `source`,
-`since_ms`, `ms`. `toy.answer`, every step, is what the network makes of it all, sure or not: its `kind` says whether it is
-idle, unknown, unsure, sure of an affect or of a gesture.
+**React to events.** There is one for each touch: it *begins* when its affect is sure (a blow within a few samples, by
+the gate; else by the network), is *named* when its gesture is sure too, if that comes later, and *ends*. `toy.event` is
+the newest thing that happened to one: `what`, `number`, `affect`, `gesture` (`PLUSH_NO_GESTURE` while unnamed),
+`source`, `since_ms`, `ms`. `toy.answer`, every step, is what the network makes of it all, sure or not: its `kind` says
+whether it is idle, unknown, unsure, sure of an affect or of a gesture.
 
-**Sensors that fail** (out of range, stuck at an end, all frozen; the limits stand in the model) end the event that goes on.
-`toy.answer.state` is `PLUSH_FAULT` until they have recovered, then the toy is warming; `toy.faults` counts. When no frame
-comes at all, nobody can tell the toy but you: `plush_silence(&toy)` ends what goes on.
+**Sensors that fail** (out of range, stuck at an end, all frozen; the limits stand in the model) end the event that goes
+on. `toy.answer.state` is `PLUSH_FAULT` until they have recovered, then the toy is warming; `toy.faults` counts. When no
+frame comes at all, nobody can tell the toy but you: `plush_silence(&toy)` ends what goes on.
 
 One task or interrupt uses a toy at a time. Several toys may share a model, each with its own `plush_toy` and memory.
 

@@ -15,9 +15,10 @@ from plushsense.core.errors import BadInput, ConfigError
 from plushsense.core.recfile import Frames
 from plushsense.dataset.store import Dataset
 from plushsense.deploy.calibration import integer_model
-from plushsense.deploy.emit import BUNDLE, FACTS, GOLDEN, IMAGE, LIBRARY, MODEL, read_facts
 from plushsense.deploy.drill import drills_of
-from plushsense.deploy.golden import COLUMNS, HEAD, TRACKING, answers_of, column, golden_frames, read_golden
+from plushsense.deploy.emit import BUNDLE, FACTS, GOLDEN, IMAGE, LIBRARY, MODEL, read_facts
+from plushsense.deploy.golden import COLUMNS, HEAD, TRACKING, answers_of, column, read_golden
+from plushsense.deploy.made_frames import golden_frames
 from plushsense.deploy.streams import frames_of
 from plushsense.models.bundle import Bundle
 from plushsense.models.image import IntegerModel, memory_bytes
@@ -137,8 +138,8 @@ class Export:
             )
 
     def drills(self) -> list[Vectors]:
-        """The export's network with rules that speak up on made-up frames (`plushsense.deploy.drill`): its own may never
-        do. None for a model that is not that of the bundle beside it."""
+        """The export's network with rules that speak up on made-up frames, as its own may never do
+        (`plushsense.deploy.drill`); none for a model that is not that of the bundle beside it."""
         if not self.is_own:
             return []
         if self._drills is None:

@@ -21,7 +21,8 @@ import numpy as np
 
 from plushsense.core.errors import BuildError, ProgramError, ToolError
 from plushsense.deploy.emit import IMAGE, LIBRARY, MODEL
-from plushsense.deploy.faults import RULES, Fault, faults_of
+from plushsense.deploy.faults import Fault, faults_of
+from plushsense.deploy.rule_faults import RULES
 from plushsense.deploy.targets import C_FOLDER, TARGETS, build, missing_tools, require, target_named
 from plushsense.deploy.vectors import Compared, Counts, Export, Vectors, compare, counted
 
@@ -330,9 +331,7 @@ def _attempt(export: Export, folder: Path, setting: Setting, stream: Stream, cas
     return replace(seen, first=f"{where}: {seen.first}.") if seen.first else seen
 
 
-def _plant(
-    export: Export, fault: Fault, setting: Setting, streams: Sequence[Stream], room: Path, out: Path
-) -> Caught:
+def _plant(export: Export, fault: Fault, setting: Setting, streams: Sequence[Stream], room: Path, out: Path) -> Caught:
     """Plant one fault in a copy, and see whether the golden vectors notice it, or the drills, which have models of
     their own: a fault in the export's they cannot notice."""
     copy = out / "export"

@@ -145,6 +145,12 @@ static int wrong(const char *words)
     return 0;
 }
 
+static const uint8_t *failed(const char *words)
+{
+    wrong(words);
+    return NULL;
+}
+
 static int status_words(plush_status status)
 {
     switch (status) {
@@ -206,26 +212,25 @@ static const uint8_t *run(const uint8_t *p, const uint8_t *model, uint32_t bytes
     memset(&toy, 0xa5, sizeof toy);
     room = own != 0 ? plush_memory_bytes(model, bytes) : PLUSH_MODEL_MEMORY_BYTES;
     if (plush_memory_bytes(model, bytes) > room)
-        return wrong("PLUSH_MODEL_MEMORY_BYTES is less than plush_memory_bytes() says."), NULL;
+        return failed("PLUSH_MODEL_MEMORY_BYTES is less than plush_memory_bytes() says.");
     if (room > 4u * MEMORY_WORDS)
-        return wrong("plush_memory_bytes() says more than PlushSense does."), NULL;
+        return failed("plush_memory_bytes() says more than PlushSense does.");
     if (!status_words(plush_begin(&toy, model, bytes, memory + 1, room)))
         return NULL;
     if (toy.channels != PLUSH_MODEL_CHANNELS || toy.classes != PLUSH_MODEL_CLASSES)
-        return wrong("PLUSH_MODEL_CHANNELS or PLUSH_MODEL_CLASSES is not that of the model."), NULL;
+        return failed("PLUSH_MODEL_CHANNELS or PLUSH_MODEL_CLASSES is not that of the model.");
     if (toy.channels != PLUSH_HARNESS_CHANNELS || toy.classes != PLUSH_HARNESS_CLASSES)
-        return wrong("The model has other channels or classes than model.plush: put the files of one export together."),
-               NULL;
+        return failed("The model has other channels or classes than model.plush: put the files of one export together.");
     toy.on_answer = on_answer;
     toy.on_event = on_event;
     p = feed(p);
     if (p == NULL)
-        return wrong("plush_push() or toy.answers counts other answers than on_answer saw."), NULL;
+        return failed("plush_push() or toy.answers counts other answers than on_answer saw.");
     if (memory[0] != POISON)
-        return wrong("A word before the toy's memory was written to."), NULL;
+        return failed("A word before the toy's memory was written to.");
     for (i = 1u + room / 4u; i < sizeof memory / sizeof memory[0]; i++)
         if (memory[i] != POISON)
-            return wrong("A word after the toy's memory was written to."), NULL;
+            return failed("A word after the toy's memory was written to.");
     return p;
 }
 
