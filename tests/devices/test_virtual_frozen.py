@@ -8,6 +8,7 @@ compared while this holds. Whoever changes it on purpose measures again, writes 
 from __future__ import annotations
 
 import hashlib
+import re
 
 import numpy as np
 
@@ -52,7 +53,8 @@ def test_what_comes_out_is_frozen() -> None:
         for episode in [session.idle(1.0), *(session.perform(label) for label in labels), session.handle()]:
             for numbers in (episode.values, episode.device_ms):
                 digest.update(np.ascontiguousarray(numbers, dtype="<i8").tobytes())
-            digest.update(repr(episode.marks).encode())
+            # A mark's `struck` came later, out of the same draws: it is no part of what was frozen.
+            digest.update(re.sub(r", struck=(None|\d+)\)", ")", repr(episode.marks)).encode())
     assert digest.hexdigest() == SAMPLE_SHA256, "the virtual toy's signals have changed: measure its difficulty again"
 
 

@@ -42,7 +42,8 @@ class GateSpec:
         deaf_s: after firing.
         rules: most rules of one affect.
         least: a first rule must find this share of the energetic recordings, else there is no gate.
-        gain: a further rule must find this share, at least two.
+        gain: a further rule must find this share, at least two recordings.
+        worth: what goes on between recordings is calm, unless that costs this share of them.
     """
 
     false_alarms_per_hour: float = 1.0
@@ -55,7 +56,8 @@ class GateSpec:
     noise_s: float = 2.56
     rules: int = 3
     least: float = 0.2
-    gain: float = 0.01
+    gain: float = 0.005
+    worth: float = 0.05
 
 
 @dataclass(frozen=True)
@@ -129,13 +131,13 @@ def _rules_of(hearing: _Hearing, labels: list[str], spec: GateSpec) -> tuple[lis
         while len(found) < spec.rules:
             rule = best_rule(heights, left, hearing.layout.rate_hz)
             least = spec.least * n_trials if not found else max(2.0, spec.gain * n_trials)
-            if rule is None or rule.hits < least:
+            if rule is None or rule.near < least:
                 break
             found.append(rule)
             left -= rule.alarms
             heights = heights.without(rule)
         hits = sum(rule.hits for rule in found)
-        if hits > best[0] + spec.gain * 5 * n_trials:
+        if hits > best[0] + spec.worth * n_trials:
             best = hits, found, believed
         if hits >= 0.9 * n_trials or not hearing.between:
             break
@@ -276,7 +278,7 @@ def signals_of(layout: Layout, spec: GateSpec) -> list[Signal]:
     lags = sorted({min(MOST_LAG, layout.samples(s)) for s in spec.lags_s})
     slow, slower = (max(1, min(15, round(math.log2(s * layout.rate_hz)))) for s in (spec.baseline_s, spec.noise_s))
     several = [tuple(group) for group in groups.values()]
-    watched = [(LEVEL, (at,), 1) for at in range(layout.n_inputs)]
+    watched: list[tuple[int, tuple[int, ...], int]] = [(LEVEL, (at,), 1) for at in range(layout.n_inputs)]
     watched += [(JERK, (at,), lags[len(lags) // 2]) for at in range(layout.n_inputs)]
     watched += [(JERK, group, lag) for group in several for lag in lags if (JERK, group, lag) not in watched]
     return [Signal(kind, group, lag, 0, slow, slower) for kind, group, lag in watched]
@@ -291,6 +293,7 @@ def measure(plan: GatePlan, material: Material, layout: Layout) -> dict[str, Any
     first: dict[int, int] = {}
     wrong = {CALM: 0, BETWEEN: 0}
     calm_hit: set[int] = set()
+    wrong_by: dict[str, int] = {}
     for stretch in material.stretches:
         gate = Gate(plan)
         begun = {int(t): int(np.argmax(stretch.what == t)) for t in np.unique(stretch.what) if t >= 0}
@@ -302,7 +305,10 @@ def measure(plan: GatePlan, material: Material, layout: Layout) -> dict[str, Any
                 first.setdefault(what, at - begun[what])
             elif what != LEFT_OUT:
                 wrong[what] += 1
-                calm_hit.add(int(stretch.calm[at]))
+                if what == CALM:
+                    calm_hit.add(int(stretch.calm[at]))
+                    label = material.calm[int(stretch.calm[at])][1]
+                    wrong_by[label] = wrong_by.get(label, 0) + 1
     by_gesture: dict[str, list[int]] = {}
     for trial, (_, label) in enumerate(material.trials):
         by_gesture.setdefault(label, []).append(trial)
@@ -322,5 +328,6 @@ def measure(plan: GatePlan, material: Material, layout: Layout) -> dict[str, Any
         "false_alarms_per_hour_in_calm_recordings": round(wrong[CALM] / hours[CALM], 2) if hours[CALM] else None,
         "false_alarms_per_hour_between": round(wrong[BETWEEN] / hours[BETWEEN], 2) if hours[BETWEEN] else None,
         "calm_recordings": len(material.calm),
-        "calm_recordings_with_a_false_alarm": len(calm_hit - {-1}),
+        "calm_recordings_with_a_false_alarm": len(calm_hit),
+        "false_alarms_by_gesture": dict(sorted(wrong_by.items())),
     }

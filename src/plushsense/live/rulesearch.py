@@ -14,7 +14,11 @@ _SHARES = (0.5, 1, 2, 4, 7, 10, 15, 20, 30, 40, 50, 65, 80)
 """Thresholds of the first term that are tried: percentiles of the trials' heights."""
 _COMMON = 0.05
 """A first term that holds in more of the calm samples than this is no term."""
-_SHORTLIST = 40
+_SHORTLIST = 60
+_NEARBY = (0.85, 1.0, 1.18)
+"""Other people are a little different: a rule's recall is the mean of that with its thresholds times these."""
+_CARELESS = 2
+"""At the lowest of them a rule may be wrong so many times as often as allowed, and once more."""
 _PER_SECOND = 0.1
 """What an answer a second sooner is worth, as a share of the trials."""
 
@@ -62,16 +66,29 @@ class Heights:
 
 @dataclass(frozen=True)
 class Found:
-    """A rule: columns and their thresholds (one or two), and what it does to the trials it was chosen on."""
+    """A rule: columns and their thresholds (one or two), and what it does to the trials it was chosen on: ``hits``,
+    ``near`` (the mean with thresholds a little higher and lower), ``alarms``, the median ``delay`` in samples."""
 
     terms: tuple[tuple[int, int], ...]
-    hits: int
-    alarms: int
-    delay: float
+    hits: int = 0
+    near: float = 0.0
+    alarms: int = 0
+    delay: float = 0.0
 
     def holds(self, heights: Ints32) -> NDArray[np.bool_]:
         """(n,) where it holds."""
-        return np.logical_and.reduce([heights[:, column] >= threshold for column, threshold in self.terms])
+        every: NDArray[np.bool_] = np.ones(len(heights), dtype=np.bool_)
+        for column, threshold in self.terms:
+            every &= heights[:, column] >= threshold
+        return every
+
+    def times(self, factor: float) -> Found:
+        """The same with other thresholds."""
+        return Found(tuple((column, max(1, round(factor * threshold))) for column, threshold in self.terms))
+
+    def alarms_in(self, heights: Heights) -> int:
+        """In how many chunks it is wrong."""
+        return len(np.unique(heights.chunks[self.holds(heights.calm)]))
 
 
 def best_rule(heights: Heights, alarms: int, rate_hz: float) -> Found | None:
@@ -105,7 +122,7 @@ def best_rule(heights: Heights, alarms: int, rate_hz: float) -> Found | None:
             break
         found = _settle(heights, first, threshold, second, alarms)
         if found is not None:
-            worth = found.hits / n_trials - _PER_SECOND * found.delay / rate_hz
+            worth = found.near / n_trials - _PER_SECOND * found.delay / rate_hz
             if best is None or worth > best[0]:
                 best = worth, found
     return best[1] if best else None
@@ -128,13 +145,15 @@ def _settle(heights: Heights, first: int, threshold: int, second: int, alarms: i
             return None
         middle = round((needed * float(np.percentile(passing, 1))) ** 0.5)
         terms[column] = max(needed, min(int(passing.min()), middle))
-    found = Found(tuple(terms.items()), 0, 0, 0.0)
-    wrong, right = found.holds(heights.calm), found.holds(heights.rough)
+    found = Found(tuple(terms.items()))
+    right = found.holds(heights.rough)
     trials, at = np.unique(heights.trials[right], return_index=True)
-    if not len(trials):
+    careless = found.times(_NEARBY[0]).alarms_in(heights)
+    if not len(trials) or careless > _CARELESS * alarms + 1:
         return None
+    near = [len(np.unique(heights.trials[found.times(f).holds(heights.rough)])) for f in _NEARBY]
     delay = float(np.median(heights.delays[right][at]))
-    return Found(found.terms, len(trials), len(np.unique(heights.chunks[wrong])), delay)
+    return Found(found.terms, len(trials), float(np.mean(near)), found.alarms_in(heights), delay)
 
 
 def _highest(heights: Ints32, groups: Whole) -> tuple[Ints32, Whole]:
@@ -150,6 +169,6 @@ def _needed(calm: Ints32, chunks: Whole, alarms: int) -> Whole:
     tops, _ = _highest(calm, chunks)
     if len(tops) <= alarms:
         return np.ones(calm.shape[1], dtype=np.int64)
-    return np.maximum(
-        1, np.partition(tops, len(tops) - 1 - alarms, axis=0)[len(tops) - 1 - alarms].astype(np.int64) + 1
-    )
+    rank = len(tops) - 1 - alarms
+    highest = np.partition(tops, rank, axis=0)[rank]
+    return np.array([max(1, int(one) + 1) for one in highest], dtype=np.int64)
