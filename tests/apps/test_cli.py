@@ -15,6 +15,7 @@ import pytest
 from plushsense.apps.cli.main import VERBS
 from plushsense.apps.cli.settings import epochs_shown
 from plushsense.dataset.store import Dataset
+from plushsense.models.bundle import Bundle
 
 Cli = Callable[..., Any]
 
@@ -266,6 +267,9 @@ def test_a_name_depends_on_every_setting_and_on_the_data(dataset: Dataset) -> No
         {"evaluation": {"classes": ("Slow", "Fast")}},
         {"evaluation": {"classes": ("Slow", "Rest")}},
         {"evaluation": {"train_context": "loop"}},
+        {"evaluation": {"train_context": "anywhere"}},
+        {"evaluation": {"train_context": "anywhere"}, "anywhere": {"idle_share": 0.4}},
+        {"windows": {"context": "anywhere"}},
         {"windows": {"window_s": 2.0}},
         {"windows": {"step_s": 0.25}},
         {"model": {"pool_s": 0.5}},
@@ -275,8 +279,22 @@ def test_a_name_depends_on_every_setting_and_on_the_data(dataset: Dataset) -> No
     assert len(set(names)) == len(names)
     same = resolve(None, evaluation={"workers": 2, "train_context": "stream"}, training={"threads": 2})
     assert name_of(same, dataset) == names[0]
+    unused = resolve(None, anywhere={"idle_share": 0.4})
+    assert name_of(unused, dataset) == names[0], "nothing is trained anywhere"
     fewer = Dataset(dataset.path, dataset.head, dataset.recordings[:-1], dataset.streams)
     assert name_of(resolve(None), fewer) != names[0]
+
+
+def test_train_for_work_in_a_stream(cli: Cli, dataset: Dataset, tmp_path: Path) -> None:
+    config, out = tmp_path / "run.toml", tmp_path / "live.plush"
+    config.write_text("[anywhere]\nidle_share = 0.5\nevery_s = 0.5\n")
+    words = ("--context", "anywhere", "--pool-s", "0.5", "--config", config, "--filters", "4,4,4", "--epochs", "1")
+    ran = cli("train", dataset.path, *words, "--out", out, "--json")
+    assert ran.status == 0
+    assert "added a class for what happens between gestures: Idle" in ran.err
+    bundle = Bundle.load(out)
+    assert (bundle.arch.pool, bundle.gestures.labels[-1]) == (50, "Idle")
+    assert bundle.windowing["anywhere"]["idle_share"] == 0.5
 
 
 def test_an_evaluation_is_replaced_only_by_its_like_or_by_force(cli: Cli, dataset: Dataset, tmp_path: Path) -> None:

@@ -63,6 +63,17 @@ def test_streams_hold_more_than_the_recordings(folder: Path) -> None:
     assert stream > 1.5 * recorded
 
 
+def test_handling_at_the_end_is_in_the_stream_alone(folder: Path) -> None:
+    frames = read_stream(folder / "P01" / "fulldatastream.csv", PLUSH).frames
+    ends = [read_recording(p, PLUSH).frames.device_ms[-1] for p in (folder / "P01").glob("*_*.csv")]
+    after = frames.values[np.searchsorted(frames.device_ms, max(ends) + 3000) :]
+    assert len(after) > 1500, "six times up and down again, and a rest after each"
+    z = PLUSH.index("acc_z")
+    turned = np.abs(after[:, z] - np.median(after[:, z])) > 3 * np.std(frames.values[:50, z])
+    runs = np.flatnonzero(np.diff(turned.astype(int)) == 1)
+    assert len(set((runs // 300).tolist())) >= 6, "it moves again and again"
+
+
 def test_file_form(folder: Path) -> None:
     first, second = next((folder / "P01").glob("Tail pull_*.csv")).read_text(encoding="utf-8").split("\n")[:2]
     assert first.startswith("Cumulative capacitive; C1; ") and first.endswith("Arduino Timestamp (ms)")

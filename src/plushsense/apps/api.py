@@ -110,6 +110,8 @@ def train(
     Whole people validate (15 % of them, chosen by the seed), and the scores are theirs. Under presets with early
     stopping they also decide when to stop, which flatters a little; ask `evaluate` for a figure over everybody.
     The preset ``search`` splits windows as the paper does (70/15/15), which is leaky, and says so.
+    ``context="anywhere"`` trains for work in a stream (see `windows.anywhere`): idleness is a class then, and what is
+    scored is whole gestures with their real past.
 
     Args:
         config: resolved settings; or give ``arch``, ``filters`` and settings such as ``preset="loso"``,

@@ -1,8 +1,8 @@
 """Recording sessions of the virtual toy's people, left on disk exactly as the authors' recorder leaves them.
 
 One folder a person, with ``<label>_<epoch ms>_<rows>.csv`` a recording and ``fulldatastream.csv`` for all that the
-toy sent; nobody's recordings of the toy at rest are in the folder ``none``. A score on these says nothing about a
-real toy.
+toy sent, at its end some handling that is no gesture; nobody's recordings of the toy at rest are in the folder
+``none``. A score on these says nothing about a real toy.
 """
 
 from __future__ import annotations
@@ -30,12 +30,15 @@ from plushsense.core.recfile import (
 from plushsense.core.signal import DEVICE_MS, Layout, load_layout
 from plushsense.devices.virtual.motions import AT_REST
 from plushsense.devices.virtual.people import draw_person
-from plushsense.devices.virtual.session import GESTURES, Mark, Session
+from plushsense.devices.virtual.session import GESTURES, Episode, Mark, Session
 from plushsense.devices.virtual.stream import channel_columns
 from plushsense.devices.virtual.world import WORLD, World
 
 START_MS = 1_760_000_000_000
 """The first session, milliseconds since 1970: fixed, so that the same seed writes the same files."""
+
+HANDLED = 6
+"""So often a person takes the toy up and puts it down when all is recorded: no gesture, in the stream alone."""
 
 Progress = Callable[[int, int, str], None]
 
@@ -76,18 +79,45 @@ def _session(
     episodes += [session.perform(label, repetitions) for label in gestures]
     episodes.append(session.idle(2.0))
     marks: list[Mark] = [m for e in episodes for m in e.marks]
+    number = 0 if who is None else who + 1
+    order = 40 if who is None else who
+    rng = np.random.default_rng([seed, number, 0xF11E])
+    frames, row_of, lost = _taken_in(episodes, START_MS + order * 86_400_000, True, layout, world, rng)
+    if who is not None:
+        # At the end and by chance of its own: the recordings are what they are without it.
+        handling = [e for _ in range(HANDLED) for e in (session.handle(), session.idle(2.0))]
+        after = int(frames.host_ms[-1]) if frames.host_ms is not None else 0
+        more, _, more_lost = _taken_in(
+            handling, after, False, layout, world, np.random.default_rng([seed, number, 0xA4D])
+        )
+        frames, lost = _joined(frames, more), lost + more_lost
+    cuts = [(m.label, int(row_of[m.record_start]), int(row_of[m.record_stop])) for m in marks]
+    return _Take(frames, cuts, lost)
+
+
+def _taken_in(
+    episodes: Sequence[Episode], host_ms: int, first: bool, layout: Layout, world: World, rng: np.random.Generator
+) -> tuple[Frames, NDArray[np.int64], int]:
+    """What the recorder takes in from ``host_ms`` on (the ``first`` of a session begins some time that day): frames,
+    the frame of each row that was sent (and of the end), and how many were lost."""
     values = np.concatenate([e.values for e in episodes])[:, channel_columns(layout)]
     device_ms = np.concatenate([e.device_ms for e in episodes])
     # The recorder writes the last integer of a line as it came: of firmware without a clock, the delay.
     written = device_ms if DEVICE_MS in layout.wire else np.concatenate([e.delay_ms for e in episodes])
-    rng = np.random.default_rng([seed, 0 if who is None else who + 1, 0xF11E])
     kept = rng.random(len(values)) >= world.lost + world.garbled
-    order = 40 if who is None else who
-    host_ms = START_MS + order * 86_400_000 + int(rng.integers(0, 20_000_000)) + _arrival(device_ms, rng)
+    begin = host_ms + (int(rng.integers(0, 20_000_000)) if first else 10)
+    host = begin + _arrival(device_ms, rng)
     row_of = np.concatenate(([0], np.cumsum(kept)))
-    frames = Frames(values[kept], written[kept], host_ms[kept])
-    cuts = [(m.label, int(row_of[m.record_start]), int(row_of[m.record_stop])) for m in marks]
-    return _Take(frames, cuts, int(np.sum(~kept)))
+    return Frames(values[kept], written[kept], host[kept]), row_of, int(np.sum(~kept))
+
+
+def _joined(one: Frames, other: Frames) -> Frames:
+    assert one.host_ms is not None and other.host_ms is not None
+    return Frames(
+        np.concatenate([one.values, other.values]),
+        np.concatenate([one.device_ms, other.device_ms]),
+        np.concatenate([one.host_ms, other.host_ms]),
+    )
 
 
 def _arrival(device_ms: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
