@@ -121,6 +121,7 @@ def test_every_system_on_people_left_out(cli: Cli, dataset: Dataset, tmp_path: P
         (("--split", "by-subject:2", "--late", "-1"), "accepted are 0 to 10 seconds"),
         (("--split", "by-subject:2", "--padding", "mirror"), "cannot follow a stream"),
         (("--model", "m.plush", "--out", "X"), "belong to --split"),
+        (("--split", "by-subject:2", "--anywhere-pool", "0"), "accepted is above 0"),
     ],
 )
 def test_refusals(cli: Cli, dataset: Dataset, words: tuple[str, ...], said: str) -> None:

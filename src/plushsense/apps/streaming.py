@@ -40,7 +40,7 @@ from plushsense.evaluation.streams import (
 from plushsense.evaluation.systems import SYSTEMS
 from plushsense.evaluation.truth import people_with_streams
 from plushsense.live.decide import DecideSpec
-from plushsense.live.gate import fit_gate
+from plushsense.live.gate import GateSpec, fit_gate
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.runs.journal import Journal, job_id
@@ -239,7 +239,10 @@ class TrainStreams:
 
     def key(self) -> dict[str, Any]:
         """What all of it depends on, beside the data and the fold."""
-        return {"gate": self.gate, **{name: recipe.key() for name, recipe in self.recipes.items()}}
+        return {
+            "gate": str(GateSpec()) if self.gate else None,
+            **{name: recipe.key() for name, recipe in self.recipes.items()},
+        }
 
 
 def recipes_for(
