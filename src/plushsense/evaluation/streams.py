@@ -40,7 +40,7 @@ from plushsense.models.gate import GatePlan
 from plushsense.runs.journal import Journal, Result, job_id
 from plushsense.runs.pool import Job, Report, run_jobs
 from plushsense.scoring.events import LATE_S, Costs
-from plushsense.scoring.splits import Split, make_folds, parse_split
+from plushsense.scoring.splits import make_folds, parse_split
 
 # Part of every job's id: raise it when the meaning of a stored fold changes.
 _VERSION = 1
@@ -300,18 +300,3 @@ def scored_people(
         if heard:
             found[person] = total(heard, spec, settings.weights, settings.late_s)
     return found
-
-
-__all__ = [
-    "ANYWHERE",
-    "WINDOWS",
-    "FitStreams",
-    "Fitted",
-    "PeopleFold",
-    "Settings",
-    "Split",
-    "crossvalidated_streams",
-    "people_folds",
-    "scored_fold",
-    "scored_people",
-]

@@ -76,7 +76,8 @@ def _one(args: argparse.Namespace) -> int:
 
 
 def _folds(args: argparse.Namespace) -> int:
-    from plushsense.apps.streaming import ANYWHERE_POOL_S, PAGE, stream_benchmark
+    from plushsense.apps.stream_training import ANYWHERE_POOL_S
+    from plushsense.apps.streaming import PAGE, stream_benchmark
     from plushsense.core.errors import ConfigError
 
     if args.subjects:
