@@ -26,9 +26,6 @@ from plushsense.training.spec import TrainSpec
 from plushsense.windows.anywhere import AnywhereSpec
 from plushsense.windows.cut import WindowSpec
 
-# A network that is asked at any moment should not have to wait until the gesture fills a long pool.
-ANYWHERE_POOL_S = 0.5
-
 EpochProgress = Callable[[int, int, dict[str, Any]], None]
 
 
@@ -101,9 +98,9 @@ class TrainStreams:
 
 
 def recipes_for(
-    dataset: Dataset, config: RunConfig, networks: Collection[str], anywhere_pool_s: float, warn: Warn = silent
+    dataset: Dataset, config: RunConfig, networks: Collection[str], anywhere_pool_s: float | None, warn: Warn = silent
 ) -> dict[str, Recipe]:
-    """How each network is trained: both alike but for the windows, the pool, and the epochs.
+    """How each network is trained: both alike but for the windows, the epochs and, where it is given, the pool.
 
     There are several times as many windows anywhere in a stream, so half the epochs are more steps all the same.
     """
@@ -122,7 +119,7 @@ def recipes_for(
         found[WINDOWS] = Recipe(arch, training, windows, gestures)
     if ANYWHERE in networks:
         gestures = classes_for(dataset, wanted, "anywhere", warn if WINDOWS not in networks else silent)
-        model = replace(config.model, pool_s=anywhere_pool_s)
+        model = config.model if anywhere_pool_s is None else replace(config.model, pool_s=anywhere_pool_s)
         arch = model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
         halved = replace(training, epochs=-(-training.epochs // 2))
         if training.halve_every:

@@ -16,7 +16,7 @@ from plushsense import __version__
 from plushsense.apps.config import RunConfig, from_settings
 from plushsense.apps.places import check_folder
 from plushsense.apps.preparation import Warn, opened, silent
-from plushsense.apps.stream_training import ANYWHERE_POOL_S, TrainStreams, recipes_for
+from plushsense.apps.stream_training import TrainStreams, recipes_for
 from plushsense.core.errors import BadInput, BundleError, ConfigError, DatasetError, nearest
 from plushsense.core.extras import need
 from plushsense.core.gestures import NOBODY
@@ -171,7 +171,7 @@ def stream_benchmark(
     out: str | os.PathLike[str] | None = None,
     overwrite: bool = False,
     late_s: float = LATE_S,
-    anywhere_pool_s: float = ANYWHERE_POOL_S,
+    anywhere_pool_s: float | None = None,
     progress: Callable[[FoldProgress], None] | None = None,
     warn: Warn = silent,
     **settings: Any,
@@ -187,7 +187,7 @@ def stream_benchmark(
         systems: names of `plushsense.evaluation.systems.SYSTEMS`; by default all.
         out: a folder for the table as JSON and CSV, a page, and its figures.
         late_s: how long after its end a gesture may be answered.
-        anywhere_pool_s: over how long the networks of stream training pool.
+        anywhere_pool_s: over how long the networks of stream training pool (default: as the others).
 
     Returns:
         what `plushsense.evaluation.stream_scores.summed` returns, with ``dataset``, ``simulated``, ``split``, ``note``.

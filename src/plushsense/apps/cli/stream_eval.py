@@ -40,7 +40,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--anywhere-pool",
         type=float,
         metavar="S",
-        help="for --split: over how long networks trained anywhere in the stream pool, seconds (0.5)",
+        help="for --split: seconds that networks trained anywhere in the stream pool (default: as the others)",
     )
     parser.add_argument("--workers", type=int, metavar="N", help="folds at a time (default 0: one a processor)")
     parser.add_argument("--out", metavar="DIR", help="for --split: folder for the page, figures, CSV and JSON")
@@ -76,7 +76,6 @@ def _one(args: argparse.Namespace) -> int:
 
 
 def _folds(args: argparse.Namespace) -> int:
-    from plushsense.apps.stream_training import ANYWHERE_POOL_S
     from plushsense.apps.streaming import PAGE, stream_benchmark
     from plushsense.core.errors import ConfigError
 
@@ -91,7 +90,7 @@ def _folds(args: argparse.Namespace) -> int:
         out=args.out,
         overwrite=args.force,
         late_s=args.late,
-        anywhere_pool_s=ANYWHERE_POOL_S if args.anywhere_pool is None else args.anywhere_pool,
+        anywhere_pool_s=args.anywhere_pool,
         progress=folds_shown("streams"),
         warn=warn,
     )
