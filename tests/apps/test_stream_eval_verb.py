@@ -95,7 +95,7 @@ def test_every_system_on_people_left_out(cli: Cli, dataset: Dataset, tmp_path: P
         best = system["balanced"]
         assert set(KEYS) <= set(best) and best["truths"] == 30 and len(best["people"]) == 5
         assert all(0 <= p["recall"] <= 1 for p in system["curve"])
-    assert [row["recall"] for row in found["at_recall"]] == [0.3, 0.4, 0.5, 0.6, 0.7, 0.8]
+    assert [row["recall"] for row in found["at_recall"]] == [0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.85, 0.9]
     assert sorted(p.name for p in out.iterdir()) == [
         "curves.png", "latencies.png", "streams.csv", "streams.html", "streams.json",
     ]  # fmt: skip
@@ -121,6 +121,7 @@ def test_every_system_on_people_left_out(cli: Cli, dataset: Dataset, tmp_path: P
         (("--split", "by-subject:2", "--late", "-1"), "accepted are 0 to 10 seconds"),
         (("--split", "by-subject:2", "--padding", "mirror"), "cannot follow a stream"),
         (("--model", "m.plush", "--out", "X"), "belong to --split"),
+        (("--split", "by-subject:2", "--anywhere-pool", "0"), "accepted is above 0"),
     ],
 )
 def test_refusals(cli: Cli, dataset: Dataset, words: tuple[str, ...], said: str) -> None:

@@ -7,31 +7,24 @@ import io
 import json
 import os
 import tempfile
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from plushsense import __version__
 from plushsense.apps.config import RunConfig, from_settings
 from plushsense.apps.places import check_folder
-from plushsense.apps.preparation import Warn, choose_classes, classes_for, opened, silent, windows_for
+from plushsense.apps.preparation import Warn, opened, silent
+from plushsense.apps.stream_training import TrainStreams, recipes_for
 from plushsense.core.errors import BadInput, BundleError, ConfigError, DatasetError, nearest
 from plushsense.core.extras import need
-from plushsense.core.gestures import NOBODY, GestureSet
+from plushsense.core.gestures import NOBODY
 from plushsense.dataset.importers import import_recordings
 from plushsense.dataset.store import HEAD, Dataset, write_atomically
-from plushsense.deploy.calibration import calibration
 from plushsense.evaluation.crossval import FoldProgress
 from plushsense.evaluation.stream_scores import pooled_scores, summed
 from plushsense.evaluation.streams import (
-    ANYWHERE,
-    WINDOWS,
-    Fitted,
-    PeopleFold,
     Settings,
     crossvalidated_streams,
     people_folds,
@@ -40,21 +33,13 @@ from plushsense.evaluation.streams import (
 from plushsense.evaluation.systems import SYSTEMS
 from plushsense.evaluation.truth import people_with_streams
 from plushsense.live.decide import DecideSpec
-from plushsense.live.gate import fit_gate
-from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
-from plushsense.runs.journal import Journal, job_id
+from plushsense.runs.journal import Journal
 from plushsense.scoring.events import LATE_S
-from plushsense.training.spec import TrainSpec
-from plushsense.windows.anywhere import AnywhereSpec
-from plushsense.windows.cut import WindowSpec
 
 TABLE, SHEET, PAGE, CURVES, LATENCIES = "streams.json", "streams.csv", "streams.html", "curves.png", "latencies.png"
 SPLIT = "by-subject:5"
-# A network that is asked at any moment should not have to wait until the gesture fills a long pool.
-ANYWHERE_POOL_S = 0.5
 
-EpochProgress = Callable[[int, int, dict[str, Any]], None]
 
 UPPER_BOUND = (
     "Events outside of marked recordings count as false, and that is an upper bound: between recordings these people "
@@ -177,102 +162,6 @@ def _same_sensors(dataset: Dataset, bundle: Bundle) -> None:
         )
 
 
-@dataclass(frozen=True)
-class Recipe:
-    """One of a fold's networks: how it is trained, on which windows."""
-
-    arch: Arch
-    training: TrainSpec
-    windows: WindowSpec
-    gestures: GestureSet
-    anywhere: AnywhereSpec | None = None
-
-    def key(self) -> dict[str, Any]:
-        """What a network depends on, beside the data and the fold."""
-        return {
-            "arch": self.arch.to_dict(),
-            "training": self.training.key(),
-            "windows": vars(self.windows),
-            "gestures": self.gestures.to_dict(),
-            "anywhere": None if self.anywhere is None else vars(self.anywhere),
-        }
-
-
-@dataclass(frozen=True)
-class TrainStreams:
-    """Fits what a fold of the benchmark needs; a network that was trained once is kept in ``folder``."""
-
-    recipes: Mapping[str, Recipe]
-    gate: bool
-    folder: Path
-
-    def __call__(self, dataset: Dataset, fold: PeopleFold, progress: EpochProgress, /) -> Fitted:
-        networks = {name: self._network(recipe, dataset, fold, progress) for name, recipe in self.recipes.items()}
-        if not self.gate:
-            return Fitted(networks)
-        fitted = fit_gate(dataset, next(iter(networks.values())).gestures, fold.train)
-        return Fitted(networks, fitted.plan, {"gate": fitted.report, "plan": fitted.plan.to_dict()})
-
-    def _network(self, recipe: Recipe, dataset: Dataset, fold: PeopleFold, progress: EpochProgress) -> Bundle:
-        path = self.folder / f"{job_id({**recipe.key(), 'data': dataset.hash, 'fold': vars(fold)})}.plush"
-        if path.is_file():
-            return Bundle.load(path)
-        from plushsense.training.fit import fit
-
-        arch, gestures = recipe.arch, recipe.gestures
-        cut = scored = windows_for(dataset, arch, recipe.windows, gestures, anywhere=recipe.anywhere)
-        if recipe.anywhere is not None:
-            scored = windows_for(dataset, arch, replace(recipe.windows, context="stream"), gestures)
-        # What nobody made (the toy at rest) belongs to no fold, and is trained on in every one.
-        train = cut.take(np.flatnonzero(np.isin(cut.subject, [*fold.train, NOBODY])))
-        watch = scored.take(np.flatnonzero(np.isin(scored.subject, fold.validation)))
-        fitted = fit(train, watch, arch, recipe.training, progress)
-        kept = calibration(arch, fitted.weights, fitted.scaler, train.x)
-        people = {"subjects": list(fold.train), "validation_subjects": list(fold.validation)}
-        told = {"dataset": dataset.head.name, "dataset_hash": dataset.hash, "code_version": __version__, **people}
-        bundle = Bundle(
-            arch, fitted.weights, dataset.layout, fitted.scaler, gestures, dict(vars(recipe.windows)), {}, told, kept
-        )
-        self.folder.mkdir(parents=True, exist_ok=True)
-        bundle.save(path)
-        return bundle
-
-    def key(self) -> dict[str, Any]:
-        """What all of it depends on, beside the data and the fold."""
-        return {"gate": self.gate, **{name: recipe.key() for name, recipe in self.recipes.items()}}
-
-
-def recipes_for(
-    dataset: Dataset, config: RunConfig, networks: Collection[str], anywhere_pool_s: float, warn: Warn = silent
-) -> dict[str, Recipe]:
-    """How each network is trained: both alike but for the windows, the pool, and the epochs.
-
-    There are several times as many windows anywhere in a stream, so half the epochs are more steps all the same.
-    """
-    from plushsense.training.fit import placed
-
-    if config.padding != "stream":
-        raise ConfigError(f"A network with {config.padding} padding cannot follow a stream: use --padding stream.")
-    training = placed(config.training)
-    wanted, found = config.evaluation.classes, {}
-    if WINDOWS in networks:
-        gestures = choose_classes(dataset, wanted, warn)
-        windows = replace(
-            config.windows, context="stream" if config.windows.context == "anywhere" else config.windows.context
-        )
-        arch = config.model.build(dataset.layout, len(gestures), windows.window_s, config.padding)
-        found[WINDOWS] = Recipe(arch, training, windows, gestures)
-    if ANYWHERE in networks:
-        gestures = classes_for(dataset, wanted, "anywhere", warn if WINDOWS not in networks else silent)
-        model = replace(config.model, pool_s=anywhere_pool_s)
-        arch = model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
-        halved = replace(training, epochs=-(-training.epochs // 2))
-        if training.halve_every:
-            halved = replace(halved, halve_every=-(-training.halve_every // 2))
-        found[ANYWHERE] = Recipe(arch, halved, replace(config.windows, context="anywhere"), gestures, config.anywhere)
-    return found
-
-
 def stream_benchmark(
     dataset: Dataset | str | os.PathLike[str],
     config: RunConfig | None = None,
@@ -282,7 +171,7 @@ def stream_benchmark(
     out: str | os.PathLike[str] | None = None,
     overwrite: bool = False,
     late_s: float = LATE_S,
-    anywhere_pool_s: float = ANYWHERE_POOL_S,
+    anywhere_pool_s: float | None = None,
     progress: Callable[[FoldProgress], None] | None = None,
     warn: Warn = silent,
     **settings: Any,
@@ -298,7 +187,7 @@ def stream_benchmark(
         systems: names of `plushsense.evaluation.systems.SYSTEMS`; by default all.
         out: a folder for the table as JSON and CSV, a page, and its figures.
         late_s: how long after its end a gesture may be answered.
-        anywhere_pool_s: over how long the networks of stream training pool.
+        anywhere_pool_s: over how long the networks of stream training pool (default: as the others).
 
     Returns:
         what `plushsense.evaluation.stream_scores.summed` returns, with ``dataset``, ``simulated``, ``split``, ``note``.

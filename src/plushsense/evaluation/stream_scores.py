@@ -14,7 +14,7 @@ from plushsense.scoring.events import at_recall
 from plushsense.scoring.metrics import BOOTSTRAP_SEED, summary
 
 HITS, TRUTHS, FALSE, HOURS = range(4)
-RECALLS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
+RECALLS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.85, 0.9)
 _RESAMPLES = 500
 LATENCY_SHARES = tuple(n / 20 for n in range(21))
 

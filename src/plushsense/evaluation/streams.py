@@ -14,6 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from plushsense.core.errors import BadInput, ConfigError
+from plushsense.core.gestures import GestureSet
 from plushsense.dataset.store import Dataset
 from plushsense.evaluation.crossval import FoldProgress
 from plushsense.evaluation.heard import Heard, StreamScore, hear, quick
@@ -39,7 +40,7 @@ from plushsense.models.gate import GatePlan
 from plushsense.runs.journal import Journal, Result, job_id
 from plushsense.runs.pool import Job, Report, run_jobs
 from plushsense.scoring.events import LATE_S, Costs
-from plushsense.scoring.splits import Split, make_folds, parse_split
+from plushsense.scoring.splits import make_folds, parse_split
 
 # Part of every job's id: raise it when the meaning of a stored fold changes.
 _VERSION = 1
@@ -121,9 +122,13 @@ class Settings:
     late_s: float = LATE_S
     weights: Costs = field(default_factory=Costs)
 
-    def key(self) -> dict[str, Any]:
-        """What a stored fold depends on."""
-        grids = {name: (SYSTEMS[name].title, SYSTEMS[name].rounds) for name in self.systems}
+    def key(self, gestures: GestureSet) -> dict[str, Any]:
+        """What a stored fold depends on, the settings that are tried among it."""
+        grids = {}
+        for name in self.systems:
+            system = SYSTEMS[name]
+            tried_first = [str(spec) for spec in system.grid(gestures)]
+            grids[name] = [system.network, system.rounds, system.gate_to, tried_first]
         return {"systems": grids, "targets": self.targets, "late_s": self.late_s, "weights": vars(self.weights)}
 
 
@@ -162,7 +167,7 @@ def crossvalidated_streams(
         "key": dict(key or {}),
         "data": dataset.hash,
         "gestures": dataset.gestures.to_dict(),
-        "asked": settings.key(),
+        "asked": settings.key(dataset.gestures),
     }
     jobs = [Job(job_id({**base, "fold": vars(fold)}), fold) for fold in folds]
     done = resumed = 0
@@ -295,18 +300,3 @@ def scored_people(
         if heard:
             found[person] = total(heard, spec, settings.weights, settings.late_s)
     return found
-
-
-__all__ = [
-    "ANYWHERE",
-    "WINDOWS",
-    "FitStreams",
-    "Fitted",
-    "PeopleFold",
-    "Settings",
-    "Split",
-    "crossvalidated_streams",
-    "people_folds",
-    "scored_fold",
-    "scored_people",
-]

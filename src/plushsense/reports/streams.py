@@ -38,7 +38,7 @@ HOWS = {
 def curves(result: Mapping[str, Any]) -> Figure:
     """Recall against false events an hour of every system, over all people left out; a star where there is no
     threshold."""
-    figure: Figure = need("matplotlib.figure", "reports").Figure(figsize=(8.6, 5.4), layout="constrained")
+    figure: Figure = need("matplotlib.figure", "reports").Figure(figsize=(8.6, 6.0), layout="constrained")
     axes = figure.add_subplot()
     for name, system in result["systems"].items():
         colour, style, marker = _LOOKS.get(name, _OTHER)
@@ -66,22 +66,27 @@ def curves(result: Mapping[str, Any]) -> Figure:
             )
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter(need("matplotlib.ticker", "reports").FuncFormatter(lambda v, _: f"{v:g}"))
-    axes.set_xlim(0, 1)
+    lowest = min((p["recall"] for s in result["systems"].values() for p in s["curve"]), default=0.0)
+    axes.set_xlim(max(0.0, int(10 * lowest) / 10 - 0.1), 1)
     axes.set_xlabel("Recall: share of true gestures answered with the right gesture")
     axes.set_ylabel("False events an hour of stream (log scale)")
     axes.grid(color="#dddddd", linewidth=0.5, which="both")
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(fontsize=8, frameon=False, loc="lower right")
+    figure.legend(fontsize=8, frameon=False, loc="outside lower center", ncols=3)
     axes.set_title(_title(result), fontsize=10, loc="left", parse_math=False)
     return figure
 
 
 def latencies(result: Mapping[str, Any]) -> Figure:
     """How soon: of all true gestures the share that was answered within so many seconds of the onset, rightly (left)
-    and at all (right)."""
-    figure: Figure = need("matplotlib.figure", "reports").Figure(figsize=(9.6, 4.4), layout="constrained")
-    left, right = figure.subplots(1, 2, sharey=True)
-    for axes, level, said in ((left, "gesture", "the right gesture"), (right, "anything", "any event")):
+    and at all (right, not where every sample has a label)."""
+    # Where every sample has a label, something is always being said, and "any event" would tell nothing.
+    panels = [("gesture", "the right gesture"), ("anything", "any event")][: 1 if result["labelled"] else 2]
+    figure: Figure = need("matplotlib.figure", "reports").Figure(
+        figsize=(4.8 * len(panels) + 0.6, 4.8), layout="constrained"
+    )
+    grid = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+    for axes, (level, said) in zip(grid, panels, strict=True):
         for name, system in result["systems"].items():
             colour, style, _ = _LOOKS.get(name, _OTHER)
             row = system["balanced"]
@@ -104,11 +109,11 @@ def latencies(result: Mapping[str, Any]) -> Figure:
         axes.set_xlabel(f"Seconds from the onset to {said}")
         axes.grid(color="#dddddd", linewidth=0.5)
         axes.spines[["top", "right"]].set_visible(False)
-    left.set_ylabel("Share of true gestures")
-    left.legend(fontsize=8, frameon=False, loc="upper left")
-    figure.suptitle(f"{_title(result)}; settings of the highest F1 on those who tune", fontsize=10).set_parse_math(
-        False
-    )
+    grid[0].set_ylabel("Share of true gestures")
+    drawn, named = grid[0].get_legend_handles_labels()
+    figure.legend(drawn, named, fontsize=8, frameon=False, loc="outside lower center", ncols=2 * len(panels))
+    title = f"{_title(result)}\nsettings of the highest F1 on those who tune; the line at 1 s is the aim for the median"
+    figure.suptitle(title, fontsize=9).set_parse_math(False)
     return figure
 
 

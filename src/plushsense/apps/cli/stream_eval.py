@@ -36,6 +36,12 @@ def add(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="how long after its end a gesture may still be answered, seconds (1)",
     )
+    parser.add_argument(
+        "--anywhere-pool",
+        type=float,
+        metavar="S",
+        help="for --split: seconds that networks trained anywhere in the stream pool (default: as the others)",
+    )
     parser.add_argument("--workers", type=int, metavar="N", help="folds at a time (default 0: one a processor)")
     parser.add_argument("--out", metavar="DIR", help="for --split: folder for the page, figures, CSV and JSON")
     parser.add_argument("--force", action="store_true", help="replace a benchmark that is in --out")
@@ -56,8 +62,8 @@ def _one(args: argparse.Namespace) -> int:
     from plushsense.apps.streaming import stream_eval
     from plushsense.core.errors import ConfigError
 
-    if args.out or args.systems:
-        raise ConfigError("--out and --systems belong to --split: leave them out, or leave --model out.")
+    if args.out or args.systems or args.anywhere_pool is not None:
+        raise ConfigError("--out, --systems and --anywhere-pool belong to --split: leave them or --model out.")
     result = stream_eval(
         args.source,
         args.model,
@@ -84,6 +90,7 @@ def _folds(args: argparse.Namespace) -> int:
         out=args.out,
         overwrite=args.force,
         late_s=args.late,
+        anywhere_pool_s=args.anywhere_pool,
         progress=folds_shown("streams"),
         warn=warn,
     )
