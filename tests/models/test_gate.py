@@ -85,7 +85,7 @@ def test_a_hung_toy_is_not_read() -> None:
     assert fired(LEVELS, rows) == []
 
 
-def test_a_suspect_sample_makes_everything_begin_anew() -> None:
+def test_suspect_samples_are_not_read_and_after_some_it_begins_anew() -> None:
     """A sensor at its end stop: neither the jump there nor the one back is a blow."""
     jump = [100] * 30 + [30_000] * 20 + [100] * 30
     jerks = GatePlan((Signal(JERK, (0,), lag=4, floor=10),), (BLOW,))
@@ -93,6 +93,11 @@ def test_a_suspect_sample_makes_everything_begin_anew() -> None:
         assert fired(plan, tremble(jump))  # nobody said that it is broken
         assert fired(plan, tremble(jump), set(range(31, 50))) == []
         assert fired(plan, tremble([*jump, 900, 900]), set(range(31, 50)))[0][0] == 81
+
+
+def test_a_blow_that_touches_the_end_stop_is_one() -> None:
+    hit = [100] * 30 + [30_000, 30_000, 30_000, 20_000] + [100] * 30
+    assert fired(LEVELS, tremble(hit), {31, 32})[0][0] == 33
 
 
 def test_a_reset_forgets_the_deafness_too() -> None:

@@ -223,8 +223,20 @@ RULE_TEXTS = (
     Text(
         "gate",
         "suspect samples are read",
-        "    if (toy->suspect) {\n        toy->gate_seen = 0;",
-        "    if (toy->suspect && deaf > 1) {\n        toy->gate_seen = 0;",
+        "    if (toy->suspect) {\n        if (toy->gate_doubt",
+        "    if (toy->suspect && deaf > 1) {\n        if (toy->gate_doubt",
+    ),
+    Text(
+        "gate",
+        "a suspect sample makes the gate begin anew at once",
+        "++toy->gate_doubt == GATE_DOUBT) {",
+        "++toy->gate_doubt == 1u) {",
+    ),
+    Text(
+        "gate",
+        "the gate never begins anew",
+        "toy->gate_doubt < GATE_DOUBT && ++toy",
+        "toy->gate_doubt > GATE_DOUBT && ++toy",
     ),
     Text(
         "gate",

@@ -15,9 +15,10 @@ inputs, raw, one even sample at a time, and works from the first samples on, whi
 - A *rule* fires when all its terms hold. The first rule that fires speaks; then the gate is deaf for its ``deaf``
   samples, while signals and terms go on.
 
-A sample whose inputs all repeat the one before is not read (a hung toy is not hit); it only shortens the deafness. At a
-suspect sample (see ``models/health``) everything but the deafness begins anew: a sensor that jumps to its end stop and
-back is broken, not hit.
+A sample whose inputs all repeat the one before is not read (a hung toy is not hit), nor is a suspect one (see
+``models/health``); it only shortens the deafness. So a blow that holds a sensor at its end stop for a moment goes on
+counting after it. After `DOUBT` suspect samples in a row everything but the deafness begins anew: a sensor that jumps
+to its end stop and back is broken, not hit.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ HELD = 1 << 20
 EXTRA_BITS = 8
 THRESHOLD_BITS = 4
 NOISE_CLIP = 4
+DOUBT = 10
 MOST_SIZE = 2 * HELD << THRESHOLD_BITS  # of a deviation of 2^21 over a floor of 1
 MOST_SIGNALS, MOST_RULES, MOST_TERMS, MOST_LAG = 32, 16, 8, 16
 
@@ -149,7 +151,7 @@ class Gate:
 
     def reset(self) -> None:
         """Begin a new stream: after a gap, a clock reset, a fault."""
-        self._deaf = 0
+        self._deaf = self._doubt = 0
         self._forget()
 
     def _forget(self) -> None:
@@ -168,10 +170,13 @@ class Gate:
         deaf = self._deaf > 0
         if deaf:
             self._deaf -= 1
-        if suspect:
-            self._forget()
-            return -1
         now, past = list(inputs), self._past
+        if suspect:
+            self._doubt += 1
+            if self._doubt == DOUBT:
+                self._forget()
+            return -1
+        self._doubt = 0
         if past and past[-1] == now:
             return -1
         self._follow(now)

@@ -56,6 +56,7 @@ enum { FAULT_MS = 0, STILL_MS = 2, RECOVER_MS = 4, LIMITS = 6, HEALTH_BYTES = 8 
 #define SIGN_ABOVE 1u
 #define SIGN_BELOW 255u
 #define GATE_HELD (INT32_C(1) << 20)
+#define GATE_DOUBT 10u /* suspect samples in a row, after which it begins anew */
 #define MOST_GATE_SIGNALS 32u
 #define MOST_GATE_RULES 16u
 #define MOST_GATE_TERMS 8u
@@ -1170,10 +1171,13 @@ static void gate_sample(plush_toy *toy, uint32_t ms)
     if (deaf)
         toy->gate_deaf--;
     if (toy->suspect) {
-        toy->gate_seen = 0;
-        memset(toy->gate_state, 0, toy->gate_bytes);
+        if (toy->gate_doubt < GATE_DOUBT && ++toy->gate_doubt == GATE_DOUBT) {
+            toy->gate_seen = 0;
+            memset(toy->gate_state, 0, toy->gate_bytes);
+        }
         return;
     }
+    toy->gate_doubt = 0;
     if (toy->gate_seen > 0 && same(past_inputs(toy, 0), past_inputs(toy, 1), toy->inputs))
         return;
     for (n = 0; n < toy->gate_signals; n++)
@@ -1365,7 +1369,7 @@ static void forget(plush_toy *toy)
     memset(toy->memory, 0, toy->memory_bytes);
     toy->heard = toy->running = 0;
     toy->block = toy->gate_deaf = 0;
-    toy->gate_seen = toy->gate_newest = 0;
+    toy->gate_seen = toy->gate_newest = toy->gate_doubt = 0;
     toy->warm = toy->answer.sample = 0;
     say_nothing(toy, toy->faulty ? PLUSH_FAULT : PLUSH_WARMING);
     /* So that a step ends with the very sample that fills the span. */

@@ -154,7 +154,7 @@ typedef struct plush_toy {
     int32_t *held, *before, *sample;
 
     /* The gate: the inputs of the newest samples, what it knows of each signal, and of each term of a rule. */
-    uint8_t gate_seen, gate_newest;
+    uint8_t gate_seen, gate_newest, gate_doubt;
     uint16_t gate_deaf;
     int32_t *gate_inputs, *gate_state;
     uint16_t *gate_hold;
