@@ -40,7 +40,7 @@ NOTHING, FREE = -1, -2
 class AnywhereSpec:
     """Which positions of a stream are trained on, in seconds and shares; the room's own words state the rules."""
 
-    every_s: float = 0.2
+    every_s: float = 0.4
     onset_s: float = 0.3
     after_s: float = 0.2
     settle_s: float = 1.0
