@@ -12,12 +12,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import settings
 
 # Many small arrays: threads only get in each other's way when tests run in parallel.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("MPLBACKEND", "Agg")
 
 REPO = Path(__file__).resolve().parents[1]
+# CI draws the same examples every time, so that a change is judged by itself; at a desk they are new ones each time.
+settings.register_profile("ci", derandomize=True, print_blob=True)
+if os.environ.get("PLUSHSENSE_REQUIRE"):
+    settings.load_profile("ci")
 REQUIRED = {word.strip() for word in os.environ.get("PLUSHSENSE_REQUIRE", "").split(",") if word.strip()}
 
 

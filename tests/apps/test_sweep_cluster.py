@@ -39,10 +39,16 @@ class Killer:
 
     def on_start(self, job: Any) -> None:
         self.begun.append(job.id)
+        if len(set(self.begun)) > 2:
+            self.kill()  # where a busy machine was through with the first before the second began
 
     def on_report(self, job: Any, message: Any) -> None:
         # One training runs on each node by then.
-        if self.thread is None and len(set(self.begun)) > 1:
+        if len(set(self.begun)) > 1:
+            self.kill()
+
+    def kill(self) -> None:
+        if self.thread is None:
             self.thread = threading.Thread(target=self.cluster.remove_node, args=(self.node, False))
             self.thread.start()
 

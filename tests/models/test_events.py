@@ -456,7 +456,7 @@ def test_events_follow_one_another_whatever_comes(plan: EventPlan, stream: list[
         else:
             batches.append((machine.step(logits(shares), now, suspect=what == 4)[1], "step"))
         for updates, cause in batches:
-            switched = len(updates) == 2
+            switched, open_before = len(updates) == 2, going is not None
             for u in updates:
                 assert u.since <= u.now == now
                 if u.kind == BEGUN:
@@ -473,7 +473,7 @@ def test_events_follow_one_another_whatever_comes(plan: EventPlan, stream: list[
                     if cause == "step":
                         assert steps + 1 - began >= plan.hold and what != 4
                     going, ended = None, -99 if cause == "lost" else steps
-            if cause == "step" and (what != 3 or going is not None):
+            if cause == "step" and (what != 3 or open_before):
                 steps += 1
             if cause == "lost":
                 ended = -99
