@@ -31,6 +31,7 @@ from plushsense.scoring.splits import parse_split
 from plushsense.training.spec import TrainSpec
 from plushsense.windows.cut import WindowSet
 
+# Raise it when the meaning of what is kept changes, that of the default smoothing included.
 _VERSION = 1
 FIGURE, TABLE = "risk-coverage.png", "abstaining.json"
 

@@ -277,11 +277,11 @@ def sheet(table: dict[str, Any]) -> str:
     """The curves and the chosen settings as CSV, one row a point."""
     text = io.StringIO()
     names = ("system", "title", "point", "target", "recall", "precision", "f1", "false_events_per_hour")
-    more = ("latency_median_s", "latency_p90_s")
+    more = ("latency_median_s", "latency_p90_s", "simulated")
     writer = csv.DictWriter(text, [*names, *more], extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
     for name, system in table["systems"].items():
-        head = {"system": name, "title": system["title"]}
+        head = {"system": name, "title": system["title"], "simulated": "yes" if table["simulated"] else "no"}
         for point in system["curve"]:
             writer.writerow({**head, "point": "curve", **point})
         for how in ("plain", "balanced", "cheapest"):
