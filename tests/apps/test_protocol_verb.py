@@ -105,6 +105,25 @@ def test_recorded_sessions_give_the_same_table_under_their_own_heading(capsys, s
     assert "P02 has no session stream, only single recordings, and was left out." in result["said"]
 
 
+def test_a_network_that_may_have_met_them_is_told(capsys, sessions, tmp_path):
+    for more in ({"subjects": ["P01"]}, {"subjects": ["A"], "validation_subjects": ["P01"]}):
+        path = bundle(simulated=False, dataset="elsewhere", **more).save(tmp_path / "m.plush")
+        status, text, _ = said(capsys, "--model", path, "--session", sessions, "--no-rules", "--json")
+        assert status == 0 and any("of the codes P01: if they are the same" in s for s in json.loads(text)["said"])
+    own = replace(bundle(simulated=False, dataset="elsewhere", subjects=["A"]), personal={"subject": "P02"})
+    status, text, _ = said(
+        capsys, "--model", own.save(tmp_path / "p.plush"), "--session", sessions, "--no-rules", "--json"
+    )
+    result = json.loads(text)
+    assert status == 0 and any("of the codes P02: if they are the same" in s for s in result["said"])
+    assert "codes" not in result
+    export = bundle(simulated=False, dataset="elsewhere", subjects=20, validation_subjects=4).save(tmp_path / "e.plush")
+    status, text, err = said(capsys, "--model", export, "--session", sessions, "--no-rules", "--json")
+    assert status == 0, err
+    assert any("does not say on whom it was trained" in s for s in json.loads(text)["said"])
+    assert ["Trained on", "elsewhere, 20 people"] in json.loads(text)["about"]
+
+
 def test_the_old_rules_are_tuned_on_people_who_are_not_scored(capsys, sessions, tmp_path):
     stranger = str(bundle(simulated=False, dataset="elsewhere", subjects=["A"]).save(tmp_path / "m.plush"))
     status, text, err = said(capsys, "--model", stranger, "--session", sessions, "--subjects", "P02", "--json")

@@ -53,6 +53,21 @@ def test_somebody_it_was_trained_on_is_marked_loudly(cli: Cli, dataset: Dataset,
     assert cli("stream-eval", dataset.path, "--model", bundle, "--subjects", met, "--json").json["trained_on"] == [met]
 
 
+def test_who_may_be_the_same_is_told(cli: Cli, dataset: Dataset, bundle: Path, tmp_path: Path) -> None:
+    own = Bundle.load(bundle)
+    own.personal.update(subject="P5")
+    assert trained_people(own, dataset) == {"P1", "P2", "P3", "P5"}
+    ran = cli("stream-eval", dataset.path, "--model", own.save(tmp_path / "own.plush"), "--json")
+    assert list(ran.json["people"]) == ["P4"]
+    told = Bundle.load(bundle)
+    told.provenance.update(dataset="elsewhere", dataset_hash="other")
+    ran = cli("stream-eval", dataset.path, "--model", told.save(tmp_path / "other.plush"), "--json")
+    assert len(ran.json["people"]) == 5 and "same codes in 'elsewhere': if P1, P2, P3 are the same people" in ran.err
+    told.provenance.update(subjects=2, validation_subjects=1)  # as an export has it
+    ran = cli("stream-eval", dataset.path, "--model", told.save(tmp_path / "export.plush"), "--json")
+    assert len(ran.json["people"]) == 5 and "does not say on whom it was trained" in ran.err
+
+
 def test_nobody_left_is_refused(cli: Cli, dataset: Dataset, bundle: Path, tmp_path: Path) -> None:
     whole = Bundle.load(bundle)
     everybody = tmp_path / "all.plush"
@@ -102,6 +117,7 @@ def test_every_system_on_people_left_out(cli: Cli, dataset: Dataset, tmp_path: P
     assert json.loads((out / "streams.json").read_text(encoding="utf-8"))["systems"].keys() == SYSTEMS.keys()
     rows = list(csv.DictReader(io.StringIO((out / "streams.csv").read_text(encoding="utf-8"))))
     assert {r["point"] for r in rows} == {"curve", "plain", "balanced", "cheapest"}
+    assert {r["simulated"] for r in rows} == {"no"}
     page = (out / "streams.html").read_text(encoding="utf-8")
     assert "upper bound" in page and "Ward" in page and "http" not in page.replace("http-equiv", "")
     refused = cli(*words, "--out", out)

@@ -19,7 +19,6 @@ from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks
 from plushsense.dataset.store import Dataset
 from plushsense.evaluation.heard import Heard, StreamScore, hear, quick, rate, score
-from plushsense.evaluation.replaying import Listener, events_of
 from plushsense.evaluation.stream_scores import pooled_scores, summed
 from plushsense.evaluation.streams import (
     Fitted,
@@ -29,9 +28,10 @@ from plushsense.evaluation.streams import (
     people_folds,
     scored_people,
 )
-from plushsense.evaluation.systems import SYSTEMS, Point, balanced, best_of, cheapest, fewest, searched, tried
+from plushsense.evaluation.systems import SYSTEMS, Point, balanced, best_of, cheapest, fewest, gated, searched, tried
 from plushsense.evaluation.truth import StreamTruth, people_with_streams, row_times_s, truth_of, usual_rows
 from plushsense.live.decide import DecideSpec, argmax_spec
+from plushsense.live.replaying import Listener, events_of
 from plushsense.live.trace import Part, Trace, replay, trace_of
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
@@ -236,6 +236,10 @@ def test_settings_are_chosen_on_those_who_tune() -> None:
     best = fewest(points, 1.0)
     assert (best.recall, best.false_per_hour) == (1.0, 0.0)
     assert balanced(points).f1 == 1.0 and cheapest(tuning, points).false_per_hour == 0.0
+    # Without a rule there is no gate, and nothing to choose anew; with one, every choice without it is still there.
+    assert gated(tuning, points, GatePlan()) == points
+    with_gate = [replace(p.spec, gate=GatePlan(), wait_s=1.0) for p in gated(tuning, points, GATE)]
+    assert all(replace(p.spec, wait_s=1.0) in with_gate for p in best_of(points))
     plain = tried(tuning, [argmax_spec()])[0]
     assert plain.recall == 1.0 and plain.false_per_hour == pytest.approx(rate(3, tuning[0].hours))
     several = [Point(argmax_spec(), r, f, 0.0) for r, f in ((0.5, 4.0), (0.8, 9.0), (0.8, 8.0), (0.6, 10.0))]

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from plushsense.apps.config import RunConfig, from_settings
-from plushsense.apps.preparation import Warn, choose_classes, opened, silent, windows_for
+from plushsense.apps.preparation import Warn, choose_classes, opened, outside_streams, silent, windows_for
 from plushsense.core.errors import BadInput, ConfigError, DatasetError
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.dataset.index import open_dataset
@@ -31,6 +31,7 @@ from plushsense.scoring.splits import parse_split
 from plushsense.training.spec import TrainSpec
 from plushsense.windows.cut import WindowSet
 
+# Raise it when the meaning of what is kept changes, that of the default smoothing included.
 _VERSION = 1
 FIGURE, TABLE = "risk-coverage.png", "abstaining.json"
 
@@ -67,6 +68,12 @@ class _AnswerWork:
 @lru_cache(maxsize=1)
 def _opened(path: str) -> Dataset:
     return open_dataset(Path(path))
+
+
+def _heard_apart(fold: WindowFold, windows: WindowSet, dataset: Dataset) -> WindowFold:
+    """The fold without training windows from the streams of those who are heard."""
+    heard = set(windows.subject[np.concatenate([fold.validation, fold.test])].tolist()) - {NOBODY}
+    return replace(fold, train=fold.train[outside_streams(windows, dataset, heard)[fold.train]])
 
 
 def _without(windows: WindowSet, label: str) -> WindowSet:
@@ -131,7 +138,9 @@ def abstaining(
     gestures = choose_classes(dataset, config.evaluation.classes, warn)
     arch = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
     windows = windows_for(dataset, arch, config.windows, gestures, warn)
-    folds = fold_windows(windows, windows, asked, config.evaluation.seed)
+    folds = [
+        _heard_apart(fold, windows, dataset) for fold in fold_windows(windows, windows, asked, config.evaluation.seed)
+    ]
     from plushsense.training.fit import placed
 
     key = {

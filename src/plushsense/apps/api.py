@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from plushsense import __version__
 from plushsense.apps.config import RunConfig, from_settings
-from plushsense.apps.preparation import Warn, classes_for, opened, silent, windows_for
+from plushsense.apps.preparation import Warn, classes_for, opened, outside_streams, silent, windows_for
 from plushsense.apps.reporting import check_place, save_evaluation
 from plushsense.core.errors import ConfigError
 from plushsense.core.gestures import NOBODY
@@ -140,6 +140,9 @@ def train(
         scored = windows_for(dataset, network, config.scored_on, gestures)
     division = _divide(windows, config, scored)
     train_at, test_at = division.train, division.fold.test
+    if division.kind == _WHOLE_PEOPLE:
+        # Decisions are fitted on the whole streams of those who validate.
+        train_at = train_at[outside_streams(windows, dataset, division.fold.subjects)[train_at]]
     from plushsense.training.fit import fit, predict
 
     fitted = fit(windows.take(train_at), scored.take(division.watch), network, config.training, progress)

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
 
 from plushsense.apps.config import ALL, SHARED
 from plushsense.core.errors import DatasetError
@@ -73,6 +76,16 @@ def windows_for(
     for line in cut.left_out:
         warn(f"left out: {line}")
     return cut
+
+
+def outside_streams(windows: WindowSet, dataset: Dataset, people: Collection[str]) -> NDArray[np.bool_]:
+    """Which windows lie in no stream of ``people``, (N,).
+
+    The toy at rest is nobody's and trains in every fold, but somebody may have recorded it within a session; whoever
+    is heard as a whole stream must not have given any of it.
+    """
+    theirs = [s.id for s in dataset.streams if s.subject in people]
+    return ~np.isin(windows.stream, np.array(theirs, dtype=np.str_))
 
 
 def opened(dataset: Dataset | str | os.PathLike[str]) -> Dataset:

@@ -24,6 +24,7 @@ from plushsense.evaluation.sittings import (
     FIRST_STRANGER,
     Left,
     Progress,
+    known_people,
     recorded_people,
     recorded_sittings,
     virtual_numbers,
@@ -156,6 +157,7 @@ def _recorded(
     return made | {
         "heading": f"The paper's real-time protocol on {what}: {dataset.head.name}",
         "simulated": virtual,
+        "codes": people,
         "left": [_left(entry) for entry in left],
         "people_said": f"{len({s.who.partition(',')[0] for s in sittings})} of {len(dataset.subjects)}: "
         + ", ".join(s.who for s in sittings),
@@ -182,13 +184,21 @@ def _told(made: dict[str, Any], bundle: Bundle, engine: str) -> dict[str, Any]:
         said.append(tuned)
     if not settings.fitted:
         said.append("The event settings of this bundle were not fitted: they are the defaults.")
-    if not provenance.get("subjects"):
+    if not known_people(provenance):
         said.append("This bundle does not say on whom it was trained: that it never met these people is not known.")
+    known = known_people(provenance) | ({bundle.adapted_to} if bundle.adapted_to is not None else set())
+    met = sorted(known & set(made.pop("codes", ())))
+    if met:
+        said.append(
+            f"This bundle was trained on, or adapted to, people of the codes {', '.join(met)}: if they are the same "
+            "people, their figures flatter."
+        )
     if provenance.get("simulated") is True and not made["simulated"]:
         said.append("This network was trained on a virtual toy: on a real one its figures mean nothing yet.")
     said += [f"{entry['who']} {entry['why']}, and was left out." for entry in made["left"]]
     filters = "/".join(map(str, bundle.arch.filters))
-    who = len(set(provenance.get("subjects", ())) - {NOBODY})
+    subjects = provenance.get("subjects", ())
+    who = subjects if isinstance(subjects, int) else len(set(subjects) - {NOBODY})
     trained = f"{provenance.get('dataset', 'unknown data')}, {who} people"
     times = [o["repetition"] for o in made["outcomes"]]
     about = [

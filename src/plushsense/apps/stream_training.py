@@ -11,7 +11,7 @@ import numpy as np
 
 from plushsense import __version__
 from plushsense.apps.config import RunConfig
-from plushsense.apps.preparation import Warn, choose_classes, classes_for, silent, windows_for
+from plushsense.apps.preparation import Warn, choose_classes, classes_for, outside_streams, silent, windows_for
 from plushsense.core.errors import ConfigError
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.dataset.store import Dataset
@@ -76,7 +76,8 @@ class TrainStreams:
         if recipe.anywhere is not None:
             scored = windows_for(dataset, arch, replace(recipe.windows, context="stream"), gestures)
         # What nobody made (the toy at rest) belongs to no fold, and is trained on in every one.
-        train = cut.take(np.flatnonzero(np.isin(cut.subject, [*fold.train, NOBODY])))
+        mine = np.isin(cut.subject, [*fold.train, NOBODY])
+        train = cut.take(np.flatnonzero(mine & outside_streams(cut, dataset, {*fold.validation, *fold.test})))
         watch = scored.take(np.flatnonzero(np.isin(scored.subject, fold.validation)))
         fitted = fit(train, watch, arch, recipe.training, progress)
         kept = calibration(arch, fitted.weights, fitted.scaler, train.x)

@@ -122,7 +122,12 @@ def stream_eval(
         met = [p for p in wanted if p in trained]
         if met:
             warn(f"TRAINED ON: the model has met {', '.join(met)}; their figures flatter and are no result")
-        if not bundle.provenance.get("subjects"):
+        if alike := [p for p in wanted if p not in trained and p in _codes(bundle)]:
+            warn(
+                f"the model was trained on people of the same codes in '{bundle.provenance.get('dataset')}': if "
+                f"{', '.join(alike)} are the same people, their figures flatter"
+            )
+        if not _codes(bundle):
             warn("the bundle does not say on whom it was trained: if on these people, the figures flatter")
         spec = DecideSpec.from_dict(bundle.decision)
         scores = scored_people(dataset, bundle, wanted, spec, Settings((), late_s=late_s))
@@ -142,16 +147,21 @@ def stream_eval(
 
 
 def trained_people(bundle: Bundle, dataset: Dataset) -> set[str]:
-    """Codes on whom a bundle was trained, or who were held back and tuned it. Those of another data set, of another
-    name and other content, are other people."""
+    """Codes on whom a bundle was trained, or who were held back and tuned it, or to whom it was adapted. Those of
+    another data set, of another name and other content, are other people; what it was adapted to, it does not say."""
     told = bundle.provenance
     known = told.get("dataset") is None or told.get("dataset") == dataset.head.name
     known = known or told.get("dataset_hash") == dataset.hash
+    adapted = set() if bundle.adapted_to is None else {bundle.adapted_to}
+    return adapted | (_codes(bundle) if known else set())
+
+
+def _codes(bundle: Bundle) -> set[str]:
     people: set[str] = set()
     for key in ("subjects", "validation_subjects"):
-        if isinstance(each := told.get(key, ()), list | tuple):
+        if isinstance(each := bundle.provenance.get(key, ()), list | tuple):
             people |= set(map(str, each))
-    return people - {NOBODY} if known else set()
+    return people - {NOBODY}
 
 
 def _same_sensors(dataset: Dataset, bundle: Bundle) -> None:
@@ -277,11 +287,11 @@ def sheet(table: dict[str, Any]) -> str:
     """The curves and the chosen settings as CSV, one row a point."""
     text = io.StringIO()
     names = ("system", "title", "point", "target", "recall", "precision", "f1", "false_events_per_hour")
-    more = ("latency_median_s", "latency_p90_s")
+    more = ("latency_median_s", "latency_p90_s", "simulated")
     writer = csv.DictWriter(text, [*names, *more], extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
     for name, system in table["systems"].items():
-        head = {"system": name, "title": system["title"]}
+        head = {"system": name, "title": system["title"], "simulated": "yes" if table["simulated"] else "no"}
         for point in system["curve"]:
             writer.writerow({**head, "point": "curve", **point})
         for how in ("plain", "balanced", "cheapest"):

@@ -16,11 +16,10 @@ from plushsense.core.gestures import GestureSet
 from plushsense.dataset.store import Dataset
 from plushsense.live.decide import DecideSpec
 from plushsense.live.fitting import covered, known_threshold, labelled_steps, streams_heard, sure_threshold
-from plushsense.live.tuning import Hearing
+from plushsense.live.replaying import Listener
 from plushsense.models.bundle import Bundle
 from plushsense.models.events import ONE
-from plushsense.models.fixed import SMOOTH_EXTRA_BITS, smoothing_weight
-from plushsense.models.gate import GatePlan
+from plushsense.models.fixed import smoothing_weight
 from plushsense.scoring.abstaining import RiskCoverage, auroc, confidences, risk_coverage
 
 Floats = NDArray[np.float64]
@@ -44,27 +43,27 @@ class Ends:
 def ends(bundle: Bundle, dataset: Dataset, subjects: Iterable[str], spec: DecideSpec, gestures: GestureSet) -> Ends:
     """The answers at the ends of the recordings of ``gestures`` in some people's streams."""
     weight = smoothing_weight(spec.smoothing_s, bundle.arch.step * bundle.layout.period_us / 1e6)
-    rows: list[tuple[NDArray[Any], NDArray[Any], str, str]] = []
+    rows: list[tuple[NDArray[Any], NDArray[Any], Any, str, str]] = []
     for heard in streams_heard(bundle, dataset, subjects, spec, gestures):
         parts = heard.trace.parts
-        means = Hearing(heard, GatePlan()).means(weight)
+        smoothed = Listener(heard.trace).smoothed(weight)
         for truth in heard.truths:
             if truth.gesture < 0:
                 continue
-            for part, mean in zip(parts, means, strict=True):
+            for part, after in zip(parts, smoothed, strict=True):
                 times = heard.trace.step_times_us(part)
                 at = int(np.searchsorted(times, truth.stop_us, side="right")) - 1
                 if at >= 0 and times[at] > truth.start_us:
-                    rows.append((part.logits[at], mean[at], gestures.labels[truth.gesture], heard.person))
+                    label = gestures.labels[truth.gesture]
+                    rows.append((part.logits[at], after.shares[at], after.highest[at], label, heard.person))
     k = len(bundle.gestures)
     logits = np.array([r[0] for r in rows], dtype=np.float64).reshape(len(rows), k) / 256
-    smoothed = np.array([r[1] >> SMOOTH_EXTRA_BITS for r in rows], dtype=np.int64).reshape(len(rows), k + 1)
     return Ends(
         logits,
-        smoothed[:, :-1] / ONE,
-        smoothed[:, -1] / 256,
-        np.array([r[2] for r in rows], dtype=np.str_),
+        np.array([r[1] for r in rows], dtype=np.int64).reshape(len(rows), k) / ONE,
+        np.array([r[2] for r in rows], dtype=np.int64) / 256,
         np.array([r[3] for r in rows], dtype=np.str_),
+        np.array([r[4] for r in rows], dtype=np.str_),
     )
 
 

@@ -10,9 +10,9 @@ import numpy as np
 
 from plushsense.core.gestures import GestureSet
 from plushsense.dataset.store import Dataset
-from plushsense.evaluation.replaying import Listener, Said
 from plushsense.evaluation.truth import StreamTruth, streams_of, truth_of, usual_rows
 from plushsense.live.decide import DecideSpec
+from plushsense.live.replaying import Listener, Said
 from plushsense.live.trace import trace_of
 from plushsense.models.bundle import Bundle
 from plushsense.models.events import AFFECTS, NO_GESTURE

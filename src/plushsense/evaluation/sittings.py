@@ -78,9 +78,11 @@ def virtual_numbers(people: int, first: int, provenance: Mapping[str, Any]) -> l
 
 
 def known_people(provenance: Mapping[str, Any]) -> set[str]:
-    """Codes of the people that a bundle was trained on or chosen by; nobody is none of them."""
-    listed = [*provenance.get("subjects", ()), *provenance.get("validation_subjects", ())]
-    return {str(code) for code in listed} - {NOBODY, UNKNOWN_SUBJECT}
+    """Codes of the people that a bundle was trained on or chosen by; nobody is none of them. Empty for an export,
+    which says how many, not who."""
+    listed = [provenance.get(key) for key in ("subjects", "validation_subjects")]
+    codes = {str(code) for each in listed if isinstance(each, list | tuple) for code in each}
+    return codes - {NOBODY, UNKNOWN_SUBJECT}
 
 
 def virtual_sittings(

@@ -135,8 +135,15 @@ def searched(heard: Sequence[Heard], system: System, late_s: float = LATE_S) -> 
 
 
 def gated(heard: Sequence[Heard], points: Sequence[Point], gate: GatePlan, late_s: float = LATE_S) -> list[Point]:
-    """The best of these settings with a gate, and how long its events wait for the network."""
-    specs = [replace(spec, gate=gate, wait_s=wait_s) for spec in _best_specs(points) for wait_s in _WAITS]
+    """The best of these settings with a gate, and how long its events wait for the network.
+
+    A gate without rules changes nothing, the choice among the settings included.
+    """
+    if not gate.rules:
+        return list(points)
+    # All that a choice without the gate could fall on: else the two would differ by more than the gate.
+    base = {_key(spec): spec for spec in (*_best_specs(points), *(p.spec for p in best_of(points)))}
+    specs = [replace(spec, gate=gate, wait_s=wait_s) for spec in base.values() for wait_s in _WAITS]
     return tried(heard, specs, late_s)
 
 

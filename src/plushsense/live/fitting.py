@@ -21,12 +21,13 @@ from plushsense.dataset.store import Dataset, RecordingInfo
 from plushsense.live.decide import DecideSpec
 from plushsense.live.gate import fit_gate
 from plushsense.live.limits import fit_health
+from plushsense.live.replaying import Listener
 from plushsense.live.stream import whole_logits
 from plushsense.live.trace import trace_of
-from plushsense.live.tuning import OTHER, Costs, Heard, Hearing, Truth, tune
+from plushsense.live.tuning import OTHER, Costs, Heard, Truth, tune
 from plushsense.models.bundle import Bundle
 from plushsense.models.events import ONE
-from plushsense.models.fixed import SMOOTH_EXTRA_BITS, Ints, smoothing_weight, softmax
+from plushsense.models.fixed import Ints, smoothing_weight, softmax
 from plushsense.windows.cut import WindowSpec, cut_windows
 
 COVERAGE = 0.9
@@ -230,26 +231,30 @@ def truths_of(
 def labelled_steps(bundle: Bundle, heard: Sequence[Heard], spec: DecideSpec) -> Labelled:
     """The steps in the second half of each recording that the network knows, smoothed as ``spec`` has it."""
     weight = smoothing_weight(spec.smoothing_s, bundle.arch.step * bundle.layout.period_us / 1e6)
-    rows: list[Ints] = []
+    shares = [np.zeros((0, len(bundle.gestures)), dtype=np.int64)]
+    highest = [_ints(())]
     truth: list[int] = []
     person: list[str] = []
     recording: list[int] = []
     number = 0
     for h in heard:
-        means = Hearing(h, type(spec.gate)()).means(weight)
+        parts = Listener(h.trace).smoothed(weight)
         times = [h.trace.step_times_us(part) for part in h.trace.parts]
         for t in h.truths:
             if t.gesture == OTHER:
                 continue
             number += 1
-            for mean, at in zip(means, times, strict=True):
-                mine = mean[(at >= (t.start_us + t.stop_us) // 2) & (at <= t.stop_us)] >> SMOOTH_EXTRA_BITS
-                rows.append(mine)
-                truth += [t.gesture] * len(mine)
-                person += [h.person] * len(mine)
-                recording += [number] * len(mine)
-    values = np.concatenate(rows) if rows else np.zeros((0, len(bundle.gestures) + 1), dtype=np.int64)
-    return Labelled(values[:, :-1], values[:, -1], _ints(truth), np.array(person, dtype=np.str_), _ints(recording))
+            for part, at in zip(parts, times, strict=True):
+                mine = (at >= (t.start_us + t.stop_us) // 2) & (at <= t.stop_us)
+                shares.append(part.shares[mine])
+                highest.append(part.highest[mine])
+                n = int(mine.sum())
+                truth += [t.gesture] * n
+                person += [h.person] * n
+                recording += [number] * n
+    return Labelled(
+        np.concatenate(shares), np.concatenate(highest), _ints(truth), np.array(person, dtype=np.str_), _ints(recording)
+    )
 
 
 def labelled_windows(bundle: Bundle, dataset: Dataset, subjects: Iterable[str]) -> Labelled:

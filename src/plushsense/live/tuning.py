@@ -1,12 +1,12 @@
 """Which event settings suit people best: what an event costs, and a search over traces.
 
-A stream is read by the network once (`live/trace`); here its events are made anew for every setting that is tried,
-by the very machine that a toy has. What a setting does not change is computed once.
+A stream is read by the network once (`live/trace`); its events are made anew for every setting that is tried
+(`live/replaying`), by the very machine that a toy has.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,11 +15,9 @@ from numpy.typing import NDArray
 
 from plushsense.core.gestures import GestureSet
 from plushsense.live.decide import DecideSpec
-from plushsense.live.trace import Part, Trace, gate_hits
-from plushsense.models.events import AFFECT_CODES, BEGUN, ENDED, NAMED, NO_GESTURE, EventMachine, Update
-from plushsense.models.fixed import SMOOTH_EXTRA_BITS, Ints, smooth, smoothing_weight, softmax
-from plushsense.models.gate import GatePlan
-from plushsense.models.rules import Rules
+from plushsense.live.replaying import Listener
+from plushsense.live.trace import Trace
+from plushsense.models.events import AFFECT_CODES, BEGUN, ENDED, NAMED, NO_GESTURE, Update
 
 OTHER = -1
 
@@ -89,91 +87,6 @@ def spoken(updates: Sequence[Update]) -> list[Spoken]:
         elif u.kind == ENDED:
             out[-1].ended_us = u.now
     return out
-
-
-class Hearing(EventMachine):
-    """`replay` of one trace for many settings: the same updates, far sooner."""
-
-    def __init__(self, heard: Heard, gate: GatePlan) -> None:
-        super().__init__(Rules().events, 1, heard.trace.gestures)
-        self.heard, self.rules = heard, gate.rules
-        self._hits = [dict(gate_hits(part, gate)) for part in heard.trace.parts]
-        self._raw = [self._shares(part) for part in heard.trace.parts]
-        self._smoothed: dict[int, list[Ints]] = {}
-
-    @staticmethod
-    def _shares(part: Part) -> Ints:
-        """(n, K + 1) probabilities and highest logit of every step."""
-        rows = [np.append(softmax(row), row.max()) for row in part.logits]
-        return np.array(rows, dtype=np.int64).reshape(len(rows), part.logits.shape[1] + 1)
-
-    def means(self, weight: int) -> list[Ints]:
-        """(n, K + 1) of each part, smoothed, with all bits that the machine keeps."""
-        if weight not in self._smoothed:
-            out = []
-            for raw in self._raw:
-                mean, rows = None, np.empty_like(raw)
-                for i, row in enumerate(raw):
-                    rows[i] = mean = smooth(mean, row, weight)
-                out.append(rows)
-            self._smoothed[weight] = out
-        return self._smoothed[weight]
-
-    def updates(self, spec: DecideSpec) -> list[Update]:
-        """What `replay` makes of the trace; the gate is the one that this was made with."""
-        trace = self.heard.trace
-        step_s = trace.arch.step * trace.period_us / 1e6
-        self.plan = spec.rules(step_s).events
-        self.reset()
-        said: list[Update] = []
-        means = self.means(smoothing_weight(spec.smoothing_s, step_s))
-        for part, mean, fired in zip(trace.parts, means, self._hits, strict=True):
-            said += self._part(part, mean, fired)
-            said += self.lost(part.ends_us)
-        return said
-
-    def _part(self, part: Part, mean: Ints, fired: Mapping[int, int]) -> list[Update]:
-        trace, plan = self.heard.trace, self.plan
-        step, span, period = trace.arch.step, trace.arch.span, trace.period_us
-        rows = mean[:, :-1] >> SMOOTH_EXTRA_BITS
-        best = mean[:, :-1].argmax(axis=1) if len(mean) else np.zeros(0, dtype=np.int64)
-        share = rows[np.arange(len(rows)), best]
-        idle, affects = np.array(self._idle), np.array(self._affects)
-        speaks = (mean[:, -1] >> SMOOTH_EXTRA_BITS >= plan.known) & ~idle[best]
-        named = speaks & (share >= plan.enter)
-        masses = np.stack([rows[:, (affects == a) & ~idle].sum(axis=1) for a in (1, 2, 3)], axis=1)
-        felt = speaks & ~named & (masses.max(axis=1, initial=0) >= plan.enter_affect)
-        gesture = np.where(named, best, NO_GESTURE).tolist()
-        affect = np.where(named, affects[best], np.where(felt, masses.argmax(axis=1) + 1, 0)).tolist()
-        quiet = (~named & ~felt).tolist()
-        shares, bests = rows.tolist(), best.tolist()
-        suspect = part.suspect[span - 1 :: step].tolist()
-        said: list[Update] = []
-        phase = span % step
-        steps = range((phase or step) - 1, len(part.inputs), step)
-        for at in sorted({*steps, *fired}) if fired else steps:
-            now = part.start_us + at * period
-            if at in fired:
-                rule = self.rules[fired[at]]
-                said += self.gate(rule.affect, rule.gesture, now)
-            if (at + 1) % step != phase:
-                continue
-            i = (at + 1 - span) // step
-            if i < 0:
-                said += self.blind_step(now)
-            elif suspect[i]:
-                said += self._one(shares[i], bests[i], NO_GESTURE, 0, now, True)
-            elif quiet[i] and not self.open and self._wanted < 0 and self._gesture == NO_GESTURE:
-                self._resting -= self._resting > 0
-            else:
-                self._count(gesture[i], affect[i], now)
-                said += self._one(shares[i], bests[i], gesture[i], affect[i], now, False)
-        return said
-
-    def _one(self, shares: list[int], best: int, said: int, affect: int, now: int, suspect: bool) -> list[Update]:
-        if self.open:
-            return self._open_step(shares, best, said, affect, now, suspect)
-        return self._closed_step(said, affect, now)
 
 
 def costs(heard: Heard, events: Sequence[Spoken], gestures: GestureSet, prices: Costs) -> NDArray[np.float64]:
@@ -300,7 +213,7 @@ def tune(
         keep: settings that are not tried.
     """
     prices = prices or Costs()
-    hearings = [Hearing(h, spec.gate) for h in heard]
+    listeners = [(h, Listener(h.trace)) for h in heard]
     gate = bool(spec.gate.rules)
     knobs = TRIED | (TRIED_AFFECT if gestures.tells_affect else {}) | (TRIED_GATE if gate else {})
     knobs = {name: values for name, values in knobs.items() if name not in keep}
@@ -309,7 +222,7 @@ def tune(
     def cost(candidate: DecideSpec) -> list[NDArray[np.float64]]:
         key = tuple(getattr(candidate, name) for name in knobs)
         if key not in known:
-            known[key] = [costs(h.heard, spoken(h.updates(candidate)), gestures, prices) for h in hearings]
+            known[key] = [costs(h, spoken(listener.said(candidate)), gestures, prices) for h, listener in listeners]
         return known[key]
 
     people = [h.person for h in heard]

@@ -40,18 +40,14 @@ class Said:
 
 
 @dataclass(frozen=True, eq=False)
-class _Smoothed:
-    """A part's smoothed shares (n, K) in steps of 2^-15, the best class by all bits (n,), the highest logit (n,)."""
+class Smoothed:
+    """A part's smoothed shares (n, K) in steps of 2^-15, the best class by all bits (n,), the highest logit (n,) in
+    steps of 1/256; ``masses`` (n, 4) the shares of each affect together, idle classes left out."""
 
     shares: Ints
     best: Ints
-    known: Ints
+    highest: Ints
     masses: Ints
-
-    @cached_property
-    def rows(self) -> list[list[int]]:
-        found: list[list[int]] = self.shares.tolist()
-        return found
 
 
 class Listener:
@@ -62,7 +58,7 @@ class Listener:
         self.step_s = trace.arch.step * trace.period_us / 1e6
         self._affects = np.array([AFFECT_CODES[a] for a in trace.gestures.affects], dtype=np.int64)
         self._idle = np.array([g.idle for g in trace.gestures.gestures], dtype=np.bool_)
-        self._smoothed: dict[int, list[_Smoothed]] = {}
+        self._smoothed: dict[int, list[Smoothed]] = {}
         self._hits: dict[GatePlan, Hits] = {}
 
     @cached_property
@@ -74,7 +70,7 @@ class Listener:
             for part in self.trace.parts
         ]
 
-    def smoothed(self, weight: int) -> list[_Smoothed]:
+    def smoothed(self, weight: int) -> list[Smoothed]:
         """What stands after smoothing, kept for the next time."""
         if weight not in self._smoothed:
             self._smoothed[weight] = [self._smooth(rows, weight) for rows in self._probabilities]
@@ -84,7 +80,7 @@ class Listener:
         """Let go of what was smoothed: it is many times the trace."""
         self._smoothed.clear()
 
-    def _smooth(self, rows: Ints, weight: int) -> _Smoothed:
+    def _smooth(self, rows: Ints, weight: int) -> Smoothed:
         means = np.empty_like(rows)
         mean: Ints | None = None
         for at, row in enumerate(rows):
@@ -94,7 +90,7 @@ class Listener:
         masses = np.zeros((len(rows), 4), dtype=np.int64)
         for code in range(4):
             masses[:, code] = shares[:, :-1][:, (self._affects == code) & ~self._idle].sum(axis=1)
-        return _Smoothed(shares[:, :-1], means[:, :-1].argmax(axis=1), shares[:, -1], masses)
+        return Smoothed(shares[:, :-1], means[:, :-1].argmax(axis=1), shares[:, -1], masses)
 
     def hits(self, plan: GatePlan) -> Hits:
         """When the gate fires, asked once a plan."""
@@ -112,15 +108,18 @@ class Listener:
             updates += machine.follow(self.trace, part, heard, said, affect, fired, rules.gate)
         return updates
 
+    def said(self, spec: DecideSpec) -> list[Update]:
+        """The updates under ``spec``."""
+        return self.updates(spec.rules(self.step_s), smoothing_weight(spec.smoothing_s, self.step_s))
+
     def events(self, spec: DecideSpec) -> list[Said]:
         """What somebody who listens is told, under ``spec``."""
-        weight = smoothing_weight(spec.smoothing_s, self.step_s)
-        return events_of(self.updates(spec.rules(self.step_s), weight))
+        return events_of(self.said(spec))
 
-    def _wanted(self, heard: _Smoothed, plan: EventPlan) -> tuple[Ints, Ints]:
+    def _wanted(self, heard: Smoothed, plan: EventPlan) -> tuple[Ints, Ints]:
         """What each step would say, as `EventMachine._wants` has it: (n,) gesture or `NO_GESTURE`, (n,) affect."""
         share = np.take_along_axis(heard.shares, heard.best[:, None], axis=1)[:, 0]
-        speaks = (heard.known >= plan.known) & ~self._idle[heard.best]
+        speaks = (heard.highest >= plan.known) & ~self._idle[heard.best]
         sure = speaks & (share >= plan.enter)
         most = heard.masses[:, 1:].argmax(axis=1) + 1
         leans = speaks & ~sure & (heard.masses[:, 1:].max(axis=1) >= plan.enter_affect)
@@ -135,7 +134,7 @@ class _Skipping(EventMachine):
         self,
         trace: Trace,
         part: Part,
-        heard: _Smoothed,
+        heard: Smoothed,
         said: Ints,
         affect: Ints,
         hits: Sequence[tuple[int, int]],
@@ -176,7 +175,7 @@ class _Skipping(EventMachine):
             if at < 0:
                 yield from self.blind_step(part.start_us + (at * step + span - 1) * trace.period_us)
             else:
-                yield from self._told(heard.rows[at], best[at], wants[at], leans[at], times[at], doubts[at])
+                yield from self._told(heard.shares[at].tolist(), best[at], wants[at], leans[at], times[at], doubts[at])
             at += 1
         yield from self.lost(part.ends_us)
 
