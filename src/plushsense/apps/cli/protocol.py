@@ -75,7 +75,7 @@ def lines(result: dict[str, Any]) -> list[str]:
     out += ["", table(head, rows), ""]
     out += [
         f"{row['system']}, {row['minutes']} minutes between the gestures: {row['positive']} positive and "
-        f"{row['negative']} negative events, {row['none']} without affect ({row['reactions']} an hour)"
+        f"{row['negative']} negative events, {row['none']} without affect: {row['reactions']} an hour"
         for row in between_rows(result)
     ]
     if result["aims"]:
