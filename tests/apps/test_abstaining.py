@@ -44,6 +44,9 @@ def test_given_settings_stay_and_train_says_what_it_did(cli: Cli, dataset: Datas
     assert (spec.smoothing_s, spec.enter) == (0.45, 0.85)
     assert "Decisions fitted on 1 person who were held back" not in ran.out
     assert "Decisions fitted on 1 person who was held back" in ran.out
+    gate = spec.fitted["gate"]
+    notices = f"it notices {100 * gate['recall']:.0f} % of" if "recall" in gate else gate["reason"]
+    assert notices in ran.out, "what the gate's fit found, or why there is none"
 
 
 def test_where_nobody_is_held_back_the_defaults_stay_and_train_says_so(dataset: Dataset) -> None:

@@ -59,6 +59,17 @@ def test_every_line_has_its_reactions_and_without_the_option_none_has(capsys, mo
     assert all("reactions" not in json.loads(line) for line in said)
 
 
+def test_in_words_too_the_toy_says_what_it_does(capsys, model):
+    status, said, err = lines(capsys, model, "--seconds", "20", "--reactions", "standard", "--text")
+    assert status == 0, err
+    _, every, _ = lines(capsys, model, "--seconds", "20", "--reactions", "standard", "--events")
+    wanted = [r for line in every for r in json.loads(line)["reactions"]]
+    told = [line for line in said if "the toy:" in line]
+    assert wanted
+    assert [float(line.split()[0]) for line in told] == pytest.approx([r["t_s"] for r in wanted], abs=0.006)
+    assert all(f"eyes {r['eyes']}" in line and (r["sound"] or "") in line for r, line in zip(wanted, told, strict=True))
+
+
 @pytest.mark.parametrize(
     ("given", "text", "said"),
     [

@@ -162,6 +162,7 @@ def test_what_does_not_fit_is_one_sentence(capsys, model, sessions, tmp_path):
         (("--dataset", sessions, "--session", sessions), "give one of them"),
         (("--session", sessions, "--subjects", "P9"), "There is no 'P9'"),
         (("--session", tmp_path / "no"), "no"),
+        (("--session", sessions, "--people", 3), "--people is for virtual people"),
         (("--out", taken), "something that is not a protocol"),
         (("--engine", "int4"), "invalid choice"),
         (("--engine", "int8"), "calibration"),

@@ -74,6 +74,10 @@ def test_the_table_stands_beside_the_paper():
     assert by["Fine", "Rules"]["named"] == "—", "rules name no gesture"
     assert (by["Taps", "Network"]["median"], by["Taps", "Network"]["likelihood"]) == ("—", "—")
     assert [len(line) for line in report.text_lines(result())] == [11] * 6
+    elsewhere = result()
+    for row in elsewhere["rows"]:
+        row["group"] = "other"
+    assert [len(line) for line in report.text_lines(elsewhere)] == [9] * 6, "the paper has no such gestures"
 
 
 def test_the_csv_holds_numbers_of_groups_and_gestures():

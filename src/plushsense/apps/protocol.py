@@ -39,11 +39,12 @@ ENGINES = ("float", "int8")
 NO_GATE = (
     "This bundle has no gate, so there is no hybrid: network and hybrid would be the same. Blows wait for the network."
 )
+NO_AFFECT = "These gestures have no affect: any event counts as an answer, and nothing can be called negative."
 NO_RULES = "The old heuristic was not asked: there are no figures of rules only."
 _ANSWERED = (
     "Answered: an event of the gesture's affect began between 0.3 s before the hand touched and 2 s after it left. "
-    "Named: so the right gesture was, in any event of the trial. Shares are of all trials, times of those that were "
-    "answered."
+    "Named: an event of the trial, also one that began before it, was called rightly. Shares are of all trials, times "
+    "of those that were answered."
 )
 _LIKELIHOOD = (
     "Likelihood: mean over the trials of the highest smoothed probability of what was said first. Called negative: an "
@@ -182,6 +183,8 @@ def _told(made: dict[str, Any], bundle: Bundle, engine: str) -> dict[str, Any]:
     tuned = made.pop("rules_said")
     if not ruled:
         said.append(tuned)
+    if not bundle.gestures.tells_affect:
+        said.append(NO_AFFECT)
     if not settings.fitted:
         said.append("The event settings of this bundle were not fitted: they are the defaults.")
     if not known_people(provenance):
@@ -199,7 +202,7 @@ def _told(made: dict[str, Any], bundle: Bundle, engine: str) -> dict[str, Any]:
     filters = "/".join(map(str, bundle.arch.filters))
     subjects = provenance.get("subjects", ())
     who = subjects if isinstance(subjects, int) else len(set(subjects) - {NOBODY})
-    trained = f"{provenance.get('dataset', 'unknown data')}, {who} people"
+    trained = f"{provenance['dataset']}, {who} people" if provenance.get("dataset") else "not told by the bundle"
     times = [o["repetition"] for o in made["outcomes"]]
     about = [
         ["People", made.pop("people_said")],
@@ -207,7 +210,7 @@ def _told(made: dict[str, Any], bundle: Bundle, engine: str) -> dict[str, Any]:
         ["Network", f"{bundle.arch.symbol}, filters {filters}, {bundle.arch.padding}; span {_span(bundle):.2f} s"],
         ["Trained on", trained],
         ["Arithmetic", "8 bits, the toy's own" if engine == "int8" else "floating point"],
-        ["Gate", f"{len(settings.gate.rules)} rule(s)" if settings.gate.rules else "none"],
+        ["Gate", {0: "none", 1: "1 rule"}.get(len(settings.gate.rules), f"{len(settings.gate.rules)} rules")],
         ["Event settings", "fitted" if settings.fitted else "defaults, not fitted"],
     ]
     if ruled:

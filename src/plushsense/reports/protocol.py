@@ -184,7 +184,7 @@ def csv_rows(result: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def text_lines(result: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    """The main table as cells for a plain table; its head first."""
+    """The main table as cells for a plain table; its head first; without the paper where it has no such group."""
     head = (
         *("gesture", "system", "answered", "right gesture named", "median s", "p90 s", "in 0.2 s", "likelihood"),
         *("called negative", "paper: answered", "paper: time"),
@@ -196,7 +196,11 @@ def text_lines(result: Mapping[str, Any]) -> list[tuple[str, ...]]:
         )
         for row in table_rows(result)
     ]
-    return [head, *body]
+    return [line if _with_paper(result) else line[:-2] for line in (head, *body)]
+
+
+def _with_paper(result: Mapping[str, Any]) -> bool:
+    return any((row["group"], row["system"]) in PAPER for row in result["rows"])
 
 
 def figure(result: Mapping[str, Any]) -> Figure:
@@ -277,7 +281,7 @@ def page(result: Mapping[str, Any]) -> str:
         confusions=confusion_rows(result),
         between=between_rows(result),
         left=result["left"],
-        with_paper=any((row["group"], row["system"]) in PAPER for row in result["rows"]),
+        with_paper=_with_paper(result),
         source=SOURCE,
         confused=CONFUSED,
         counted=result["counted"],

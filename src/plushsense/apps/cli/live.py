@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -13,11 +14,12 @@ from plushsense.apps.cli.output import say
 if TYPE_CHECKING:
     from plushsense.live.decide import DecideSpec
     from plushsense.live.integer import BothEngines
+    from plushsense.live.react import Reaction
     from plushsense.live.stream import Decision, Event, State, StreamReader
     from plushsense.models.bundle import Bundle
 
 STATES = {
-    "warming": "getting to know what goes on (only the gate answers yet)",
+    "warming": "getting to know what goes on",
     "tracking": "reading",
     "no signal": "no signal",
     "sensor fault": "sensor fault: what the sensors say cannot be believed",
@@ -99,7 +101,7 @@ def run(args: argparse.Namespace) -> int:
                     if not (news or decision.events or reactions):
                         continue
                 if args.text:
-                    lines = told(decision, news)
+                    lines = told(decision, news, reactions)
                 else:
                     more = {"reactions": [r.to_dict() for r in reactions]} if reactor else {}
                     lines = [json.dumps(decision.to_dict() | more, ensure_ascii=False)]
@@ -125,9 +127,10 @@ def classifier_of(bundle: Bundle, decide: DecideSpec | None, engine: str) -> Str
     return integer if engine == "int8" else BothEngines(integer, StreamClassifier(bundle, decide))
 
 
-def told(decision: Decision, news: bool) -> list[str]:
-    """Lines for people: the state when it is new, and what happened to events."""
+def told(decision: Decision, news: bool, reactions: Sequence[Reaction] = ()) -> list[str]:
+    """Lines for people: what happened to events, what the toy does about it, and the state when it is new."""
     lines = [f"{event.t_s:9.2f} s  {_event(event)}" for event in decision.events]
+    lines += [f"{reaction.t_s:9.2f} s    {_reaction(reaction)}" for reaction in reactions]
     if news:
         lines.append(f"{decision.t_s:9.2f} s  {STATES[decision.state]}")
     return lines
@@ -140,3 +143,9 @@ def _event(event: Event) -> str:
         return f"  end of {event.number}, {what}"
     by = " (gate)" if event.source == "gate" and event.what == "begun" else ""
     return f"{event.number} {what}{by}" if event.what == "begun" else f"{event.number} it is {what}"
+
+
+def _reaction(reaction: Reaction) -> str:
+    shown = [f"eyes {reaction.eyes}", *([reaction.sound] if reaction.sound else [])]
+    lasting = f" for {reaction.seconds:g} s" if reaction.seconds else ""
+    return f"the toy: {', '.join(shown)}{lasting}"

@@ -6,20 +6,20 @@ import argparse
 from typing import Any
 
 from plushsense.apps.cli.output import bar, emit, table
+from plushsense.core.errors import ConfigError
 
 
 def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--model", required=True, metavar="BUNDLE", help="a .plush bundle")
-    parser.add_argument("--people", type=int, default=5, metavar="N", help="virtual people (5, as in the paper)")
+    parser.add_argument("--people", type=int, metavar="N", help="virtual people (5, as in the paper)")
     parser.add_argument(
         "--first",
         type=int,
-        default=1001,
         metavar="N",
         help="number of the first virtual person (1001: nobody met them)",
     )
-    parser.add_argument("--seed", type=int, default=1, metavar="N", help="of the virtual population (1)")
-    parser.add_argument("--repetitions", type=int, default=3, metavar="N", help="of each gesture by each person (3)")
+    parser.add_argument("--seed", type=int, metavar="N", help="of the virtual population (1)")
+    parser.add_argument("--repetitions", type=int, metavar="N", help="of each gesture by each person (3)")
     parser.add_argument("--dataset", metavar="DS", help="recorded sessions instead: a data set with session streams")
     parser.add_argument(
         "--session",
@@ -47,12 +47,13 @@ def run(args: argparse.Namespace) -> int:
     from plushsense.apps.cli.settings import listed
     from plushsense.apps.protocol import protocol
 
+    virtual = {name: getattr(args, name) for name in ("people", "first", "seed", "repetitions")}
+    virtual = {name: value for name, value in virtual.items() if value is not None}
+    if virtual and (args.dataset or args.session):
+        raise ConfigError(f"--{next(iter(virtual))} is for virtual people: leave it out, or --dataset and --session.")
     result = protocol(
         args.model,
-        people=args.people,
-        first=args.first,
-        seed=args.seed,
-        repetitions=args.repetitions,
+        **virtual,
         dataset=args.dataset,
         session=args.session,
         subjects=listed(args.subjects) if args.subjects else None,
@@ -75,7 +76,7 @@ def lines(result: dict[str, Any]) -> list[str]:
     out += ["", table(head, rows), ""]
     out += [
         f"{row['system']}, {row['minutes']} minutes between the gestures: {row['positive']} positive and "
-        f"{row['negative']} negative events, {row['none']} without affect ({row['reactions']} an hour)"
+        f"{row['negative']} negative events, {row['none']} without affect: {row['reactions']} an hour"
         for row in between_rows(result)
     ]
     if result["aims"]:

@@ -87,16 +87,30 @@ def decided(decision: Mapping[str, Any]) -> list[str]:
     events, answers = fitted["events"], fitted.get("answers")
     said = f"Decisions fitted on {people} who {'was' if fitted['people'] == 1 else 'were'} held back"
     if "cost" in events:
-        said += (
-            f" ({fitted['gestures']} gestures in {60 * fitted['hours']:.0f} min of streams): an event's cost "
-            f"{figure(events['cost_before'])} with the defaults, {figure(events['cost'])} now"
-        )
+        said += f" ({fitted['gestures']} gestures in {60 * fitted['hours']:.0f} min of streams): an event's cost "
+        said += f"{figure(events['cost_before'])} with the defaults, "
+        said += f"{figure(events['cost'])} now" if events["moved"] else "and nothing was found that is surely better"
     else:
         said += "; no stream of theirs, so events keep the defaults"
     out = [said + "."]
+    gate = fitted.get("gate")
+    if gate:
+        out.append(_gate(gate))
     if answers:
         line = f"Sets of {answers['classes_in_set']:.1f} classes hold the true one in {100 * answers['coverage']:g} %"
         if answers["coverage_left_out"] is not None:
             line += f" (person by person, with the others' threshold: {100 * answers['coverage_left_out']:.1f} %)"
         out.append(line + f" of the {answers['on']}.")
     return out
+
+
+def _gate(gate: Mapping[str, Any]) -> str:
+    """What the gate's fit found, on the people it was fitted on, or why there is no gate."""
+    if "reason" in gate:
+        return f"No gate for energetic gestures: {gate['reason']}."
+    false = gate["false_alarms_per_hour"]
+    often = "" if false is None else f", with {false:.1f} false alarms an hour"
+    return (
+        f"Gate fitted on {gate['people']} people: it notices {100 * gate['recall']:.0f} % of their "
+        f"{gate['recordings']} energetic recordings{often}."
+    )
