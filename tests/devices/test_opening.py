@@ -104,3 +104,9 @@ def test_every_scheme_has_its_room() -> None:
 
     for module in SCHEMES.values():
         assert callable(importlib.import_module(module).open_url)
+
+
+@pytest.mark.parametrize("port", ["/dev/ttyUSB99", "COM77"])
+def test_a_bare_port_is_told_its_url(port: str) -> None:
+    with pytest.raises(ConfigError, match=f"write serial://{port}"):
+        parse_url(port)

@@ -89,6 +89,8 @@ def parse_url(url: str) -> Address:
     if match is None or (match[2] is None and match[1].lower() not in SCHEMES):
         if Path(text).is_file():
             return Address(text, "replay", text)
+        if re.fullmatch(r"/dev/\S+|COM\d+", text):
+            raise ConfigError(f"'{text}' is a port, no recording to replay: write serial://{text}.")
         place, query = _split_query(text, text)
         return Address(text, "replay", place, query)
     scheme = match[1].lower()
