@@ -7,6 +7,7 @@ import math
 import struct
 import sys
 import zlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +19,14 @@ TESTS = Path(__file__).parents[1]
 sys.path.insert(0, str(TESTS))
 
 from c_toy import answers, seat  # noqa: E402
-from integers import INT32, any_frames, edged_model, models, plain_model  # noqa: E402
-from plushsense.deploy.golden import answers_of  # noqa: E402
+from integers import INT32, any_frames, edged_model, models, plain_model, ruled_model  # noqa: E402
+from plushsense.deploy.golden import EVENT, answers_of, column  # noqa: E402
+from plushsense.models.events import NO_GESTURE, EventPlan  # noqa: E402
 from plushsense.models.fixed import exponentials  # noqa: E402
+from plushsense.models.gate import DOUBT, JERK, GatePlan, Rule, Signal, Term  # noqa: E402
+from plushsense.models.health import HealthPlan  # noqa: E402
 from plushsense.models.image import IntegerModel, memory_bytes  # noqa: E402
+from plushsense.models.rules import Rules  # noqa: E402
 
 OK, TOO_SMALL = 0, 4
 
@@ -53,6 +58,26 @@ def test_most_random_streams_are_answered(c_library: Any) -> None:
         gestures |= set(found[found[:, 3] == 1, 4].tolist())
     assert tracked > 500
     assert len(gestures) == 3
+
+
+def test_sensors_in_doubt(c_library: Any) -> None:
+    """Runs of suspect samples, too short and long enough for the gate to begin anew."""
+    told, longest = 0, 0
+    blow = Rule((Term(0, 24, times=1),), 3, NO_GESTURE, within=2, deaf=3)
+    gate = GatePlan((Signal(JERK, (1,), lag=3, shift=4, baseline=4, noise=4),), (blow,))
+    for seed in range(8):
+        model, rng = ruled_model(seed), np.random.default_rng(seed)
+        rules = Rules(EventPlan(hold=0, rest=0), gate, HealthPlan(fault_ms=2000 * (seed % 2)))
+        model = replace(model, rules=rules)
+        frames, at = any_frames(model, seed, 700), 30
+        while at < len(frames):
+            run = int(rng.integers(1, 26))
+            frames[at : at + run, 2] = 30_001  # out of its range
+            at, longest = at + run + int(rng.integers(3, 60)), max(longest, run)
+        rows = seat(c_library, model).push(frames)
+        assert np.array_equal(rows, answers_of(model, frames))
+        told += int((column(rows, "source", EVENT) == 1).sum())
+    assert longest > 2 * DOUBT and told > 500, "events of the gate"
 
 
 def test_every_edge(c_library: Any, plain_c_library: Any) -> None:
@@ -98,8 +123,8 @@ def test_a_restart_is_a_fresh_toy(c_library: Any) -> None:
     c_library.seat_restart(used.toy)
     got, wanted = answers(used.push(after)), answers(fresh.push(after))
     # The counts of restarts and invalid values, and the frames' numbers, go on.
-    for column in (0, 7, 8):
-        got[:, column] -= got[0, column] - wanted[0, column]
+    for count in (0, 7, 8):
+        got[:, count] -= got[0, count] - wanted[0, count]
     assert np.array_equal(got, wanted)
     assert (wanted[:, 3] == 1).any()
 
@@ -162,8 +187,8 @@ def test_counts_wrap_and_nothing_else_changes(c_library: Any) -> None:
     wanted, got = answers(young.push(frames)), answers(old.push(frames))
     assert c_library.seat_answers(old.toy) == (c_library.seat_answers(young.toy) + by) % 2**32
     assert c_library.seat_answers(old.toy) < c_library.seat_answers(young.toy)
-    for column in (7, 8):
-        assert np.array_equal(got[:, column].view(np.uint32), (wanted[:, column].astype(np.int64) + by) % 2**32)
+    for count in (7, 8):
+        assert np.array_equal(got[:, count].view(np.uint32), (wanted[:, count].astype(np.int64) + by) % 2**32)
     # A restart sets the samples to 0, whatever they were.
     since = wanted[:, 2].astype(np.int64) + np.where(wanted[:, 7] == 0, by, 0)
     assert np.array_equal(got[:, 2].view(np.uint32), since % 2**32)

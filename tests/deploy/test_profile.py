@@ -44,7 +44,8 @@ def test_counts(target: str, small: Path, target_here: Here) -> None:
     assert cost.stack_push is not None
     assert cost.stack_functions["plush_push"] < cost.stack_push < sum(cost.stack_functions.values()) + 64
     assert cost.stack_memory_bytes is not None
-    assert cost.stack_functions["plush_memory_bytes"] <= cost.stack_memory_bytes < 600
+    # It makes a toy on its stack.
+    assert cost.stack_functions["plush_memory_bytes"] <= cost.stack_memory_bytes < TOY_BYTES + 160
     assert "memset" in cost.needs and not cost.heap and not cost.floats
 
 

@@ -17,7 +17,9 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from exports import bundle_of, exported
 from plushsense.apps.cli.main import main
+from plushsense.apps.cli.verify import _text
 from plushsense.core.errors import BadInput, ToolError
+from plushsense.core.gestures import Gesture, GestureSet
 from plushsense.core.signal import Layout, load_layout
 from plushsense.dataset.importers import import_recordings
 from plushsense.dataset.index import open_dataset
@@ -29,7 +31,7 @@ from plushsense.deploy.package import ARDUINO, package
 from plushsense.deploy.rule_faults import RULES
 from plushsense.deploy.targets import TARGETS
 from plushsense.deploy.vectors import Export
-from plushsense.deploy.verify import Setting, verify
+from plushsense.deploy.verify import Setting, Verified, verify
 from plushsense.live.decide import DecideSpec
 from plushsense.models.events import NO_GESTURE
 from plushsense.models.gate import JERK, GatePlan, Rule, Signal, Term
@@ -169,6 +171,37 @@ def test_every_fault_is_caught_on_the_host(c_compiler: str, small: Path, capsys:
     assert len(done.faults) == len(TEXTS) + 10
     # By an answer, not because the toy would not begin or crashed.
     assert all("should be" in (f.first or "") and "plush_begin" not in (f.first or "") for f in done.faults)
+
+
+def test_a_fault_of_the_rules_that_no_drill_shows_is_no_fault_of_the_c(
+    c_compiler: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two classes, of which drills make one idle: what shows seldom needs more drills, or is told not to show."""
+    two = GestureSet("two", (Gesture("pat", "positive"), Gesture("rest", "none")))
+    export = Export(exported(tmp_path / "out", bundle_of("accel-3", gestures=two, seed=2)))
+    seldom = "an affect stays at the share at which it begins"
+
+    def planted() -> Verified:
+        names = {seldom, "an event begins a step too soon"}
+        return verify(export, ["host"], only=plainly, plant=lambda fault: fault.name in names)
+
+    assert all(f.caught for f in planted().faults)
+    monkeypatch.setattr("plushsense.deploy.verify.MORE_DRILLS", 0)
+    done = planted()
+    assert [f.fault for f in done.faults if not f.caught] == [seldom] == [f.fault for f in done.faults if f.silent]
+    assert done.passed and done.to_dict()["passed"]
+    assert "not shown: nothing that this network does" in "\n".join(_text(done))
+
+
+def test_drills_have_sensors_that_are_stuck_where_they_may_be(small: Path) -> None:
+    """Also where six spreads are wider than the valid range, as of a lively accelerometer."""
+    export = Export(small)
+    wide = replace(export.bundle.scaler, scale=export.bundle.scaler.scale / 1e6)
+    low, high = export.model.layout.valid_min_int, export.model.layout.valid_max_int
+    for drill in drills_of(export.model, wide):
+        limits = drill.model.rules.health
+        assert (np.array(limits.low) > low).any() and (np.array(limits.high) < high).any()
+        assert "fault" in reached(drill)
 
 
 def test_a_weight_a_shift_an_index_and_a_rounding_are_caught_on_every_chip(emulators: None, small: Path) -> None:

@@ -29,6 +29,7 @@ from plushsense.windows.clock import resample
 from plushsense.windows.features import Scaler, inputs
 
 _SPREAD = 450  # of a logit over the frames, in steps of 1/256
+_INSIDE = 8  # of a valid range, at each end: room for a sensor to be stuck there
 _AFFECTS: tuple[tuple[str, bool], ...] = (
     ("positive", False),
     ("neutral", True),
@@ -69,11 +70,11 @@ class Drill:
     rows: NDArray[np.int32]
 
 
-def drills_of(model: IntegerModel, scaler: Scaler) -> list[Drill]:
-    """A few drills for a model, one of each of `COURSES`, the same ones each time."""
+def drills_of(model: IntegerModel, scaler: Scaler, again: int = 0) -> list[Drill]:
+    """A few drills for a model, one of each of `COURSES`: the same ones each time, others for each ``again``."""
     return [
         _drill(replace(model, rules=Rules(), gestures=_gestures(model, course)), scaler, course, seed)
-        for seed, course in enumerate(COURSES, 1)
+        for seed, course in enumerate(COURSES, 1 + again * len(COURSES))
     ]
 
 
@@ -209,11 +210,12 @@ def _events(level: _Level, course: _Course, rng: np.random.Generator) -> EventPl
 
 
 def _health(model: IntegerModel, scaler: Scaler, rng: np.random.Generator) -> HealthPlan:
-    """Limits about six spreads from the mean, within what is valid, so that the ends of a range lie beyond."""
+    """Limits about six spreads from the mean, and inside the valid range, so that its ends lie beyond them."""
     layout = model.layout
     mean, spread = measured(layout, scaler)
-    low = np.clip(np.rint(mean - 6 * spread), layout.valid_min_int, layout.valid_max_int).astype(np.int64)
-    high = np.clip(np.rint(mean + 6 * spread), layout.valid_min_int, layout.valid_max_int).astype(np.int64)
+    inside = np.minimum(_INSIDE, (layout.valid_max_int - layout.valid_min_int) // 2)
+    ends = layout.valid_min_int + inside, layout.valid_max_int - inside
+    low, high = (np.clip(np.rint(mean + way * spread), *ends).astype(np.int64) for way in (-6, 6))
     times = {name: int(rng.integers(80, 260)) for name in ("fault_ms", "still_ms", "recover_ms")}
     return HealthPlan(tuple(low.tolist()), tuple(high.tolist()), **times)
 

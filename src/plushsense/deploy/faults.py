@@ -154,6 +154,7 @@ TEXTS = (
         "answers fall due at another phase of the step",
         "toy->filled = (uint16_t)(phase == 0 ? 0 : toy->step - phase);",
         "toy->filled = (uint16_t)(phase == 0 ? 1 : 0);",
+        "stepped",
     ),
     *RULE_TEXTS,
 )
@@ -186,6 +187,8 @@ def faults_of(image: bytes, source: str) -> list[Fault]:
         "dilated": any(layer.dilation > 1 for layer in at.layers),
         "magnitude": at.magnitudes,
         "ranged": bool(ranged),
+        # Every sample is a step where one makes a step.
+        "stepped": at.step > 1,
         # With the whole weight on the new step nothing is left to round.
         "smoothed": at.smoothing < 1 << PROBABILITY_BITS,
         # In fine units of time hardly any value lies just between two whole numbers.
@@ -235,7 +238,7 @@ class _Places:
     """Where things stand in an image; the format is that of `plushsense.models.image`."""
 
     def __init__(self, image: bytes) -> None:
-        count, channels, inputs, classes = struct.unpack_from("<BBBB", image, BODY)
+        count, channels, inputs, classes, self.step = struct.unpack_from("<BBBBH", image, BODY)
         (self.units_per_ms,) = struct.unpack_from("<I", image, BODY + 20)
         (self.smoothing,) = struct.unpack_from("<H", image, BODY + _SMOOTHING_AT)
         at = BODY + _FIXED_BYTES

@@ -137,12 +137,15 @@ static uint32_t memory[PLUSH_MODEL_MEMORY_WORDS];
 static plush_toy toy;
 
 void react(plush_affect affect); /* yours */
+void calm_down(void);            /* yours */
 
 static void on_event(const plush_toy *of, void *user)
 {{
     (void)user;
     if (of->event.what == PLUSH_BEGUN)
         react(of->event.affect);
+    else if (of->event.what == PLUSH_ENDED)
+        calm_down();
 }}
 
 int begin(void)
@@ -166,9 +169,14 @@ the newest thing that happened to one: `what`, `number`, `affect`, `gesture` (`P
 `source`, `since_ms`, `ms`. `toy.answer`, every step, is what the network makes of it all, sure or not: its `kind` says
 whether it is idle, unknown, unsure, sure of an affect or of a gesture.
 
+Whatever begins ends: by itself, when another takes its place (that one's beginning follows at once), in a gap, a fault,
+silence or a restart. While it warms, the toy may already tell events, of the gate. In `on_event` do little, for it runs
+within `plush_push()`: set a flag, and play the sound in your loop, as the example does.
+
 **Sensors that fail** (out of range, stuck at an end, all frozen; the limits stand in the model) end the event that goes
 on. `toy.answer.state` is `PLUSH_FAULT` until they have recovered, then the toy is warming; `toy.faults` counts. When no
-frame comes at all, nobody can tell the toy but you: `plush_silence(&toy)` ends what goes on.
+frame comes at all, nobody can tell the toy but you: `plush_silence(&toy)` ends what goes on; call it once, when none
+came for longer than {gap} ms.
 
 One task or interrupt uses a toy at a time. Several toys may share a model, each with its own `plush_toy` and memory.
 
@@ -189,7 +197,8 @@ flash, RAM and stack.
 ## Another model without compiling
 
 Put `{image}` of another export into flash and begin on its bytes, which must stay readable (on an ESP32: a data
-partition and `esp_partition_mmap()`). They need no alignment. The checksum is looked at first.
+partition and `esp_partition_mmap()`). They need no alignment. The checksum is looked at first. The bytes of an earlier
+PlushSense, without events, are `PLUSH_OTHER_VERSION`: export that model again.
 
 ```c
 #include <stddef.h>

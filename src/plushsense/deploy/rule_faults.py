@@ -17,7 +17,7 @@ class Text:
     name: str
     text: str
     wrong: str
-    when: Literal["always", "dilated", "magnitude", "ranged", "smoothed", "ties"] = "always"
+    when: Literal["always", "dilated", "magnitude", "ranged", "smoothed", "stepped", "ties"] = "always"
 
 
 RULE_TEXTS = (

@@ -102,7 +102,7 @@ class Export:
             raise BadInput(f"'{self.folder / FACTS}' has the smoothing {smoothing!r}: export the model again.")
         self.model: IntegerModel = replace(model, smoothing=smoothing)
         self.image = (self.folder / IMAGE).read_bytes()
-        self._drills: list[Vectors] | None = None
+        self._drills: dict[int, list[Vectors]] = {}
         arch = self.model.network.arch
         frames, answers = read_golden(self.folder / GOLDEN, len(self.model.layout.channels), arch.classes)
         self.golden = Vectors("golden", frames, answers, self.samples_of(frames))
@@ -137,17 +137,18 @@ class Export:
                 "golden vectors can be checked: export the model again."
             )
 
-    def drills(self) -> list[Vectors]:
+    def drills(self, again: int = 0) -> list[Vectors]:
         """The export's network with rules that speak up on made-up frames, as its own may never do
-        (`plushsense.deploy.drill`); none for a model that is not that of the bundle beside it."""
+        (`plushsense.deploy.drill`), others for each ``again``; none for a model that is not that of the bundle beside
+        it."""
         if not self.is_own:
             return []
-        if self._drills is None:
-            found = drills_of(self.model, self.bundle.scaler)
-            self._drills = [
+        if again not in self._drills:
+            found = drills_of(self.model, self.bundle.scaler, again)
+            self._drills[again] = [
                 Vectors("drill", d.frames, d.rows, self.samples_of(d.frames), d.model, d.silences) for d in found
             ]
-        return self._drills
+        return self._drills[again]
 
     def made_up(self, samples: int) -> list[Vectors]:
         """More frames such as the golden ones, until they make this many samples."""

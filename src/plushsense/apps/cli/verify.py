@@ -84,9 +84,13 @@ def _text(done: Verified) -> list[str]:
         targets = list(dict.fromkeys(f.target for f in done.faults))
         by_fault: dict[tuple[str, str], dict[str, str]] = {}
         for f in done.faults:
-            by_fault.setdefault((f.kind, f.fault), {})[f.target] = "caught" if f.caught else "NOT CAUGHT"
+            by_fault.setdefault((f.kind, f.fault), {})[f.target] = (
+                "caught" if f.caught else "not shown" if f.silent else "NOT CAUGHT"
+            )
         shown = [(*fault, *(found.get(t, "") for t in targets)) for fault, found in by_fault.items()]
         said += ["", table(("planted", "fault", *targets), shown)]
+        if any(f.silent for f in done.faults):
+            said += ["", "not shown: nothing that this network does in any drill hangs on that line of the rules."]
     if done.first:
         said += ["", done.first]
     elif done.passed:

@@ -18,6 +18,13 @@
 #define LOGIT_LIMIT 16384
 #define WEIGHT_ZERO 128u    /* weights are stored with this added: some cores cannot load a signed byte */
 
+/* Not copied to where it is called: for the registers of a loop, or for the flash. */
+#if defined(__GNUC__)
+#define PLUSH_APART __attribute__((noinline))
+#else
+#define PLUSH_APART
+#endif
+
 /* What a model may ask for, so that every sum, size and address below is sure to fit. */
 #define MOST_UNITS (UINT32_C(1) << 22) /* of the clock's gap and period: see part_of() */
 #define MOST_STEP 257u                 /* 257 x 255 is the most that 16 bits hold */
@@ -130,6 +137,7 @@ static uint32_t part_of(uint32_t distance, uint32_t into, uint32_t by, uint32_t 
     return quotient + (rest + add) / by;
 }
 
+PLUSH_APART
 static int same(const int32_t *one, const int32_t *other, uint32_t n)
 {
     while (n > 0 && *one == *other) {
@@ -642,9 +650,7 @@ static uint32_t surplus(plush_layer *layer)
 
 /* The sums of four filters at the newest position, of activations times (weight + 128), modulo 2^32; returns where the
  * next filters' weights begin. By itself, so that its loop has all registers. */
-#if defined(__GNUC__)
-__attribute__((noinline))
-#endif
+PLUSH_APART
 static const uint8_t *four_sums(const plush_layer *layer, const uint8_t *w, uint32_t sum[GROUP])
 {
     uint32_t row = layer->groups * GROUP, size = layer->rows * row, stride = layer->dilation * row;
@@ -827,6 +833,7 @@ static uint32_t mass_of(const plush_toy *toy, uint32_t affect)
     return sum;
 }
 
+PLUSH_APART
 static plush_kind kind_of(const plush_toy *toy, uint32_t best)
 {
     uint32_t sure = setting(toy, SURE), members = 0, affects = 0, k;
@@ -862,6 +869,7 @@ static void tell(plush_toy *toy, plush_what what, uint32_t since, uint32_t ms)
         toy->on_event(toy, toy->user);
 }
 
+PLUSH_APART
 static void begin_event(plush_toy *toy, uint32_t affect, uint32_t gesture, plush_source by, uint32_t since,
                         uint32_t ms)
 {
@@ -873,6 +881,7 @@ static void begin_event(plush_toy *toy, uint32_t affect, uint32_t gesture, plush
     tell(toy, PLUSH_BEGUN, since, ms);
 }
 
+PLUSH_APART
 static void end_event(plush_toy *toy, uint32_t since, uint32_t ms)
 {
     toy->resting = (uint16_t)setting(toy, REST);
@@ -880,6 +889,7 @@ static void end_event(plush_toy *toy, uint32_t since, uint32_t ms)
 }
 
 /* The signal is gone: what is going on ends, all but the count of events is forgotten. */
+PLUSH_APART
 static void lose(plush_toy *toy, uint32_t ms)
 {
     if (going_on(toy))

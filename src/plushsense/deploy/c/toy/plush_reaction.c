@@ -76,7 +76,9 @@ static uint16_t wanted(const plush_reaction *reaction, const plush_toy *toy, uin
     case PLUSH_AFFECT_NONE:
         break;
     }
-    return toy->event.gesture == PLUSH_NO_GESTURE ? NEUTRAL : (uint16_t)(GESTURE + toy->event.gesture);
+    if (toy->event.gesture == PLUSH_NO_GESTURE)
+        return NEUTRAL;
+    return (uint16_t)(GESTURE + toy->event.gesture);
 }
 
 void plush_react(plush_reaction *reaction, const plush_toy *toy, uint32_t ms, plush_look *look)
