@@ -11,7 +11,7 @@
    taps of a dilated layer are spread over a longer kernel, with zeros between, which costs it 2.8 times as many
    multiply-accumulates for the default network. So a network without dilation stands beside it.
 3. Toys at 100 Hz in one process and one thread, in real time. A decision is late when it comes more than one step after
-   its frame was due. The virtual toys' own lines are computed in the same process.
+   its frame was due. What the virtual toys send is worked out before.
 
 Without `--bundle` the weights are made up: costs hardly depend on them. What the virtual toy plays is a simulation.
 """
@@ -19,6 +19,7 @@ Without `--bundle` the weights are made up: costs hardly depend on them. What th
 from __future__ import annotations
 
 import argparse
+import gc
 import importlib.util
 import json
 import os
@@ -35,6 +36,7 @@ from plushsense.core.signal import Layout, load_layout
 from plushsense.deploy.calibration import calibrated, integer_model
 from plushsense.devices.base import Frame
 from plushsense.devices.opening import open_device
+from plushsense.devices.virtual.device import VirtualDevice
 from plushsense.devices.virtual.stream import ToySpec, ToyStream
 from plushsense.devices.wire import LineParser
 from plushsense.live.integer import IntegerClassifier
@@ -202,9 +204,14 @@ def timed(ways: dict[str, Any], blocks: list[slice], rounds: int) -> dict[str, l
 
 
 def many(bundle: Bundle, toys: int, seconds: float) -> dict[str, Any]:
-    """Virtual toys in real time, in this thread."""
+    """Virtual toys in real time, in this thread; what they send was worked out before."""
     urls = [f"virtual://?person={n + 1}&seed={n + 1}&seconds={seconds}" for n in range(toys)]
     devices = [open_device(url, bundle.layout) for url in urls]
+    for device in devices:
+        assert isinstance(device, VirtualDevice)
+        device.play_ahead()
+    gc.collect()
+    gc.freeze()  # what is there stays: looking through it again and again would cost tens of ms each time
     live = run_many([(device, StreamClassifier(bundle)) for device in devices])
     for _ in live:
         pass

@@ -215,3 +215,21 @@ def test_unknown_gesture() -> None:
         Session(draw_person(1)).perform("Tail pul")
     with pytest.raises(ConfigError, match="share"):
         ToySpec(lost=1.5)
+
+
+def test_played_ahead_it_sends_the_same() -> None:
+    heard = []
+    for ahead in (False, True):
+        with open_device("virtual://?person=4&seed=2&seconds=3&speed=0") as device:
+            assert isinstance(device, VirtualDevice)
+            if ahead:
+                device.play_ahead()
+            heard.append([frame.values for frame in device])
+    assert heard[0] == heard[1]
+    assert len(heard[0]) > 250
+
+
+def test_a_toy_without_an_end_is_not_played_ahead() -> None:
+    with open_device("virtual://?person=4") as device, pytest.raises(ConfigError, match="give it seconds="):
+        assert isinstance(device, VirtualDevice)
+        device.play_ahead()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
+from plushsense.core.errors import ConfigError
 from plushsense.core.signal import Layout
 from plushsense.devices.base import Device, Frame, Pacer, now_ms
 from plushsense.devices.opening import Address
@@ -42,6 +43,21 @@ class VirtualDevice(Device):
     def first_ms(self) -> int | None:
         """The device clock at the first line, the zero of a live run's times; None before it."""
         return self._first_ms
+
+    def play_ahead(self) -> None:
+        """Work out all its lines now; then reading costs only what reading a real toy does. It needs ``seconds``.
+
+        Raises:
+            ConfigError: for a toy without an end.
+        """
+        if not self._seconds:
+            raise ConfigError(f"'{self.url}' has no end to play ahead to: give it seconds=.")
+        lines: list[Line] = []
+        for line in self._lines:
+            lines.append(line)
+            if line.device_ms - lines[0].device_ms >= self._seconds * 1000.0:
+                break
+        self._lines = iter(lines)
 
     def follow(self, cues: Cues | None = None) -> None:
         """From now on the person only does what ``cues`` or `perform` say; call it before the first `read`."""
