@@ -161,11 +161,14 @@ def test_asked_to_end_while_recording(tmp_path: Path, pty_possible: None, name: 
     import pty
     import termios
 
+    def at_a_terminal() -> None:
+        fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)  # which nohup, around the tests, would have ignored
+
     master, slave = pty.openpty()  # of no size, as some are
     process = subprocess.Popen(
         [*COMMAND, str(tmp_path), "--device", "virtual://", "--speed", "5", "--subject", "S01", "--protocol", "quick"],
-        stdin=slave, stderr=slave, stdout=subprocess.DEVNULL, start_new_session=True,
-        preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
+        stdin=slave, stderr=slave, stdout=subprocess.DEVNULL, start_new_session=True, preexec_fn=at_a_terminal,
     )  # fmt: skip
     os.close(slave)
     shown, limit = b"", time.monotonic() + 60
