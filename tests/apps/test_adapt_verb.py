@@ -186,3 +186,17 @@ def test_an_export_says_that_it_is_adapted_and_not_to_whom(
     assert not [path for path in out.rglob("*") if path.is_file() and b"S99" in path.read_bytes()]
     ran = cli("adapt", out / "model.plush", "--undo", "--out", tmp_path / "back.plush")
     assert ran.status == 2 and "an export leaves that out" in ran.err
+
+
+def test_a_bundle_that_was_trained_anywhere_in_streams(
+    cli: Cli, bundle: Path, make_session: Make, tmp_path: Path
+) -> None:
+    """Its recordings are read whole, and what its stream holds between them is nobody's gesture."""
+    make_session(tmp_path / "R" / "S98", 105)
+    trained = Bundle.load(bundle)
+    anywhere = replace(trained, windowing=dict(trained.windowing) | {"context": "anywhere", "anywhere": {}})
+    anywhere.save(tmp_path / "any.plush")
+    ran = cli("adapt", tmp_path / "any.plush", tmp_path / "R" / "S98", "--force", "--out", tmp_path / "mine.plush")
+    assert ran.status in (0, 1), ran.err
+    same = cli("adapt", bundle, tmp_path / "R" / "S98", "--force", "--out", tmp_path / "other.plush")
+    assert ran.out.replace("mine", "other") == same.out

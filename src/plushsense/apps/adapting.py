@@ -36,7 +36,7 @@ from plushsense.live.personal import (
 )
 from plushsense.models.bundle import Bundle
 from plushsense.scoring.splits import parse_split, purge
-from plushsense.windows.cut import WindowSet, WindowSpec
+from plushsense.windows.cut import WindowSet, whole_gestures
 
 Given = Dataset | str | os.PathLike[str]
 
@@ -127,7 +127,7 @@ def adapt(
         _same_layout(given, dataset)
         _tell_of_training(given, person, warn)
         own, left_out = _only(dataset, person, given, warn)
-        windows = windows_for(own, given.arch, _windowing(given), given.gestures, warn)
+        windows = windows_for(own, given.arch, whole_gestures(given.windowing), given.gestures, warn)
         times = {r.id: r.epoch_ms for r in own.recordings}
     adapting, test = windows, None
     if use is not None:
@@ -208,11 +208,6 @@ def _only(dataset: Dataset, person: str, bundle: Bundle, warn: Warn) -> tuple[Da
             f"{', '.join(bundle.gestures.labels)}."
         )
     return Dataset(dataset.path, dataset.head, known, dataset.streams), left_out
-
-
-def _windowing(bundle: Bundle) -> WindowSpec:
-    known = {field.name for field in fields(WindowSpec)}
-    return WindowSpec(**{k: v for k, v in bundle.windowing.items() if k in known})
 
 
 def _first(windows: WindowSet, times: dict[str, int], use: int) -> NDArray[np.bool_]:

@@ -28,7 +28,7 @@ from plushsense.live.tuning import OTHER, Costs, Heard, Truth, tune
 from plushsense.models.bundle import Bundle
 from plushsense.models.events import ONE
 from plushsense.models.fixed import Ints, smoothing_weight, softmax
-from plushsense.windows.cut import WindowSpec, cut_windows
+from plushsense.windows.cut import cut_windows, whole_gestures
 
 COVERAGE = 0.9
 KNOWN_SHARE = 0.95
@@ -261,8 +261,7 @@ def labelled_windows(bundle: Bundle, dataset: Dataset, subjects: Iterable[str]) 
     """The windows of some people's recordings; for data without streams."""
     people = set(subjects)
     mine = [r for r in dataset.recordings if r.subject in people]
-    known = {field.name for field in fields(WindowSpec)}
-    spec = WindowSpec(**{k: v for k, v in bundle.windowing.items() if k in known})
+    spec = whole_gestures(bundle.windowing)
     span_s = bundle.arch.span / bundle.layout.rate_hz
     spec = replace(spec, span_s=span_s if span_s > spec.window_s else 0.0)
     try:

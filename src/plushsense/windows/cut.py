@@ -15,8 +15,9 @@ it is left out, and named.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,6 +60,15 @@ class WindowSpec:
             raise ConfigError(
                 f"A window of {self.window_s} s every {self.step_s} s is out of range: above 0, at most 60 s."
             )
+
+
+def whole_gestures(windowing: Mapping[str, Any]) -> WindowSpec:
+    """How a bundle's windows were cut (its ``windowing``); where it was trained anywhere, or on arrays, whole
+    gestures with their real past."""
+    given = {field.name: windowing[field.name] for field in fields(WindowSpec) if field.name in windowing}
+    if given.get("context") not in CONTEXTS:
+        given["context"] = "stream"
+    return WindowSpec(**given)
 
 
 @dataclass(frozen=True)
