@@ -176,7 +176,9 @@ def recorded_people(dataset: Dataset, asked: Sequence[str] | None, provenance: M
                 f"{nearest(code, dataset.subjects)}"
             )
         if code in met:
-            raise ConfigError(f"'{code}' is among the people that this network was trained on or chosen by: leave out.")
+            raise ConfigError(
+                f"'{code}' is among the people that this network was trained on or chosen by: leave that person out."
+            )
     return list(dict.fromkeys(asked))
 
 
