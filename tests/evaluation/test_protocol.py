@@ -11,8 +11,9 @@ from plushsense.core.gestures import load_gestures
 from plushsense.core.recfile import Frames
 from plushsense.core.signal import load_layout
 from plushsense.devices.base import Frame
-from plushsense.evaluation.protocol import Heard, aims, confusions, group_of, hear, run, score, summary, windows_of
+from plushsense.evaluation.protocol import aims, confusions, run, summary
 from plushsense.evaluation.sittings import Sitting, Trial, virtual_sittings
+from plushsense.evaluation.trials import Heard, group_of, hear, score, windows_of
 from plushsense.live.decide import DecideSpec
 from plushsense.live.stream import Event, StreamClassifier
 from plushsense.models.arch import Arch

@@ -7,7 +7,7 @@ import re
 import pytest
 
 from plushsense.core.gestures import load_gestures
-from plushsense.evaluation.protocol import SYSTEMS
+from plushsense.evaluation.trials import SYSTEMS
 from plushsense.reports import protocol as report
 from plushsense.reports.protocol_paper import PAPER
 
@@ -97,7 +97,7 @@ def test_aims_say_met_or_not():
 
 
 def test_the_papers_cells_are_of_systems_and_groups_that_there_are():
-    from plushsense.evaluation.protocol import GROUPS, group_of
+    from plushsense.evaluation.trials import GROUPS, group_of
 
     ours = {group_of(g) for g in load_gestures("plush-18").gestures}
     assert {group for group, _ in PAPER} <= ours <= set(GROUPS)

@@ -12,7 +12,7 @@ from plushsense.core.recfile import Frames
 from plushsense.core.signal import Layout
 from plushsense.dataset.importers import import_recordings
 from plushsense.dataset.store import Dataset
-from plushsense.evaluation.protocol import Heuristic
+from plushsense.evaluation.trials import Heuristic
 from plushsense.live.heuristic import HeuristicPlan, fit_heuristic, heuristic_updates
 from plushsense.live.stream import Event
 from plushsense.recording.simulate import simulate
