@@ -27,7 +27,7 @@ $(VENV)/.train: $(VENV)/.python pyproject.toml constraints.txt
 	@touch $@
 
 $(VENV)/.dev: $(VENV)/.train
-	$(PIP) -e '.[train,baselines,ble,cluster,lsl,mlflow,onnx,publish,tables,tflite,dev]'
+	$(PIP) -e '.[train,baselines,ble,cluster,lsl,mlflow,onnx,publish,studio,tables,tflite,dev]'
 	@touch $@
 
 # The registry's plain `torch` brings gigabytes of CUDA; an exact version takes a CPU build where one is at hand.

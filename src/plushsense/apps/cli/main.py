@@ -46,6 +46,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "live": ("live", "read a toy and say what it feels, 20 times a second"),
     "adapt": ("adapt", "adapt a bundle to one person from a minute of their gestures, where that helps; undo"),
     "protocol": ("protocol", "the paper's real-time protocol: who answers which touch, and how soon"),
+    "studio": ("studio", "the whole work in a browser, on this machine alone"),
     "toy": ("toy", "a virtual toy that speaks the wire format over a pty or TCP"),
     "simulate": ("simulate", "recordings of virtual people, as the authors' recorder would leave them"),
 }
@@ -66,6 +67,7 @@ STOPPED = {
     "backup": "no backup was written",
     "restore": "nothing was written",
     "forget": "the same command finishes what was begun",
+    "studio": "everything is kept, and the same command goes on from there",
     "publish": "there is no zip; a folder that was written whole can be proved with  plushsense publish --check OUT",
     "train": "no bundle was written",
     "adapt": "no bundle was written; of --evaluate, trained networks are kept",

@@ -1,0 +1,145 @@
+"""Who may talk to the studio: this machine, or whoever shows the one-time token; and pages may load nothing foreign."""
+
+from __future__ import annotations
+
+import hmac
+import ipaddress
+import secrets
+from collections.abc import Awaitable, Callable, Iterable
+from http.cookies import CookieError, SimpleCookie
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+Scope = dict[str, Any]
+Receive = Callable[[], Awaitable[dict[str, Any]]]
+Send = Callable[[dict[str, Any]], Awaitable[None]]
+App = Callable[[Scope, Receive, Send], Awaitable[None]]
+
+COOKIE = "plushsense_visitor"
+TOKEN = "token"
+_LOOPBACK = ("127.0.0.1", "localhost", "[::1]", "::1")
+
+# NiceGUI's Vue templates are compiled in the browser, which needs eval; nothing may come from elsewhere.
+CONTENT_POLICY = (
+    "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; style-src 'self' 'unsafe-inline'; "
+    "img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self'; object-src 'none'; base-uri 'self'; "
+    "form-action 'self'; frame-ancestors 'none'"
+)
+_HEADERS = [
+    (b"content-security-policy", CONTENT_POLICY.encode()),
+    (b"x-content-type-options", b"nosniff"),
+    (b"referrer-policy", b"no-referrer"),
+    (b"permissions-policy", b"camera=(), microphone=(), geolocation=()"),
+]
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address is this machine's own."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+class Visitors:
+    """Who may come in: everybody on this machine when the studio listens there alone, else who showed a token.
+
+    Args:
+        host: the address that the studio listens on.
+        names: more names under which it may be called, such as the machine's.
+
+    A token opens the studio once: whoever shows it gets a cookie, and the token is worth nothing any more.
+    """
+
+    def __init__(self, host: str, names: Iterable[str] = ()) -> None:
+        self.open = is_loopback(host)
+        self._names = {n.lower() for n in (*_LOOPBACK, host, *names)}
+        self._tokens: set[str] = set()
+        self._known: set[str] = set()
+
+    def invite(self) -> str:
+        """A new token, good for one visitor."""
+        token = secrets.token_urlsafe(24)
+        self._tokens.add(token)
+        return token
+
+    def strange(self, headers: dict[str, str]) -> str:
+        """Why a request is none of ours; "" for one that is. A foreign page must not reach us under another name."""
+        host = urlsplit(f"//{headers.get('host', '')}").hostname or ""
+        if host.lower() not in self._names and f"[{host.lower()}]" not in self._names:
+            return f"This studio is not called '{host}': use the address that it printed."
+        origin = headers.get("origin")
+        if origin and urlsplit(origin).netloc.lower() != headers.get("host", "").lower():
+            return "Another page asked for this: open the studio by its own address."
+        return ""
+
+    def knows(self, headers: dict[str, str]) -> bool:
+        """Whether the request may pass."""
+        if self.open:
+            return True
+        try:
+            cookie = SimpleCookie(headers.get("cookie", "")).get(COOKIE)
+        except CookieError:
+            return False
+        return cookie is not None and any(hmac.compare_digest(cookie.value.encode(), v.encode()) for v in self._known)
+
+    def admit(self, query: str) -> str:
+        """A cookie's value for whoever shows a token, which is used up; "" for anybody else."""
+        given = parse_qs(query).get(TOKEN, [""])[0].encode()
+        token = next((t for t in self._tokens if hmac.compare_digest(t.encode(), given)), None)
+        if token is None:
+            return ""
+        self._tokens.discard(token)
+        visitor = secrets.token_urlsafe(24)
+        self._known.add(visitor)
+        return visitor
+
+
+class Guard:
+    """ASGI middleware: lets in whom `Visitors` knows, and forbids pages to load anything foreign."""
+
+    def __init__(self, app: App, visitors: Visitors) -> None:
+        self._app, self._visitors = app, visitors
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        headers = {k.decode("latin-1").lower(): v.decode("latin-1") for k, v in scope["headers"]}
+        if strange := self._visitors.strange(headers):
+            await _refuse(scope, send, 400, strange)
+        elif self._visitors.knows(headers):
+            await self._app(scope, receive, _with_headers(send))
+        elif scope["type"] == "http" and (
+            visitor := self._visitors.admit(scope.get("query_string", b"").decode("latin-1"))
+        ):
+            await _to_start(send, visitor)
+        else:
+            said = "This studio needs the address with the token that it printed when it was started."
+            await _refuse(scope, send, 401, said)
+
+
+def _with_headers(send: Send) -> Send:
+    async def sending(message: dict[str, Any]) -> None:
+        if message["type"] == "http.response.start":
+            message = {**message, "headers": [*message.get("headers", []), *_HEADERS]}
+        await send(message)
+
+    return sending
+
+
+async def _to_start(send: Send, visitor: str) -> None:
+    """To the first page, without the token in the address."""
+    cookie = f"{COOKIE}={visitor}; Path=/; HttpOnly; SameSite=Strict"
+    headers = [(b"location", b"/"), (b"set-cookie", cookie.encode()), *_HEADERS]
+    await send({"type": "http.response.start", "status": 303, "headers": headers})
+    await send({"type": "http.response.body", "body": b""})
+
+
+async def _refuse(scope: Scope, send: Send, status: int, said: str) -> None:
+    if scope["type"] == "websocket":
+        await send({"type": "websocket.close", "code": 1008, "reason": said[:100]})
+        return
+    headers = [(b"content-type", b"text/plain; charset=utf-8"), *_HEADERS]
+    await send({"type": "http.response.start", "status": status, "headers": headers})
+    await send({"type": "http.response.body", "body": f"{said}\n".encode()})

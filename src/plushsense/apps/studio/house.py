@@ -1,0 +1,187 @@
+"""What a running studio knows: the folders it was given, its toys, and one of each part that pages share."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+from plushsense.core.errors import ConfigError
+from plushsense.dataset.store import DatasetHead
+from plushsense.recording.sessionfile import SESSION_HEAD
+
+RECORDINGS, DATASETS, BUNDLES, EXPORTS, PACKAGES = "recordings", "datasets", "bundles", "exports", "packages"
+VIRTUAL = "virtual://?person=7"
+_HEAD = "dataset.toml"
+_BUNDLE = "*.plush"
+
+T = TypeVar("T")
+
+
+@dataclass
+class House:
+    """One studio. Pages may read and write inside ``folder`` and the data sets given at start, nowhere else.
+
+    Attributes:
+        folder: holds `RECORDINGS`, `DATASETS`, `BUNDLES`, `EXPORTS`, `PACKAGES`, each made when it is needed.
+        given: data sets named at start, wherever they lie.
+        devices: toys named at start; the first is chosen.
+        models: bundles named at start.
+        toy: the URL of the toy that is chosen on the home page.
+        speed: times real time at which a virtual toy runs.
+        invite: gives an address with a new token for one more visitor; None where everybody may come.
+    """
+
+    folder: Path
+    given: tuple[Path, ...] = ()
+    devices: tuple[str, ...] = ()
+    models: tuple[Path, ...] = ()
+    toy: str = ""
+    speed: float = 1.0
+    invite: Callable[[], str] | None = None
+    _parts: dict[type, Any] = field(default_factory=dict, repr=False)
+    _lock: Any = field(default_factory=threading.RLock, repr=False)
+
+    def __post_init__(self) -> None:
+        self.folder = self.folder.resolve()
+        self.given = tuple(p.resolve() for p in self.given)
+        self.models = tuple(p.resolve() for p in self.models)
+        self.toy = self.toy or (self.devices[0] if self.devices else "")
+
+    def part(self, kind: Callable[[House], T]) -> T:
+        """The one object of this class that all pages share, made on first use as ``kind(house)``.
+
+        One that has a ``close`` is closed when the studio ends.
+        """
+        with self._lock:
+            if kind not in self._parts:
+                self._parts[kind] = kind(self)  # type: ignore[index]
+            found: T = self._parts[kind]  # type: ignore[index]
+            return found
+
+    def close(self) -> None:
+        """Close all parts, the last made first."""
+        with self._lock:
+            parts, self._parts = list(self._parts.values()), {}
+        for part in reversed(parts):
+            if hasattr(part, "close"):
+                part.close()
+
+    # What is there --------------------------------------------------------------------------------------------
+
+    @property
+    def recordings(self) -> Path:
+        """Where sessions are recorded: ``recordings/<subject>/<session>/``."""
+        return self.folder / RECORDINGS
+
+    def datasets(self) -> list[Path]:
+        """All data sets: those given at start, then those in the folder by name."""
+        found = [p for p in self.given if (p / _HEAD).is_file()]
+        below = sorted(p.parent for p in (self.folder / DATASETS).glob(f"*/{_HEAD}"))
+        return [*found, *(p for p in below if p.resolve() not in self.given)]
+
+    def bundles(self) -> list[Path]:
+        """All bundles: those given at start, those in the folder, and those beside a data set; the newest first."""
+        places = [self.folder / BUNDLES, *self.datasets()]
+        found = {p.resolve(): p for p in self.models if p.is_file()}
+        found |= {p.resolve(): p for place in places for p in place.glob(_BUNDLE)}
+        return sorted(found.values(), key=lambda p: -p.stat().st_mtime)
+
+    def sessions(self) -> list[Path]:
+        """Every session's folder in `recordings`, by person and name."""
+        return sorted(p.parent for p in self.recordings.glob(f"*/*/{SESSION_HEAD}"))
+
+    def roots(self) -> Iterator[Path]:
+        """The folders that pages may touch."""
+        yield self.folder
+        yield from self.given
+
+    def inside(self, path: str | os.PathLike[str]) -> Path:
+        """``path`` (absolute, or within ``folder``), where pages may touch it: for every name that a browser sends.
+
+        Raises:
+            ConfigError: for a path outside, also by way of ``..`` or a link.
+        """
+        real = (self.folder / path).resolve()
+        if real in self.models or any(real == root or root in real.parents for root in self.roots()):
+            return real
+        raise ConfigError(
+            f"'{path}' lies outside the studio's folders: choose something in '{self.folder}', or start the studio "
+            "with --dataset or --home for the other one."
+        )
+
+    def new(self, kind: str, name: str) -> Path:
+        """The place for something new of this name in ``folder / kind``; nothing is made yet.
+
+        Raises:
+            ConfigError: for a name that is no plain file name, and one that is taken.
+        """
+        plain = name.strip()
+        if not plain or len(plain) > 64 or plain.startswith(".") or not all(c.isalnum() or c in " ._-" for c in plain):
+            raise ConfigError(
+                f"'{name}' cannot be a name: give at most 64 letters, digits, spaces, points and hyphens."
+            )
+        place = self.inside(Path(kind) / plain)
+        if place.exists():
+            raise ConfigError(
+                f"'{plain}' is there already in '{place.parent}': give another name, nothing is replaced."
+            )
+        return place
+
+    def title(self, dataset: Path) -> str:
+        """A data set's name, with a word where it is a simulation; its folder's name where it cannot be read."""
+        try:
+            return DatasetHead.read(dataset).name
+        except Exception:  # noqa: BLE001 (a page that lists data sets must list the broken one, too)
+            return dataset.name
+
+
+class Bell:
+    """Something changed: rung from any thread, heard by open pages on their own loop, many rings as one."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._hearers: dict[object, Callable[[], None]] = {}
+
+    def ring(self) -> None:
+        """Tell everybody; never blocks."""
+        with self._lock:
+            hearers = list(self._hearers.values())
+        for hearer in hearers:
+            hearer()
+
+    def hear(self, callback: Callable[[], Any], loop: asyncio.AbstractEventLoop | None = None) -> Callable[[], None]:
+        """Call ``callback`` on this loop after rings, once for all that came before it ran; returns what ends it.
+
+        Pages use `plushsense.apps.studio.shell.on_ring`, which ends it with the page.
+        """
+        loop = loop or asyncio.get_running_loop()
+        key, waiting = object(), threading.Event()
+
+        def call() -> None:
+            waiting.clear()
+            if key in self._hearers:
+                callback()
+
+        def rung() -> None:
+            if waiting.is_set():
+                return
+            waiting.set()
+            try:
+                loop.call_soon_threadsafe(call)
+            except RuntimeError:
+                # The loop is closed: the studio is ending.
+                self._hearers.pop(key, None)
+
+        with self._lock:
+            self._hearers[key] = rung
+
+        def end() -> None:
+            with self._lock:
+                self._hearers.pop(key, None)
+
+        return end

@@ -1,0 +1,198 @@
+"""Long work in processes of its own: begun, watched, stopped and taken up again, whatever page is open."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from plushsense.apps.studio.house import Bell, House
+from plushsense.core.errors import ConfigError
+from plushsense.dataset.store import write_atomically
+
+FOLDER = "work"
+RUNNING, DONE, REFUSED, STOPPED = "running", "done", "refused", "stopped"
+_KEPT = 2000
+_STOP_S = 10.0
+
+
+@dataclass
+class Job:
+    """One piece of work.
+
+    Attributes:
+        id: unique, in the order of beginning. ``task``: a key of `plushsense.apps.studio.worker.TASKS`.
+        spec: what the task is given, plain values. ``title``: for people.
+        state: `RUNNING`, `DONE`, `REFUSED` (``said`` is the sentence), or `STOPPED` (by a person, or with the studio).
+        progress: the newest report of the task; ``reports``: all of them, up to some thousands. Plain values.
+        warnings: sentences. ``result``: what the task returned.
+        begun_s, ended_s: seconds since 1970.
+    """
+
+    id: str
+    task: str
+    spec: dict[str, Any]
+    title: str
+    state: str = RUNNING
+    progress: dict[str, Any] = field(default_factory=dict)
+    reports: list[dict[str, Any]] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    result: dict[str, Any] = field(default_factory=dict)
+    said: str = ""
+    begun_s: float = 0.0
+    ended_s: float = 0.0
+
+
+class Jobs:
+    """All work of a studio, kept in ``<house>/work/<id>.json``. `bell` rings at every report."""
+
+    def __init__(self, house: House) -> None:
+        self.bell = Bell()
+        self._folder = house.folder / FOLDER
+        self._processes: dict[str, subprocess.Popen[str]] = {}
+        self._lock = threading.RLock()
+        self._jobs: dict[str, Job] = {}
+        for path in sorted(self._folder.glob("*.json")):
+            with contextlib.suppress(OSError, ValueError, TypeError):
+                job = Job(**json.loads(path.read_text(encoding="utf-8")))
+                # What was running ended with the studio that ran it.
+                job.state = STOPPED if job.state == RUNNING else job.state
+                self._jobs[job.id] = job
+
+    def all(self, *tasks: str) -> list[Job]:
+        """The newest first; of these tasks, or of all."""
+        with self._lock:
+            return [job for job in reversed(self._jobs.values()) if not tasks or job.task in tasks]
+
+    def get(self, identity: str) -> Job:
+        """One job.
+
+        Raises:
+            ConfigError: for an id that is none.
+        """
+        try:
+            return self._jobs[identity]
+        except KeyError:
+            raise ConfigError(f"There is no work '{identity}': it may have been removed.") from None
+
+    def start(self, task: str, spec: dict[str, Any], title: str) -> Job:
+        """Begin work in a process of its own."""
+        with self._lock:
+            identity = f"{time.time_ns() // 1_000_000:d}"
+            while identity in self._jobs:
+                identity = str(int(identity) + 1)
+            job = Job(identity, task, spec, title)
+            self._jobs[identity] = job
+        self._run(job)
+        return job
+
+    def resume(self, identity: str) -> Job:
+        """Begin a stopped job again with the same settings; the task itself goes on from what it kept."""
+        job = self.get(identity)
+        if job.state == RUNNING:
+            return job
+        job.state, job.said, job.result, job.reports, job.warnings = RUNNING, "", {}, [], []
+        self._run(job)
+        return job
+
+    def stop(self, identity: str) -> None:
+        """Have a job end as Ctrl-C would; harmless for one that has ended. Does not wait."""
+        process = self._processes.get(identity)
+        if process is None or process.poll() is not None:
+            return
+        threading.Thread(target=_end, args=(process,), daemon=True).start()
+
+    def close(self) -> None:
+        """Stop all."""
+        processes = [p for p in self._processes.values() if p.poll() is None]
+        for process in processes:
+            threading.Thread(target=_end, args=(process,), daemon=True).start()
+        for process in processes:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(_STOP_S)
+
+    def _run(self, job: Job) -> None:
+        job.begun_s, job.ended_s, job.progress = time.time(), 0.0, {}
+        new_group = (
+            {"creationflags": getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)}
+            if sys.platform == "win32"
+            else {"start_new_session": True}
+        )
+        process = subprocess.Popen(
+            [sys.executable, "-m", "plushsense.apps.studio.worker"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+            encoding="utf-8",
+            **new_group,
+        )
+        self._processes[job.id] = process
+        self._keep(job)
+        assert process.stdin is not None
+        with contextlib.suppress(OSError):
+            # Its standard input stays open: the worker ends when the studio is gone.
+            process.stdin.write(json.dumps({"task": job.task, "spec": job.spec}) + "\n")
+            process.stdin.flush()
+        threading.Thread(target=self._follow, args=(job, process), daemon=True).start()
+
+    def _follow(self, job: Job, process: subprocess.Popen[str]) -> None:
+        assert process.stdout is not None
+        outcome: dict[str, Any] = {}
+        for line in process.stdout:
+            try:
+                message = json.loads(line)
+            except ValueError:
+                continue
+            if "progress" in message:
+                job.progress = message["progress"]
+                if len(job.reports) >= _KEPT:
+                    del job.reports[::2]
+                job.reports.append(job.progress)
+            elif "warning" in message:
+                job.warnings.append(str(message["warning"]))
+            else:
+                outcome = message
+            self.bell.ring()
+        process.wait()
+        job.ended_s = time.time()
+        if "result" in outcome:
+            job.state, job.result = DONE, outcome["result"]
+        elif "refused" in outcome:
+            job.state, job.said = REFUSED, str(outcome["refused"])
+        else:
+            job.state = STOPPED
+        with contextlib.suppress(OSError):
+            self._keep(job)
+        self.bell.ring()
+
+    def _keep(self, job: Job) -> None:
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            write_atomically(self._folder / f"{job.id}.json", json.dumps(asdict(job)))
+        except OSError as cause:
+            process = self._processes.pop(job.id, None)
+            if process is not None and process.poll() is None:
+                process.kill()
+            job.state, job.said = REFUSED, f"'{self._folder}' cannot be written to: {cause.strerror or cause}."
+            self.bell.ring()
+
+
+def _end(process: subprocess.Popen[str]) -> None:
+    """As Ctrl-C; then less kindly."""
+    for polite in (True, False):
+        with contextlib.suppress(OSError, ValueError):
+            if sys.platform == "win32":
+                process.terminate()
+            else:
+                os.killpg(process.pid, signal.SIGINT if polite else signal.SIGKILL)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(_STOP_S / 2)
+            return

@@ -1,0 +1,1 @@
+"""One module a page: ``show(house)`` builds it. `plushsense.apps.studio.serve.PAGES` is their table."""

@@ -1,0 +1,150 @@
+// A uPlot in a Vue component. Fixed data come by `show`, live samples by `push`; clicks go out as `pick`.
+import { loadResource } from "../../static/utils/resources.js";
+
+const colour = (name) => getComputedStyle(document.body).getPropertyValue(name).trim() || "#555";
+
+export default {
+  template: '<div role="img" :aria-label="label"><div ref="place"></div></div>',
+  props: {
+    label: String, series: Array, xTitle: String, yTitle: String, height: Number, windowS: Number,
+    rangeY: Array, legend: Boolean, pickable: Boolean, start: Object, resourcePath: String,
+  },
+  async mounted() {
+    await this.$nextTick();
+    const at = window.path_prefix + this.resourcePath;
+    await Promise.all([loadResource(`${at}/uPlot.min.css`), loadResource(`${at}/uPlot.iife.min.js`)]);
+    this.curves = this.series;
+    this.kept = this.start ? this.start.data : [[], ...this.series.map(() => [])];
+    this.marks = this.start ? this.start.marks : [];
+    this.build();
+    this.resizer = new ResizeObserver(() => {
+      const width = this.$el.clientWidth;
+      if (this.u && width && width !== this.u.width) this.u.setSize({ width, height: this.height });
+    });
+    this.resizer.observe(this.$el);
+    this.lights = new MutationObserver(() => this.build());
+    this.lights.observe(document.body, { attributes: true, attributeFilter: ["class"] });
+    for (const late of this.late || []) late();
+    this.late = null;
+  },
+  beforeUnmount() {
+    this.resizer?.disconnect();
+    this.lights?.disconnect();
+    this.u?.destroy();
+    this.u = null;
+  },
+  methods: {
+    build() {
+      const off = this.u ? this.u.series.map((s) => s.show) : null;
+      this.u?.destroy();
+      const ink = colour("--ps-ink"), grid = { stroke: colour("--ps-line"), width: 1 };
+      const axis = (title, size) => ({ stroke: ink, grid, ticks: grid, label: title || undefined, labelSize: 22, size });
+      const options = {
+        width: this.$el.clientWidth || 600,
+        height: this.height,
+        legend: { show: this.legend, live: false },
+        cursor: { drag: { x: false, y: false } },
+        scales: { x: { time: false }, y: this.rangeY ? { range: this.rangeY } : {} },
+        axes: [axis(this.xTitle, 44), axis(this.yTitle, 64)],
+        series: [{ label: this.xTitle || "x" },
+          ...this.curves.map((s, i) => ({ width: 1.5, points: { show: false }, ...s,
+            points: { show: s.points === true }, ...(off && off[i + 1] === false ? { show: false } : {}) }))],
+        hooks: { draw: [(u) => this.drawMarks(u)] },
+      };
+      this.u = new uPlot(options, this.kept, this.$refs.place);
+      if (this.pickable) {
+        const over = this.u.over;
+        over.style.cursor = "crosshair";
+        const pick = (event, button) => {
+          event.preventDefault();
+          const x = this.u.posToVal(event.clientX - over.getBoundingClientRect().left, "x");
+          this.$emit("pick", { x, button, shift: event.shiftKey });
+        };
+        over.addEventListener("click", (event) => pick(event, "left"));
+        over.addEventListener("contextmenu", (event) => pick(event, "right"));
+      }
+    },
+    drawMarks(u) {
+      const { ctx } = u, { left, top, width, height } = u.bbox;
+      ctx.save();
+      ctx.beginPath();
+      ctx.rect(left, top, width, height);
+      ctx.clip();
+      for (const m of this.marks) {
+        const x = u.valToPos(m.x, "x", true);
+        if (m.to !== undefined && m.to !== null) {
+          ctx.globalAlpha = 0.15;
+          ctx.fillStyle = m.stroke;
+          ctx.fillRect(x, top, u.valToPos(m.to, "x", true) - x, height);
+          ctx.globalAlpha = 1;
+        }
+        ctx.strokeStyle = ctx.fillStyle = m.stroke || "#D55E00";
+        ctx.lineWidth = 2 * devicePixelRatio;
+        ctx.setLineDash((m.dash || []).map((v) => v * devicePixelRatio));
+        ctx.beginPath();
+        ctx.moveTo(x, top);
+        ctx.lineTo(x, top + height);
+        ctx.stroke();
+        if (m.label) {
+          ctx.font = `${13 * devicePixelRatio}px sans-serif`;
+          const wide = ctx.measureText(m.label).width, pad = 4 * devicePixelRatio;
+          ctx.fillText(m.label, x + pad + wide > left + width ? x - pad - wide : x + pad, top + 14 * devicePixelRatio);
+        }
+      }
+      ctx.restore();
+    },
+    ready(call) {
+      // A call may come before the library is loaded.
+      if (this.u) return true;
+      (this.late = this.late || []).push(call);
+      return false;
+    },
+    show(data, marks, series) {
+      if (!this.ready(() => this.show(data, marks, series))) return;
+      this.kept = data;
+      if (marks) this.marks = marks;
+      if (series) {
+        this.curves = series;
+        this.build();
+      } else {
+        this.u.setData(data);
+      }
+    },
+    setMarks(marks) {
+      if (!this.ready(() => this.setMarks(marks))) return;
+      this.marks = marks;
+      this.u.redraw(false);
+    },
+    push(x, curves) {
+      if (!this.ready(() => this.push(x, curves))) return;
+      const all = [x, ...curves];
+      for (let i = 0; i < all.length; i++) for (const v of all[i]) this.kept[i].push(v);
+      const xs = this.kept[0], from = xs[xs.length - 1] - this.windowS;
+      if (this.windowS > 0) {
+        let cut = 0;
+        while (cut < xs.length && xs[cut] < from) cut++;
+        if (cut > 0) for (const column of this.kept) column.splice(0, cut);
+      }
+      this.pushed = (this.pushed || 0) + 1;
+      this.u.setData(this.kept, false);
+      const low = this.windowS > 0 ? from : xs[0];
+      this.u.batch(() => {
+        this.u.setScale("x", { min: low, max: xs[xs.length - 1] });
+        if (!this.rangeY) this.scaleY();
+      });
+    },
+    scaleY() {
+      let low = Infinity, high = -Infinity;
+      for (let i = 1; i < this.kept.length; i++) {
+        if (this.u.series[i].show === false) continue;
+        for (const v of this.kept[i]) {
+          if (v < low) low = v;
+          if (v > high) high = v;
+        }
+      }
+      if (low > high) return;
+      const pad = 0.05 * (high - low || 1);
+      this.u.setScale("y", { min: low - pad, max: high + pad });
+    },
+  },
+};

@@ -1,0 +1,96 @@
+"""A real studio in a process of its own, and a real Chromium that looks at it."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import os
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from browsing import CHROMIUM, DESK, Look, Studio, is_own
+from conftest import missing
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page
+
+
+@pytest.fixture
+def studio(tmp_path: Path) -> Iterator[Callable[..., Studio]]:
+    """``studio("--device", URL, home=...)`` starts one; all are stopped at the end, and none may have failed inside."""
+    begun: list[Studio] = []
+
+    def start(*options: str, home: Path | None = None) -> Studio:
+        begun.append(Studio(home or tmp_path / "home", options).start())
+        return begun[-1]
+
+    yield start
+    for each in begun:
+        each.stop()
+    assert not [line for each in begun for line in each.errors if "Traceback" in line], "".join(
+        line for each in begun for line in each.errors
+    )
+
+
+@pytest.fixture(scope="session")
+def chromium() -> Iterator[Browser]:
+    """Debian's Chromium, headless, driven by Playwright."""
+    found = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if found is None:
+        missing("browser", "chromium is not installed")
+    if importlib.util.find_spec("playwright") is None or importlib.util.find_spec("nicegui") is None:
+        missing("browser", "playwright or nicegui is not installed")
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=found, headless=True, args=CHROMIUM)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def look(chromium: Browser) -> Iterator[Callable[..., Look]]:
+    """``look(size, dark, language)`` gives a browser; at the end none may have asked for anything foreign."""
+    made: list[Look] = []
+
+    def new(size: tuple[int, int] = DESK, dark: bool = False, language: str = "en", touch: bool = False) -> Look:
+        context = chromium.new_context(
+            viewport={"width": size[0], "height": size[1]},
+            color_scheme="dark" if dark else "light",
+            locale=language,
+            has_touch=touch,
+            reduced_motion="reduce",
+        )
+        one = Look(context)
+        context.on("request", lambda r: one.asked.append(r.url))
+        made.append(one)
+        return one
+
+    yield new
+    for one in made:
+        one.context.close()
+        foreign = [u for u in one.asked if not is_own(u)]
+        assert foreign == [], f"the page asked for something foreign: {foreign}"
+
+
+@pytest.fixture
+def shots(request: pytest.FixtureRequest) -> Callable[[Page, str], Path]:
+    """Takes a screenshot of the whole page; they lie in ``PLUSHSENSE_SHOTS`` where that is set, for looking at."""
+    folder = Path(os.environ.get("PLUSHSENSE_SHOTS") or request.getfixturevalue("tmp_path"))
+
+    def take(page: Page, name: str) -> Path:
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / f"{name}.png"
+        with contextlib.suppress(Exception):
+            page.wait_for_load_state("networkidle", timeout=2000)
+        page.screenshot(path=str(path), full_page=True)
+        return path
+
+    return take

@@ -1,0 +1,48 @@
+"""The languages say the same things."""
+
+from __future__ import annotations
+
+import string
+import tomllib
+from importlib import resources
+from typing import Any
+
+import pytest
+
+from plushsense.apps.studio.words import LANGUAGES, Words
+from plushsense.core.gestures import load_gestures
+
+
+def texts(language: str) -> dict[str, Any]:
+    file = resources.files("plushsense.apps.studio").joinpath(f"words/{language}.toml")
+    return tomllib.loads(file.read_text(encoding="utf-8"))
+
+
+def fields(text: str) -> set[str]:
+    return {name for _, name, _, _ in string.Formatter().parse(text) if name}
+
+
+@pytest.mark.parametrize("language", [code for code in LANGUAGES if code != "en"])
+def test_every_key_is_there_with_the_same_fields(language: str) -> None:
+    english, other = texts("en"), texts(language)
+    assert set(english) == set(other)
+    for table in set(english) - {"gestures"}:
+        assert set(english[table]) == set(other[table]), table
+        for key, text in english[table].items():
+            assert other[table][key].strip(), f"{table}.{key} is empty"
+            assert fields(other[table][key]) == fields(text), f"{table}.{key}"
+
+
+@pytest.mark.parametrize("language", [code for code in LANGUAGES if code != "en"])
+def test_every_gesture_of_the_toy_has_a_name(language: str) -> None:
+    assert set(texts(language)["gestures"]) >= set(load_gestures("plush-18").labels)
+
+
+def test_a_gesture_without_a_name_reads_as_its_label() -> None:
+    assert Words("lv").gesture("Custom") == "Custom"
+    assert Words("en").gesture("Tail pull") == "Tail pull"
+
+
+def test_values_are_filled_in() -> None:
+    said = Words("en")("shell.system_refused", where=" 'x'", why="no room")
+    assert said == "The computer refused 'x': no room."
