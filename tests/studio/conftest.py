@@ -94,3 +94,23 @@ def shots(request: pytest.FixtureRequest) -> Callable[[Page, str], Path]:
         return path
 
     return take
+
+
+@pytest.fixture(scope="session")
+def furniture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A studio's folder with a data set of six virtual people and a little trained bundle; read only: take a `copy`."""
+    import plushsense as ps
+
+    home = tmp_path_factory.mktemp("furniture") / "home"
+    ps.simulate(home / "made", people=6, repetitions=1, dataset=home / "datasets" / "virtual")
+    shutil.rmtree(home / "made")
+    trained = ps.train(home / "datasets" / "virtual", preset="loso", epochs=12, context="anywhere")
+    (home / "bundles").mkdir()
+    trained.save(home / "bundles" / "little.plush")
+    return home
+
+
+@pytest.fixture
+def home(furniture: Path, tmp_path: Path) -> Path:
+    """A furnished folder of one's own."""
+    return Path(shutil.copytree(furniture, tmp_path / "home"))

@@ -54,3 +54,8 @@ def test_a_foreign_page_is_refused(header: str, studio: Fixture) -> None:
     with pytest.raises(urllib.error.HTTPError) as refused:
         urllib.request.urlopen(asked, timeout=20)
     assert refused.value.code == 400
+
+
+def test_a_furnished_home_opens(studio: Fixture, look: Fixture, home: Path) -> None:
+    page = look().open(studio(home=home).url)
+    assert marked(page, "title").inner_text() == "Home"

@@ -67,6 +67,8 @@ export default {
     drawMarks(u) {
       const { ctx } = u, { left, top, width, height } = u.bbox;
       ctx.save();
+      ctx.textAlign = "left";
+      ctx.textBaseline = "alphabetic";
       ctx.beginPath();
       ctx.rect(left, top, width, height);
       ctx.clip();
