@@ -78,6 +78,10 @@ class Run(Iterator[Decision]):
 
     A device that sends no frame for ``silence_s`` gives one decision of the state ``no signal``, and its event ends; so
     does an event that is going on when the device ends.
+
+    Attributes:
+        over: whether it came to its end.
+        latency_s: from the newest bytes that brought a decision to that decision; None before the first.
     """
 
     def __init__(
@@ -94,6 +98,7 @@ class Run(Iterator[Decision]):
         self._silent = False
         self._decisions = self._warming = self._late = self._events = self._no_signal = 0
         self._latencies: list[float] = []
+        self.latency_s: float | None = None
         self._due: deque[Decision] = deque()
         self.over = False
 
@@ -152,6 +157,7 @@ class Run(Iterator[Decision]):
         return decision
 
     def _note_latency(self, latency_s: float) -> None:
+        self.latency_s = latency_s
         self._late += latency_s > self.classifier.step_s
         if len(self._latencies) < _KEPT:
             self._latencies.append(latency_s)

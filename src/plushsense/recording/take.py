@@ -13,8 +13,9 @@ from plushsense.devices.base import Counters, Frame
 from plushsense.recording.protocol import Step
 from plushsense.recording.sessionfile import FORMAT_VERSION, SessionHead
 
-Ended = Literal["space", "auto", "longest", "toy"]
-"""What ended a recording: the space bar, the recorder's own press (--auto), the protocol's longest_s, the toy's end."""
+Ended = Literal["space", "auto", "longest", "toy", "cut"]
+"""What ended a recording: the space bar, the recorder's own press (--auto), the protocol's longest_s, the toy's end;
+or it was cut from a longer one afterwards."""
 
 
 @dataclass

@@ -12,11 +12,8 @@ from typing import TYPE_CHECKING
 from plushsense.apps.cli.output import say
 
 if TYPE_CHECKING:
-    from plushsense.live.decide import DecideSpec
-    from plushsense.live.integer import BothEngines
     from plushsense.live.react import Reaction
-    from plushsense.live.stream import Decision, Event, State, StreamReader
-    from plushsense.models.bundle import Bundle
+    from plushsense.live.stream import Decision, Event, State
 
 STATES = {
     "warming": "getting to know what goes on",
@@ -73,6 +70,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    from plushsense.apps.engines import classifier_of
     from plushsense.devices.opening import open_device
     from plushsense.live.decide import DecideSpec
     from plushsense.live.integer import BothEngines
@@ -113,18 +111,6 @@ def run(args: argparse.Namespace) -> int:
             both = {"agreement": classifier.agreement()} if isinstance(classifier, BothEngines) else {}
             say(json.dumps(live.summary().to_dict() | both))
     return 0
-
-
-def classifier_of(bundle: Bundle, decide: DecideSpec | None, engine: str) -> StreamReader | BothEngines:
-    """What reads the stream; ``engine`` is "float", "int8" or "both"."""
-    from plushsense.deploy.calibration import integer_model
-    from plushsense.live.integer import BothEngines, IntegerClassifier
-    from plushsense.live.stream import StreamClassifier
-
-    if engine == "float":
-        return StreamClassifier(bundle, decide)
-    integer = IntegerClassifier(integer_model(bundle, decide))
-    return integer if engine == "int8" else BothEngines(integer, StreamClassifier(bundle, decide))
 
 
 def told(decision: Decision, news: bool, reactions: Sequence[Reaction] = ()) -> list[str]:

@@ -1,0 +1,472 @@
+// Signals, bars, voices, eyes and time line of a live toy. `scene` says what there is, `update` what is new;
+// drawing waits for the next frame of the screen, so that it never falls behind.
+
+const el = (tag, cls, text) => {
+  const e = document.createElement(tag);
+  if (cls) e.className = cls;
+  if (text !== undefined) e.textContent = text;
+  return e;
+};
+const say = (node, text) => { if (node.textContent !== text) node.textContent = text; };
+const fill = (text, values) => text.replace(/\{(\w+)\}/g, (_, key) => values[key]);
+const LANE = 34, SPOKEN_MS = 2500, KEPT_DELAYS = 600;
+
+const EYES = {
+  // Round and lifted; narrowed under slanted brows; closed: told apart by shape as much as by colour.
+  green: `<g class="lv-eye-light"><circle cx="60" cy="58" r="26" fill="#0f7a4d"/><circle cx="140" cy="58" r="26" fill="#0f7a4d"/>
+    <circle cx="60" cy="58" r="16" fill="#5df2ae"/><circle cx="140" cy="58" r="16" fill="#5df2ae"/>
+    <circle cx="66" cy="51" r="5" fill="#fff"/><circle cx="146" cy="51" r="5" fill="#fff"/></g>
+    <path d="M38 24 Q60 10 82 24 M118 24 Q140 10 162 24" fill="none" stroke="#5b3b22" stroke-width="6" stroke-linecap="round"/>
+    <path d="M82 104 Q100 118 118 104" fill="none" stroke="#3a2413" stroke-width="5" stroke-linecap="round"/>`,
+  red: `<g class="lv-eye-light"><path d="M34 52 L86 66 A27 20 0 0 1 34 62 Z" fill="#8a1500"/><path d="M166 52 L114 66 A27 20 0 0 0 166 62 Z" fill="#8a1500"/>
+    <circle cx="60" cy="67" r="9" fill="#ff6a4d"/><circle cx="140" cy="67" r="9" fill="#ff6a4d"/></g>
+    <path d="M32 34 L88 54 M168 34 L112 54" fill="none" stroke="#5b3b22" stroke-width="8" stroke-linecap="round"/>
+    <path d="M82 112 Q100 98 118 112" fill="none" stroke="#3a2413" stroke-width="5" stroke-linecap="round"/>`,
+  off: `<path d="M34 60 Q60 72 86 60 M114 60 Q140 72 166 60" fill="none" stroke="#3a2413" stroke-width="6" stroke-linecap="round"/>
+    <path d="M86 108 L114 108" fill="none" stroke="#3a2413" stroke-width="5" stroke-linecap="round"/>`,
+};
+const face = (eyes) => `<svg viewBox="0 0 200 132" aria-hidden="true" focusable="false">
+  <ellipse cx="26" cy="16" rx="22" ry="16" fill="#9c6a3d"/><ellipse cx="174" cy="16" rx="22" ry="16" fill="#9c6a3d"/>
+  <rect x="10" y="6" width="180" height="122" rx="58" fill="#c08a55"/>${EYES[eyes] || EYES.off}
+  <ellipse cx="100" cy="88" rx="10" ry="7" fill="#3a2413"/></svg>`;
+
+const CSS = `
+.lv { display: grid; gap: 16px; grid-template-columns: minmax(0, 1.25fr) minmax(0, 1fr); width: 100%; }
+.lv > section { border: 1px solid var(--ps-line); border-radius: 10px; padding: 12px 14px; min-width: 0; }
+.lv h2 { margin-bottom: 8px; } .lv .lv-wide { grid-column: 1 / -1; }
+.lv canvas { display: block; width: 100%; }
+.lv-top { display: flex; gap: 16px; align-items: center; flex-wrap: wrap; }
+.lv-face { width: 170px; flex: none; } .lv-face svg { display: block; width: 100%; }
+.lv-event { font-size: 1.5rem; line-height: 2rem; font-weight: 600; overflow-wrap: anywhere; min-height: 2rem; }
+.lv-badge { display: inline-block; color: #fff; font-weight: 600; border-radius: 6px; padding: 1px 9px; }
+.lv-state { font-weight: 600; } .lv-state::before { content: ""; display: inline-block; width: .7em; height: .7em; margin-right: .5em;
+  border: 2px solid var(--ps-ink); border-radius: 50%; }
+.lv-state[data-state=tracking]::before { background: var(--ps-ink); }
+.lv-state[data-state="no signal"]::before, .lv-state[data-state="sensor fault"]::before { border-radius: 0; transform: rotate(45deg); }
+.lv-voices { display: grid; grid-template-columns: 1fr 1fr; gap: 10px; margin-top: 10px; }
+.lv-voices > div { border-top: 3px solid var(--ps-line); padding-top: 6px; min-width: 0; overflow-wrap: anywhere; }
+.lv-voices h3, .lv-group h3 { font-size: 1rem; line-height: 1.4rem; font-weight: 600; margin: 0; }
+.lv-group { margin-bottom: 8px; } .lv ul, .lv ol { list-style: none; margin: 0; padding: 0; }
+.lv-bar { display: grid; grid-template-columns: minmax(7em, 11em) 1fr 3.2em; gap: 8px; align-items: center; line-height: 1.35rem; }
+.lv-bar > i { display: block; height: 12px; background: var(--ps-soft); border-radius: 4px; overflow: hidden; border: 1px solid var(--ps-line); }
+.lv-bar > i > b { display: block; height: 100%; width: 100%; transform: scaleX(0); transform-origin: left; }
+.lv-bar > span:last-child { text-align: right; font-variant-numeric: tabular-nums; }
+.lv-bar.lv-best > span { font-weight: 700; }
+.lv-list { max-height: 236px; overflow-y: auto; } .lv-list li { display: flex; gap: 10px; flex-wrap: wrap; padding: 3px 0; border-bottom: 1px solid var(--ps-line); }
+.lv-list li > :nth-child(1) { min-width: 5.2em; font-variant-numeric: tabular-nums; color: var(--ps-dim); }
+.lv-dim { color: var(--ps-dim); } .lv-hidden { position: absolute; width: 1px; height: 1px; overflow: hidden; clip-path: inset(50%); white-space: nowrap; }
+@media (max-width: 900px) { .lv { grid-template-columns: minmax(0, 1fr); } }
+@media (prefers-reduced-motion: no-preference) {
+  .lv-face[data-eyes=green] .lv-eye-light { animation: lv-glow 1.1s ease-in-out infinite alternate; }
+  .lv-face[data-eyes=red] .lv-eye-light { animation: lv-glow .5s ease-in-out infinite alternate; } }
+@keyframes lv-glow { from { opacity: .75 } to { opacity: 1 } }`;
+
+export default {
+  template: '<div></div>',
+  props: { words: Object, affects: Object, signs: Object, colours: Object, lines: Array, locale: String, sameClock: Boolean, start: Object },
+  mounted() {
+    if (!document.getElementById("lv-css")) {
+      const css = el("style", "", CSS);
+      css.id = "lv-css";
+      document.head.append(css);
+    }
+    this.stats = window.plushsenseLive = { updates: 0, drawn: 0, samples: 0, scenes: 0, delays: [], shown: [] };
+    this.build();
+    this.scene(this.start);
+    this.resizer = new ResizeObserver(() => { this.size(); this.draw(); });
+    this.resizer.observe(this.$el);
+    this.lights = new MutationObserver(() => { this.inks(); this.strip = true; this.draw(); });
+    this.lights.observe(document.body, { attributes: true, attributeFilter: ["class"] });
+    this.seen = () => this.$emit("visible", { on: !document.hidden });
+    document.addEventListener("visibilitychange", this.seen);
+    if (document.hidden) this.seen();
+    this.beat = setInterval(() => this.tell(), 1000);
+  },
+  beforeUnmount() {
+    this.resizer?.disconnect();
+    this.lights?.disconnect();
+    document.removeEventListener("visibilitychange", this.seen);
+    clearInterval(this.beat);
+    cancelAnimationFrame(this.frame);
+    this.gone = true;
+  },
+  methods: {
+    // What stands ------------------------------------------------------------------------------------------------
+    build() {
+      const w = this.words, root = el("div", "lv"), n = (this.n = {});
+      const section = (title, cls, name) => {
+        const s = el("section", cls), h = el("h2", "", title);
+        s.dataset.test = name;
+        h.id = `lv-h-${name}`;
+        s.setAttribute("aria-labelledby", h.id);
+        s.append(h);
+        root.append(s);
+        return s;
+      };
+      const signals = section(w.signals, "", "signals");
+      n.signals = el("canvas");
+      n.signals.setAttribute("role", "img");
+      n.latency = el("p", "lv-dim");
+      n.latency.dataset.test = "latency";
+      signals.append(n.signals, n.latency);
+
+      const now = section(w.now, "", "now"), top = el("div", "lv-top"), told = el("div");
+      n.face = el("div", "lv-face");
+      n.face.dataset.test = "eyes";
+      n.face.setAttribute("role", "img");
+      n.state = el("div", "lv-state");
+      n.state.dataset.test = "state";
+      n.event = el("div", "lv-event");
+      n.event.dataset.test = "event";
+      n.badge = el("span", "lv-badge");
+      n.badge.dataset.test = "affect";
+      n.eyes = el("div", "lv-dim");
+      told.append(n.state, n.event, n.badge, n.eyes);
+      top.append(n.face, told);
+      const voices = el("div", "lv-voices");
+      for (const [key, title] of [["network", w.network], ["gate", w.gate]]) {
+        const box = el("div");
+        box.dataset.test = key;
+        n[key] = el("p", "");
+        box.append(el("h3", "", title), n[key]);
+        voices.append(box);
+      }
+      n.spoken = el("p", "lv-hidden");
+      n.spoken.setAttribute("aria-live", "polite");
+      now.append(top, voices, n.spoken);
+      const chances = el("h2", "", w.chances);
+      chances.style.marginTop = "14px";
+      n.bars = el("div");
+      n.bars.dataset.test = "bars";
+      now.append(chances, n.bars);
+
+      const line = section(w.timeline, "lv-wide", "timeline");
+      n.strip = el("canvas");
+      n.strip.setAttribute("role", "img");
+      n.strip.setAttribute("aria-label", w.timeline_label);
+      n.list = el("ol", "lv-list");
+      n.list.dataset.test = "events";
+      n.list.setAttribute("tabindex", "0");
+      n.list.setAttribute("aria-label", w.events);
+      line.append(n.strip, n.list);
+      this.$el.append(root);
+    },
+    inks() {
+      const css = getComputedStyle(document.body), get = (name) => css.getPropertyValue(name).trim();
+      this.ink = { ink: get("--ps-ink"), dim: get("--ps-dim"), line: get("--ps-line"), soft: get("--ps-soft"), dark: document.body.classList.contains("body--dark") };
+    },
+    size() {
+      const fit = (canvas, height) => {
+        const ratio = window.devicePixelRatio || 1, width = canvas.parentElement.clientWidth - 28;
+        canvas.width = Math.max(1, Math.round(width * ratio));
+        canvas.height = Math.round(height * ratio);
+        canvas.style.height = `${height}px`;
+        canvas.getContext("2d").setTransform(ratio, 0, 0, ratio, 0, 0);
+        return { width, height };
+      };
+      this.signalsAt = fit(this.n.signals, Math.max(2, this.channels.length) * LANE + 24);
+      this.stripAt = fit(this.n.strip, 96);
+      this.strip = true;
+    },
+    scene(s) {
+      if (this.gone) return;
+      this.stats.scenes++;
+      Object.assign(this, { channels: s.channels, classes: s.classes, windowS: s.window, stripS: s.strip, gateRules: s.gate_rules });
+      this.xs = [];
+      this.ys = this.channels.map(() => []);
+      this.range = this.channels.map(() => null);
+      this.spans = new Map();
+      this.t = 0;
+      this.chances = null;
+      this.said = { running: false, said: "", state: "", gate: null, event: null, eyes: "off", sound: "" };
+      this.net = null;
+      this.names = Object.fromEntries(this.classes.map((c) => [c.label, c.name]));
+      this.n.signals.setAttribute("aria-label", fill(this.words.signals_label, { n: this.channels.length, s: s.window }));
+      this.buildBars();
+      this.inks();
+      this.size();
+      this.update(s.first, true);
+    },
+    buildBars() {
+      this.bars = [];
+      const groups = ["positive", "neutral", "negative", "none"].map((affect) => [affect, this.classes.map((c, i) => [c, i]).filter(([c]) => c.affect === affect)]);
+      this.groups = [];
+      this.n.bars.replaceChildren(...groups.filter(([, of]) => of.length).map(([affect, of]) => {
+        const group = el("div", "lv-group"), list = el("ul"), head = el("h3");
+        head.append(this.badge(el("span", "lv-badge"), affect), " ");
+        const sum = head.appendChild(el("span", "lv-dim"));
+        this.groups.push({ sum, of: of.map(([, i]) => i), share: -1 });
+        for (const [c, i] of of) {
+          const row = el("li", "lv-bar"), track = el("i"), bar = el("b"), share = el("span", "", "–");
+          row.dataset.label = c.label;
+          track.setAttribute("aria-hidden", "true");
+          bar.style.background = this.colours[affect];
+          track.append(bar);
+          row.append(el("span", "", c.name), track, share);
+          list.append(row);
+          this.bars[i] = { row, bar, share, at: -1 };
+        }
+        group.append(head, list);
+        return group;
+      }));
+    },
+    badge(node, affect) {
+      const key = affect || "none";
+      say(node, `${this.signs[key]} ${this.affects[key]}`);
+      node.style.background = this.colours[key];
+      node.dataset.affect = key;
+      return node;
+    },
+
+    // What comes -------------------------------------------------------------------------------------------------
+    update(m, first) {
+      if (this.gone) return;
+      const clock = performance.timeOrigin + performance.now();
+      this.last = m.n;
+      if (!first) {
+        this.stats.updates++;
+        if (this.sameClock) this.delay = clock - m.at;
+        else if (m.round !== undefined) this.delay = m.out - m.at + m.round;
+        if (this.delay !== undefined && m.at > 0 && m.x && m.x.length) {
+          this.stats.delays.push(this.delay);
+          if (this.stats.delays.length > KEPT_DELAYS) this.stats.delays.splice(0, 100);
+        }
+        this.waits = this.waits || m.at;
+      }
+      this.t = m.t;
+      if (m.lat !== undefined) this.decided = m.lat;
+      if (m.x && m.x.length) {
+        this.stats.samples += m.x.length;
+        this.xs.push(...m.x);
+        m.y.forEach((column, i) => this.ys[i].push(...column));
+        const from = this.xs[this.xs.length - 1] - this.windowS;
+        let cut = 0;
+        while (cut < this.xs.length && this.xs[cut] < from) cut++;
+        // Rarely, and many at once: cutting a column costs as much for one as for fifty.
+        if (cut > 50 || this.xs.length > 5000) for (const column of [this.xs, ...this.ys]) column.splice(0, cut);
+      }
+      this.chances = m.p || null;
+      if (m.net) this.net = m.net;
+      if (m.spans) {
+        for (const s of m.spans) {
+          this.speakEvent(s, this.spans.get(s.id), first);
+          this.spans.set(s.id, s);
+        }
+        while (this.spans.size > 200) this.spans.delete(this.spans.keys().next().value);
+        this.listed = false;
+      }
+      if (m.now) {
+        if (!first && (m.now.state !== this.said.state || m.now.running !== this.said.running)) this.speak(this.stateWords(m.now));
+        this.said = m.now;
+        this.told = false;
+      }
+      this.draw();
+    },
+    draw() {
+      if (this.frame || this.gone) return;
+      this.frame = requestAnimationFrame(() => {
+        this.frame = null;
+        if (this.gone) return;
+        this.drawSignals();
+        this.drawStrip();
+        this.showNow();
+        this.showBars();
+        if (!this.listed) this.list();
+        this.stats.drawn++;
+        if (this.waits && this.sameClock) {
+          this.stats.shown.push(performance.timeOrigin + performance.now() - this.waits);
+          if (this.stats.shown.length > KEPT_DELAYS) this.stats.shown.splice(0, 100);
+        }
+        this.waits = 0;
+      });
+    },
+    tell() {
+      if (this.last === undefined || document.hidden) return;
+      const sorted = [...this.stats.delays].slice(-200).sort((a, b) => a - b);
+      const p95 = sorted.length ? sorted[Math.min(sorted.length - 1, Math.floor(0.95 * sorted.length))] : null;
+      const w = this.words, parts = [];
+      if (this.said.running) {
+        if (this.decided !== undefined) parts.push(fill(w.latency_decision, { ms: this.number(this.decided) }));
+        if (p95 !== null) parts.push(fill(this.sameClock ? w.latency_page : w.latency_page_most, { ms: this.number(p95) }));
+      }
+      say(this.n.latency, parts.length ? `${w.latency} ${parts.join("; ")}.` : "");
+      this.$emit("seen", { n: this.last, p95, updates: this.stats.updates, drawn: this.stats.drawn });
+    },
+    number(value) {
+      return value.toLocaleString(this.locale, { maximumFractionDigits: value < 10 ? 1 : 0 });
+    },
+
+    // What is drawn ----------------------------------------------------------------------------------------------
+    drawSignals() {
+      const { width, height } = this.signalsAt, c = this.n.signals.getContext("2d"), k = this.ink;
+      c.clearRect(0, 0, width, height);
+      const left = Math.min(150, width * 0.3), right = width - 4, bottom = this.channels.length * LANE;
+      const end = this.xs.length ? this.xs[this.xs.length - 1] : 0, begin = end - this.windowS;
+      const x = (s) => left + ((s - begin) / this.windowS) * (right - left);
+      c.font = "12px sans-serif";
+      c.strokeStyle = k.line;
+      c.fillStyle = k.dim;
+      c.lineWidth = 1;
+      c.textAlign = "center";
+      for (let s = Math.ceil(Math.max(begin, 0)); s <= end; s += 1) {
+        c.beginPath();
+        c.moveTo(x(s), 0);
+        c.lineTo(x(s), bottom);
+        c.stroke();
+        if (s % 2 === 0 && x(s) < right - 12) c.fillText(`${s} s`, x(s), bottom + 16);
+      }
+      let from = 0;
+      while (from < this.xs.length && this.xs[from] < begin) from++;
+      this.channels.forEach((channel, i) => {
+        const ys = this.ys[i], top = i * LANE, mid = top + LANE / 2;
+        let low = Infinity, high = -Infinity;
+        for (let j = from; j < ys.length; j++) {
+          if (ys[j] < low) low = ys[j];
+          if (ys[j] > high) high = ys[j];
+        }
+        c.textAlign = "left";
+        c.fillStyle = k.ink;
+        c.fillText(channel.name, 0, mid - 2);
+        if (low > high) return;
+        const value = (ys[ys.length - 1] * channel.step - channel.offset) * channel.scale;
+        c.fillStyle = k.dim;
+        c.fillText(`${value.toLocaleString(this.locale, { maximumFractionDigits: 2 })} ${channel.unit === "count" ? this.words.unit_count : channel.unit}`, 0, mid + 12);
+        // A lane keeps its scale until the signal leaves it or has long been small in it.
+        const kept = this.range[i], span = Math.max(high - low, 8);
+        if (!kept || low < kept[0] || high > kept[1] || kept[1] - kept[0] > 3 * span) this.range[i] = [low - 0.15 * span, high + 0.15 * span];
+        const [a, b] = this.range[i], y = (v) => top + 3 + (1 - (v - a) / (b - a)) * (LANE - 6);
+        c.strokeStyle = k.line;
+        c.beginPath();
+        c.moveTo(0, top + LANE);
+        c.lineTo(right, top + LANE);
+        c.stroke();
+        c.strokeStyle = k.dark ? "#8cc4f0" : this.lines[0];
+        c.lineWidth = 1.5;
+        c.beginPath();
+        for (let j = from; j < ys.length; j++) {
+          // A hole in the toy's clock is a hole in the line.
+          if (j === from || this.xs[j] - this.xs[j - 1] > 0.3) c.moveTo(x(this.xs[j]), y(ys[j]));
+          else c.lineTo(x(this.xs[j]), y(ys[j]));
+        }
+        c.stroke();
+        c.lineWidth = 1;
+      });
+    },
+    drawStrip() {
+      const { width } = this.stripAt, c = this.n.strip.getContext("2d"), k = this.ink;
+      c.clearRect(0, 0, width, 96);
+      const begin = this.t - this.stripS, x = (s) => ((s - begin) / this.stripS) * width;
+      c.font = "12px sans-serif";
+      c.textAlign = "center";
+      for (let s = Math.ceil(Math.max(0, begin) / 10) * 10; s <= this.t; s += 10) {
+        c.strokeStyle = k.line;
+        c.beginPath();
+        c.moveTo(x(s), 0);
+        c.lineTo(x(s), 74);
+        c.stroke();
+        c.fillStyle = k.dim;
+        if (x(s) > 14 && x(s) < width - 14) c.fillText(`${s} s`, x(s), 90);
+      }
+      c.textAlign = "left";
+      for (const s of this.spans.values()) {
+        const to = s.to === null ? this.t : s.to;
+        if (to < begin) continue;
+        const row = s.id % 2, top = 4 + row * 36, a = Math.max(x(s.from), 0), b = Math.max(x(to), a + 3);
+        c.fillStyle = this.colours[s.affect || "none"];
+        c.fillRect(a, top, b - a, 12);
+        if (s.source === "gate") {
+          c.fillStyle = k.ink;
+          c.beginPath();
+          c.moveTo(a, top - 3);
+          c.lineTo(a + 8, top + 6);
+          c.lineTo(a, top + 15);
+          c.fill();
+        }
+        c.fillStyle = k.ink;
+        const label = `${this.signs[s.affect || "none"]} ${this.nameOf(s)}`;
+        c.fillText(label, Math.min(a, width - c.measureText(label).width), top + 27);
+      }
+    },
+    showNow() {
+      if (!this.net && !this.said) return;
+      const w = this.words, said = this.said, net = this.net, e = said.event;
+      // The network's voice is new at every step, the rest only when it changed.
+      if (net && said.running && (said.state === "tracking" || said.state === "warming")) {
+        const answer = w[`answer_${net.answer || "none"}`];
+        say(this.n.network, net.answer === null ? w.answer_none : fill(answer, { gesture: this.names[net.gesture] || net.gesture || "", sure: net.sure, affect: this.affectText(net.affect) }));
+      } else say(this.n.network, said.running ? w.answer_none : "–");
+      const g = said.gate;
+      if (!this.gateRules) say(this.n.gate, w.gate_none);
+      else if (!g) say(this.n.gate, w.gate_quiet);
+      else say(this.n.gate, fill(w.gate_ago, { what: [this.affectText(g.affect), this.names[g.gesture] || g.gesture].filter(Boolean).join(", "), s: Math.max(0, Math.round(this.t - g.t)) }));
+      if (this.told) return;
+      this.told = true;
+      say(this.n.state, this.stateWords(said));
+      this.n.state.dataset.state = said.running ? said.state : "stopped";
+      say(this.n.event, e ? this.nameOf(e) : w.nothing);
+      this.n.event.dataset.label = e && e.gesture ? e.gesture : "";
+      this.n.badge.style.visibility = e ? "visible" : "hidden";
+      if (e) this.badge(this.n.badge, e.affect);
+      const eyes = EYES[said.eyes] ? said.eyes : "off", text = w[`eyes_${eyes}`] + (said.sound ? ` · ♪ ${said.sound}` : "");
+      if (this.n.face.dataset.eyes !== eyes) {
+        this.n.face.dataset.eyes = eyes;
+        this.n.face.innerHTML = face(eyes);
+      }
+      this.n.face.setAttribute("aria-label", `${w.eyes_label}: ${text}`);
+      say(this.n.eyes, text);
+    },
+    showBars() {
+      const p = this.chances, best = p ? p.indexOf(Math.max(...p)) : -1;
+      this.bars.forEach((bar, i) => {
+        const at = p ? p[i] : -1;
+        if (at !== bar.at) {
+          bar.at = at;
+          bar.bar.style.transform = `scaleX(${Math.max(0, at) / 1000})`;
+          say(bar.share, at < 0 ? "–" : `${Math.round(at / 10)} %`);
+        }
+        bar.row.classList.toggle("lv-best", i === best);
+      });
+      for (const group of this.groups) {
+        const share = p ? Math.round(group.of.reduce((sum, i) => sum + p[i], 0) / 10) : -1;
+        if (share !== group.share) say(group.sum, (group.share = share) < 0 ? "" : `${Math.min(100, share)} %`);
+      }
+    },
+    list() {
+      this.listed = true;
+      const w = this.words, spans = [...this.spans.values()].slice(-20).reverse();
+      if (!spans.length) return this.n.list.replaceChildren(el("li", "lv-dim", w.events_none));
+      this.n.list.replaceChildren(...spans.map((s) => {
+        const row = el("li");
+        Object.assign(row.dataset, { id: s.id, affect: s.affect, gesture: s.gesture || "", from: s.from, to: s.to === null ? "" : s.to, source: s.source });
+        const seconds = (v) => v.toLocaleString(this.locale, { minimumFractionDigits: 1, maximumFractionDigits: 1 });
+        row.append(el("span", "", `${seconds(s.from)} s`), this.badge(el("span", "lv-badge"), s.affect), el("b", "", this.nameOf(s)),
+          el("span", "", s.to === null ? w.lasting : `${seconds(s.to - s.from)} s`), el("span", "lv-dim", s.source === "gate" ? w.by_gate : w.by_network));
+        return row;
+      }));
+    },
+
+    // What is said -----------------------------------------------------------------------------------------------
+    nameOf(s) { return s.gesture ? this.names[s.gesture] || s.gesture : this.words.some_gesture; },
+    affectText(affect) { const key = affect || "none"; return `${this.signs[key]} ${this.affects[key]}`; },
+    stateWords(said) {
+      return said.running ? this.words[`state_${said.state.replace(" ", "_")}`] || "" : this.words.state_stopped;
+    },
+    speakEvent(s, before, first) {
+      if (first || s.to !== null || (before && before.gesture === s.gesture)) return;
+      this.speak(`${this.nameOf(s)}, ${this.affects[s.affect || "none"]}`);
+    },
+    speak(text) {
+      // At most one sentence in a while, always the newest: a voice that lags behind the toy is of no use.
+      this.speaks = text;
+      if (this.speaking) return;
+      const due = () => {
+        this.speaking = null;
+        if (this.speaks === null || this.gone) return;
+        say(this.n.spoken, this.speaks);
+        this.speaks = null;
+        this.speaking = setTimeout(due, SPOKEN_MS);
+      };
+      due();
+    },
+  },
+};

@@ -1,0 +1,303 @@
+"""The hard cases: what was seen live is kept, looked at again, given its label, and added to a data set."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from nicegui import ui
+
+from plushsense.apps.studio.clips import Clip, Clips
+from plushsense.apps.studio.listening import Listening
+from plushsense.apps.studio.plot import Plot
+from plushsense.apps.studio.shell import LINES, Page, on_ring, tag
+from plushsense.core.gestures import GestureSet
+from plushsense.core.recfile import Frames
+from plushsense.dataset.store import DatasetHead
+
+_KEEP_S = (5, 10, 20, 40)
+_MOST_POINTS = 3000
+_START, _END = "#009E73", "#D55E00"
+
+
+@dataclass
+class _Shown:
+    """The clip that is open on this page. ``first`` and ``last``: rows, the last not in it."""
+
+    clip: Clip
+    frames: Frames
+    seconds: Any
+    first: int
+    last: int
+    next_end: bool = False
+
+
+def show(page: Page, listening: Listening) -> None:
+    """Build the part of the page below the live view."""
+    clips = page.house.part(Clips)
+    words = page.words
+    with ui.element("section").classes("ps-card w-full column no-wrap q-gutter-y-sm"):
+        ui.html(words("live.hard"), sanitize=False, tag="h2")
+        ui.label(words("live.hard_about")).classes("ps-dim")
+        _keeping(page, listening, clips)
+        listing = tag(ui.column().classes("w-full q-gutter-y-xs"), "clips")
+        desk = tag(ui.column().classes("w-full"), "clip")
+
+    async def refresh() -> None:
+        found = await asyncio.to_thread(clips.all)
+        listing.clear()
+        with listing:
+            if not found:
+                ui.label(words("live.clips_none")).classes("ps-dim")
+            for clip in found:
+                _row(page, clips, clip, lambda key=clip.key: opened(key))
+
+    async def opened(key: str) -> None:
+        with page.refusing():
+            clip = await asyncio.to_thread(clips.get, key)
+            frames = await asyncio.to_thread(clips.rows, clip)
+            desk.clear()
+            with desk:
+                _Desk(page, clips, clip, frames)
+
+    async def first() -> None:
+        await refresh()
+
+    ui.timer(0.05, first, once=True)
+    on_ring(clips.bell, lambda: ui.timer(0.0, refresh, once=True))
+
+
+def _keeping(page: Page, listening: Listening, clips: Clips) -> None:
+    """Whose it is, and the buttons that keep it."""
+    words = page.words
+    with ui.row().classes("w-full items-end q-gutter-sm"):
+        person = tag(ui.input(words("live.person"), placeholder="S01"), "person")
+        seconds = ui.select({s: words("live.seconds", s=s) for s in _KEEP_S}, value=10, label=words("live.keep_last"))
+        tag(seconds, "keep-seconds").classes("w-32")
+        keep = tag(ui.button(words("live.keep"), icon="bookmark_add"), "keep")
+        begin = tag(ui.button(words("live.record"), icon="fiber_manual_record").props("outline"), "record")
+        end = tag(ui.button(words("live.record_end"), icon="stop").props("color=negative"), "record-end")
+        length = tag(ui.label("").props('role="timer"').classes("ps-dim"), "record-length")
+
+    async def kept() -> None:
+        with page.refusing():
+            key = await asyncio.to_thread(clips.keep, listening, float(seconds.value), str(person.value or ""))
+            page.say(words("live.kept", clip=key), "good")
+
+    async def begun() -> None:
+        with page.refusing():
+            await asyncio.to_thread(clips.begin, listening, str(person.value or ""))
+
+    async def ended() -> None:
+        key = await asyncio.to_thread(clips.end)
+        if key and not clips.failed:
+            page.say(words("live.kept", clip=key), "good")
+
+    shown: list[Any] = [None, 0.0]
+
+    def changed() -> None:
+        now = clips.recording
+        keep.set_enabled(bool(listening.device is not None and listening.device.ring.count))
+        begin.set_enabled(listening.now.running)
+        begin.set_visibility(not now)
+        end.set_visibility(bool(now))
+        if clips.failed and shown[0] != clips.failed:
+            page.say(clips.failed, "error")
+        shown[0] = clips.failed
+
+    def moved() -> None:
+        # Twenty times a second: only once in a while is there something to change.
+        if time.monotonic() - shown[1] < 0.5:
+            return
+        shown[1] = time.monotonic()
+        text = words("live.recorded", s=f"{clips.recorded_s:.0f}") if clips.recording else ""
+        if length.text != text:
+            length.set_text(text)
+        if keep.enabled != bool(listening.device is not None and listening.device.ring.count) or (
+            begin.enabled != listening.now.running
+        ):
+            changed()
+
+    keep.on_click(kept)
+    begin.on_click(begun)
+    end.on_click(ended)
+    person.on("keydown.enter", kept)
+    on_ring(clips.bell, changed)
+    on_ring(listening.bell, moved)
+    changed()
+
+
+def _row(page: Page, clips: Clips, clip: Clip, opened: Any) -> None:
+    words = page.words
+    seconds = clip.rows / clip.layout.rate_hz
+    when = time.strftime("%Y-%m-%d %H:%M", time.localtime(clip.head.started_ms / 1000.0))
+    if clip.key == clips.recording:
+        state = words("live.clip_recording")
+    elif not clip.labels:
+        state = words("live.clip_unlabelled")
+    else:
+        state = ", ".join(words.gesture(label.gesture) for label in clip.labels)
+        state += f"; {words('live.clip_added', names=', '.join(clip.added))}" if clip.added else ""
+    with ui.row().classes("w-full items-center q-gutter-sm").style("border-bottom: 1px solid var(--ps-line)") as row:
+        tag(row, f"clip-{clip.key}")
+        ui.label(clip.key).classes("font-bold")
+        ui.label(f"{when}, {seconds:.1f} s").classes("ps-dim")
+        ui.label(state).classes("flex-grow")
+        if clip.head.simulated:
+            ui.label(words("live.simulated_short")).classes("ps-said ps-said-warning").style("padding: 0 8px")
+        look = ui.button(words("live.clip_open"), on_click=opened).props("flat dense")
+        look.props(f'aria-label="{words("live.clip_open")} {clip.key}"').set_enabled(clip.key != clips.recording)
+
+
+class _Desk:
+    """One clip open: its signals, the part that is chosen, its label, and where it goes."""
+
+    def __init__(self, page: Page, clips: Clips, clip: Clip, frames: Frames) -> None:
+        self._page, self._clips = page, clips
+        seconds = np.maximum.accumulate(frames.device_ms - frames.device_ms[:1]) / 1000.0
+        self._shown = _Shown(clip, frames, seconds, 0, len(frames))
+        self._setting = False
+        words = page.words
+        ui.html(words("live.clip_title", clip=clip.key), sanitize=False, tag="h2")
+        ui.label(words("live.clip_about")).classes("ps-dim")
+        names = clip.layout.names
+        series = [{"label": name, "stroke": LINES[i % len(LINES)]} for i, name in enumerate(names)]
+        self._plot = Plot(
+            words("live.clip_plot", clip=clip.key),
+            series,
+            x=words("live.clip_time"),
+            height=340,
+            range_y=(-0.1, len(names) + 0.1),
+            on_pick=self._picked,
+        )
+        tag(self._plot, "clip-plot").begin(*self._lanes(), self._marks())
+        with ui.row().classes("w-full items-end q-gutter-sm"):
+            self._from = self._number(words("live.clip_from"), "clip-from")
+            self._to = self._number(words("live.clip_to"), "clip-to")
+            self._said = tag(ui.label("").classes("ps-dim"), "clip-rows")
+        with ui.row().classes("w-full items-end q-gutter-sm"):
+            self._datasets = {str(p): page.house.title(p) for p in page.house.datasets()}
+            self._dataset = ui.select(
+                self._datasets,
+                value=next(iter(self._datasets), None),
+                label=words("live.clip_dataset"),
+                on_change=self._offer,
+            ).classes("col-12 col-sm-4")
+            tag(self._dataset, "clip-dataset")
+            self._gesture = ui.select(
+                [], label=words("live.clip_gesture"), with_input=True, new_value_mode="add-unique"
+            ).classes("col-12 col-sm-4")
+            tag(self._gesture, "clip-gesture")
+            self._button = tag(ui.button(words("live.clip_label"), icon="label", on_click=self._label), "clip-label")
+            self._adding = tag(
+                ui.button(words("live.clip_add"), icon="playlist_add", on_click=self._add).props("outline"), "clip-add"
+            )
+        self._adding.set_enabled(bool(clip.labels))
+        self._offer()
+        self._show()
+
+    def _number(self, label: str, name: str) -> ui.number:
+        field = ui.number(label, step=0.01, format="%.2f", suffix="s", on_change=self._typed)
+        return tag(field.classes("w-32"), name)
+
+    def _lanes(self) -> tuple[list[float], list[list[float]]]:
+        """Every channel in a lane of its own, the first on top."""
+        shown = self._shown
+        every = max(1, -(-len(shown.frames) // _MOST_POINTS))
+        values = shown.frames.values[::every].astype(float)
+        low, high = values.min(axis=0, initial=np.inf), values.max(axis=0, initial=-np.inf)
+        lanes = 0.05 + 0.9 * (values - low) / np.maximum(high - low, 8.0) + np.arange(values.shape[1])[::-1]
+        return (
+            [round(s, 3) for s in shown.seconds[::every].tolist()],
+            [[round(v, 3) for v in column] for column in lanes.T.tolist()],
+        )
+
+    def _marks(self) -> list[dict[str, Any]]:
+        shown, words = self._shown, self._page.words
+        begin, end = self._at(shown.first), self._at(shown.last - 1)
+        marks: list[dict[str, Any]] = [
+            {"x": begin, "label": words("live.mark_start"), "stroke": _START, "to": end},
+            {"x": end, "label": words("live.mark_end"), "stroke": _END, "dash": [6, 4]},
+        ]
+        marks += [
+            {"x": self._at(label.first), "label": words.gesture(label.gesture), "stroke": "#888888", "dash": [2, 4]}
+            for label in shown.clip.labels
+        ]
+        return marks
+
+    def _at(self, row: int) -> float:
+        seconds = self._shown.seconds
+        return float(seconds[min(max(row, 0), len(seconds) - 1)]) if len(seconds) else 0.0
+
+    def _row(self, seconds: float) -> int:
+        """The row nearest to a time."""
+        return int(np.abs(self._shown.seconds - seconds).argmin()) if len(self._shown.seconds) else 0
+
+    def _picked(self, x: float, button: str, shift: bool) -> None:
+        """A click: the start, then the end; the right button or shift: the end."""
+        shown = self._shown
+        row = self._row(x)
+        if button == "right" or shift or (shown.next_end and row > shown.first):
+            shown.last, shown.next_end = row + 1, False
+        else:
+            shown.first, shown.next_end = row, True
+            if shown.last <= row + 1:
+                shown.last = len(shown.frames)
+        self._show()
+
+    def _typed(self) -> None:
+        if self._setting or self._from.value is None or self._to.value is None:
+            return
+        self._shown.first = self._row(float(self._from.value))
+        self._shown.last = self._row(float(self._to.value)) + 1
+        self._show(fields=False)
+
+    def _show(self, fields: bool = True) -> None:
+        shown = self._shown
+        if fields:
+            self._setting = True
+            self._from.set_value(round(self._at(shown.first), 2))
+            self._to.set_value(round(self._at(shown.last - 1), 2))
+            self._setting = False
+        length = self._at(shown.last - 1) - self._at(shown.first)
+        said = self._page.words("live.clip_rows", rows=max(0, shown.last - shown.first), s=f"{max(0.0, length):.2f}")
+        self._said.set_text(said)
+        self._plot.lines(self._marks())
+
+    def _offer(self) -> None:
+        """The gestures of the chosen data set, by their names in the page's language."""
+        words = self._page.words
+        labels: tuple[str, ...] = ()
+        if self._dataset.value:
+            with self._page.refusing():
+                gestures: GestureSet = DatasetHead.read(Path(self._dataset.value)).gestures
+                labels = gestures.labels
+        value = self._gesture.value if self._gesture.value in labels else None
+        self._gesture.set_options({label: words.gesture(label) for label in labels}, value=value)
+
+    async def _label(self) -> None:
+        page, shown = self._page, self._shown
+        with page.refusing():
+            gesture = str(self._gesture.value or "")
+            if not gesture:
+                page.say(page.words("live.clip_which"), "error")
+                return
+            label = await asyncio.to_thread(self._clips.label, shown.clip.key, gesture, shown.first, shown.last)
+            shown.clip = await asyncio.to_thread(self._clips.get, shown.clip.key)
+            self._adding.set_enabled(True)
+            self._show()
+            page.say(page.words("live.clip_labelled", gesture=page.words.gesture(gesture), file=label.file), "good")
+
+    async def _add(self) -> None:
+        page, shown = self._page, self._shown
+        with page.refusing():
+            if not self._dataset.value:
+                page.say(page.words("live.clip_no_dataset"), "error")
+                return
+            done = await asyncio.to_thread(self._clips.add, shown.clip.key, Path(self._dataset.value))
+            name = self._datasets[self._dataset.value]
+            page.say(page.words("live.clip_in", n=done.added["recordings"], name=name), "good")
