@@ -182,8 +182,8 @@ async def _bounded(app: App, scope: Scope, receive: Receive, send: Send, headers
 
 def _is_upload(scope: Scope) -> bool:
     """Whether this is NiceGUI's route for files: ``/_nicegui/client/<page>/upload/<element>``."""
-    parts = scope["path"].split("/")
-    return scope["method"] == "POST" and parts[1:3] == ["_nicegui", "client"] and parts[4:5] == ["upload"]
+    parts: list[str] = scope["path"].split("/")
+    return bool(scope["method"] == "POST" and parts[1:3] == ["_nicegui", "client"] and parts[4:5] == ["upload"])
 
 
 async def _to_start(send: Send, visitor: str) -> None:

@@ -30,7 +30,7 @@ class House:
     """One studio. Pages may read and write inside ``folder`` and the data sets given at start, nowhere else.
 
     Attributes:
-        folder: holds `RECORDINGS`, `DATASETS`, `BUNDLES`, `EXPORTS`, `PACKAGES` and `WORK`, each made when it is needed.
+        folder: holds `RECORDINGS`, `DATASETS`, `BUNDLES`, `EXPORTS`, `PACKAGES`, `WORK`, each made when it is needed.
         given: data sets named at start, wherever they lie.
         devices: toys named at start; the first is chosen.
         models: bundles named at start.

@@ -206,7 +206,7 @@ def _size(path: Path) -> int:
     for place, _, names in os.walk(path):
         for name in names:
             with contextlib.suppress(OSError):
-                total += os.lstat(os.path.join(place, name)).st_size
+                total += Path(place, name).lstat().st_size
     return total
 
 
@@ -254,4 +254,6 @@ def _bundle(path: Path) -> BundleSeen:
     except OSError as cause:
         return BundleSeen(path, path.stem, refused=f"'{path}' cannot be read: {cause.strerror or cause}.")
     made = bundle.provenance
-    return BundleSeen(path, path.stem, str(made.get("dataset") or ""), len(bundle.gestures), bool(made.get("simulated")))
+    return BundleSeen(
+        path, path.stem, str(made.get("dataset") or ""), len(bundle.gestures), bool(made.get("simulated"))
+    )

@@ -64,9 +64,9 @@ def run(
     if everywhere:
         names = (*names, socket.gethostname(), *_addresses())
     visitors = Visitors(host, names)
-    inner = app.build_middleware_stack
+    inner: Any = app.build_middleware_stack
     # Outermost, also around what answers when something failed: middleware that is added stands within NiceGUI's own.
-    app.build_middleware_stack = lambda: Guard(inner(), visitors)
+    vars(app)["build_middleware_stack"] = lambda: Guard(inner(), visitors)
     shown = (_addresses() or [socket.gethostname()])[0] if everywhere else host
     address = f"http://{f'[{shown}]' if ':' in shown else shown}:{port}/"
     if not visitors.open:

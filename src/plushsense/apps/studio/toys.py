@@ -123,7 +123,7 @@ class Toys:
         if first is None or last is None:
             if counters.malformed:
                 raise DeviceError(
-                    f"'{url}' sends lines that are no frames of the layout '{layout.name}' ({counters.malformed} came): "
+                    f"'{url}' sends no frames of the layout '{layout.name}' but other lines ({counters.malformed}): "
                     "name its layout, as in ?layout=plush-14 at the end of the address."
                 )
             raise DeviceError(f"'{url}' sent nothing within {_PATIENCE_S:g} s: check that the toy is switched on.")
