@@ -21,7 +21,7 @@ App = Callable[[Scope, Receive, Send], Awaitable[None]]
 COOKIE = "plushsense_visitor"
 TOKEN = "token"
 WELCOME = "welcome"
-UPLOAD_BYTES = 512_000_000
+UPLOAD_BYTES = 501_000_000
 """The largest body of a request that brings a file."""
 BODY_BYTES = 4_000_000
 """The largest body of any other request."""

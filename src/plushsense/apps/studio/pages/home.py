@@ -30,12 +30,12 @@ async def show(page: Page) -> None:
     seen = await run.io_bound(overview.look)
     step = NextStep(page, jobs, toys)
     with ui.element("div").classes("ps-two w-full"):
-        with ui.column().classes("w-full q-gutter-y-md no-wrap"):
+        with ui.column().classes("w-full"):
             datasets = Datasets(page, jobs)
             sessions = Sessions(page, jobs)
             networks = bundles(page)
             incoming(page, jobs, lambda: refresh())
-        with ui.column().classes("w-full q-gutter-y-md no-wrap"):
+        with ui.column().classes("w-full"):
             toy_section(page, toys)
             work = Work(page, jobs)
             invitation(page)
@@ -93,7 +93,7 @@ class NextStep:
         self._box.clear()
         with self._box:
             ui.html(escape(words("home.next")), sanitize=False, tag="h2")
-            with ui.row().classes("items-center w-full q-gutter-md"):
+            with ui.row().classes("items-center w-full"):
                 tag(ui.label(words(f"home.next_{step.key}", **step.about)), "next-sentence").classes("text-lg")
                 if words.has(f"home.next_{step.key}_button"):
                     button = ui.button(words(f"home.next_{step.key}_button"), on_click=lambda: self._do(step))

@@ -12,6 +12,9 @@ from plushsense.apps.studio.jobs import DONE, RUNNING, Job, Jobs
 from plushsense.apps.studio.overview import DatasetSeen, Seen, SessionSeen
 from plushsense.apps.studio.shell import Page, address, named, tag
 
+SMALL = 'outline no-caps padding="4px 12px"'
+"""Looks of the buttons in rows."""
+
 
 def size(page: Page, count: float) -> str:
     """Bytes for people."""
@@ -38,7 +41,7 @@ class Datasets:
     def __init__(self, page: Page, jobs: Jobs) -> None:
         self._page, self._jobs = page, jobs
         with section(page, "home.datasets", "datasets"):
-            self._rows = ui.column().classes("w-full q-gutter-y-sm")
+            self._rows = ui.column().classes("w-full ps-tight")
 
     def fill(self, seen: Seen) -> None:
         """Show these."""
@@ -52,7 +55,7 @@ class Datasets:
     def _row(self, one: DatasetSeen) -> None:
         page, words = self._page, self._page.words
         with tag(ui.column().classes("ps-row w-full"), "dataset"):
-            with ui.row().classes("items-center w-full q-gutter-x-sm"):
+            with ui.row().classes("items-center w-full ps-tight"):
                 ui.label(one.name).classes("text-weight-bold")
                 if one.simulated:
                     simulated(page)
@@ -68,7 +71,7 @@ class Datasets:
             ]
             ui.label(" · ".join(facts)).classes("ps-dim")
             ui.label(self._findings(one))
-            with ui.row().classes("items-center q-gutter-sm"):
+            with ui.row().classes("items-center ps-tight"):
                 for to in ("review", "train", "publish"):
                     link = ui.link(words(f"pages.{to}"), address(to, dataset=one.path)).classes("ps-link")
                     named(link, f"{words(f'pages.{to}')}: {one.name}")
@@ -77,7 +80,7 @@ class Datasets:
                 )
                 if not busy:
                     check = ui.button(words("home.check"), on_click=lambda: self._check(one))
-                    named(check.props("outline dense no-caps"), f"{words('home.check')}: {one.name}")
+                    named(check.props(SMALL), f"{words('home.check')}: {one.name}")
 
     def _findings(self, one: DatasetSeen) -> str:
         done = self._newest(one)
@@ -116,7 +119,7 @@ class Sessions:
         self._shown: tuple[object, ...] = ()
         self._box = section(page, "home.sessions", "sessions")
         with self._box:
-            self._inner = ui.column().classes("w-full q-gutter-y-sm")
+            self._inner = ui.column().classes("w-full ps-tight")
         self._box.set_visibility(False)
 
     def fill(self, seen: Seen) -> None:
@@ -140,12 +143,12 @@ class Sessions:
         with tag(ui.column().classes("ps-row w-full"), "batch"):
             if batch[0].simulated:
                 simulated(page)
-            scroll = ui.column().classes("ps-scroll w-full q-gutter-none").props("tabindex=0 role=group")
+            scroll = ui.column().classes("ps-scroll w-full ps-close").props("tabindex=0 role=group")
             with named(scroll, words("home.sessions")):
                 for one in batch:
                     box = ui.checkbox(self._said(one), value=str(one.path) in self._chosen)
                     box.on_value_change(lambda e, one=one: self._choose(one, bool(e.value)))
-            with ui.row().classes("items-end q-gutter-sm w-full"):
+            with ui.row().classes("items-end ps-tight w-full"):
                 name = tag(ui.input(words("home.name")).props("dense outlined"), "new-name")
                 make = ui.button(words("home.make"), on_click=lambda: self._make(batch, str(name.value or "")))
                 tag(make.props("unelevated no-caps"), "make")
@@ -155,7 +158,7 @@ class Sessions:
                 if d.simulated == batch[0].simulated and d.layout == batch[0].layout
             }
             if fitting:
-                with ui.row().classes("items-end q-gutter-sm w-full"):
+                with ui.row().classes("items-end ps-tight w-full"):
                     to = ui.select(fitting, value=next(iter(fitting)), label=words("home.add_to"))
                     to.props("dense outlined").classes("ps-wide")
                     add = ui.button(words("home.add"), on_click=lambda: self._add(batch, str(to.value)))

@@ -28,7 +28,7 @@ def bundles(page: Page) -> Callable[[Seen], None]:
     """The section of trained networks; returns what fills it."""
     box = section(page, "home.bundles", "bundles")
     with box:
-        rows = ui.column().classes("w-full q-gutter-y-sm")
+        rows = ui.column().classes("w-full ps-tight")
 
     def fill(seen: Seen) -> None:
         rows.clear()
@@ -36,7 +36,7 @@ def bundles(page: Page) -> Callable[[Seen], None]:
         with rows:
             for one in seen.bundles:
                 with tag(ui.column().classes("ps-row w-full"), "bundle"):
-                    with ui.row().classes("items-center q-gutter-x-sm"):
+                    with ui.row().classes("items-center ps-tight"):
                         ui.label(one.name).classes("text-weight-bold ps-break")
                         if one.simulated:
                             simulated(page)
@@ -47,7 +47,7 @@ def bundles(page: Page) -> Callable[[Seen], None]:
                     if one.dataset:
                         facts.append(page.words("home.trained_on", name=one.dataset))
                     ui.label(" · ".join(facts)).classes("ps-dim")
-                    with ui.row().classes("q-gutter-sm"):
+                    with ui.row().classes("ps-tight"):
                         for to in ("live", "export"):
                             link = ui.link(page.words(f"pages.{to}"), address(to, model=one.path)).classes("ps-link")
                             named(link, f"{page.words(f'pages.{to}')}: {one.name}")
@@ -99,7 +99,7 @@ def incoming(page: Page, jobs: Jobs, changed: Callable[[], Awaitable[None]]) -> 
         ui.label(words("home.incoming_about", mb=ARCHIVE_BYTES // 1_000_000, bundle=BUNDLE_BYTES // 1_000_000)).classes(
             "ps-dim"
         )
-        with ui.row().classes("items-end q-gutter-sm w-full"):
+        with ui.row().classes("items-end ps-tight w-full"):
             title = tag(
                 ui.input(words("home.incoming_name")).props("dense outlined").classes("ps-wide"), "incoming-name"
             )

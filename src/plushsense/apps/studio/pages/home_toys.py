@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from nicegui import run, ui
 
-from plushsense.apps.studio.pages.home_data import section, simulated
+from plushsense.apps.studio.pages.home_data import SMALL, section, simulated
 from plushsense.apps.studio.shell import Page, named, on_ring, tag
 from plushsense.apps.studio.toys import PERSONS, Toys, refusal
 
@@ -13,8 +13,8 @@ def toy_section(page: Page, toys: Toys) -> None:
     """Build the section; looks for toys when nobody has looked yet."""
     words, house = page.words, page.house
     with section(page, "home.toy", "toy"):
-        chosen = ui.column().classes("w-full q-gutter-y-sm").props('aria-live="polite"')
-        with ui.row().classes("items-end q-gutter-sm w-full"):
+        chosen = ui.column().classes("w-full ps-tight").props('aria-live="polite"')
+        with ui.row().classes("items-end ps-tight w-full"):
             options = {n: words("home.person", n=n) for n in range(1, PERSONS + 1)}
             who = ui.select(options, value=7, label=words("home.virtual_person")).props("dense outlined")
             tag(who.classes("ps-wide"), "person")
@@ -22,8 +22,8 @@ def toy_section(page: Page, toys: Toys) -> None:
                 words("home.choose_virtual"), on_click=lambda: take(lambda: toys.person(int(who.value)))
             )
             tag(virtual.props("unelevated no-caps"), "virtual")
-        found = ui.column().classes("w-full q-gutter-y-sm")
-        with ui.row().classes("items-end q-gutter-sm w-full"):
+        found = ui.column().classes("w-full ps-tight")
+        with ui.row().classes("items-end ps-tight w-full"):
             other = ui.input(words("home.address"), placeholder="tcp://192.168.1.20:3333").props("dense outlined")
             tag(other.classes("ps-wide"), "address")
             use = ui.button(words("home.use"), on_click=lambda: take(lambda: toys.choose(str(other.value or ""))))
@@ -42,7 +42,7 @@ def toy_section(page: Page, toys: Toys) -> None:
             if not house.toy:
                 ui.label(words("home.no_toy")).classes("ps-dim")
                 return
-            with ui.row().classes("items-center q-gutter-sm"):
+            with ui.row().classes("items-center ps-tight"):
                 tag(ui.label(words("home.chosen", url=house.toy)).classes("ps-break text-weight-bold"), "chosen")
                 if toys.simulated:
                     simulated(page)
@@ -80,13 +80,13 @@ def toy_section(page: Page, toys: Toys) -> None:
         with found:
             for url, name, about in [*given, *listed]:
                 with ui.row().classes("ps-row items-center justify-between w-full no-wrap"):
-                    with ui.column().classes("q-gutter-none"):
+                    with ui.column().classes("ps-close"):
                         ui.label(name or url).classes("ps-break")
                         ui.label(" · ".join(t for t in (url if name else "", about) if t)).classes("ps-dim ps-break")
                     choose = ui.button(words("home.choose"), on_click=lambda url=url: take(lambda: toys.choose(url)))
-                    named(choose.props("outline dense no-caps"), f"{words('home.choose')}: {name or url}")
+                    named(choose.props(SMALL), f"{words('home.choose')}: {name or url}")
             if toys.looking:
-                with ui.row().classes("items-center q-gutter-sm").props('role="status"'):
+                with ui.row().classes("items-center ps-tight").props('role="status"'):
                     ui.spinner(size="1.2em").props("aria-hidden=true")
                     ui.label(words("home.looking"))
                 return
@@ -95,7 +95,7 @@ def toy_section(page: Page, toys: Toys) -> None:
             for note in toys.listing.notes:
                 ui.label(note).classes("ps-dim ps-note")
             again = ui.button(words("home.look_again" if toys.looked else "home.look"), on_click=toys.look)
-            tag(again.props("outline dense no-caps"), "look")
+            tag(again.props(SMALL), "look")
 
     def rung() -> None:
         show_chosen()

@@ -8,7 +8,7 @@ from typing import Any
 from nicegui import ui
 
 from plushsense.apps.studio.jobs import DONE, REFUSED, RUNNING, STOPPED, Job, Jobs
-from plushsense.apps.studio.pages.home_data import findings, section
+from plushsense.apps.studio.pages.home_data import SMALL, findings, section
 from plushsense.apps.studio.shell import Page, address, named, tag
 
 PAGE_OF = {
@@ -36,7 +36,7 @@ class Work:
         self._stand: tuple[Any, ...] = ()
         self._going: dict[str, tuple[ui.label, ui.linear_progress]] = {}
         with section(page, "home.work", "work"):
-            self._rows = ui.column().classes("w-full q-gutter-y-sm")
+            self._rows = ui.column().classes("w-full ps-tight")
         self._stand = ("nothing shown",)
         self.update()
 
@@ -54,7 +54,7 @@ class Work:
                 if not stand:
                     ui.label(self._page.words("home.no_work")).classes("ps-dim")
                 for job in (*running, *earlier):
-                    with tag(ui.column().classes("ps-row w-full q-gutter-y-xs"), f"job-{job.state}"):
+                    with tag(ui.column().classes("ps-row w-full ps-tight"), f"job-{job.state}"):
                         self._row(job)
         for job in running:
             label, bar = self._going[job.id]
@@ -78,7 +78,7 @@ class Work:
             ui.label(job.said).classes("ps-bad ps-break")
         if job.state == DONE:
             self._result(job)
-        with ui.row().classes("items-center q-gutter-sm"):
+        with ui.row().classes("items-center ps-tight"):
             if job.state == DONE:
                 query = {"dataset": str(job.result.get("dataset") or "")}
                 name = words(f"pages.{PAGE_OF.get(job.task, 'home')}")
@@ -97,7 +97,7 @@ class Work:
                 do()
 
         label = self._page.words(f"home.{key}")
-        button = ui.button(label, on_click=clicked).props("outline dense no-caps")
+        button = ui.button(label, on_click=clicked).props(SMALL)
         tag(named(button, f"{label}: {job.title}"), f"job-{key}")
 
     def _progress(self, job: Job) -> tuple[str, float | None]:
