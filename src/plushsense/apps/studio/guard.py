@@ -1,4 +1,7 @@
-"""Who may talk to the studio: this machine, or whoever shows the one-time token; and pages may load nothing foreign."""
+"""Who may talk to the studio: this machine, or whoever shows the one-time token; and pages may load nothing foreign.
+
+The guard stands around everything, NiceGUI's own routes and its websocket too, so that there is one place to look.
+"""
 
 from __future__ import annotations
 
@@ -17,6 +20,11 @@ App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 COOKIE = "plushsense_visitor"
 TOKEN = "token"
+WELCOME = "welcome"
+UPLOAD_BYTES = 501_000_000
+"""The largest body of a request that brings a file."""
+BODY_BYTES = 4_000_000
+"""The largest body of any other request."""
 _LOOPBACK = ("127.0.0.1", "localhost", "[::1]", "::1")
 
 # NiceGUI's Vue templates are compiled in the browser, which needs eval; nothing may come from elsewhere.
@@ -69,6 +77,9 @@ class Visitors:
         if host.lower() not in self._names and f"[{host.lower()}]" not in self._names:
             return f"This studio is not called '{host}': use the address that it printed."
         origin = headers.get("origin")
+        # Browsers say whose page asks; a link that somebody follows to us is no harm.
+        if headers.get("sec-fetch-site") == "cross-site" and headers.get("sec-fetch-mode") != "navigate":
+            return "Another page asked for this: open the studio by its own address."
         if origin and urlsplit(origin).netloc.lower() != headers.get("host", "").lower():
             return "Another page asked for this: open the studio by its own address."
         return ""
@@ -96,7 +107,8 @@ class Visitors:
 
 
 class Guard:
-    """ASGI middleware: lets in whom `Visitors` knows, and forbids pages to load anything foreign."""
+    """ASGI application around another: lets in whom `Visitors` knows, bounds what they send, and forbids pages to load
+    anything foreign."""
 
     def __init__(self, app: App, visitors: Visitors) -> None:
         self._app, self._visitors = app, visitors
@@ -106,32 +118,79 @@ class Guard:
             await self._app(scope, receive, send)
             return
         headers = {k.decode("latin-1").lower(): v.decode("latin-1") for k, v in scope["headers"]}
+        query = scope.get("query_string", b"").decode("latin-1")
         if strange := self._visitors.strange(headers):
             await _refuse(scope, send, 400, strange)
+        elif scope["type"] == "websocket":
+            if self._visitors.knows(headers):
+                await self._app(scope, receive, send)
+            else:
+                await _refuse(scope, send, 401, _UNKNOWN)
+        elif not self._visitors.open and scope["method"] == "GET" and (visitor := self._visitors.admit(query)):
+            await _to_start(send, "" if self._visitors.knows(headers) else visitor)
         elif self._visitors.knows(headers):
-            await self._app(scope, receive, _with_headers(send))
-        elif scope["type"] == "http" and (
-            visitor := self._visitors.admit(scope.get("query_string", b"").decode("latin-1"))
-        ):
-            await _to_start(send, visitor)
+            await _bounded(self._app, scope, receive, send, headers)
+        elif scope["path"] == "/" and query == WELCOME:
+            # A browser that followed a link of another page keeps the cookie back for one request.
+            await _answer(send, 200, b'<!doctype html><meta http-equiv="refresh" content="0;url=/">', "text/html")
         else:
-            said = "This studio needs the address with the token that it printed when it was started."
-            await _refuse(scope, send, 401, said)
+            await _refuse(scope, send, 401, _UNKNOWN)
 
 
-def _with_headers(send: Send) -> Send:
+_UNKNOWN = "This studio needs the address with the token that it printed when it was started; each is good for once."
+
+
+async def _bounded(app: App, scope: Scope, receive: Receive, send: Send, headers: dict[str, str]) -> None:
+    """Have ``app`` answer, with our headers; a body that is too large is refused, also one without a length."""
+    most = UPLOAD_BYTES if _is_upload(scope) else BODY_BYTES
+    said = f"This is larger than the {most / 1e6:g} MB that are accepted here."
+    length = headers.get("content-length", "0")
+    if not length.isdecimal() or int(length) > most:
+        await _refuse(scope, send, 413, said)
+        return
+    came, over, begun = 0, False, False
+
+    async def receiving() -> dict[str, Any]:
+        nonlocal came, over
+        if over:
+            return {"type": "http.disconnect"}
+        message = await receive()
+        came += len(message.get("body", b""))
+        if came > most:
+            over = True
+            return {"type": "http.disconnect"}
+        return message
+
     async def sending(message: dict[str, Any]) -> None:
+        nonlocal begun
+        if over and not begun:
+            return
         if message["type"] == "http.response.start":
+            begun = True
             message = {**message, "headers": [*message.get("headers", []), *_HEADERS]}
         await send(message)
 
-    return sending
+    try:
+        await app(scope, receiving, sending)
+    except Exception:
+        # Whatever reads a body takes its end for the visitor's leaving.
+        if not over:
+            raise
+    if over and not begun:
+        await _refuse(scope, send, 413, said)
+
+
+def _is_upload(scope: Scope) -> bool:
+    """Whether this is NiceGUI's route for files: ``/_nicegui/client/<page>/upload/<element>``."""
+    parts: list[str] = scope["path"].split("/")
+    return bool(scope["method"] == "POST" and parts[1:3] == ["_nicegui", "client"] and parts[4:5] == ["upload"])
 
 
 async def _to_start(send: Send, visitor: str) -> None:
     """To the first page, without the token in the address."""
-    cookie = f"{COOKIE}={visitor}; Path=/; HttpOnly; SameSite=Strict"
-    headers = [(b"location", b"/"), (b"set-cookie", cookie.encode()), *_HEADERS]
+    headers = [(b"location", f"/?{WELCOME}".encode()), (b"cache-control", b"no-store"), *_HEADERS]
+    if visitor:
+        headers.append((b"set-cookie", f"{COOKIE}={visitor}; Path=/; HttpOnly; SameSite=Strict".encode()))
     await send({"type": "http.response.start", "status": 303, "headers": headers})
     await send({"type": "http.response.body", "body": b""})
 
@@ -139,7 +198,11 @@ async def _to_start(send: Send, visitor: str) -> None:
 async def _refuse(scope: Scope, send: Send, status: int, said: str) -> None:
     if scope["type"] == "websocket":
         await send({"type": "websocket.close", "code": 1008, "reason": said[:100]})
-        return
-    headers = [(b"content-type", b"text/plain; charset=utf-8"), *_HEADERS]
+    else:
+        await _answer(send, status, f"{said}\n".encode(), "text/plain")
+
+
+async def _answer(send: Send, status: int, body: bytes, kind: str) -> None:
+    headers = [(b"content-type", f"{kind}; charset=utf-8".encode()), (b"cache-control", b"no-store"), *_HEADERS]
     await send({"type": "http.response.start", "status": status, "headers": headers})
-    await send({"type": "http.response.body", "body": f"{said}\n".encode()})
+    await send({"type": "http.response.body", "body": body})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import threading
 from collections.abc import Callable, Iterator
@@ -11,10 +12,12 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from plushsense.core.errors import ConfigError
+from plushsense.dataset.copying import DEVICE_NAME
 from plushsense.dataset.store import DatasetHead
 from plushsense.recording.sessionfile import SESSION_HEAD
 
 RECORDINGS, DATASETS, BUNDLES, EXPORTS, PACKAGES = "recordings", "datasets", "bundles", "exports", "packages"
+WORK = "work"
 VIRTUAL = "virtual://?person=7"
 _HEAD = "dataset.toml"
 _BUNDLE = "*.plush"
@@ -27,7 +30,7 @@ class House:
     """One studio. Pages may read and write inside ``folder`` and the data sets given at start, nowhere else.
 
     Attributes:
-        folder: holds `RECORDINGS`, `DATASETS`, `BUNDLES`, `EXPORTS`, `PACKAGES`, each made when it is needed.
+        folder: holds `RECORDINGS`, `DATASETS`, `BUNDLES`, `EXPORTS`, `PACKAGES`, `WORK`, each made when it is needed.
         given: data sets named at start, wherever they lie.
         devices: toys named at start; the first is chosen.
         models: bundles named at start.
@@ -89,7 +92,12 @@ class House:
         places = [self.folder / BUNDLES, *self.datasets()]
         found = {p.resolve(): p for p in self.models if p.is_file()}
         found |= {p.resolve(): p for place in places for p in place.glob(_BUNDLE)}
-        return sorted(found.values(), key=lambda p: -p.stat().st_mtime)
+        dated = []
+        for path in found.values():
+            # One may be gone since it was listed, or be a link that leads nowhere.
+            with contextlib.suppress(OSError):
+                dated.append((-path.stat().st_mtime, str(path), path))
+        return [path for _, _, path in sorted(dated)]
 
     def sessions(self) -> list[Path]:
         """Every session's folder in `recordings`, by person and name."""
@@ -106,9 +114,11 @@ class House:
         Raises:
             ConfigError: for a path outside, also by way of ``..`` or a link.
         """
-        real = (self.folder / path).resolve()
-        if real in self.models or any(real == root or root in real.parents for root in self.roots()):
-            return real
+        with contextlib.suppress(ValueError, OSError, RuntimeError):
+            # Refused there: a NUL, a name that cannot be written, links in a circle.
+            real = (self.folder / path).resolve()
+            if real in self.models or any(real == root or root in real.parents for root in self.roots()):
+                return real
         raise ConfigError(
             f"'{path}' lies outside the studio's folders: choose something in '{self.folder}', or start the studio "
             "with --dataset or --home for the other one."
@@ -121,7 +131,8 @@ class House:
             ConfigError: for a name that is no plain file name, and one that is taken.
         """
         plain = name.strip()
-        if not plain or len(plain) > 64 or plain.startswith(".") or not all(c.isalnum() or c in " ._-" for c in plain):
+        odd = plain.startswith(".") or plain.endswith(".") or not all(c.isalnum() or c in " ._-" for c in plain)
+        if not plain or len(plain) > 64 or odd or DEVICE_NAME.match(plain):
             raise ConfigError(
                 f"'{name}' cannot be a name: give at most 64 letters, digits, spaces, points and hyphens."
             )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,11 +14,12 @@ import time
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from plushsense.apps.studio.house import Bell, House
+from plushsense.apps.studio.house import WORK, Bell, House
 from plushsense.core.errors import ConfigError
 from plushsense.dataset.store import write_atomically
 
-FOLDER = "work"
+UNFINISHED = ".unfinished-"
+"""How folders in the work folder begin that hold what is made on the way; they are removed at the next start."""
 RUNNING, DONE, REFUSED, STOPPED = "running", "done", "refused", "stopped"
 _KEPT = 2000
 _STOP_S = 10.0
@@ -55,13 +57,17 @@ class Jobs:
 
     def __init__(self, house: House) -> None:
         self.bell = Bell()
-        self._folder = house.folder / FOLDER
+        self._folder = house.folder / WORK
         self._processes: dict[str, subprocess.Popen[str]] = {}
         self._lock = threading.RLock()
         self._jobs: dict[str, Job] = {}
+        for left in self._folder.glob(f"{UNFINISHED}*"):
+            shutil.rmtree(left, ignore_errors=True)
         for path in sorted(self._folder.glob("*.json")):
-            with contextlib.suppress(OSError, ValueError, TypeError):
+            with contextlib.suppress(OSError, ValueError, TypeError, RecursionError):
                 job = Job(**json.loads(path.read_text(encoding="utf-8")))
+                if job.id != path.stem:
+                    continue
                 # What was running ended with the studio that ran it.
                 job.state = STOPPED if job.state == RUNNING else job.state
                 self._jobs[job.id] = job
@@ -85,9 +91,9 @@ class Jobs:
     def start(self, task: str, spec: dict[str, Any], title: str) -> Job:
         """Begin work in a process of its own."""
         with self._lock:
-            identity = f"{time.time_ns() // 1_000_000:d}"
-            while identity in self._jobs:
-                identity = str(int(identity) + 1)
+            # Ids stay in the order of beginning, also when the clock was set back.
+            last = max((int(i) for i in self._jobs if i.isdecimal()), default=0)
+            identity = str(max(time.time_ns() // 1_000_000, last + 1))
             job = Job(identity, task, spec, title)
             self._jobs[identity] = job
         self._run(job)
@@ -96,11 +102,26 @@ class Jobs:
     def resume(self, identity: str) -> Job:
         """Begin a stopped job again with the same settings; the task itself goes on from what it kept."""
         job = self.get(identity)
-        if job.state == RUNNING:
-            return job
-        job.state, job.said, job.result, job.reports, job.warnings = RUNNING, "", {}, [], []
+        with self._lock:
+            if job.state == RUNNING:
+                return job
+            job.state, job.said, job.result, job.reports, job.warnings = RUNNING, "", {}, [], []
         self._run(job)
         return job
+
+    def drop(self, identity: str) -> None:
+        """Take work that has ended out of the list; what it made stays.
+
+        Raises:
+            ConfigError: for work that is running, or an id that is none.
+        """
+        job = self.get(identity)
+        with self._lock:
+            if job.state == RUNNING:
+                raise ConfigError(f"'{job.title}' is running: stop it first.")
+            (self._folder / f"{job.id}.json").unlink(missing_ok=True)
+            self._jobs.pop(job.id, None)
+        self.bell.ring()
 
     def stop(self, identity: str) -> None:
         """Have a job end as Ctrl-C would; harmless for one that has ended. Does not wait."""
@@ -120,27 +141,36 @@ class Jobs:
 
     def _run(self, job: Job) -> None:
         job.begun_s, job.ended_s, job.progress = time.time(), 0.0, {}
-        new_group = (
+        new_group: dict[str, Any] = (
             {"creationflags": getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)}
             if sys.platform == "win32"
             else {"start_new_session": True}
         )
-        process = subprocess.Popen(
-            [sys.executable, "-m", "plushsense.apps.studio.worker"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            text=True,
-            encoding="utf-8",
-            **new_group,
-        )
+        try:
+            # First, so that nothing works that nobody could find again.
+            self._keep(job)
+            process = subprocess.Popen(
+                [sys.executable, "-m", "plushsense.apps.studio.worker"],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                text=True,
+                encoding="utf-8",
+                **new_group,
+            )
+        except OSError as cause:
+            where = cause.filename or self._folder
+            job.state, job.said = REFUSED, f"The work cannot begin: '{where}': {cause.strerror or cause}."
+            job.ended_s = time.time()
+            self.bell.ring()
+            return
         self._processes[job.id] = process
-        self._keep(job)
         assert process.stdin is not None
         with contextlib.suppress(OSError):
             # Its standard input stays open: the worker ends when the studio is gone.
-            process.stdin.write(json.dumps({"task": job.task, "spec": job.spec}) + "\n")
+            process.stdin.write(json.dumps({"task": job.task, "spec": job.spec}, default=str) + "\n")
             process.stdin.flush()
+        self.bell.ring()
         threading.Thread(target=self._follow, args=(job, process), daemon=True).start()
 
     def _follow(self, job: Job, process: subprocess.Popen[str]) -> None:
@@ -150,6 +180,8 @@ class Jobs:
             try:
                 message = json.loads(line)
             except ValueError:
+                continue
+            if not isinstance(message, dict):
                 continue
             if "progress" in message:
                 job.progress = message["progress"]
@@ -162,6 +194,10 @@ class Jobs:
                 outcome = message
             self.bell.ring()
         process.wait()
+        for end in (process.stdin, process.stdout):
+            with contextlib.suppress(OSError):
+                if end is not None:
+                    end.close()
         job.ended_s = time.time()
         if "result" in outcome:
             job.state, job.result = DONE, outcome["result"]
@@ -170,19 +206,13 @@ class Jobs:
         else:
             job.state = STOPPED
         with contextlib.suppress(OSError):
+            # Done is done, also where the disk has no room to say so.
             self._keep(job)
         self.bell.ring()
 
     def _keep(self, job: Job) -> None:
-        try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            write_atomically(self._folder / f"{job.id}.json", json.dumps(asdict(job)))
-        except OSError as cause:
-            process = self._processes.pop(job.id, None)
-            if process is not None and process.poll() is None:
-                process.kill()
-            job.state, job.said = REFUSED, f"'{self._folder}' cannot be written to: {cause.strerror or cause}."
-            self.bell.ring()
+        self._folder.mkdir(parents=True, exist_ok=True)
+        write_atomically(self._folder / f"{job.id}.json", json.dumps(asdict(job), default=str))
 
 
 def _end(process: subprocess.Popen[str]) -> None:

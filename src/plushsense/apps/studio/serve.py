@@ -13,7 +13,7 @@ from collections.abc import Callable
 from typing import Any
 
 from plushsense.apps.studio.guard import TOKEN, Guard, Visitors, is_loopback
-from plushsense.apps.studio.house import House
+from plushsense.apps.studio.house import WORK, House
 from plushsense.core.errors import ConfigError
 from plushsense.core.extras import need
 
@@ -50,6 +50,9 @@ def run(
         ConfigError: for an address that cannot be listened on.
     """
     need("nicegui", "studio")
+    # NiceGUI would keep things in the working directory, or far away: we keep none there, and it shall not begin to.
+    os.environ["NICEGUI_STORAGE_PATH"] = str(house.folder / WORK / "nicegui")
+    os.environ.pop("NICEGUI_REDIS_URL", None)
     from nicegui import app, ui
 
     from plushsense.apps.studio.shell import PAGES
@@ -61,7 +64,9 @@ def run(
     if everywhere:
         names = (*names, socket.gethostname(), *_addresses())
     visitors = Visitors(host, names)
-    app.add_middleware(Guard, visitors=visitors)
+    inner: Any = app.build_middleware_stack
+    # Outermost, also around what answers when something failed: middleware that is added stands within NiceGUI's own.
+    vars(app)["build_middleware_stack"] = lambda: Guard(inner(), visitors)
     shown = (_addresses() or [socket.gethostname()])[0] if everywhere else host
     address = f"http://{f'[{shown}]' if ':' in shown else shown}:{port}/"
     if not visitors.open:

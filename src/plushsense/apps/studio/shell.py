@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import inspect
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
+from copy import copy
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from typing import Any, Literal, TypeVar
+from urllib.parse import urlencode
 
-from nicegui import context, ui
+from nicegui import background_tasks, context, ui
+from nicegui.translations import translations
 
 from plushsense.apps.studio.house import Bell, House
 from plushsense.apps.studio.words import LANGUAGES, Words
@@ -33,6 +37,16 @@ AFFECT_COLOURS = {"positive": "#00805c", "neutral": "#3a6ea5", "negative": "#b84
 """After Okabe and Ito's palette for colour-blind eyes, darkened to read as text on white."""
 LINES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8a8a00", "#7f3c8d", "#a06000", "#444444")
 """Colours of lines in plots (Okabe and Ito, and four more)."""
+
+_QUASAR = {"en": "en-US", "lv": "lv"}
+_LIGHTS = {"system": "brightness_auto", "light": "light_mode", "dark": "dark_mode"}
+# The colour of Quasar's dark page.
+_NIGHT = "#121212"
+_BEAR = (
+    '<svg viewBox="0 0 32 32" width="28" height="28"><g fill="#e0a872"><circle cx="8" cy="8" r="5"/>'
+    '<circle cx="24" cy="8" r="5"/><circle cx="16" cy="18" r="12"/></g><g fill="#3a2410"><circle cx="11.5" cy="16" '
+    'r="1.8"/><circle cx="20.5" cy="16" r="1.8"/><ellipse cx="16" cy="21" rx="3" ry="2"/></g></svg>'
+)
 
 E = TypeVar("E", bound=ui.element)
 Kind = Literal["info", "good", "warning", "error"]
@@ -96,13 +110,13 @@ def frame(house: House, name: str) -> Iterator[Page]:
     """The bar and an empty page to fill; ``name`` is a key of `PAGES`."""
     words, dark = visitor()
     page = Page(house, name, words, bool(dark))
+    _lit(words, dark)
     ui.page_title(f"{words(f'pages.{name}')} · PlushSense")
     ui.add_head_html(f"<style>{_CSS.read_text(encoding='utf-8')}</style>")
-    ui.add_head_html(f"<script>document.documentElement.lang = '{words.language}'</script>")
-    ui.dark_mode(dark)
     ui.link(words("shell.skip"), "#content").classes("ps-skip")
-    with ui.header().classes("items-center q-py-xs").style("background: #123a5c"):
-        ui.label("PlushSense").classes("text-lg font-bold q-mr-sm").style("color: #fff")
+    with ui.header().classes("ps-header items-center no-wrap"):
+        ui.html(_BEAR, sanitize=False, tag="span").classes("ps-bear").props("aria-hidden=true")
+        ui.label("PlushSense").classes("ps-brand")
         with ui.element("nav").classes("ps-bar row items-center").props(f'aria-label="{words("shell.pages")}"'):
             for key, path in PAGES.items():
                 link = ui.link(words(f"pages.{key}"), path)
@@ -110,12 +124,33 @@ def frame(house: House, name: str) -> Iterator[Page]:
                     link.props('aria-current="page"')
         ui.space()
         _choices(words, dark)
-    with (
-        ui.element("main").classes("ps-main column no-wrap items-start q-gutter-md").props('id="content" tabindex="-1"')
-    ):
+    with ui.element("main").classes("ps-main column no-wrap items-start").props('id="content" tabindex="-1"'):
         tag(ui.html(escape(words(f"{name}.title")), sanitize=False, tag="h1"), "title")
-        page._said = ui.column().classes("w-full q-mt-none")
+        page._said = ui.column().classes("w-full ps-sayings")
         yield page
+
+
+def _lit(words: Words, dark: bool | None) -> None:
+    """Language and light of the answer itself, so that nothing shows in the wrong one before scripts have run."""
+    client = context.client
+    # The page object is the route's, shared by all visitors: each gets a copy.
+    own = copy(client.page)
+    own.dark, own.language = dark, _QUASAR[words.language]  # type: ignore[assignment]
+    client.page = own
+    translations[own.language] = {  # type: ignore[index]
+        "connection_lost": words("shell.connection_lost"),
+        "trying_to_reconnect": words("shell.trying_to_reconnect"),
+        "message_too_long": words("shell.message_too_long"),
+        "message_too_long_body": words("shell.message_too_long_body"),
+    }
+    night = f":root {{ color-scheme: dark; background: {_NIGHT}; }}"
+    early = night if dark else "" if dark is False else f"@media (prefers-color-scheme: dark) {{ {night} }}"
+    ui.add_head_html(f"<style>{early}</style>")
+    # The connection's loss is said to screen readers, too.
+    ui.add_body_html(
+        "<script>addEventListener('DOMContentLoaded', () => document.querySelectorAll('.nicegui-error-popup')"
+        ".forEach(box => box.setAttribute('role', 'alert')))</script>"
+    )
 
 
 def _choices(words: Words, dark: bool | None) -> None:
@@ -126,9 +161,16 @@ def _choices(words: Words, dark: bool | None) -> None:
         f'aria-label="{words("shell.language")}"'
     )
     tag(language, "language").on_value_change(lambda e: _keep(LANGUAGE_COOKIE, str(e.value)))
-    icon, other = ("light_mode", "light") if dark else ("dark_mode", "dark")
-    light = ui.button(icon=icon, on_click=lambda: _keep(LIGHT_COOKIE, other)).props("flat round color=white")
-    tag(light, "light").props(f'aria-label="{words(f"shell.{other}")}"')
+    now = "dark" if dark else "system" if dark is None else "light"
+    button = ui.button(icon=_LIGHTS[now]).props("flat round dense color=white")
+    tag(button, "light").props(f'aria-label="{words("shell.lights")}: {words(f"shell.{now}")}" aria-haspopup="menu"')
+    with button, ui.menu():
+        for light, icon in _LIGHTS.items():
+            item = ui.menu_item(on_click=lambda light=light: _keep(LIGHT_COOKIE, light))
+            tag(item, f"light-{light}").props(f'aria-current="{"true" if light == now else "false"}"')
+            with item, ui.row().classes("items-center no-wrap q-gutter-sm"):
+                ui.icon(icon).props("aria-hidden=true")
+                ui.label(words(f"shell.{light}")).classes("text-weight-bold" if light == now else "")
 
 
 def _keep(cookie: str, value: str) -> None:
@@ -138,19 +180,44 @@ def _keep(cookie: str, value: str) -> None:
 
 
 def on_ring(bell: Bell, callback: Callable[[], Any]) -> None:
-    """Call ``callback`` in this page after the bell rang (many rings as one), for as long as the page is open."""
+    """Call ``callback`` (it may be async) in this page after the bell rang (many rings as one), for as long as the page
+    is open."""
     client = context.client
+
+    async def going_on(made: Awaitable[Any]) -> None:
+        with client:
+            await made
 
     def called() -> None:
         with client:
-            callback()
+            made = callback()
+        if inspect.isawaitable(made):
+            background_tasks.create(going_on(made))
 
     client.on_delete(bell.hear(called))
+
+
+def address(page: str, **query: str | Path) -> str:
+    """The address of a page that begins with something chosen, such as ``address("review", dataset=path)``."""
+    chosen = {key: str(value) for key, value in query.items() if str(value)}
+    return PAGES[page] + (f"?{urlencode(chosen)}" if chosen else "")
+
+
+def asked(key: str) -> str:
+    """What this page's address says of ``key``; "" where it says nothing. Paths go through `House.inside`."""
+    request = context.client.request
+    return str(request.query_params.get(key, "")) if request is not None else ""
 
 
 def tag(element: E, name: str) -> E:
     """Give an element a name that browsers see, ``data-test``: for tests and the manual, never for looks."""
     element.props(f'data-test="{name}"')
+    return element
+
+
+def named(element: E, label: str) -> E:
+    """Give an element a name for screen readers, whatever characters that holds."""
+    element.props["aria-label"] = label
     return element
 
 

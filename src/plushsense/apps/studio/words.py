@@ -23,6 +23,11 @@ class Words:
         text = self._texts[key]
         return text.format(**values) if values else text
 
+    def number(self, value: float, digits: int = 0) -> str:
+        """A number as it is written in this language."""
+        text = f"{value:.{digits}f}"
+        return text.replace(".", self._texts["shell.decimal_point"])
+
     def has(self, key: str) -> bool:
         """Whether there is a text of this key."""
         return key in self._texts

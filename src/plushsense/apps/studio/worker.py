@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import json
 import os
+import signal
 import sys
 import threading
 from collections.abc import Callable
@@ -26,6 +27,7 @@ TASKS = {
     "publish": "plushsense.apps.studio.tasks.publish",
     "export": "plushsense.apps.studio.tasks.export",
     "verify": "plushsense.apps.studio.tasks.verify",
+    "simulate": "plushsense.apps.studio.tasks.simulating",
 }
 """Task to the module with its ``run(spec, tell) -> result``, plain values all; ``tell`` is a `Tell`."""
 
@@ -85,6 +87,9 @@ def _watch() -> None:
     """End with the studio: its end closes our standard input."""
     while sys.stdin.read(1):
         pass
+    if sys.platform != "win32" and os.getpgrp() == os.getpid():
+        # With all processes that the task has begun.
+        os.killpg(os.getpid(), signal.SIGKILL)
     os._exit(1)
 
 
