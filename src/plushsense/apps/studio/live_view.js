@@ -9,7 +9,7 @@ const el = (tag, cls, text) => {
 };
 const say = (node, text) => { if (node.textContent !== text) node.textContent = text; };
 const fill = (text, values) => text.replace(/\{(\w+)\}/g, (_, key) => values[key]);
-const LANE = 34, SPOKEN_MS = 2500, KEPT_DELAYS = 600;
+const LANE = 50, SPOKEN_MS = 2500, KEPT_DELAYS = 600;
 
 const EYES = {
   // Round and lifted; narrowed under slanted brows; closed: told apart by shape as much as by colour.
@@ -73,9 +73,12 @@ export default {
     this.stats = window.plushsenseLive = { updates: 0, drawn: 0, samples: 0, scenes: 0, delays: [], shown: [] };
     this.build();
     this.scene(this.start);
-    this.resizer = new ResizeObserver(() => { this.size(); this.draw(); });
+    this.resizer = new ResizeObserver(() => {
+      // A canvas that changes its size is empty: it is drawn in the same frame.
+      if (this.n.signals.parentElement.clientWidth !== this.wide) { this.size(); this.paint(); }
+    });
     this.resizer.observe(this.$el);
-    this.lights = new MutationObserver(() => { this.inks(); this.strip = true; this.draw(); });
+    this.lights = new MutationObserver(() => { this.inks(); this.draw(); });
     this.lights.observe(document.body, { attributes: true, attributeFilter: ["class"] });
     this.seen = () => this.$emit("visible", { on: !document.hidden });
     document.addEventListener("visibilitychange", this.seen);
@@ -156,6 +159,7 @@ export default {
       this.ink = { ink: get("--ps-ink"), dim: get("--ps-dim"), line: get("--ps-line"), soft: get("--ps-soft"), dark: document.body.classList.contains("body--dark") };
     },
     size() {
+      this.wide = this.n.signals.parentElement.clientWidth;
       const fit = (canvas, height) => {
         const ratio = window.devicePixelRatio || 1, width = canvas.parentElement.clientWidth - 28;
         canvas.width = Math.max(1, Math.round(width * ratio));
@@ -166,7 +170,6 @@ export default {
       };
       this.signalsAt = fit(this.n.signals, Math.max(2, this.channels.length) * LANE + 24);
       this.stripAt = fit(this.n.strip, 96);
-      this.strip = true;
     },
     scene(s) {
       if (this.gone) return;
@@ -267,11 +270,7 @@ export default {
       this.frame = requestAnimationFrame(() => {
         this.frame = null;
         if (this.gone) return;
-        this.drawSignals();
-        this.drawStrip();
-        this.showNow();
-        this.showBars();
-        if (!this.listed) this.list();
+        this.paint();
         this.stats.drawn++;
         if (this.waits && this.sameClock) {
           this.stats.shown.push(performance.timeOrigin + performance.now() - this.waits);
@@ -279,6 +278,13 @@ export default {
         }
         this.waits = 0;
       });
+    },
+    paint() {
+      this.drawSignals();
+      this.drawStrip();
+      this.showNow();
+      this.showBars();
+      if (!this.listed) this.list();
     },
     tell() {
       if (this.last === undefined || document.hidden) return;
@@ -326,11 +332,11 @@ export default {
         }
         c.textAlign = "left";
         c.fillStyle = k.ink;
-        c.fillText(channel.name, 0, mid - 2);
+        c.fillText(channel.name, 0, mid - 3);
         if (low > high) return;
         const value = (ys[ys.length - 1] * channel.step - channel.offset) * channel.scale;
         c.fillStyle = k.dim;
-        c.fillText(`${value.toLocaleString(this.locale, { maximumFractionDigits: 2 })} ${channel.unit === "count" ? this.words.unit_count : channel.unit}`, 0, mid + 12);
+        c.fillText(`${value.toLocaleString(this.locale, { maximumFractionDigits: 2 })} ${channel.unit === "count" ? this.words.unit_count : channel.unit}`, 0, mid + 13);
         // A lane keeps its scale until the signal leaves it or has long been small in it.
         const kept = this.range[i], span = Math.max(high - low, 8);
         if (!kept || low < kept[0] || high > kept[1] || kept[1] - kept[0] > 3 * span) this.range[i] = [low - 0.15 * span, high + 0.15 * span];

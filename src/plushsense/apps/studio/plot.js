@@ -7,7 +7,7 @@ export default {
   template: '<div role="img" :aria-label="label"><div ref="place"></div></div>',
   props: {
     label: String, series: Array, xTitle: String, yTitle: String, height: Number, windowS: Number,
-    rangeY: Array, legend: Boolean, pickable: Boolean, start: Object, resourcePath: String,
+    rangeY: Array, valuesY: { type: Boolean, default: true }, legend: Boolean, pickable: Boolean, start: Object, resourcePath: String,
   },
   async mounted() {
     await this.$nextTick();
@@ -45,7 +45,7 @@ export default {
         legend: { show: this.legend, live: false },
         cursor: { drag: { x: false, y: false } },
         scales: { x: { time: false }, y: this.rangeY ? { range: this.rangeY } : {} },
-        axes: [axis(this.xTitle, 44), axis(this.yTitle, 64)],
+        axes: [axis(this.xTitle, 44), this.valuesY ? axis(this.yTitle, 64) : { show: false }],
         series: [{ label: this.xTitle || "x" },
           ...this.curves.map((s, i) => ({ width: 1.5, points: { show: false }, ...s,
             points: { show: s.points === true }, ...(off && off[i + 1] === false ? { show: false } : {}) }))],

@@ -23,6 +23,7 @@ class Plot(Element, component="plot.js"):
         height: in pixels; the width is that of the place it stands in.
         window_s: show the last so many seconds of what `push` brings, which begins to fall off on the left.
         range_y: fixed limits of the y-axis; None: what the data need.
+        values_y: whether the y-axis says its values; not where every curve has a lane of its own.
         legend: whether the curves are listed below, to be clicked on and off.
         on_pick: called with (x, "left" or "right", shift held) for every click into the plot.
     """
@@ -37,6 +38,7 @@ class Plot(Element, component="plot.js"):
         height: int = 240,
         window_s: float = 0.0,
         range_y: tuple[float, float] | None = None,
+        values_y: bool = True,
         legend: bool = True,
         on_pick: Callable[[float, str, bool], Any] | None = None,
     ) -> None:
@@ -48,6 +50,7 @@ class Plot(Element, component="plot.js"):
         self._props["height"] = height
         self._props["windowS"] = window_s
         self._props["rangeY"] = list(range_y) if range_y else None
+        self._props["valuesY"] = values_y
         self._props["legend"] = legend
         self._props["pickable"] = on_pick is not None
         self._props["start"] = None

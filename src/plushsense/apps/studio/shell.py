@@ -31,7 +31,7 @@ PAGES = {
 }
 """The pages in the order of the work, and where each is."""
 
-AFFECT_SIGNS = {"positive": "＋", "neutral": "○", "negative": "−", "none": "·"}
+AFFECT_SIGNS = {"positive": "+", "neutral": "○", "negative": "−", "none": "·"}
 """Affect is never told by colour alone: a sign and a word stand with it."""
 AFFECT_COLOURS = {"positive": "#00805c", "neutral": "#3a6ea5", "negative": "#b84a00", "none": "#767676"}
 """After Okabe and Ito's palette for colour-blind eyes, darkened to read as text on white."""

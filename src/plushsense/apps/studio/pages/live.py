@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from pathlib import Path
 from typing import Any
 
@@ -14,17 +15,19 @@ from plushsense.apps.studio.listening import Choice, Listening
 from plushsense.apps.studio.live_view import LiveView
 from plushsense.apps.studio.pages import live_clips
 from plushsense.apps.studio.shell import Page, on_ring, tag
-from plushsense.core.signal import layout_names
-from plushsense.devices.listing import list_devices
-from plushsense.devices.opening import parse_url
+from plushsense.apps.studio.toys import Toys
+from plushsense.core.errors import PlushSenseError
 from plushsense.live.react import reaction_names
+from plushsense.recording.toy import is_virtual
+
+_GRID = "display: grid; grid-template-columns: repeat(auto-fit, minmax(230px, 1fr)); gap: 12px"
 
 
 def show(page: Page) -> None:
     """Build the page."""
     listening = page.house.part(Listening)
     words = page.words
-    with ui.element("section").classes("ps-card w-full column no-wrap q-gutter-y-sm"):
+    with ui.element("section").classes("ps-card w-full column no-wrap ps-tight"):
         _controls(page, listening)
     simulated = tag(ui.label(words("shell.simulation")).classes("ps-said ps-said-warning w-full"), "simulation")
 
@@ -81,37 +84,37 @@ def _follow(view: LiveView, feed: Feed, listening: Listening) -> None:
 
 def _controls(page: Page, listening: Listening) -> None:
     words, house = page.words, page.house
+    toys = house.part(Toys)
     choice = listening.choice
-    toys = _toys(house, choice)
     bundles = {str(path): path.stem for path in house.bundles()}
     chosen = str(choice.bundle) if choice.bundle else next(iter(bundles), None)
-    with ui.row().classes("w-full items-end q-gutter-sm"):
+    first = choice.toy if listening.now.running else house.toy or VIRTUAL
+    with ui.element("div").classes("w-full").style(_GRID):
         toy = ui.select(
-            toys,
-            value=choice.toy or house.toy or VIRTUAL,
+            _named(toys, house, first),
+            value=first,
             label=words("live.toy"),
             with_input=True,
             new_value_mode="add-unique",
-        ).classes("col-12 col-md-4")
-        tag(toy, "toy")
-        look = ui.button(words("live.look"), icon="search").props("flat")
-        tag(look, "look")
-        bundle = ui.select(bundles, value=chosen, label=words("live.bundle")).classes("col-12 col-md-3")
-        tag(bundle, "bundle")
+        )
+        tag(toy.props("outlined dense"), "toy")
+        bundle = ui.select(bundles, value=chosen, label=words("live.bundle"))
+        tag(bundle.props("outlined dense"), "bundle")
         engines = {"float": words("live.engine_float"), "int8": words("live.engine_int8")}
-        engine = ui.select(engines, value=choice.engine, label=words("live.engine")).classes("col-12 col-sm-3")
-        tag(engine, "engine")
-        reactions = {"": words("live.reactions_none")} | {
+        engine = ui.select(engines, value=choice.engine, label=words("live.engine"))
+        tag(engine.props("outlined dense"), "engine")
+        answers = {"": words("live.reactions_none")} | {
             name: words(f"live.reactions_{name}") if words.has(f"live.reactions_{name}") else name
             for name in reaction_names()
         }
-        answers = ui.select(reactions, value=choice.reactions, label=words("live.reactions"))
-        tag(answers, "reactions").classes("col-12 col-sm-3")
-    with ui.row().classes("w-full items-center q-gutter-sm"):
-        start = tag(ui.button(words("live.start"), icon="play_arrow"), "start")
-        stop = tag(ui.button(words("live.stop"), icon="stop").props("outline"), "stop")
+        reactions = ui.select(answers, value=choice.reactions, label=words("live.reactions"))
+        tag(reactions.props("outlined dense"), "reactions")
+    with ui.row().classes("w-full items-center ps-tight"):
+        start = tag(ui.button(words("live.start"), icon="play_arrow").props("unelevated no-caps"), "start")
+        stop = tag(ui.button(words("live.stop"), icon="stop").props("outline no-caps"), "stop")
+        look = tag(ui.button(words("live.look"), icon="search", on_click=toys.look).props("flat no-caps"), "look")
         virtual = tag(ui.checkbox(words("live.simulated"), value=choice.simulated), "simulated")
-        busy = tag(ui.spinner(size="1.6em"), "busy")
+        busy = tag(ui.spinner(size="1.6em").props("aria-hidden=true"), "busy")
     busy.set_visibility(False)
 
     async def working(what: Any, *args: Any) -> bool:
@@ -127,85 +130,74 @@ def _controls(page: Page, listening: Listening) -> None:
 
     async def begin() -> None:
         with page.refusing():
-            url = _allowed(house, str(toy.value or ""))
-            wanted = Choice(
-                url, Path(bundle.value) if bundle.value else None, engine.value, answers.value, bool(virtual.value)
-            )
-            await working(listening.start, wanted)
+            url = toys.choose(str(toy.value or ""))
+            path = Path(bundle.value) if bundle.value else None
+            await working(listening.start, Choice(url, path, engine.value, reactions.value, bool(virtual.value)))
 
     async def other() -> None:
         # Also called when a page follows what another tab chose: then there is nothing to do.
         now = listening.choice
-        wanted = (Path(bundle.value) if bundle.value else None, engine.value, answers.value)
-        if wanted == (now.bundle, now.engine, now.reactions):
-            return
-        if not await working(listening.choose, *wanted):
+        wanted = (Path(bundle.value) if bundle.value else None, engine.value, reactions.value)
+        if wanted != (now.bundle, now.engine, now.reactions) and not await working(listening.choose, *wanted):
             follow()
 
     def follow() -> None:
+        """Show what is chosen, whoever chose it."""
         now = listening.choice
-        if now.bundle is not None and str(now.bundle) in bundle.options:
+        if now.bundle is not None:
+            if str(now.bundle) not in bundles:
+                bundles[str(now.bundle)] = now.bundle.stem
+                bundle.set_options(bundles)
             bundle.set_value(str(now.bundle))
         engine.set_value(now.engine)
-        answers.set_value(now.reactions)
+        reactions.set_value(now.reactions)
+        if listening.now.running:
+            toy.set_options(_named(toys, house, now.toy), value=now.toy)
+            virtual.set_value(now.simulated)
 
-    def changed() -> None:
+    def changed(before: list[Any]) -> None:
         running = listening.now.running
         start.set_visibility(not running)
         stop.set_visibility(running)
-        toy.set_enabled(not running)
-        look.set_enabled(not running)
-        virtual.set_enabled(not running)
+        for control in (toy, look, virtual):
+            control.set_enabled(not running)
         if said := listening.now.trouble or listening.now.said:
             page.say(said, "warning")
-        elif state and state[0]:
+        elif before and before[0]:
             page.say("")
 
     state: list[Any] = []
 
     def rung() -> None:
-        now = listening.now
-        seen = [now.trouble or now.said, now.running, listening.choice]
+        # At every decision, too: mostly there is nothing new here.
+        seen = [listening.now.trouble or listening.now.said, listening.now.running, listening.choice]
         if seen != state:
-            changed()
+            changed(state)
             state[:] = seen
             follow()
 
-    async def search() -> None:
-        busy.set_visibility(True)
-        found = await asyncio.to_thread(list_devices)
-        busy.set_visibility(False)
-        toy.set_options(toys | {d.url: f"{d.name or d.url}: {d.description}" for d in found.devices}, value=toy.value)
-        if found.notes:
-            page.say(" ".join(found.notes))
+    def listed() -> None:
+        busy.set_visibility(toys.looking)
+        if not listening.now.running:
+            toy.set_options(_named(toys, house, str(toy.value or "")), value=toy.value)
+
+    def simulated() -> None:
+        if not listening.now.running:
+            with contextlib.suppress(PlushSenseError):
+                virtual.set_value(is_virtual(str(toy.value or "")))
 
     start.on_click(begin)
     stop.on_click(lambda: working(listening.stop))
-    look.on_click(search)
-    for control in (bundle, engine, answers):
+    toy.on_value_change(simulated)
+    for control in (bundle, engine, reactions):
         control.on_value_change(other)
     on_ring(listening.bell, rung)
+    on_ring(toys.bell, listed)
+    simulated()
     rung()
 
 
-def _toys(house: House, choice: Choice) -> dict[str, str]:
-    """The toys that were named, each once, and the virtual one."""
-    named = dict.fromkeys(t for t in (choice.toy, house.toy, *house.devices, VIRTUAL) if t)
-    return {url: url for url in named}
-
-
-def _allowed(house: House, url: str) -> str:
-    """A toy's address as typed in a browser: a file that it names must lie in the studio's folders.
-
-    Raises:
-        ConfigError: for an address that is none, or a file elsewhere.
-    """
-    address = parse_url(url)
-    if url in (*house.devices, house.toy):
-        return url
-    if address.scheme == "replay":
-        house.inside(address.place)
-    layout = address.query.get("layout", "")
-    if layout and layout not in layout_names():
-        house.inside(layout)
-    return url
+def _named(toys: Toys, house: House, url: str) -> dict[str, str]:
+    """The toys that were named, the one at ``url``, the virtual one, and those that were found."""
+    named = {one: one for one in (url, house.toy, *house.devices, VIRTUAL) if one}
+    return named | {d.url: f"{d.name or d.url}: {d.description}" for d in toys.listing.devices}

@@ -14,7 +14,7 @@ from nicegui import ui
 from plushsense.apps.studio.clips import Clip, Clips
 from plushsense.apps.studio.listening import Listening
 from plushsense.apps.studio.plot import Plot
-from plushsense.apps.studio.shell import LINES, Page, on_ring, tag
+from plushsense.apps.studio.shell import LINES, Page, named, on_ring, tag
 from plushsense.core.gestures import GestureSet
 from plushsense.core.recfile import Frames
 from plushsense.dataset.store import DatasetHead
@@ -40,11 +40,11 @@ def show(page: Page, listening: Listening) -> None:
     """Build the part of the page below the live view."""
     clips = page.house.part(Clips)
     words = page.words
-    with ui.element("section").classes("ps-card w-full column no-wrap q-gutter-y-sm"):
+    with ui.element("section").classes("ps-card w-full column no-wrap ps-tight"):
         ui.html(words("live.hard"), sanitize=False, tag="h2")
         ui.label(words("live.hard_about")).classes("ps-dim")
         _keeping(page, listening, clips)
-        listing = tag(ui.column().classes("w-full q-gutter-y-xs"), "clips")
+        listing = tag(ui.column().classes("w-full ps-close"), "clips")
         desk = tag(ui.column().classes("w-full"), "clip")
 
     async def refresh() -> None:
@@ -64,23 +64,25 @@ def show(page: Page, listening: Listening) -> None:
             with desk:
                 _Desk(page, clips, clip, frames)
 
-    async def first() -> None:
-        await refresh()
-
-    ui.timer(0.05, first, once=True)
-    on_ring(clips.bell, lambda: ui.timer(0.0, refresh, once=True))
+    ui.timer(0.05, refresh, once=True)
+    on_ring(clips.bell, refresh)
 
 
 def _keeping(page: Page, listening: Listening, clips: Clips) -> None:
     """Whose it is, and the buttons that keep it."""
     words = page.words
-    with ui.row().classes("w-full items-end q-gutter-sm"):
+    with ui.row().classes("w-full items-end ps-tight"):
         person = tag(ui.input(words("live.person"), placeholder="S01"), "person")
         seconds = ui.select({s: words("live.seconds", s=s) for s in _KEEP_S}, value=10, label=words("live.keep_last"))
         tag(seconds, "keep-seconds").classes("w-32")
-        keep = tag(ui.button(words("live.keep"), icon="bookmark_add"), "keep")
-        begin = tag(ui.button(words("live.record"), icon="fiber_manual_record").props("outline"), "record")
-        end = tag(ui.button(words("live.record_end"), icon="stop").props("color=negative"), "record-end")
+        keep = tag(ui.button(words("live.keep"), icon="bookmark_add").props("unelevated no-caps"), "keep")
+        begin = tag(ui.button(words("live.record"), icon="fiber_manual_record").props("outline no-caps"), "record")
+        end = tag(
+            ui.button(words("live.record_end"), icon="stop")
+            .props("unelevated no-caps")
+            .style("background: #a3310a !important; color: #fff !important"),
+            "record-end",
+        )
         length = tag(ui.label("").props('role="timer"').classes("ps-dim"), "record-length")
 
     async def kept() -> None:
@@ -114,7 +116,7 @@ def _keeping(page: Page, listening: Listening, clips: Clips) -> None:
         if time.monotonic() - shown[1] < 0.5:
             return
         shown[1] = time.monotonic()
-        text = words("live.recorded", s=f"{clips.recorded_s:.0f}") if clips.recording else ""
+        text = words("live.recorded", s=words.number(clips.recorded_s)) if clips.recording else ""
         if length.text != text:
             length.set_text(text)
         if keep.enabled != bool(listening.device is not None and listening.device.ring.count) or (
@@ -142,15 +144,15 @@ def _row(page: Page, clips: Clips, clip: Clip, opened: Any) -> None:
     else:
         state = ", ".join(words.gesture(label.gesture) for label in clip.labels)
         state += f"; {words('live.clip_added', names=', '.join(clip.added))}" if clip.added else ""
-    with ui.row().classes("w-full items-center q-gutter-sm").style("border-bottom: 1px solid var(--ps-line)") as row:
+    with ui.row().classes("w-full items-center ps-tight").style("border-bottom: 1px solid var(--ps-line)") as row:
         tag(row, f"clip-{clip.key}")
         ui.label(clip.key).classes("font-bold")
-        ui.label(f"{when}, {seconds:.1f} s").classes("ps-dim")
+        ui.label(f"{when}, {words.number(seconds, 1)} s").classes("ps-dim")
         ui.label(state).classes("flex-grow")
         if clip.head.simulated:
-            ui.label(words("live.simulated_short")).classes("ps-said ps-said-warning").style("padding: 0 8px")
-        look = ui.button(words("live.clip_open"), on_click=opened).props("flat dense")
-        look.props(f'aria-label="{words("live.clip_open")} {clip.key}"').set_enabled(clip.key != clips.recording)
+            ui.label(words("live.simulated_short")).classes("ps-simulated")
+        look = ui.button(words("live.clip_open"), on_click=opened).props("flat dense no-caps")
+        named(look, f"{words('live.clip_open')} {clip.key}").set_enabled(clip.key != clips.recording)
 
 
 class _Desk:
@@ -172,14 +174,15 @@ class _Desk:
             x=words("live.clip_time"),
             height=340,
             range_y=(-0.1, len(names) + 0.1),
+            values_y=False,
             on_pick=self._picked,
         )
         tag(self._plot, "clip-plot").begin(*self._lanes(), self._marks())
-        with ui.row().classes("w-full items-end q-gutter-sm"):
+        with ui.row().classes("w-full items-end ps-tight"):
             self._from = self._number(words("live.clip_from"), "clip-from")
             self._to = self._number(words("live.clip_to"), "clip-to")
             self._said = tag(ui.label("").classes("ps-dim"), "clip-rows")
-        with ui.row().classes("w-full items-end q-gutter-sm"):
+        with ui.row().classes("w-full items-end ps-tight"):
             self._datasets = {str(p): page.house.title(p) for p in page.house.datasets()}
             self._dataset = ui.select(
                 self._datasets,
@@ -192,9 +195,13 @@ class _Desk:
                 [], label=words("live.clip_gesture"), with_input=True, new_value_mode="add-unique"
             ).classes("col-12 col-sm-4")
             tag(self._gesture, "clip-gesture")
-            self._button = tag(ui.button(words("live.clip_label"), icon="label", on_click=self._label), "clip-label")
+            self._button = tag(
+                ui.button(words("live.clip_label"), icon="label", on_click=self._label).props("unelevated no-caps"),
+                "clip-label",
+            )
             self._adding = tag(
-                ui.button(words("live.clip_add"), icon="playlist_add", on_click=self._add).props("outline"), "clip-add"
+                ui.button(words("live.clip_add"), icon="playlist_add", on_click=self._add).props("outline no-caps"),
+                "clip-add",
             )
         self._adding.set_enabled(bool(clip.labels))
         self._offer()
@@ -264,7 +271,9 @@ class _Desk:
             self._to.set_value(round(self._at(shown.last - 1), 2))
             self._setting = False
         length = self._at(shown.last - 1) - self._at(shown.first)
-        said = self._page.words("live.clip_rows", rows=max(0, shown.last - shown.first), s=f"{max(0.0, length):.2f}")
+        said = self._page.words(
+            "live.clip_rows", rows=max(0, shown.last - shown.first), s=self._page.words.number(max(0.0, length), 2)
+        )
         self._said.set_text(said)
         self._plot.lines(self._marks())
 
