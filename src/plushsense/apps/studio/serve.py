@@ -12,6 +12,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from filelock import FileLock, Timeout
+
 from plushsense.apps.studio.guard import TOKEN, Guard, Visitors, is_loopback
 from plushsense.apps.studio.house import WORK, House
 from plushsense.core.errors import ConfigError
@@ -47,7 +49,7 @@ def run(
 
     Raises:
         MissingExtraError: without the extra ``studio``.
-        ConfigError: for an address that cannot be listened on.
+        ConfigError: for an address that cannot be listened on, and a folder that another studio serves.
     """
     need("nicegui", "studio")
     # NiceGUI would keep things in the working directory, or far away: we keep none there, and it shall not begin to.
@@ -57,6 +59,7 @@ def run(
 
     from plushsense.apps.studio.shell import PAGES
 
+    alone = _alone(house)
     port = _free_port(host, port)
     for name, path in PAGES.items():
         ui.page(path, response_timeout=30.0)(_page(house, name))
@@ -90,6 +93,28 @@ def run(
         reconnect_timeout=10.0,
         uvicorn_logging_level="error",
     )
+    if alone is not None:
+        alone.release()
+
+
+def _alone(house: House) -> FileLock | None:
+    """A lock on the folder, held until this process ends: two studios would each take the other's work for left over.
+
+    Raises:
+        ConfigError: when another studio has it.
+    """
+    lock = FileLock(house.folder / WORK / "studio.lock", timeout=0)
+    try:
+        (house.folder / WORK).mkdir(parents=True, exist_ok=True)
+        lock.acquire()
+    except Timeout:
+        raise ConfigError(
+            f"A studio is open on '{house.folder}' already: use that one, or give another folder with --home."
+        ) from None
+    except (OSError, NotImplementedError):
+        # Where nothing can be written there is nothing to keep apart.
+        return None
+    return lock
 
 
 def _page(house: House, name: str) -> Callable[[], Any]:

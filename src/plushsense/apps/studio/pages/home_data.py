@@ -149,7 +149,7 @@ class Sessions:
                     box = ui.checkbox(self._said(one), value=str(one.path) in self._chosen)
                     box.on_value_change(lambda e, one=one: self._choose(one, bool(e.value)))
             with ui.row().classes("items-end ps-tight w-full"):
-                name = tag(ui.input(words("home.name")).props("dense outlined"), "new-name")
+                name = tag(ui.input(words("home.name")).props("dense outlined").classes("ps-wide"), "new-name")
                 make = ui.button(words("home.make"), on_click=lambda: self._make(batch, str(name.value or "")))
                 tag(make.props("unelevated no-caps"), "make")
             fitting = {

@@ -1,0 +1,265 @@
+"""Long work is begun, stopped, taken up, and never outlives its studio."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from plushsense.apps.studio.house import WORK, House
+from plushsense.apps.studio.jobs import DONE, REFUSED, RUNNING, STOPPED, UNFINISHED, Job, Jobs
+from plushsense.core.errors import ConfigError
+
+SIMULATE = {"people": 2, "repetitions": 1}
+LONG = {"people": 400, "repetitions": 3}
+
+
+@pytest.fixture
+def house(tmp_path: Path) -> House:
+    return House(tmp_path / "home")
+
+
+@pytest.fixture
+def jobs(house: House) -> Iterator[Jobs]:
+    made = Jobs(house)
+    yield made
+    made.close()
+
+
+def spec(house: House, name: str, size: dict[str, int]) -> dict[str, object]:
+    return {**size, "dest": str(house.folder / "datasets" / name), "work": str(house.folder / WORK)}
+
+
+def until(what: Callable[[], object], seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < end, "it did not happen"
+        time.sleep(0.02)
+
+
+def ended(job: Job) -> Job:
+    until(lambda: job.state != RUNNING)
+    return job
+
+
+def on_disk(house: House, job: Job) -> dict[str, object]:
+    read: dict[str, object] = json.loads((house.folder / WORK / f"{job.id}.json").read_text(encoding="utf-8"))
+    return read
+
+
+def alive(pid: int) -> bool:
+    stat = Path(f"/proc/{pid}/stat")
+    if stat.exists():
+        return stat.read_text().rpartition(")")[2].split()[0] != "Z"
+    try:
+        os.kill(pid, 0)
+    except OSError:
+        return False
+    return True
+
+
+def test_work_reports_and_ends_with_its_result(house: House, jobs: Jobs) -> None:
+    job = ended(jobs.start("simulate", spec(house, "a", SIMULATE), "Trying"))
+    assert job.state == DONE, job.said
+    assert job.result["people"] == 2
+    assert (house.folder / "datasets" / "a" / "dataset.toml").is_file()
+    assert {r["what"] for r in job.reports} == {"recording", "importing"}
+    assert job.progress == job.reports[-1]
+    assert 0 < job.begun_s <= job.ended_s
+    until(lambda: on_disk(house, job)["state"] == DONE)
+    assert [p for p in (house.folder / WORK).iterdir() if p.name.startswith(UNFINISHED)] == []
+    # Another studio on the same folder knows of it.
+    again = Jobs(house).get(job.id)
+    assert (again.state, again.result, again.title) == (DONE, job.result, "Trying")
+
+
+def test_what_a_task_refuses_is_a_sentence(house: House, jobs: Jobs) -> None:
+    job = ended(jobs.start("check", {"dataset": str(house.folder / "nothing")}, "Check"))
+    assert job.state == REFUSED
+    assert job.said.startswith("There is no folder")
+    until(lambda: on_disk(house, job)["state"] == REFUSED)
+
+
+@pytest.mark.parametrize(("task", "asked"), [("nothing", {}), ("check", {}), ("simulate", {"people": "many"})])
+def test_a_task_that_cannot_be_is_refused(jobs: Jobs, task: str, asked: dict[str, object]) -> None:
+    job = ended(jobs.start(task, asked, "x"))
+    assert job.state == REFUSED
+    assert job.said.startswith("The work broke off")
+
+
+def test_stopped_work_ends_soon_and_can_be_begun_again(house: House, jobs: Jobs) -> None:
+    job = jobs.start("simulate", spec(house, "long", LONG), "Long")
+    until(lambda: job.progress)
+    assert jobs.resume(job.id) is job
+    with pytest.raises(ConfigError, match="stop it first"):
+        jobs.drop(job.id)
+    jobs.stop(job.id)
+    ended(job)
+    assert job.state == STOPPED
+    assert not (house.folder / "datasets" / "long").exists()
+    jobs.stop(job.id)
+    job.spec = spec(house, "long", SIMULATE)
+    jobs.resume(job.id)
+    assert ended(job).state == DONE
+    jobs.drop(job.id)
+    assert jobs.all() == [] and not (house.folder / WORK / f"{job.id}.json").exists()
+
+
+def test_closing_stops_everything(house: House) -> None:
+    jobs = Jobs(house)
+    two = [jobs.start("simulate", spec(house, f"long {n}", LONG), "Long") for n in range(2)]
+    for job in two:
+        until(lambda job=job: job.progress)
+    jobs.close()
+    for job in two:
+        assert ended(job).state == STOPPED
+
+
+def test_ids_are_unique_in_order_also_when_the_clock_goes_back(
+    house: House, jobs: Jobs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(time, "time_ns", lambda: 5_000_000_000)
+    made = [jobs.start("check", {}, str(n)) for n in range(3)]
+    monkeypatch.setattr(time, "time_ns", lambda: 1_000_000_000)
+    made.append(jobs.start("check", {}, "3"))
+    assert [int(j.id) for j in made] == sorted({int(j.id) for j in made})
+    assert [j.title for j in jobs.all()] == ["3", "2", "1", "0"]
+    assert jobs.all("train") == []
+    for job in made:
+        ended(job)
+
+
+def test_an_id_that_is_none_is_refused(jobs: Jobs) -> None:
+    for call in (jobs.get, jobs.resume, jobs.drop):
+        with pytest.raises(ConfigError, match="no work"):
+            call("nothing")
+    jobs.stop("nothing")
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "{", "[]", "7", "null", '{"id": "bad"}', "[" * 100_000, '{"id":"other","task":"check","spec":{},"title":""}'],
+    ids=lambda t: ascii(t)[:12],
+)
+def test_a_broken_file_is_passed_over(house: House, text: str) -> None:
+    (house.folder / WORK).mkdir(parents=True)
+    (house.folder / WORK / "bad.json").write_text(text, encoding="utf-8")
+    good = {"id": "1", "task": "check", "spec": {}, "title": "x", "state": DONE}
+    (house.folder / WORK / "1.json").write_text(json.dumps(good), encoding="utf-8")
+    assert [j.id for j in Jobs(house).all()] == ["1"]
+    assert (house.folder / WORK / "bad.json").exists()
+
+
+@pytest.mark.skipif(sys.platform == "win32" or os.geteuid() == 0, reason="the folder could be written to all the same")
+def test_a_folder_that_cannot_be_written_to(house: House) -> None:
+    house.folder.mkdir()
+    house.folder.chmod(0o500)
+    try:
+        job = Jobs(house).start("check", {"dataset": "x"}, "Check")
+        assert job.state == REFUSED
+        assert "cannot begin" in job.said and "Permission" in job.said
+    finally:
+        house.folder.chmod(0o700)
+
+
+def test_a_file_where_the_folder_should_be(house: House) -> None:
+    house.folder.mkdir()
+    (house.folder / WORK).write_text("a file")
+    job = Jobs(house).start("check", {"dataset": "x"}, "Check")
+    assert job.state == REFUSED
+    assert str(house.folder / WORK) in job.said
+
+
+STUDIO = """
+import sys, time
+from pathlib import Path
+from plushsense.apps.studio.house import House
+from plushsense.apps.studio.jobs import Jobs
+house = House(Path(sys.argv[1]))
+jobs = Jobs(house)
+job = jobs.start("simulate", {"people": 400, "repetitions": 3, "dest": str(house.folder / "d"),
+                              "work": str(house.folder / "work")}, "Long")
+while not job.progress:
+    time.sleep(0.02)
+print(job.id, jobs._processes[job.id].pid, flush=True)
+time.sleep(600)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="kill is for POSIX")
+def test_the_work_of_a_killed_studio_ends_and_reads_as_stopped(house: House) -> None:
+    house.folder.mkdir()
+    studio = subprocess.Popen(
+        [sys.executable, "-c", STUDIO, str(house.folder)], stdout=subprocess.PIPE, text=True, env=os.environ
+    )
+    assert studio.stdout is not None
+    identity, pid = studio.stdout.readline().split()
+    assert alive(int(pid))
+    studio.send_signal(signal.SIGKILL)
+    studio.wait()
+    studio.stdout.close()
+    until(lambda: not alive(int(pid)))
+    assert list((house.folder / WORK).glob(f"{UNFINISHED}*"))
+    jobs = Jobs(house)
+    assert jobs.get(identity).state == STOPPED
+    assert not (house.folder / "d").exists()
+    assert not list((house.folder / WORK).glob(f"{UNFINISHED}*"))
+
+
+WORKER_WITH_CHILD = """
+import subprocess, sys, types
+from plushsense.apps.studio import worker
+def run(spec, tell):
+    child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
+    tell.progress(pid=child.pid)
+    child.wait()
+sys.modules["task_with_child"] = types.SimpleNamespace(run=run)
+worker.TASKS["child"] = "task_with_child"
+sys.exit(worker.main())
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="process groups are of POSIX")
+def test_a_worker_ends_with_its_studio_and_takes_its_own_processes_along() -> None:
+    worker = subprocess.Popen(
+        [sys.executable, "-c", WORKER_WITH_CHILD],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    assert worker.stdin is not None and worker.stdout is not None
+    worker.stdin.write('{"task": "child", "spec": {}}\n')
+    worker.stdin.flush()
+    child = json.loads(worker.stdout.readline())["progress"]["pid"]
+    assert alive(child)
+    worker.stdin.close()
+    worker.wait(20)
+    worker.stdout.close()
+    until(lambda: not alive(child))
+
+
+@pytest.mark.parametrize("line", ["\n", "nonsense\n", "[]\n", '{"task": 5, "spec": {}}\n'])
+def test_a_worker_that_is_asked_nonsense_refuses(line: str) -> None:
+    worker = subprocess.Popen(
+        [sys.executable, "-m", "plushsense.apps.studio.worker"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert worker.stdin is not None and worker.stdout is not None
+    # It stays open: its end would be the studio's.
+    worker.stdin.write(line)
+    worker.stdin.flush()
+    refused = json.loads(worker.stdout.readline())["refused"]
+    assert "broke off" in refused
+    assert worker.wait(60) == 2
+    worker.stdin.close()
+    worker.stdout.close()
