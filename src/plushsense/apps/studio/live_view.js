@@ -374,6 +374,7 @@ export default {
         if (x(s) > 14 && x(s) < width - 14) c.fillText(`${s} s`, x(s), 90);
       }
       c.textAlign = "left";
+      const told = [-1, -1];
       for (const s of this.spans.values()) {
         const to = s.to === null ? this.t : s.to;
         if (to < begin) continue;
@@ -390,7 +391,12 @@ export default {
         }
         c.fillStyle = k.ink;
         const label = `${this.signs[s.affect || "none"]} ${this.nameOf(s)}`;
-        c.fillText(label, Math.min(a, width - c.measureText(label).width), top + 27);
+        const wide = c.measureText(label).width, at = Math.min(a, width - wide);
+        // Names never stand on each other; the list has them all.
+        if (at > told[row]) {
+          c.fillText(label, at, top + 27);
+          told[row] = at + wide + 6;
+        }
       }
     },
     showNow() {

@@ -72,9 +72,10 @@ def _keeping(page: Page, listening: Listening, clips: Clips) -> None:
     """Whose it is, and the buttons that keep it."""
     words = page.words
     with ui.row().classes("w-full items-end ps-tight"):
-        person = tag(ui.input(words("live.person"), placeholder="S01"), "person")
+        person = ui.input(words("live.person"), placeholder="S01").props("outlined dense")
+        tag(person, "person")
         seconds = ui.select({s: words("live.seconds", s=s) for s in _KEEP_S}, value=10, label=words("live.keep_last"))
-        tag(seconds, "keep-seconds").classes("w-32")
+        tag(seconds.props("outlined dense"), "keep-seconds").classes("w-32")
         keep = tag(ui.button(words("live.keep"), icon="bookmark_add").props("unelevated no-caps"), "keep")
         begin = tag(ui.button(words("live.record"), icon="fiber_manual_record").props("outline no-caps"), "record")
         end = tag(
@@ -190,11 +191,11 @@ class _Desk:
                 label=words("live.clip_dataset"),
                 on_change=self._offer,
             ).classes("col-12 col-sm-4")
-            tag(self._dataset, "clip-dataset")
+            tag(self._dataset.props("outlined dense"), "clip-dataset")
             self._gesture = ui.select(
                 [], label=words("live.clip_gesture"), with_input=True, new_value_mode="add-unique"
             ).classes("col-12 col-sm-4")
-            tag(self._gesture, "clip-gesture")
+            tag(self._gesture.props("outlined dense"), "clip-gesture")
             self._button = tag(
                 ui.button(words("live.clip_label"), icon="label", on_click=self._label).props("unelevated no-caps"),
                 "clip-label",
@@ -209,7 +210,7 @@ class _Desk:
 
     def _number(self, label: str, name: str) -> ui.number:
         field = ui.number(label, step=0.01, format="%.2f", suffix="s", on_change=self._typed)
-        return tag(field.classes("w-32"), name)
+        return tag(field.props("outlined dense").classes("w-36"), name)
 
     def _lanes(self) -> tuple[list[float], list[list[float]]]:
         """Every channel in a lane of its own, the first on top."""
