@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -195,7 +196,7 @@ def test_what_is_kept_is_bounded_and_every_event_ends(house: House) -> None:
     late = Event("begun", 9999, "negative", None, "gate", room.KEPT_SPAN_S + 2 * room.KEPT_SPANS - 1.5, 0.0)
     with listening._lock:
         listening._take_event(late, 100.0)
-    assert [s.begin_s for s in listening.spans()][0] >= late.since_s + 100.0 - room.KEPT_SPAN_S
+    assert next(s.begin_s for s in listening.spans()) >= late.since_s + 100.0 - room.KEPT_SPAN_S
     listening.close()
 
 
@@ -225,7 +226,7 @@ def test_a_feed_sends_everything_once_and_anew_when_it_missed_some(house: House)
         seconds += message["x"]
         feed.seen(message["n"])
     assert seconds == sorted(set(seconds)), "each sample once, none left out"
-    assert max(b - a for a, b in zip(seconds, seconds[1:], strict=False)) < 0.1
+    assert max(b - a for a, b in pairwise(seconds)) < 0.1
     for name in ("hidden", "away"):
         setattr(feed, name, True)
         assert feed.message() is None

@@ -1,0 +1,305 @@
+"""The live page in a real browser: what the toy does is seen, whatever happens to bundles, toys, tabs and server."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+sys.path.insert(0, str(Path(__file__).parent))
+from bundles import OTHER, odd_bundle
+
+from browsing import DESK, TABLET, Look, Studio, axe, connected, marked
+from plushsense.apps.studio.clips import Clips
+from plushsense.apps.studio.house import House
+from plushsense.core.recfile import read_recording
+from plushsense.dataset.index import open_dataset
+
+Fixture = Callable[..., Any]
+VIRTUAL = ("--device", "virtual://?person=31", "--speed", "2")
+
+
+def live(browser: Look, url: str) -> Any:
+    """The live page, its view standing."""
+    page = browser.open(f"{url}/live")
+    page.wait_for_function("() => window.plushsenseLive && window.plushsenseLive.scenes > 0")
+    return page
+
+
+def started(browser: Look, url: str) -> Any:
+    """The same, and a toy that is being read."""
+    page = live(browser, url)
+    marked(page, "start").click()
+    marked(page, "state").get_by_text("Reading").wait_for()
+    return page
+
+
+def choose(page: Any, label: str, option: str) -> None:
+    page.get_by_label(label, exact=True).click()
+    page.get_by_role("option", name=option, exact=True).click()
+
+
+def look_at(page: Any) -> dict[str, Any]:
+    found: dict[str, Any] = page.evaluate("() => { const {delays, shown, ...s} = window.plushsenseLive; return s; }")
+    return found
+
+
+def no_sideways(page: Any) -> bool:
+    return bool(page.evaluate("() => document.documentElement.scrollWidth <= innerWidth"))
+
+
+def test_what_the_toy_feels_is_seen(studio: Fixture, look: Fixture, shots: Fixture, home: Path) -> None:
+    url = studio(*VIRTUAL, home=home).url
+    browser = look()
+    page = live(browser, url)
+    assert marked(page, "state").inner_text() == "Not reading"
+    assert axe(page) == []
+    assert not marked(page, "simulation").is_visible()
+    marked(page, "start").click()
+    page.wait_for_function("() => window.plushsenseLive.updates > 90")
+    seen = look_at(page)
+    # Twenty messages in a second of the toy, on a machine that does other things: at twice the speed twice as many
+    # samples come, and a message holds those that came since the one before.
+    assert seen["samples"] / seen["updates"] < 2 * 100 / 15
+    assert seen["drawn"] > 0
+    assert marked(page, "state").inner_text() == "Reading"
+    assert marked(page, "simulation").is_visible()
+    shares = marked(page, "bars").locator("li > span:last-child").all_inner_texts()
+    assert len(shares) == 18
+    assert sum(int(s.removesuffix(" %")) for s in shares) == pytest.approx(100, abs=9)
+    groups = marked(page, "bars").locator("h3").all_inner_texts()
+    assert [g.split()[:2] for g in groups] == [["+", "positive"], ["○", "neutral"], ["−", "negative"]]
+    marked(page, "events").locator("li[data-id]").first.wait_for()
+    row = marked(page, "events").locator("li[data-id]").last
+    assert row.locator(".lv-badge").inner_text().split()[1] == row.get_attribute("data-affect")
+    assert "%" in marked(page, "network").inner_text()
+    assert "The gate says" in marked(page, "gate").inner_text()
+    marked(page, "latency").get_by_text("to this page").wait_for()
+    assert page.locator('[data-test="signals"] canvas').get_attribute("aria-label").startswith("The toy's 13 signals")
+    assert page.locator('[data-test="now"] [aria-live="polite"]').count() == 1
+    assert axe(page) == []
+    shots(page, "live-en-light")
+    for language, dark, size in (("en", True, DESK), ("lv", False, TABLET), ("lv", True, TABLET)):
+        other = look(size, dark, language, touch=size == TABLET)
+        second = live(other, url)
+        second.wait_for_function("() => window.plushsenseLive.updates > 20")
+        assert axe(second) == [], (language, dark)
+        assert no_sideways(second)
+        shots(second, f"live-{language}-{'dark' if dark else 'light'}")
+        assert other.complaints == []
+        second.close()
+    assert browser.complaints == []
+
+
+def test_another_bundle_while_it_runs_and_one_that_does_not_fit(studio: Fixture, look: Fixture, home: Path) -> None:
+    import plushsense as ps
+
+    whole = ps.load(home / "bundles" / "little.plush").gestures
+    odd_bundle(home / "bundles" / "few.plush", gestures=whole.subset(["Tail pull", "Back stroke 1"]))
+    odd_bundle(home / "bundles" / "circus.plush", gestures=OTHER)
+    odd_bundle(home / "bundles" / "accel.plush", "accel-3")
+    url = studio(*VIRTUAL, home=home).url
+    browser = look()
+    page = live(browser, url)
+    choose(page, "Bundle", "little")
+    marked(page, "start").click()
+    marked(page, "state").get_by_text("Reading").wait_for()
+    for name, told in (("circus", "knows no gesture of"), ("accel", "accel-3")):
+        choose(page, "Bundle", name)
+        marked(page, "said").get_by_text(told).wait_for()
+        assert axe(page) == []
+        page.wait_for_function("(n) => window.plushsenseLive.updates > n + 20", arg=look_at(page)["updates"])
+        assert marked(page, "state").inner_text() == "Reading"
+        assert (
+            marked(page, "bundle").locator("span", has_text="little").count()
+            or page.get_by_label("Bundle", exact=True).input_value() == "little"
+        )
+    scenes = look_at(page)["scenes"]
+    choose(page, "Bundle", "few")
+    page.wait_for_function("(n) => window.plushsenseLive.scenes > n", arg=scenes)
+    marked(page, "bars").locator("li").nth(2).wait_for(state="detached")
+    assert sorted(marked(page, "bars").locator("li").evaluate_all("rows => rows.map(r => r.dataset.label)")) == [
+        "Back stroke 1",
+        "Tail pull",
+    ]
+    marked(page, "state").get_by_text("Reading").wait_for()
+    choose(page, "Computed", "as the chip does (int8)")
+    marked(page, "said").get_by_text("calibration").wait_for()
+    choose(page, "Bundle", "little")
+    marked(page, "bars").locator("li").nth(17).wait_for()
+    choose(page, "Computed", "as the chip does (int8)")
+    page.wait_for_function("(n) => window.plushsenseLive.scenes > n + 2", arg=scenes)
+    choose(page, "The toy's reactions", "none")
+    marked(page, "state").get_by_text("Reading").wait_for()
+    assert browser.complaints == []
+
+
+@pytest.fixture
+def toy() -> Iterator[Callable[[int], tuple[subprocess.Popen[str], str]]]:
+    """``toy(port)`` begins a virtual toy in a process of its own: the process and its address."""
+    begun: list[subprocess.Popen[str]] = []
+
+    def begin(port: int = 0) -> tuple[subprocess.Popen[str], str]:
+        command = [sys.executable, "-m", "plushsense.apps.cli.main", "toy", "--tcp", str(port), "--json"]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+        begun.append(process)
+        assert process.stdout is not None
+        return process, json.loads(process.stdout.readline())["url"]
+
+    yield begin
+    for process in begun:
+        process.kill()
+        process.wait(20.0)
+
+
+def test_a_toy_that_goes_away_and_comes_back(studio: Fixture, look: Fixture, home: Path, toy: Fixture) -> None:
+    process, address = toy()
+    browser = look()
+    page = started(browser, studio("--device", address, home=home).url)
+    assert not marked(page, "simulation").is_visible(), "nobody said that this port is a virtual toy"
+    process.kill()
+    process.wait(20.0)
+    marked(page, "state").get_by_text("No signal from the toy").wait_for()
+    marked(page, "said").wait_for()
+    assert "away" in marked(page, "said").inner_text() or "closed" in marked(page, "said").inner_text()
+    assert axe(page) == []
+    toy(int(address.rsplit(":", 1)[1]))
+    marked(page, "state").get_by_text("Reading").wait_for()
+    marked(page, "said").wait_for(state="detached")
+    assert browser.complaints == []
+
+
+def test_a_toy_that_is_not_there_is_a_sentence(studio: Fixture, look: Fixture, home: Path) -> None:
+    page = live(look(), studio("--device", "tcp://127.0.0.1:9", home=home).url)
+    marked(page, "start").click()
+    marked(page, "said").get_by_text("nobody listens on port 9").wait_for()
+    box = page.get_by_role("combobox", name="Toy (choose, or type an address and press Enter)")
+    for typed, told in (("replay:///etc/passwd", "outside"), ("serial:///dev/nothing-here", "nothing-here")):
+        box.fill(typed)
+        box.press("Enter")
+        marked(page, "start").click()
+        marked(page, "said").get_by_text(told).wait_for()
+    assert marked(page, "state").inner_text() == "Not reading"
+
+
+def test_two_tabs_and_a_reload_show_the_present(studio: Fixture, look: Fixture, home: Path) -> None:
+    url = studio(*VIRTUAL, home=home).url
+    browser = look()
+    page = started(browser, url)
+    events = marked(page, "events").locator("li[data-id]")
+    events.first.wait_for()
+    first = events.last.get_attribute("data-from")
+    second = live(browser, url)
+    assert marked(second, "state").inner_text() == "Reading"
+    assert look_at(second)["samples"] > 100, "the last seconds are there at once"
+    assert marked(second, "events").locator(f'li[data-from="{first}"]').count() == 1
+    page.reload()
+    connected(page)
+    page.wait_for_function("() => window.plushsenseLive && window.plushsenseLive.updates > 5")
+    assert marked(page, "events").locator(f'li[data-from="{first}"]').count() == 1
+    # A page in the background is sent nothing, and everything when it is seen again.
+    hide = "(on) => { Object.defineProperty(document, 'hidden', {get: () => on, configurable: true}); "
+    hide += "document.dispatchEvent(new Event('visibilitychange')); }"
+    second.evaluate(hide, True)
+    second.wait_for_timeout(500)
+    before = look_at(second)
+    page.wait_for_function("(n) => window.plushsenseLive.updates > n + 30", arg=look_at(page)["updates"])
+    assert look_at(second)["updates"] == before["updates"]
+    second.evaluate(hide, False)
+    second.wait_for_function("(n) => window.plushsenseLive.scenes > n", arg=before["scenes"])
+    second.wait_for_function("(n) => window.plushsenseLive.updates > n + 5", arg=before["updates"])
+    marked(second, "stop").click()
+    for tab in (page, second):
+        marked(tab, "state").get_by_text("Not reading").wait_for()
+        marked(tab, "start").wait_for()
+    assert browser.complaints == []
+
+
+def test_a_hard_case_is_kept_labelled_and_in_the_data_set(
+    studio: Fixture, look: Fixture, shots: Fixture, home: Path
+) -> None:
+    url = studio(*VIRTUAL, home=home).url
+    browser = look()
+    page = started(browser, url)
+    page.wait_for_function("() => window.plushsenseLive.samples > 1000")
+    marked(page, "keep").click()
+    marked(page, "said").get_by_text("no code for a person").wait_for()
+    page.get_by_label("The person's code").fill("S77")
+    marked(page, "keep").click()
+    page.get_by_role("button", name="Open S77/live-1").click()
+    over = marked(page, "clip-plot").locator(".u-over")
+    over.wait_for()
+    over.scroll_into_view_if_needed()
+    rows = Clips(House(home)).rows(Clips(House(home)).get("S77/live-1"))
+    seconds = (rows.device_ms - rows.device_ms[0]) / 1000.0
+    box = over.bounding_box()
+    for share in (0.3, 0.7):
+        over.click(position={"x": share * box["width"], "y": box["height"] / 2})
+    fields = [marked(page, name) for name in ("clip-from", "clip-to")]
+    pixel_s = seconds[-1] / box["width"]
+    page.wait_for_function(
+        "(most) => parseFloat(document.querySelector('[data-test=clip-to]').value) < most", arg=0.8 * seconds[-1]
+    )
+    for field, share in zip(fields, (0.3, 0.7), strict=True):
+        assert float(field.input_value()) == pytest.approx(share * seconds[-1], abs=pixel_s + 0.011)
+    # And by keys: the end one second on.
+    to = round(float(fields[1].input_value()) + 1.0, 2)
+    fields[1].fill(str(to))
+    fields[1].press("Tab")
+    begin, end = (float(f.input_value()) for f in fields)
+    first, last = (int(np.abs(seconds - s).argmin()) for s in (begin, end))
+    marked(page, "clip-rows").get_by_text(f"{last + 1 - first} samples").wait_for()
+    marked(page, "clip-label").click()
+    marked(page, "said").get_by_text("Say which gesture").wait_for()
+    gesture = page.get_by_role("combobox", name="Gesture (choose, or type a new one and press Enter)")
+    gesture.click()
+    page.get_by_role("option", name="Tail hit 1", exact=True).click()
+    marked(page, "clip-label").click()
+    marked(page, "said").get_by_text("Tail hit 1: kept as").wait_for()
+    assert axe(page) == []
+    shots(page, "live-clip")
+    marked(page, "clip-add").click()
+    marked(page, "said").get_by_text("1 new recordings").wait_for()
+    marked(page, "clip-S77/live-1").get_by_text("in the data set virtual").wait_for()
+    there = open_dataset(home / "datasets" / "virtual")
+    (made,) = [r for r in there.recordings if r.subject == "S77"]
+    assert (made.gesture, made.session, made.rows) == ("Tail hit 1", "live-1", last + 1 - first)
+    cut = read_recording(there.path / made.file, there.layout).frames
+    assert np.array_equal(cut.values, rows.values[first : last + 1])
+    assert np.array_equal(cut.device_ms, rows.device_ms[first : last + 1])
+    assert browser.complaints == []
+
+
+def test_the_server_is_killed_while_a_clip_is_recorded(studio: Fixture, look: Fixture, home: Path) -> None:
+    server: Studio = studio(*VIRTUAL, home=home)
+    page = started(look(), server.url)
+    page.get_by_label("The person's code").fill("S05")
+    marked(page, "record").click()
+    marked(page, "record-end").wait_for()
+    stream = home / "recordings" / "S05" / "live-1" / "fulldatastream.csv"
+    before = look_at(page)["samples"]
+    page.wait_for_function("(n) => window.plushsenseLive.samples > n + 600", arg=before)
+    server.kill()
+    left = stream.read_bytes()
+    # Half a second of the computer's clock is a second of this toy; a busy disk may be slower.
+    assert left.count(b"\n") >= 350
+    server.start()
+    page = live(look(), server.url)
+    marked(page, "clip-S05/live-1").get_by_text("no label yet").wait_for()
+    page.get_by_role("button", name="Open S05/live-1").click()
+    gesture = page.get_by_role("combobox", name="Gesture (choose, or type a new one and press Enter)")
+    gesture.fill("my own")
+    gesture.press("Enter")
+    marked(page, "clip-label").click()
+    marked(page, "said").get_by_text("my own: kept as").wait_for()
+    whole = left[: left.rfind(b"\n") + 1]
+    assert stream.read_bytes() == whole, "at most a torn last line is gone"
+    (made,) = stream.parent.glob("my own_*.csv")
+    assert made.read_bytes().count(b"\n") == whole.count(b"\n") + 1
