@@ -34,7 +34,9 @@ def test_a_replay_gives_what_pushing_its_frames_gives(bundle, recording):
     wanted.append(classifier.silence())
     with open_device(recording) as device:
         live = run(device, classifier)
+        assert live.latency_s is None
         assert list(live) == wanted
+        assert live.latency_s in live.latencies_s
         summary = live.summary()
     assert summary.decisions == len(wanted) > 80
     assert summary.warming == sum(d.state == "warming" for d in wanted)

@@ -225,6 +225,7 @@ def test_a_feed_sends_everything_once_and_anew_when_it_missed_some(house: House)
         assert {len(column) for column in message["y"]} == {len(message["x"])}
         seconds += message["x"]
         feed.seen(message["n"])
+    assert message["round"] > 0.0
     assert seconds == sorted(set(seconds)), "each sample once, none left out"
     assert max(b - a for a, b in pairwise(seconds)) < 0.1
     for name in ("hidden", "away"):

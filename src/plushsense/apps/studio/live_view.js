@@ -151,7 +151,7 @@ export default {
       n.list.dataset.test = "events";
       n.list.setAttribute("tabindex", "0");
       n.list.setAttribute("aria-label", w.events);
-      line.append(n.strip, n.list);
+      line.append(n.strip, el("p", "lv-dim", w.gate_mark), n.list);
       this.$el.append(root);
     },
     inks() {
@@ -293,7 +293,7 @@ export default {
       const w = this.words, parts = [];
       if (this.said.running) {
         if (this.decided !== undefined) parts.push(fill(w.latency_decision, { ms: this.number(this.decided) }));
-        if (p95 !== null) parts.push(fill(this.sameClock ? w.latency_page : w.latency_page_most, { ms: this.number(p95) }));
+        if (p95 !== null && p95 >= 0) parts.push(fill(this.sameClock ? w.latency_page : w.latency_page_most, { ms: this.number(p95) }));
       }
       say(this.n.latency, parts.length ? `${w.latency} ${parts.join("; ")}.` : "");
       this.$emit("seen", { n: this.last, p95, updates: this.stats.updates, drawn: this.stats.drawn });

@@ -22,6 +22,7 @@ WORDS = (
     "gate_none",
     "gate_quiet",
     "gate_ago",
+    "gate_mark",
     "now",
     "nothing",
     "chances",

@@ -90,7 +90,7 @@ export default {
         if (m.label) {
           ctx.font = `${13 * devicePixelRatio}px sans-serif`;
           const wide = ctx.measureText(m.label).width, pad = 4 * devicePixelRatio;
-          ctx.fillText(m.label, x + pad + wide > left + width ? x - pad - wide : x + pad, top + 14 * devicePixelRatio);
+          ctx.fillText(m.label, x + pad + wide > left + width ? x - pad - wide : x + pad, top + (14 + 16 * (m.row || 0)) * devicePixelRatio);
         }
       }
       ctx.restore();

@@ -84,5 +84,6 @@ class Plot(Element, component="plot.js"):
         self.run_method("push", list(x), [list(c) for c in curves])
 
     def lines(self, marks: Sequence[dict[str, Any]]) -> None:
-        """Vertical lines: ``x``, ``label``, ``stroke``; optionally ``dash`` ([6, 4]), and ``to``: shade up to there."""
+        """Vertical lines: ``x``, ``label``, ``stroke``; optionally ``dash`` ([6, 4]), ``to``: shade up to there,
+        and ``row``: how many lines down the label stands."""
         self.run_method("setMarks", list(marks))

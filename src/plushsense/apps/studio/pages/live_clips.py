@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +43,9 @@ def show(page: Page, listening: Listening) -> None:
     with ui.element("section").classes("ps-card w-full column no-wrap ps-tight"):
         ui.html(words("live.hard"), sanitize=False, tag="h2")
         ui.label(words("live.hard_about")).classes("ps-dim")
-        _keeping(page, listening, clips)
+        # What is said of clips is said where they are, not at the top of a long page.
+        near = replace(page, _said=ui.column().classes("w-full ps-sayings"))
+        _keeping(near, listening, clips)
         listing = tag(ui.column().classes("w-full ps-close"), "clips")
         desk = tag(ui.column().classes("w-full"), "clip")
 
@@ -57,7 +59,8 @@ def show(page: Page, listening: Listening) -> None:
                 _row(page, clips, clip, lambda key=clip.key: opened(key))
 
     async def opened(key: str) -> None:
-        with page.refusing():
+        with near.refusing():
+            near.say("")
             clip = await asyncio.to_thread(clips.get, key)
             frames = await asyncio.to_thread(clips.rows, clip)
             desk.clear()
@@ -204,6 +207,7 @@ class _Desk:
                 ui.button(words("live.clip_add"), icon="playlist_add", on_click=self._add).props("outline no-caps"),
                 "clip-add",
             )
+        self._page = replace(page, _said=ui.column().classes("w-full ps-sayings"))
         self._adding.set_enabled(bool(clip.labels))
         self._offer()
         self._show()
@@ -232,7 +236,13 @@ class _Desk:
             {"x": end, "label": words("live.mark_end"), "stroke": _END, "dash": [6, 4]},
         ]
         marks += [
-            {"x": self._at(label.first), "label": words.gesture(label.gesture), "stroke": "#888888", "dash": [2, 4]}
+            {
+                "x": self._at(label.first),
+                "label": words.gesture(label.gesture),
+                "stroke": "#808080",
+                "dash": [2, 4],
+                "row": 1,
+            }
             for label in shown.clip.labels
         ]
         return marks
