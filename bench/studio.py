@@ -124,6 +124,7 @@ def at_real_time(page: Any, pid: int, seconds: float) -> dict[str, Any]:
         "drawn_per_s": round((after["drawn"] - before["drawn"]) / passed, 2),
         "samples_per_s": round((after["samples"] - before["samples"]) / passed, 1),
         "server_core_percent": round(100.0 * used / passed, 2),
+        "draw_ms": round((after["drawMs"] - before["drawMs"]) / max(1, after["drawn"] - before["drawn"]), 2),
         "bytes_to_page_ms": quantiles(delays),
         "bytes_to_drawn_ms": quantiles(shown),
         "load_average": round(os.getloadavg()[0], 2),

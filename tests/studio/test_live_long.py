@@ -94,10 +94,9 @@ def test_every_gesture_is_seen_with_its_affect_and_nothing_grows(
     told = page.evaluate("() => [window.plushsenseLive.updates, window.plushsenseLive.samples]")
 
     # The page shows what the library says of the same bytes, event by event.
-    shown = [(float(s["from"]), s["affect"], s["gesture"] or None) for s in seen.values()]
-    shown.sort(key=lambda s: s[0])
-    assert [(round(at, 1), affect, gesture) for at, affect, gesture in sorted(wanted, key=lambda w: w[0])] == [
-        (round(at, 1), affect, gesture) for at, affect, gesture in shown
+    shown = [seen[key] for key in sorted(seen, key=int)]
+    assert [(round(at, 1), affect, gesture) for at, affect, gesture in wanted] == [
+        (round(float(s["from"]), 1), s["affect"], s["gesture"] or None) for s in shown
     ]
     assert all(s["to"] for s in seen.values()), "at the end every event has ended"
 

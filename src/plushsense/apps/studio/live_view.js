@@ -70,7 +70,7 @@ export default {
       css.id = "lv-css";
       document.head.append(css);
     }
-    this.stats = window.plushsenseLive = { updates: 0, drawn: 0, samples: 0, scenes: 0, delays: [], shown: [] };
+    this.stats = window.plushsenseLive = { updates: 0, drawn: 0, drawMs: 0, samples: 0, scenes: 0, delays: [], shown: [] };
     this.build();
     this.scene(this.start);
     this.resizer = new ResizeObserver(() => {
@@ -270,7 +270,9 @@ export default {
       this.frame = requestAnimationFrame(() => {
         this.frame = null;
         if (this.gone) return;
+        const began = performance.now();
         this.paint();
+        this.stats.drawMs += performance.now() - began;
         this.stats.drawn++;
         if (this.waits && this.sameClock) {
           this.stats.shown.push(performance.timeOrigin + performance.now() - this.waits);
