@@ -15,8 +15,9 @@ from bundles import odd_bundle
 from test_listening import until
 
 from plushsense.apps.studio.clips import LONGEST_S, PROTOCOL, Clips
+from plushsense.apps.studio.felt import Choice
 from plushsense.apps.studio.house import House
-from plushsense.apps.studio.listening import Choice, Listening
+from plushsense.apps.studio.listening import Listening
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.recfile import read_recording
 from plushsense.dataset.index import open_dataset

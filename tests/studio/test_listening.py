@@ -18,8 +18,9 @@ from bundles import OTHER, odd_bundle
 
 from plushsense.apps.studio import listening as room
 from plushsense.apps.studio.feeding import STRIP_S, WINDOW_S, Feed
+from plushsense.apps.studio.felt import Choice
 from plushsense.apps.studio.house import House
-from plushsense.apps.studio.listening import Choice, Listening
+from plushsense.apps.studio.listening import Listening
 from plushsense.core.errors import BundleError, ConfigError, DeviceError, PlushSenseError
 from plushsense.devices.toy import serve_tcp
 from plushsense.devices.virtual.stream import ToySpec
@@ -134,6 +135,26 @@ def test_it_ends_with_the_toy_and_by_command(house: House) -> None:
     assert not listening.now.running
     assert listening.now.said == ""
     assert not [t for t in threading.enumerate() if t.name == "plushsense-live"]
+
+
+def test_a_toy_that_nobody_looks_at_is_let_go(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(room, "ALONE_S", 0.2)
+    listening = house.part(Listening)
+    listening.start(Choice(VIRTUAL, bundle(house)))
+    going_on = [True]
+    first, second = (listening.look(lambda: going_on[0]) for _ in range(2))
+    first()
+    time.sleep(0.5)
+    assert listening.now.running, "one page still looks"
+    second()
+    reloaded = listening.look(lambda: going_on[0])
+    time.sleep(0.5)
+    assert listening.now.running, "a page that was loaded again"
+    reloaded()
+    time.sleep(0.5)
+    assert listening.now.running, "a clip is being recorded"
+    going_on[0] = False
+    until(lambda: not listening.now.running)
 
 
 def test_a_toy_that_goes_away_comes_back(house: House) -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from plushsense.apps.studio.listening import Listening, Now, Span, Voice
+from plushsense.apps.studio.felt import Now, Span, Voice
+from plushsense.apps.studio.listening import Listening
 from plushsense.live.decide import DecideSpec
 
 WINDOW_S = 8.0

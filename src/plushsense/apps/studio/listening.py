@@ -6,11 +6,13 @@ import contextlib
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from plushsense.apps.engines import classifier_of
+from plushsense.apps.studio.felt import Choice, Now, Span, Voice
 from plushsense.apps.studio.house import Bell, House
 from plushsense.apps.studio.signals import TappedDevice
 from plushsense.core.errors import ConfigError, PlushSenseError
@@ -18,7 +20,7 @@ from plushsense.devices.opening import open_device
 from plushsense.live.decide import DecideSpec
 from plushsense.live.loop import Run
 from plushsense.live.loop import run as run_on
-from plushsense.live.react import Reaction, Reactor, load_reactions
+from plushsense.live.react import Reactor, load_reactions
 from plushsense.live.stream import Decision, Event
 from plushsense.models.bundle import Bundle
 from plushsense.recording.toy import is_virtual, speed_of, with_speed
@@ -28,82 +30,10 @@ KEPT_SPAN_S = 600.0
 _BETWEEN_S = 0.06
 """Pages hear of samples at least so often, however rarely a bundle decides."""
 _JOIN_S = 10.0
+ALONE_S = 60.0
+"""After so long without a page that looks, the toy is let go, for whoever else wants it."""
 _UNREADABLE = 30
 """Lines without one frame among them."""
-
-
-@dataclass(frozen=True)
-class Choice:
-    """What is listened to, and with what. ``reactions``: a name, or "" for a toy that does nothing.
-
-    ``simulated``: the toy is a virtual one, also behind a port.
-    """
-
-    toy: str = ""
-    bundle: Path | None = None
-    engine: str = "float"
-    reactions: str = "standard"
-    simulated: bool = False
-
-
-@dataclass(frozen=True)
-class Voice:
-    """What one of the two said last: the network at every step, the gate when a rule of it fired."""
-
-    t_s: float
-    affect: str | None
-    gesture: str | None
-    confidence: float | None = None
-    answer: str | None = None
-
-
-@dataclass(frozen=True)
-class Span:
-    """An event on the time line. ``number`` counts from 1 over all bundles; ``change`` grows with every change of any.
-
-    ``end_s`` is None while it lasts.
-    """
-
-    number: int
-    change: int
-    begin_s: float
-    affect: str
-    gesture: str | None
-    source: str
-    end_s: float | None = None
-
-
-@dataclass(frozen=True)
-class Now:
-    """All that a page shows beside the signals. Times are those of the ring: seconds of the toy since it was opened.
-
-    Attributes:
-        generation: grows when the toy or the bundle is another one, and pages begin anew.
-        running: whether a toy is being read; ``said``: why not any more, a sentence, or "".
-        trouble: why nothing can be read just now, a sentence, or "".
-        state: as of a decision; "" before the first.
-        probabilities: of the classes, in the bundle's order; None while there is no answer.
-        event: what goes on.
-        reaction: what the toy does, and until when.
-        latency_s: from the bytes to the newest decision; ``arrived``: when those bytes came, seconds since 1970.
-        changes: number of the newest change of a span.
-    """
-
-    generation: int = 0
-    running: bool = False
-    said: str = ""
-    trouble: str = ""
-    state: str = ""
-    t_s: float = 0.0
-    probabilities: tuple[float, ...] | None = None
-    network: Voice | None = None
-    gate: Voice | None = None
-    event: Span | None = None
-    reaction: Reaction | None = None
-    reaction_ends_s: float = 0.0
-    latency_s: float | None = None
-    arrived: float = 0.0
-    changes: int = 0
 
 
 @dataclass
@@ -134,6 +64,8 @@ class Listening:
         self._thread: threading.Thread | None = None
         self._ends = threading.Event()
         self._rung = 0.0
+        self._pages = 0
+        self._alone: threading.Timer | None = None
 
     # Commands; each may take a second: not on the loop of the pages -------------------------------------------
 
@@ -209,7 +141,38 @@ class Listening:
 
     def close(self) -> None:
         """End with the studio."""
+        with self._lock:
+            self._pages += 1
         self.stop()
+
+    def look(self, busy: Callable[[], bool]) -> Callable[[], None]:
+        """A page looks; call what is returned when it is closed. A toy that nobody has looked at for `ALONE_S` is let
+        go, unless ``busy`` says that something still goes on."""
+        with self._lock:
+            self._pages += 1
+
+        def leave() -> None:
+            with self._lock:
+                self._pages -= 1
+                if self._pages == 0:
+                    self._wait_alone(busy)
+
+        return leave
+
+    def _wait_alone(self, busy: Callable[[], bool]) -> None:
+        if self._alone is not None:
+            self._alone.cancel()
+        self._alone = threading.Timer(ALONE_S, self._left_alone, (busy,))
+        self._alone.daemon = True
+        self._alone.start()
+
+    def _left_alone(self, busy: Callable[[], bool]) -> None:
+        if self._pages > 0:
+            return
+        if busy():
+            self._wait_alone(busy)
+        else:
+            self.stop()
 
     # For whoever shows it -------------------------------------------------------------------------------------
 

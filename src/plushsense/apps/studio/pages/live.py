@@ -9,9 +9,11 @@ from typing import Any
 
 from nicegui import context, ui
 
+from plushsense.apps.studio.clips import Clips
 from plushsense.apps.studio.feeding import Feed
+from plushsense.apps.studio.felt import Choice
 from plushsense.apps.studio.house import VIRTUAL, House
-from plushsense.apps.studio.listening import Choice, Listening
+from plushsense.apps.studio.listening import Listening
 from plushsense.apps.studio.live_view import LiveView
 from plushsense.apps.studio.pages import live_clips
 from plushsense.apps.studio.shell import Page, on_ring, tag
@@ -41,6 +43,8 @@ def show(page: Page) -> None:
     view = LiveView(words, feed)
     _follow(view, feed, listening)
     live_clips.show(page, listening)
+    clips = page.house.part(Clips)
+    context.client.on_delete(listening.look(lambda: bool(clips.recording)))
 
 
 def _follow(view: LiveView, feed: Feed, listening: Listening) -> None:
