@@ -125,7 +125,7 @@ def frame(house: House, name: str) -> Iterator[Page]:
                     link.props('aria-current="page"')
         ui.space()
         _choices(words, dark)
-    with ui.element("main").classes("ps-main column no-wrap items-start").props('id="content" tabindex="-1"'):
+    with ui.element("div").classes("ps-main column no-wrap items-start").props('id="content" tabindex="-1"'):
         tag(ui.html(escape(words(f"{name}.title")), sanitize=False, tag="h1"), "title")
         page._said = ui.column().classes("w-full ps-sayings")
         yield page
