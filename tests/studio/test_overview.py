@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
 from plushsense.apps.api import simulate
 from plushsense.apps.studio.house import BUNDLES, DATASETS, WORK, House
 from plushsense.apps.studio.overview import BundleSeen, DatasetSeen, Overview, Seen, SessionSeen, next_step
 from plushsense.apps.studio.tasks import importing
 from plushsense.apps.studio.worker import Tell
 from plushsense.dataset.marks import Mark, append_marks
-from plushsense.recording.engine import Recorder
-from plushsense.recording.machine import Auto
-from plushsense.recording.protocol import load_protocol
-from plushsense.recording.sessionfile import SessionHead
-from plushsense.recording.toy import open_toy, prompt_virtual
+from recorded import record
 
 
 class Quiet:
@@ -30,27 +28,6 @@ class Quiet:
 
 
 TELL = Tell(Quiet())
-
-
-def record(house: House, subject: str, session: str = "1", simulated: bool = True) -> Path:
-    """A session of the quick protocol, made by the recorder itself."""
-    folder = house.recordings / subject / session
-    device = open_toy("virtual://?person=3&speed=50")
-    protocol = load_protocol("quick")
-    head = SessionHead(
-        subject,
-        session,
-        1_700_000_000_000,
-        device.layout.to_dict(),
-        protocol.to_dict(),
-        device=device.url,
-        simulated=simulated,
-    )
-    recorder = Recorder.open(folder, device, head, speed=50.0, auto=Auto(1.0))
-    prompt_virtual(recorder)
-    with device, recorder:
-        assert recorder.wait("finished", timeout_s=60.0)
-    return folder
 
 
 def take_in(house: House, sessions: list[Path], name: str, **more: Any) -> dict[str, Any]:
@@ -147,6 +124,7 @@ TRIED = DatasetSeen(Path("v"), "virtual", simulated=True, recordings=9)
 BROKEN = DatasetSeen(Path("b"), "broken", "It is broken.")
 NET = BundleSeen(Path("m.plush"), "m")
 TOY_NET = BundleSeen(Path("v.plush"), "v", simulated=True)
+BROKEN_NET = BundleSeen(Path("b.plush"), "b", refused="It is broken.")
 OPEN = SessionSeen(Path("s"), "S01", "1")
 MADE = SessionSeen(Path("s"), "S01", "1", recordings=4)
 KEPT = SessionSeen(Path("s"), "S01", "1", recordings=4, finished=True, kept=("real",))
@@ -170,6 +148,8 @@ KEPT = SessionSeen(Path("s"), "S01", "1", recordings=4, finished=True, kept=("re
         (Seen(datasets=(TRIED, REAL), bundles=(TOY_NET,)), "", "review", "review"),
         (Seen(datasets=(REAL,), bundles=(NET,)), "", "live", "live"),
         (Seen(bundles=(NET,)), "", "live", "live"),
+        (Seen(bundles=(BROKEN_NET,)), "", "try", ""),
+        (Seen(datasets=(LOOKED,), bundles=(BROKEN_NET,)), "", "train", "train"),
     ],
 )
 def test_what_to_do_next(seen: Seen, toy: str, key: str, page: str) -> None:

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from browsing import DESK, TABLET, axe, marked
-from plushsense.apps.studio.shell import PAGES
+from browsing import DESK, TABLET, axe, connected, marked
+from plushsense.apps.studio.shell import LIGHT_COOKIE, PAGES
 
 Fixture = Callable[..., Any]
 
@@ -30,17 +30,88 @@ def test_pages_open_without_complaint(studio: Fixture, look: Fixture, shots: Fix
 
 
 def test_language_and_light_are_kept(studio: Fixture, look: Fixture) -> None:
-    page = look().open(studio().url)
+    browser = look()
+    page = browser.open(studio().url)
     assert marked(page, "title").inner_text() == "Home"
+    assert page.title() == "Home · PlushSense"
     with page.expect_navigation():
         marked(page, "language").get_by_text("LV").click()
     assert marked(page, "title").inner_text() == "Sākums"
+    assert page.title() == "Sākums · PlushSense"
+    assert page.evaluate("document.documentElement.lang") == "lv"
+    marked(page, "light").click()
+    marked(page, "light-dark").wait_for()
+    assert axe(page) == []
     with page.expect_navigation():
-        marked(page, "light").click()
+        marked(page, "light-dark").click()
     page.wait_for_selector("body.body--dark")
     page.reload()
     assert marked(page, "title").inner_text() == "Sākums"
     assert page.locator("body.body--dark").count() == 1
+    connected(page)
+    marked(page, "light").click()
+    with page.expect_navigation():
+        marked(page, "light-system").click()
+    page.wait_for_selector("body.body--light")
+    assert browser.complaints == []
+
+
+@pytest.mark.parametrize("dark", [False, True])
+@pytest.mark.parametrize("chosen", ["", "light", "dark"])
+def test_no_flash_of_the_wrong_light(dark: bool, chosen: str, studio: Fixture, look: Fixture) -> None:
+    """What stands there before any script has run is of the right light already."""
+    url = studio().url
+    browser = look(dark=dark)
+    if chosen:
+        browser.context.add_cookies([{"name": LIGHT_COOKIE, "value": chosen, "url": url}])
+    browser.context.route("**/*.js", lambda route: route.abort())
+    page = browser.context.new_page()
+    page.goto(url, wait_until="commit")
+    page.wait_for_selector("html > head > style", state="attached")
+    page.wait_for_selector("#app", state="attached")
+    night = page.evaluate("getComputedStyle(document.documentElement).backgroundColor") == "rgb(18, 18, 18)"
+    assert night is (chosen == "dark" or (dark and not chosen))
+
+
+@pytest.mark.parametrize(("language", "said"), [("en", "connection to the studio is lost"), ("lv", "ir zudis")])
+def test_a_lost_connection_is_said_and_found_again(language: str, said: str, studio: Fixture, look: Fixture) -> None:
+    one = studio()
+    page = look(language=language).open(one.url)
+    one.kill()
+    box = page.locator('#popup[aria-hidden="false"]')
+    box.wait_for()
+    assert said in box.inner_text()
+    assert box.get_attribute("role") == "alert"
+    one.start()
+    connected(page)
+    assert marked(page, "title").count() == 1
+
+
+def test_the_first_key_leads_to_the_content(studio: Fixture, look: Fixture) -> None:
+    page = look().open(studio().url + PAGES["publish"])
+    page.keyboard.press("Tab")
+    page.keyboard.press("Enter")
+    assert page.evaluate("document.activeElement.id") == "content"
+    assert page.get_by_role("main").count() == 1
+    assert page.locator("[aria-current=page]").inner_text() == "Publish"
+
+
+def test_the_bar_is_one_row_on_a_tablet(studio: Fixture, look: Fixture) -> None:
+    url = studio().url
+    for language in ("en", "lv"):
+        page = look(TABLET, language=language, touch=True).open(url)
+        tops = page.evaluate("[...document.querySelectorAll('.ps-bar a')].map(a => a.getBoundingClientRect().top)")
+        assert len(set(tops)) == 1, language
+        box = page.locator(".ps-header").bounding_box()
+        assert box is not None and box["height"] < 70
+        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+
+
+def test_nothing_is_made_where_the_studio_was_started(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
+    one = studio()
+    look().open(one.url)
+    assert [p.name for p in tmp_path.iterdir()] == ["home"]
+    assert [p.name for p in (tmp_path / "home").iterdir()] == ["work"]
 
 
 @pytest.mark.parametrize("header", ["origin", "host"])

@@ -120,23 +120,24 @@ def next_step(seen: Seen, *, toy: str = "", virtual: bool = False, making: bool 
     if making:
         return Next("making")
     waiting = [s for s in seen.sessions if s.waiting]
+    bundles = [b for b in seen.bundles if not b.refused]
     readable = [d for d in seen.datasets if not d.refused and d.recordings]
     if waiting:
         return Next("collect", "", {"n": len(waiting), "recordings": sum(s.recordings for s in waiting)})
-    if not readable and not seen.bundles:
+    if not readable and not bundles:
         unfinished = [s for s in seen.sessions if not s.finished and not s.refused]
         if unfinished:
             return Next("go_on", "record", {"subject": unfinished[-1].subject, "session": unfinished[-1].session})
         return Next("record", "record") if toy and not virtual else Next("try")
     unreviewed = [d for d in readable if not d.reviewed and not d.simulated]
-    if not seen.bundles:
+    if not bundles:
         if unreviewed:
             return Next("review", "review", {"name": unreviewed[0].name})
         return Next("train", "train", {"name": readable[0].name})
-    if unreviewed and all(b.simulated for b in seen.bundles):
+    if unreviewed and all(b.simulated for b in bundles):
         # The bundles are of the virtual toy: the real work goes on.
         return Next("review", "review", {"name": unreviewed[0].name})
-    return Next("live", "live", {"name": seen.bundles[0].name})
+    return Next("live", "live", {"name": bundles[0].name})
 
 
 class Overview:

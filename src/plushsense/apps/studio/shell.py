@@ -113,8 +113,9 @@ def frame(house: House, name: str) -> Iterator[Page]:
     _lit(words, dark)
     ui.page_title(f"{words(f'pages.{name}')} · PlushSense")
     ui.add_head_html(f"<style>{_CSS.read_text(encoding='utf-8')}</style>")
-    ui.link(words("shell.skip"), "#content").classes("ps-skip")
     with ui.header().classes("ps-header items-center no-wrap"):
+        # A link of NiceGUI's would load the page once more.
+        ui.html(f'<a class="ps-skip" href="#content">{escape(words("shell.skip"))}</a>', sanitize=False)
         ui.html(_BEAR, sanitize=False, tag="span").classes("ps-bear").props("aria-hidden=true")
         ui.label("PlushSense").classes("ps-brand")
         with ui.element("nav").classes("ps-bar row items-center").props(f'aria-label="{words("shell.pages")}"'):
@@ -124,7 +125,7 @@ def frame(house: House, name: str) -> Iterator[Page]:
                     link.props('aria-current="page"')
         ui.space()
         _choices(words, dark)
-    with ui.element("main").classes("ps-main column no-wrap items-start").props('id="content" tabindex="-1"'):
+    with ui.element("div").classes("ps-main column no-wrap items-start").props('id="content" tabindex="-1"'):
         tag(ui.html(escape(words(f"{name}.title")), sanitize=False, tag="h1"), "title")
         page._said = ui.column().classes("w-full ps-sayings")
         yield page
@@ -167,7 +168,7 @@ def _choices(words: Words, dark: bool | None) -> None:
     with button, ui.menu():
         for light, icon in _LIGHTS.items():
             item = ui.menu_item(on_click=lambda light=light: _keep(LIGHT_COOKIE, light))
-            tag(item, f"light-{light}").props(f'aria-current="{"true" if light == now else "false"}"')
+            tag(item, f"light-{light}").props(f"role=menuitemradio aria-checked={str(light == now).lower()}")
             with item, ui.row().classes("items-center no-wrap q-gutter-sm"):
                 ui.icon(icon).props("aria-hidden=true")
                 ui.label(words(f"shell.{light}")).classes("text-weight-bold" if light == now else "")

@@ -103,9 +103,10 @@ class Toys:
         Raises:
             DeviceError: when it cannot be reached, or sends nothing.
         """
-        url = with_speed(url or self._house.toy, self._house.speed)
+        url = url or self._house.toy
         if not url:
             raise ConfigError("No toy is chosen: choose one first.")
+        url = with_speed(url, self._house.speed)
         speed = speed_of(url) or 1.0
         frames, first, last = 0, None, None
         until = time.monotonic() + _PATIENCE_S

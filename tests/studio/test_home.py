@@ -1,0 +1,230 @@
+"""The home page says what is next, shows what is there, and takes recordings in."""
+
+from __future__ import annotations
+
+import io
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from browsing import DESK, TABLET, axe, marked
+from plushsense.apps.api import simulate
+from plushsense.apps.studio.house import DATASETS, House
+from recorded import record
+
+Fixture = Callable[..., Any]
+LONG_MS = 90_000
+
+
+def zipped(folder: Path) -> bytes:
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+        for path in sorted(folder.rglob("*")):
+            if path.is_file():
+                archive.write(path, path.relative_to(folder))
+    return out.getvalue()
+
+
+def send(page: Any, name: str, data: bytes) -> None:
+    page.locator("input[type=file]").set_input_files({"name": name, "mimeType": "application/zip", "buffer": data})
+
+
+def test_from_nothing_to_a_data_set_by_one_click(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
+    one = studio()
+    browser = look()
+    page = browser.open(one.url)
+    assert axe(page) == []
+    assert "virtual toy" in marked(page, "next-sentence").inner_text()
+    marked(page, "next-button").click()
+    page.get_by_text("A data set is being made").wait_for()
+    # Work goes on without the page, and is there again on the next.
+    page.reload()
+    marked(page, "job-done").wait_for(timeout=LONG_MS)
+    sentence = marked(page, "next-sentence")
+    sentence.get_by_text("train a network").wait_for()
+    row = marked(page, "dataset")
+    assert "people: 6" in row.inner_text() and "recordings: 238" in row.inner_text()
+    assert "Simulation" in row.inner_text()
+    assert "virtual://?person=7" in marked(page, "chosen").inner_text()
+    row.get_by_role("button", name="Check").click()
+    row.get_by_text("Checked: to decide").wait_for(timeout=LONG_MS)
+    assert axe(page) == []
+    with page.expect_navigation():
+        row.get_by_role("link", name="Review").click()
+    assert "dataset=" in page.url
+    assert browser.complaints == []
+
+
+def test_stopping_work(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
+    page = look().open(studio().url)
+    marked(page, "next-button").click()
+    marked(page, "job-stop").click()
+    marked(page, "job-stopped").wait_for()
+    assert not (tmp_path / "home" / "datasets" / "virtual toy").exists()
+    marked(page, "job-again").click()
+    marked(page, "job-done").wait_for(timeout=LONG_MS)
+    marked(page, "job-drop").click()
+    marked(page, "work").get_by_text("Nothing is running.").wait_for()
+    assert (tmp_path / "home" / "datasets" / "virtual toy" / "dataset.toml").is_file()
+
+
+def test_sessions_become_a_data_set_and_what_is_new_is_added(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
+    house = House(tmp_path / "home")
+    record(house, "S01")
+    url = studio().url
+    browser = look(TABLET)
+    page = browser.open(url)
+    assert "Sessions that are in no data set yet: 1" in marked(page, "next-sentence").inner_text()
+    marked(page, "next-button").click()
+    marked(page, "make").click()
+    marked(page, "said").get_by_text("cannot be a name").wait_for()
+    marked(page, "new-name").fill("autumn & co")
+    marked(page, "make").click()
+    marked(page, "said").get_by_text("cannot be a name").wait_for()
+    assert axe(page) == []
+    marked(page, "new-name").fill("autumn")
+    marked(page, "make").click()
+    marked(page, "dataset").get_by_text("recordings: 4").wait_for()
+    assert marked(page, "said").count() == 0
+    marked(page, "sessions").get_by_text("in the data set 'autumn'").wait_for()
+    record(house, "S02")
+    page.reload()
+    marked(page, "add").click()
+    marked(page, "job-done").get_by_text("new: 4").wait_for()
+    marked(page, "dataset").get_by_text("recordings: 8").wait_for()
+    page.locator("[data-test=batch] .q-checkbox").first.wait_for()
+    # Nothing is ticked any more, for all is kept.
+    marked(page, "add").click()
+    marked(page, "said").get_by_text("No session is chosen").wait_for()
+    assert axe(page) == []
+    assert browser.complaints == []
+
+
+def test_the_toy_is_chosen_and_tested(studio: Fixture, look: Fixture) -> None:
+    one = studio("--speed", "10")
+    browser = look()
+    page = browser.open(one.url)
+    page.get_by_text("Looking for toys").wait_for(state="detached")
+    assert "No toy is chosen yet." in marked(page, "toy").inner_text()
+    page.get_by_role("combobox", name="Person at the virtual toy").click()
+    page.get_by_role("option", name="Person 12").click()
+    marked(page, "virtual").click()
+    marked(page, "chosen").get_by_text("virtual://?person=12").wait_for()
+    marked(page, "test").click()
+    marked(page, "said").get_by_text("The toy works").wait_for()
+    # Another tab shows the same toy, and hears of a change.
+    second = browser.open(one.url)
+    marked(second, "chosen").get_by_text("person=12").wait_for()
+    for wrong in ("http://x", "replay:///etc/passwd"):
+        marked(page, "address").fill(wrong)
+        marked(page, "use").click()
+        marked(page, "said").get_by_text(wrong.partition("//")[2]).wait_for()
+    marked(page, "address").fill("virtual://?person=3")
+    marked(page, "use").click()
+    marked(second, "chosen").get_by_text("person=3").wait_for()
+    marked(page, "address").fill("tcp://127.0.0.1:9")
+    marked(page, "use").click()
+    marked(page, "chosen").get_by_text("tcp://127.0.0.1:9").wait_for()
+    marked(page, "test").click()
+    page.get_by_role("alert").get_by_text("127.0.0.1:9").wait_for()
+    assert axe(page) == []
+    assert browser.complaints == []
+
+
+def test_recordings_come_in_as_a_zip(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
+    simulate(tmp_path / "made", people=2, repetitions=1)
+    data = zipped(tmp_path / "made")
+    one = studio()
+    browser = look()
+    page = browser.open(one.url)
+    send(page, "notes.txt", b"hello")
+    page.get_by_role("alert").wait_for()
+    send(page, "broken.zip", b"PK not a zip")
+    marked(page, "job-refused").get_by_text("no zip, or a damaged one").wait_for()
+    bomb = io.BytesIO()
+    with zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("P01/Tail pull_1700000000000_300.csv", b"0" * 20_000_000)
+        archive.writestr("../../outside.csv", b"1")
+    page.get_by_role("combobox", name="Layout of the toy").click()
+    page.get_by_role("option", name="plush-15").click()
+    send(page, "bomb.zip", bomb.getvalue())
+    marked(page, "job-refused").get_by_text("holds no recording").wait_for()
+    marked(page, "incoming-name").fill("brought")
+    send(page, "mine.zip", data)
+    marked(page, "job-done").get_by_text("people: 2").wait_for(timeout=LONG_MS)
+    assert "recordings: 51" in marked(page, "dataset").inner_text()
+    marked(page, "incoming-name").fill("brought")
+    send(page, "mine.zip", data)
+    page.get_by_role("alert").get_by_text("is there already").wait_for()
+    home = tmp_path / "home"
+    assert sorted(p.name for p in (home / DATASETS).iterdir()) == ["brought"]
+    assert list((home / "work" / "incoming").iterdir()) == []
+    assert not (tmp_path / "outside.csv").exists()
+    assert browser.complaints == []
+
+
+def test_a_file_that_is_too_large_is_refused(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
+    huge = tmp_path / "huge.zip"
+    with huge.open("wb") as file:
+        file.truncate(500_000_001)
+    page = look().open(studio().url)
+    page.locator("input[type=file]").set_input_files(str(huge))
+    page.get_by_role("alert").get_by_text("at most 500 MB").wait_for()
+    assert not (tmp_path / "home" / "work" / "incoming").exists()
+
+
+def test_a_bundle_comes_in(studio: Fixture, look: Fixture, furniture: Path, tmp_path: Path) -> None:
+    page = look().open(studio().url)
+    send(page, "bad.plush", b"nothing")
+    page.get_by_role("alert").get_by_text("bad.plush").wait_for()
+    send(page, "../../good one!.plush", (furniture / "bundles" / "little.plush").read_bytes())
+    marked(page, "said").get_by_text("is here").wait_for()
+    assert "gestures: 18" in marked(page, "bundle").inner_text()
+    assert [p.name for p in (tmp_path / "home" / "bundles").iterdir()] == ["good one.plush"]
+    marked(page, "next-sentence").get_by_text("is trained").wait_for()
+
+
+def test_a_full_home_with_broken_things(studio: Fixture, look: Fixture, home: Path) -> None:
+    (home / DATASETS / "broken").mkdir()
+    (home / DATASETS / "broken" / "dataset.toml").write_text("not = [toml")
+    (home / "bundles" / "bad.plush").write_bytes(b"nothing")
+    (home / "work").mkdir()
+    (home / "work" / "1.json").write_text("{")
+    url = studio("--device", "virtual://?person=2", home=home).url
+    for language, dark, size in (("en", False, DESK), ("lv", True, TABLET)):
+        browser = look(size, dark, language)
+        page = browser.open(url)
+        assert marked(page, "dataset").count() == 2
+        assert marked(page, "bundle").count() == 2
+        assert page.locator(".ps-bad").count() == 2
+        assert "little" in marked(page, "next-sentence").inner_text()
+        assert axe(page) == []
+        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        assert browser.complaints == []
+
+
+@pytest.mark.parametrize("what", ["pages", "controls"])
+def test_everything_is_within_reach_of_the_keyboard(what: str, studio: Fixture, look: Fixture, home: Path) -> None:
+    page = look().open(studio(home=home).url)
+    page.get_by_text("Looking for toys").wait_for(state="detached")
+    reached = []
+    for _ in range(60):
+        page.keyboard.press("Tab")
+        reached.append(
+            page.evaluate(
+                "(e => (e.getAttribute('aria-label') || e.innerText || e.placeholder || e.dataset.test || '')"
+                ".trim())(document.activeElement)"
+            )
+        )
+    assert reached[0] == "To the content"
+    if what == "pages":
+        assert reached[1:8] == ["Home", "Record", "Review", "Train", "Live", "Export", "Publish"]
+    else:
+        for name in ("Watch it live", "Review: virtual toy", "Check: virtual toy", "Use the virtual toy"):
+            assert name in reached, reached

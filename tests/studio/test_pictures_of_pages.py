@@ -1,0 +1,145 @@
+"""Every page in both lights, at a desk and on a tablet, in both languages: whole, legible, and nothing foreign.
+
+With ``PLUSHSENSE_SHOTS=docs/pictures/studio`` the pictures are kept, small, for the README. A page's scene is one
+function in `SCENES`: it gets the open page, has something happen on it, and returns when that is to be seen.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from browsing import DESK, TABLET, Look, Studio, axe, connected, marked
+from conftest import missing
+from plushsense.apps.studio.house import House
+from plushsense.apps.studio.shell import PAGES
+from recorded import record
+
+Fixture = Callable[..., Any]
+KEPT = os.environ.get("PLUSHSENSE_SHOTS", "")
+MOST_BYTES = 100_000
+
+
+@dataclass(frozen=True)
+class View:
+    """How a page is looked at."""
+
+    name: str
+    size: tuple[int, int]
+    dark: bool
+    language: str
+
+
+VIEWS = (
+    View("desk-light-en", DESK, False, "en"),
+    View("desk-dark-lv", DESK, True, "lv"),
+    View("tablet-light-lv", TABLET, False, "lv"),
+    View("tablet-dark-en", TABLET, True, "en"),
+)
+
+
+def _home(page: Any) -> None:
+    """A toy that was tested, a data set that was checked, a session that waits."""
+    page.locator("[data-test=toy] [role=status]").wait_for(state="detached")
+    if not marked(page, "chosen").count():
+        marked(page, "virtual").click()
+        marked(page, "chosen").wait_for()
+    if not marked(page, "job-done").count():
+        marked(page, "dataset").get_by_role("button").click()
+    marked(page, "job-done").first.wait_for(timeout=90_000)
+    marked(page, "test").click()
+    page.locator(".ps-said-good").wait_for()
+
+
+def _as_it_opens(page: Any) -> None:
+    """Nothing to wait for but the title."""
+    marked(page, "title").wait_for()
+
+
+SCENES: dict[str, Callable[[Any], None]] = {
+    "home": _home,
+    "record": _as_it_opens,
+    "review": _as_it_opens,
+    "train": _as_it_opens,
+    "live": _as_it_opens,
+    "export": _as_it_opens,
+    "publish": _as_it_opens,
+}
+
+# Text that does not fit its box, and boxes that reach over the right edge, but for what may be scrolled.
+_CUT = """() => {
+  const cut = [];
+  const scrolled = e => { for (; e; e = e.parentElement) {
+    const s = getComputedStyle(e);
+    if (s.overflowX === 'auto' || s.overflowX === 'scroll') return true; } return false; };
+  for (const e of document.querySelectorAll('body *')) {
+    const box = e.getBoundingClientRect(), style = getComputedStyle(e);
+    if (box.width < 3 || box.height < 3 || style.visibility === 'hidden') continue;
+    const own = [...e.childNodes].some(n => n.nodeType === 3 && n.textContent.trim());
+    if (!own) continue;
+    const hidden = ['hidden', 'clip'].includes(style.overflowX);
+    if (hidden && e.scrollWidth > e.clientWidth + 1 || box.right > innerWidth + 1 && !scrolled(e.parentElement))
+      cut.push(e.textContent.trim().slice(0, 80));
+  }
+  return cut;
+}"""
+
+
+@pytest.fixture(scope="module")
+def furnished(furniture: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Studio]:
+    """One studio for all pictures: a data set, a bundle, a session, a toy at ten times the speed."""
+    home = Path(shutil.copytree(furniture, tmp_path_factory.mktemp("pictures") / "home"))
+    record(House(home), "S01")
+    one = Studio(home, ("--speed", "10")).start()
+    yield one
+    one.stop()
+
+
+def small(png: bytes, width: int) -> bytes:
+    """The picture as few bytes: a palette, and no wider than ``width``."""
+    try:
+        from PIL import Image
+    except ImportError:
+        missing("pictures", "pillow is not installed, and the pictures for the README are to be small")
+    picture = Image.open(io.BytesIO(png)).convert("RGB")
+    if picture.width > width:
+        picture = picture.resize((width, round(picture.height * width / picture.width)), Image.Resampling.LANCZOS)
+    out = io.BytesIO()
+    picture.quantize(192, dither=Image.Dither.NONE).save(out, "PNG", optimize=True)
+    return out.getvalue()
+
+
+def test_every_page_has_a_scene() -> None:
+    assert list(SCENES) == list(PAGES)
+
+
+@pytest.mark.parametrize("view", VIEWS, ids=lambda v: v.name)
+@pytest.mark.parametrize("name", SCENES)
+def test_a_page_reads_well(name: str, view: View, furnished: Studio, look: Fixture) -> None:
+    browser: Look = look(view.size, view.dark, view.language, touch=view.size == TABLET)
+    page = browser.open(furnished.url + PAGES[name])
+    SCENES[name](page)
+    connected(page)
+    page.evaluate("document.fonts.ready")
+    assert axe(page) == []
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), "the page is wider than the screen"
+    assert page.evaluate(_CUT) == []
+    assert page.evaluate("document.body.classList.contains('body--dark')") is view.dark
+    assert page.evaluate("document.documentElement.lang")[:2] == view.language
+    page.evaluate("scrollTo(0, 0)")
+    png = page.screenshot(animations="disabled")
+    assert browser.complaints == []
+    if KEPT:
+        kept = small(png, 960 if view.size == DESK else 615)
+        assert len(kept) <= MOST_BYTES, f"{name}-{view.name}.png has {len(kept)} bytes"
+        Path(KEPT).mkdir(parents=True, exist_ok=True)
+        (Path(KEPT) / f"{name}-{view.name}.png").write_bytes(kept)

@@ -1,0 +1,123 @@
+"""Toys are found in the background, chosen with care, and tested in a second."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from plushsense.apps.studio import toys as room
+from plushsense.apps.studio.house import House
+from plushsense.apps.studio.toys import PERSONS, Toys
+from plushsense.core.errors import ConfigError, DeviceError
+
+
+@pytest.fixture
+def toys(tmp_path: Path) -> Toys:
+    return Toys(House(tmp_path / "home", devices=("replay:///given.csv",), toy="virtual://?person=2", speed=20.0))
+
+
+@pytest.fixture
+def server() -> Iterator[Callable[[bytes], str]]:
+    """A toy over TCP that says the same again and again; gives its URL."""
+    sockets: list[socket.socket] = []
+
+    def serve(line: bytes) -> str:
+        listening = socket.create_server(("127.0.0.1", 0))
+        sockets.append(listening)
+
+        def talk() -> None:
+            try:
+                talking, _ = listening.accept()
+                sockets.append(talking)
+                while line:
+                    talking.sendall(line)
+                    time.sleep(0.01)
+            except OSError:
+                pass
+
+        threading.Thread(target=talk, daemon=True).start()
+        return f"tcp://127.0.0.1:{listening.getsockname()[1]}"
+
+    yield serve
+    for one in sockets:
+        one.close()
+
+
+def test_looking_does_not_wait_and_rings(toys: Toys) -> None:
+    began = time.monotonic()
+    toys.look(0.2)
+    toys.look(0.2)
+    assert time.monotonic() - began < 0.2
+    end = time.monotonic() + 30
+    while toys.looking or not toys.looked:
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    assert [d.kind for d in toys.listing.devices][-1] == "virtual"
+
+
+def test_a_person_of_the_virtual_toy(toys: Toys) -> None:
+    assert toys.person(PERSONS) == f"virtual://?person={PERSONS}"
+    assert toys.simulated
+    toys.choose("tcp://127.0.0.1:9")
+    assert not toys.simulated
+    for number in (0, PERSONS + 1, -1):
+        with pytest.raises(ConfigError, match="no virtual person"):
+            toys.person(number)
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "",
+        "http://x",
+        "/etc/passwd",
+        "replay:///etc/passwd",
+        "replay://../../secret.csv",
+        "virtual://?layout=/etc/passwd",
+        "virtual://?layout=../../x.toml",
+        "tcp://host:1?layout",
+    ],
+)
+def test_addresses_that_no_toy_can_have_are_refused(toys: Toys, url: str) -> None:
+    with pytest.raises(ConfigError):
+        toys.choose(url)
+
+
+def test_a_toy_named_at_start_may_lie_anywhere(toys: Toys) -> None:
+    assert toys.choose("replay:///given.csv") == "replay:///given.csv"
+    assert toys.choose(" virtual://?layout=plush-14 ") == "virtual://?layout=plush-14"
+
+
+def test_the_virtual_toy_passes(toys: Toys) -> None:
+    done = toys.test()
+    assert done.fits and done.on_time
+    assert done.layout == "plush-15"
+    assert done.frames > 1000
+    assert 15.0 < done.seconds < 30.0
+
+
+def test_a_toy_of_another_layout_does_not_fit(toys: Toys, server: Callable[[bytes], str]) -> None:
+    with pytest.raises(DeviceError, match=r"no frames of the layout 'plush-15'.*layout=plush-14"):
+        toys.test(server(b"1 2 3\n"))
+
+
+def test_a_slow_toy_fits_but_not_on_time(toys: Toys, server: Callable[[bytes], str]) -> None:
+    done = toys.test(server(b" ".join([b"1"] * 13) + b" 100 10\n" + b"x" * 4) + "?layout=plush-15")
+    assert not done.on_time or not done.fits
+
+
+def test_a_silent_toy_and_none_at_all(
+    toys: Toys, server: Callable[[bytes], str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(room, "_PATIENCE_S", 0.3)
+    with pytest.raises(DeviceError, match=r"sent nothing within 0\.3 s"):
+        toys.test(server(b""))
+    with pytest.raises(DeviceError):
+        toys.test("tcp://127.0.0.1:9")
+    with pytest.raises(ConfigError, match="No toy is chosen"):
+        Toys(House(Path("nowhere"))).test()
