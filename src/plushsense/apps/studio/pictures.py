@@ -28,12 +28,12 @@ Point = tuple[float, float]
 
 # Where the toy is touched, in the toy's own coordinates, and the half axes of the place.
 _PLACES: dict[str, tuple[Point, Point]] = {
-    "back": ((178, 92), (50, 12)),
-    "rump": ((231, 106), (21, 13)),
-    "head": ((84, 63), (30, 12)),
-    "ears": ((96, 58), (13, 11)),
-    "neck": ((131, 90), (15, 13)),
-    "tail": ((277, 88), (15, 16)),
+    "back": ((182, 95), (56, 15)),
+    "rump": ((226, 108), (27, 15)),
+    "head": ((86, 66), (36, 14)),
+    "ears": ((97, 60), (18, 13)),
+    "neck": ((134, 92), (19, 15)),
+    "tail": ((266, 106), (16, 13)),
     "body": ((160, 125), (66, 42)),
 }
 
@@ -99,7 +99,7 @@ def _toy(touched: str = "", tail: str = "M244 118 Q268 116 278 88") -> str:
     return "".join(parts)
 
 
-def _table(y: float = 200) -> str:
+def _table(y: float) -> str:
     return (
         f'<rect x="14" y="{y:g}" width="292" height="14" rx="4" fill="{_TABLE}" stroke="{_TABLE_LINE}" '
         f'stroke-width="3"/><rect x="40" y="{y + 14:g}" width="14" height="{HEIGHT - y - 14:g}" fill="{_TABLE_LINE}"/>'
@@ -179,7 +179,7 @@ def _scratch_ears() -> str:
 
 
 def _scratch_neck() -> str:
-    return _moved(_clawed_hand(), (134, 88)) + _zigzag((182, 62))
+    return _moved(_clawed_hand(), (134, 88)) + _zigzag((204, 70))
 
 
 def _scratch_rump() -> str:
@@ -189,21 +189,19 @@ def _scratch_rump() -> str:
 def _tap_rump() -> str:
     arcs = "".join(
         _path(d, fill="none", stroke=_ARROW, stroke_width=4, stroke_linecap="round")
-        for d in ("M196 92 q-9 6 -10 16", "M184 84 q-13 9 -14 22")
+        for d in ("M200 88 q-9 5 -10 14", "M189 79 q-14 8 -15 21")
     )
-    down = _arrow("M150 34 L150 56", (150, 58), 90, 5)
-    up = _arrow("M174 62 L174 40", (174, 38), -90, 5)
-    return _moved(_flat_hand(), (236, 84), -8, 0.9) + down + up + arcs
+    down = _arrow("M176 28 L176 48", (176, 50), 90, 6)
+    up = _arrow("M204 54 L204 34", (204, 32), -90, 6)
+    return _moved(_flat_hand(), (238, 90), -8, 0.9) + down + up + arcs
 
 
 def _hit_rump() -> str:
-    return (
-        _burst((222, 104)) + _moved(_flat_hand(), (238, 46), -22, 1.0) + _arrow("M176 16 L200 62", (201, 64), 62, 11)
-    )
+    return _burst((222, 104)) + _moved(_flat_hand(), (238, 46), -22, 1.0) + _arrow("M176 16 L200 62", (201, 64), 62, 11)
 
 
 def _pull_tail() -> str:
-    return _moved(_fist(), (270, 96), -6, 0.85) + _arrow("M232 52 L284 52", (286, 52), 0, 9)
+    return _moved(_fist(), (280, 101), -8, 0.85) + _arrow("M228 56 L284 48", (286, 48), -8, 10)
 
 
 def _rest() -> str:
@@ -213,7 +211,7 @@ def _rest() -> str:
     open_hand = _limbs(
         [("M0 22 L0 4", 20), ("M-9 2 L-12 -16", 6), ("M-2 0 L-3 -22", 6), ("M5 1 L6 -20", 6), ("M10 8 L20 -8", 6)]
     )
-    return _moved(open_hand + ring + bar, (262, 52))
+    return _moved(open_hand + ring + bar, (266, 34))
 
 
 def _two_hands() -> str:
@@ -258,9 +256,8 @@ def _hugged() -> str:
 
 def _acting(place: str, hand: str, held: bool) -> str:
     """A hand that does something, on a toy that stands on a table or is held."""
-    if held:
-        return _moved(_toy(place) + _holding() + hand, (0, 0))
-    return _table() + _toy(place) + hand
+    beneath = "" if held else _table(216)
+    return beneath + _moved(_toy(place) + (_holding() if held else "") + hand, (0, 16))
 
 
 _ACTS = {
@@ -276,10 +273,10 @@ _ACTS = {
 
 def _drawings() -> dict[str, str]:
     drawn = {
-        "At rest": _table() + _toy() + _rest(),
+        "At rest": _table(216) + _moved(_toy() + _rest(), (0, 16)),
         "Hold in hands": _picked_up(),
         "Hold strong": _hugged(),
-        "Tail pull": _toy("tail", "M244 118 Q262 104 296 94") + _holding() + _pull_tail(),
+        "Tail pull": _moved(_toy("tail", "M244 118 Q262 108 284 100") + _holding() + _pull_tail(), (0, 16)),
     }
     for family, (place, act) in _ACTS.items():
         drawn[f"{family} 1"] = _acting(place, act(), False)
@@ -301,7 +298,7 @@ def picture(label: str, name: str = "") -> str:
     Args:
         name: what a screen reader says; the label by default.
     """
-    parts = _DRAWN.get(plain_label(label)) or _table() + _toy()
+    parts = _DRAWN.get(plain_label(label)) or _table(216) + _moved(_toy(), (0, 16))
     said = escape(name or label)
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{said}">'
