@@ -12,7 +12,7 @@ from nicegui import run, ui
 from plushsense.apps.studio.desk import Desk, Sitting
 from plushsense.apps.studio.keys import Keys, on_click
 from plushsense.apps.studio.pages.record_signals import Signals
-from plushsense.apps.studio.pages.record_start import address
+from plushsense.apps.studio.pages.record_start import address, protocol_title
 from plushsense.apps.studio.pages.record_steps import Steps
 from plushsense.apps.studio.pictures import has_picture, own_picture, picture
 from plushsense.apps.studio.shell import Page, on_ring, tag
@@ -59,21 +59,21 @@ class _View:
         self._left = False
         words, head = page.words, sitting.head
         self._keys = Keys(_KEYS, self._press)
-        with ui.row().classes("w-full items-center q-gutter-sm q-mt-none"):
+        with ui.row().classes("w-full items-center").style("gap: 4px 16px"):
             ui.label(words("record.session", subject=head.subject, session=head.session)).classes("text-bold")
-            ui.label(head.protocol["title"]).classes("ps-dim")
+            ui.label(protocol_title(words, head.protocol["name"], head.protocol["title"])).classes("ps-dim")
             if head.simulated:
                 simulated = ui.label(f"◇ {words('shell.simulation')}").classes("q-px-sm rounded-borders")
                 tag(simulated, "simulation").style("background: #5b2d82; color: #fff; font-weight: 600")
         self._notices(words, sitting)
-        with ui.column().classes("w-full q-gutter-xs q-mt-none"):
+        with ui.column().classes("w-full").style("gap: 4px"):
             self._progress = tag(ui.label(), "progress").classes("text-bold")
             self._bar = ui.element("progress").classes("w-full").style("height: 14px; accent-color: #00805c")
             self._bar.props(f'aria-label="{escape(words("record.progress", done="", steps=""))}"')
             self._next = tag(ui.label(), "next").classes("ps-dim")
-        with ui.row().classes("w-full items-start q-gutter-md"):
+        with ui.row().classes("w-full items-start").style("gap: 12px 24px"):
             self._picture = tag(ui.html("", sanitize=False), "picture").style("flex: 1 1 260px; max-width: 380px")
-            with ui.column().classes("q-gutter-sm").style("flex: 3 1 380px; min-width: 0"):
+            with ui.column().style("flex: 3 1 380px; min-width: 0; gap: 10px"):
                 self._prompts()
         self._controls()
         self._finished()
@@ -92,7 +92,7 @@ class _View:
                 ui.label(f"⚠ {text}")
 
     def _prompts(self) -> None:
-        with ui.row().classes("items-baseline q-gutter-md w-full"):
+        with ui.row().classes("items-baseline w-full").style("gap: 0 20px"):
             self._name = ui.html("", sanitize=False, tag="h2").style("font-size: 2.6rem; line-height: 1.15")
             tag(self._name, "gesture")
             self._repetition = tag(ui.label(), "repetition").style("font-size: 1.5rem")
@@ -100,7 +100,9 @@ class _View:
         self._again = tag(ui.label(), "again").classes("ps-dim").style("font-size: 1.1rem")
         self._box = ui.row().classes("w-full items-center no-wrap rounded-borders q-pa-md")
         with tag(self._box, "state-box"):
-            self._number = tag(ui.label(), "number").style("font-size: 3.4rem; line-height: 1; font-weight: 700")
+            self._number = tag(ui.label(), "number").style(
+                "font-size: 3.4rem; line-height: 1; font-weight: 700; white-space: nowrap"
+            )
             self._state = tag(ui.label(), "state").style("font-size: 1.5rem; line-height: 1.25; font-weight: 700")
         self._message = (
             tag(ui.label(), "message").props('role="status"').style("font-size: 1.15rem; min-height: 1.6rem")
@@ -111,8 +113,8 @@ class _View:
 
     def _controls(self) -> None:
         words = self._page.words
-        with ui.row().classes("w-full items-center q-gutter-sm"):
-            self._main = tag(ui.button().props("no-caps unelevated"), "main")
+        with ui.row().classes("w-full items-center").style("gap: 10px"):
+            self._main = tag(ui.button(color=None).props("no-caps unelevated"), "main")
             self._main.style("font-size: 1.6rem; min-width: 260px; min-height: 72px")
             on_click(self._main, self._main_clicked, once=True)
             self._small: dict[str, ui.button] = {}
@@ -122,13 +124,13 @@ class _View:
                 ("b", "back", "back"),
                 ("p", "pause", "pause"),
             ):
-                button = tag(ui.button(words(f"record.{text}")).props("no-caps outline"), name)
+                button = tag(ui.button(words(f"record.{text}"), color=None).props("no-caps outline"), name)
                 button.style("min-height: 48px")
                 on_click(button, partial(self._press, key))
                 self._small[key] = button
             ui.space()
-            end = tag(ui.button(words("record.end"), on_click=self._ask_end), "end").props("no-caps flat")
-            end.style("min-height: 48px; color: var(--ps-ink) !important")
+            end = tag(ui.button(words("record.end"), color=None, on_click=self._ask_end), "end").props("no-caps flat")
+            end.style("min-height: 48px; ")
         self._ending = tag(ui.row().classes("ps-said ps-said-warning w-full items-center"), "ending")
         with self._ending:
             self._end_text = ui.label().classes("flex-grow")
@@ -136,7 +138,7 @@ class _View:
                 "no-caps unelevated color=deep-orange-10"
             )
             tag(yes, "end-yes")
-            no = ui.button(words("record.end_no")).props("no-caps outline color=black")
+            no = ui.button(words("record.end_no"), color=None).props("no-caps outline")
             no.on_click(lambda: self._ending.set_visibility(False))
         self._ending.set_visibility(False)
 
@@ -156,7 +158,7 @@ class _View:
         with ui.row().classes("w-full items-center no-wrap"):
             self._note = tag(ui.input(label=words("record.note")).props("outlined dense maxlength=500"), "note")
             self._note.classes("flex-grow").on("keydown.enter", self._keep_note)
-            keep = ui.button(words("record.keep_note"), on_click=self._keep_note).props("no-caps outline")
+            keep = ui.button(words("record.keep_note"), color=None, on_click=self._keep_note).props("no-caps outline")
             tag(keep, "keep-note")
 
     # Commands -------------------------------------------------------------------------------------------------

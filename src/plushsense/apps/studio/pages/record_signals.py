@@ -5,6 +5,7 @@ from __future__ import annotations
 from nicegui import ui
 
 from plushsense.apps.studio.desk import Sitting
+from plushsense.apps.studio.pages.record_start import unfolding
 from plushsense.apps.studio.plot import Plot
 from plushsense.apps.studio.shell import LINES, Page, tag
 from plushsense.recording.status import Status
@@ -34,16 +35,15 @@ class Signals:
     def __init__(self, page: Page, sitting: Sitting) -> None:
         self._page, self._device = page, sitting.device
         words = page.words
-        with ui.column().classes("ps-card w-full q-gutter-sm"):
-            with ui.row().classes("items-center q-gutter-sm w-full"):
+        with ui.column().classes("ps-card w-full").style("gap: 6px"):
+            with ui.row().classes("items-center w-full").style("gap: 4px 16px"):
                 ui.label(words("record.signal")).classes("text-bold")
                 self._light = tag(ui.label(), "light").classes("q-px-md q-py-xs rounded-borders text-bold")
                 self._lost = tag(ui.label(), "lost")
                 self._rate = tag(ui.label(), "rate")
             self._more = tag(ui.label(), "counters").classes("ps-dim")
             with tag(ui.element("details").props("open").classes("w-full"), "live"):
-                with ui.element("summary"):
-                    ui.label(words("record.live")).classes("text-bold").style("display: inline")
+                unfolding(words("record.live"))
                 self._plots = self._build(max(1.0, sitting.wanted.speed))
         rate = self._device.layout.rate_hz * max(1.0, sitting.wanted.speed)
         self._place = max(0, self._device.ring.count - int(_WINDOW_S * rate))
@@ -55,7 +55,7 @@ class Signals:
         for n, channel in enumerate(channels):
             kinds.setdefault(channel.kind, []).append(n)
         plots = []
-        with ui.row().classes("w-full q-gutter-sm items-start"):
+        with ui.row().classes("w-full items-start").style("gap: 8px"):
             for kind, which in kinds.items():
                 key = f"record.kind_{kind}"
                 title = words(key) if words.has(key) else kind

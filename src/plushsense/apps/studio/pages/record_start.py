@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from html import escape
 from typing import Any
 from urllib.parse import quote
 
@@ -10,6 +11,7 @@ from nicegui import run, ui
 
 from plushsense.apps.studio.desk import Desk, Sitting
 from plushsense.apps.studio.shell import Page, tag
+from plushsense.apps.studio.words import Words
 from plushsense.core.errors import ConfigError, PlushSenseError
 from plushsense.devices.listing import list_devices
 from plushsense.recording.beginning import PROTOCOL, Wanted
@@ -18,11 +20,25 @@ from plushsense.recording.shelf import Shelved
 
 _LISTED = 8
 _SCAN_S = 3.0
+STRONG = "background: #0b4f9e; color: #fff"
+"""The button that is meant first, readable in both lights."""
 
 
 def address(name: str, key: str = "session") -> str:
     """The page of a session."""
     return f"/record?{key}={quote(name)}"
+
+
+def protocol_title(words: Words, name: str, title: str) -> str:
+    """A protocol's title in the page's language, where it is a built-in one."""
+    key = f"record.protocol_{name}"
+    return words(key) if words.has(key) else title
+
+
+def unfolding(text: str) -> None:
+    """What is seen of a folded part of the page."""
+    style = "display: list-item; list-style-position: inside; cursor: pointer; font-weight: 600"
+    ui.html(escape(text), sanitize=False, tag="summary").style(style)
 
 
 async def show_start(page: Page, desk: Desk, asked: str, ended: str) -> None:
@@ -44,7 +60,7 @@ async def show_start(page: Page, desk: Desk, asked: str, ended: str) -> None:
     _Form(page, desk)
     done = sum(s.finished for s in sessions)
     if done:
-        with ui.row().classes("items-baseline q-gutter-sm"):
+        with ui.row().classes("items-baseline"):
             ui.label(page.words("record.finished_ones", n=done)).classes("ps-dim")
             ui.link(page.words("record.import_them"), "/")
 
@@ -63,8 +79,8 @@ def _open_ones(page: Page, desk: Desk) -> None:
         with tag(ui.row().classes("ps-card w-full items-center"), "open-session"):
             ui.label(page.words("record.open_now", name=sitting.name)).classes("flex-grow text-bold")
             there = page.words("record.show")
-            button = ui.button(there, on_click=lambda s=sitting: ui.navigate.to(address(s.name)))
-            button.props(f'aria-label="{there}: {sitting.name}" no-caps')
+            button = ui.button(there, color=None, on_click=lambda s=sitting: ui.navigate.to(address(s.name)))
+            button.props(f'aria-label="{there}: {sitting.name}" no-caps unelevated').style(STRONG)
 
 
 def _unfinished(page: Page, desk: Desk, sessions: list[Shelved]) -> None:
@@ -78,8 +94,7 @@ def _unfinished(page: Page, desk: Desk, sessions: list[Shelved]) -> None:
             _one_unfinished(page, desk, session)
         if len(left) > _LISTED:
             with ui.element("details").classes("w-full"):
-                with ui.element("summary"):
-                    ui.label(words("record.older", n=len(left) - _LISTED)).style("display: inline")
+                unfolding(words("record.older", n=len(left) - _LISTED))
                 for session in left[_LISTED:]:
                     _one_unfinished(page, desk, session)
 
@@ -91,14 +106,19 @@ def _one_unfinished(page: Page, desk: Desk, session: Shelved) -> None:
             ui.label(f"{name}: {session.said}").classes("flex-grow")
             return
         told = words("record.so_far", name=name, done=session.done, steps=session.steps)
-        with ui.column().classes("flex-grow q-gutter-none"):
+        with ui.column().classes("flex-grow").style("gap: 0"):
             ui.label(told).classes("text-bold")
-            title = session.protocol.title + (f" · {words('record.simulated')}" if session.head.simulated else "")
+            title = protocol_title(words, session.protocol.name, session.protocol.title)
+            title += f" · {words('record.simulated')}" if session.head.simulated else ""
             ui.label(title).classes("ps-dim")
         toys = list(dict.fromkeys([session.head.device, *desk.toys()]))
         toy = ui.select(toys, value=toys[0], label=words("record.toy")).classes("w-72")
         toy.props(f'outlined dense aria-label="{words("record.toy")}: {name}"')
-        button = ui.button(words("record.go_on")).props(f'no-caps aria-label="{words("record.go_on")}: {name}"')
+        button = (
+            ui.button(words("record.go_on"), color=None)
+            .style(STRONG)
+            .props(f'no-caps unelevated aria-label="{words("record.go_on")}: {name}"')
+        )
         button.on_click(lambda: _sit_down(page, button, lambda: desk.resume(name, str(toy.value))))
 
 
@@ -136,18 +156,19 @@ class _Form:
             with ui.row().classes("w-full items-start"):
                 toys = desk.toys()
                 self._toy = self._select({u: u for u in toys}, "toy", toys[0])
-                self._look = ui.button(words("record.look"), on_click=self._look_for_toys).props("no-caps outline")
+                self._look = ui.button(words("record.look"), color=None, on_click=self._look_for_toys).props(
+                    "no-caps outline"
+                )
                 self._other = self._input("other_toy", "other_toy_hint")
             with ui.element("details").classes("w-full"):
-                with ui.element("summary"):
-                    ui.label(words("record.more")).style("display: inline")
+                unfolding(words("record.more"))
                 with ui.column():
                     layouts = {"": words("record.layout_usual")} | desk.layouts()
                     self._layout = self._select(layouts, "layout", "")
                     self._simulated = ui.checkbox(words("record.is_virtual"))
                     self._anew = ui.checkbox(words("record.anew"))
-            self._begin = ui.button(words("record.begin"), on_click=self._sit).props("no-caps size=lg color=primary")
-            tag(self._begin, "begin")
+            self._begin = ui.button(words("record.begin"), color=None, on_click=self._sit)
+            tag(self._begin, "begin").props("no-caps unelevated size=lg").style(STRONG)
         self._choose_words()
 
     def _named(self, what: str, key: str, name: str) -> str:

@@ -9,6 +9,7 @@ from nicegui import ui
 
 from plushsense.apps.studio.desk import Sitting
 from plushsense.apps.studio.keys import on_click
+from plushsense.apps.studio.pages.record_start import unfolding
 from plushsense.apps.studio.shell import Page, tag
 from plushsense.recording.status import Status, StepStanding
 
@@ -27,8 +28,7 @@ class Steps:
         words = page.words
         steps = sitting.steps()
         with tag(ui.element("details").classes("ps-card w-full"), "steps"):
-            with ui.element("summary"):
-                ui.label(words("record.steps")).classes("text-bold").style("display: inline")
+            unfolding(words("record.steps"))
             if len(steps) > _MOST:
                 ui.label(words("record.steps_many"))
                 return
@@ -37,7 +37,7 @@ class Steps:
                 rows.setdefault(step.step.gesture, []).append(step)
             made: dict[int, ui.button] = {}
             for gesture, mine in rows.items():
-                with ui.row().classes("items-center q-gutter-xs w-full"):
+                with ui.row().classes("items-center w-full q-mt-xs").style("gap: 6px"):
                     ui.label(words.gesture(gesture)).style("min-width: 12rem")
                     for standing in mine:
                         made[standing.step.number] = self._button(standing.step.number, go)
@@ -45,7 +45,7 @@ class Steps:
             self._shown = [""] * len(steps)
 
     def _button(self, number: int, go: Callable[[int, str], Any]) -> ui.button:
-        button = tag(ui.button().props("no-caps outline dense"), f"step-{number}").style("min-width: 3.2rem")
+        button = tag(ui.button(color=None).props("no-caps outline dense"), f"step-{number}").style("min-width: 3.2rem")
         on_click(button, lambda seen: go(number, seen))
         return button
 
