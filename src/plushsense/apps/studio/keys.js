@@ -1,7 +1,7 @@
 // The keys of a page: each press goes out once, as `press`, with what the page showed at that moment.
 export default {
   template: '<span hidden :data-seen="seen"></span>',
-  props: { seen: String, keys: String },
+  props: { seen: String, keys: String, fields: Object },
   mounted() {
     this.listener = (event) => this.hear(event);
     // Before any button hears of it: a space must not also press the button that has the focus.
@@ -22,6 +22,13 @@ export default {
         return;
       }
       const key = event.code === "Space" ? " " : event.key.toLowerCase();
+      if (this.fields[key]) {
+        event.preventDefault();
+        event.stopImmediatePropagation();
+        // At once, here: the next letter is typed already.
+        if (event.type === "keydown") document.querySelector(this.fields[key])?.focus();
+        return;
+      }
       if (key.length !== 1 || !this.keys.includes(key)) return;
       event.preventDefault();
       event.stopImmediatePropagation();

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from nicegui import ui
@@ -18,12 +18,14 @@ class Keys(Element, component="keys.js"):
     Args:
         keys: the characters that are commands.
         on_press: gets the key and what `show` had last brought to this very browser when it was pressed.
+        fields: keys that go to a field to be typed into, and its CSS selector.
     """
 
-    def __init__(self, keys: str, on_press: Callable[[str, str], Any]) -> None:
+    def __init__(self, keys: str, on_press: Callable[[str, str], Any], fields: Mapping[str, str] | None = None) -> None:
         super().__init__()
         self._props["keys"] = keys
         self._props["seen"] = ""
+        self._props["fields"] = dict(fields or {})
 
         def pressed(event: GenericEventArguments) -> Any:
             return on_press(str(event.args["key"]), str(event.args["seen"]))

@@ -12,7 +12,7 @@ from nicegui import run, ui
 from plushsense.apps.studio.desk import Desk, Sitting
 from plushsense.apps.studio.keys import Keys, on_click
 from plushsense.apps.studio.pages.record_signals import Signals
-from plushsense.apps.studio.pages.record_start import address, protocol_title
+from plushsense.apps.studio.pages.record_start import LINK, address, protocol_title
 from plushsense.apps.studio.pages.record_steps import Steps
 from plushsense.apps.studio.pictures import has_picture, own_picture, picture
 from plushsense.apps.studio.shell import Page, on_ring, tag
@@ -20,7 +20,7 @@ from plushsense.recording.status import Status
 
 _DRAW_S = 0.1
 _REMIND_S = 20.0
-_KEYS = " rsbpn"
+_KEYS = " rsbp"
 _GREEN, _BLUE, _RED, _AMBER, _GREY = "#00664a", "#0b4f9e", "#9d2b00", "#7a4e00", "#4a5260"
 
 
@@ -58,7 +58,7 @@ class _View:
         self._spoken = ("", "")
         self._left = False
         words, head = page.words, sitting.head
-        self._keys = Keys(_KEYS, self._press)
+        self._keys = Keys(_KEYS, self._press, {"n": '[name="note"]'})
         with ui.row().classes("w-full items-center").style("gap: 4px 16px"):
             ui.label(words("record.session", subject=head.subject, session=head.session)).classes("text-bold")
             ui.label(protocol_title(words, head.protocol["name"], head.protocol["title"])).classes("ps-dim")
@@ -149,14 +149,16 @@ class _View:
             self._done_text = ui.label().classes("text-bold").style("overflow-wrap: anywhere")
             ui.label(words("record.what_next"))
             with ui.row():
-                ui.link(words("record.to_home"), "/")
-                ui.link(words("record.to_review"), "/review")
+                ui.link(words("record.to_home"), "/").style(LINK)
+                ui.link(words("record.to_review"), "/review").style(LINK)
         self._done.set_visibility(False)
 
     def _note_row(self) -> None:
         words = self._page.words
         with ui.row().classes("w-full items-center no-wrap"):
-            self._note = tag(ui.input(label=words("record.note")).props("outlined dense maxlength=500"), "note")
+            self._note = tag(
+                ui.input(label=words("record.note")).props("outlined dense maxlength=500 name=note"), "note"
+            )
             self._note.classes("flex-grow").on("keydown.enter", self._keep_note)
             keep = ui.button(words("record.keep_note"), color=None, on_click=self._keep_note).props("no-caps outline")
             tag(keep, "keep-note")
@@ -164,9 +166,6 @@ class _View:
     # Commands -------------------------------------------------------------------------------------------------
 
     def _press(self, key: str, seen: str) -> None:
-        if key == "n":
-            self._note.run_method("focus")
-            return
         with self._page.refusing():
             if self._sitting.press(key, seen):
                 self._page.say("")

@@ -20,6 +20,7 @@ from plushsense.recording.shelf import Shelved
 
 _LISTED = 8
 _SCAN_S = 3.0
+LINK = "color: var(--ps-ink); text-decoration: underline"
 STRONG = "background: #0b4f9e; color: #fff"
 """The button that is meant first, readable in both lights."""
 
@@ -62,7 +63,7 @@ async def show_start(page: Page, desk: Desk, asked: str, ended: str) -> None:
     if done:
         with ui.row().classes("items-baseline"):
             ui.label(page.words("record.finished_ones", n=done)).classes("ps-dim")
-            ui.link(page.words("record.import_them"), "/")
+            ui.link(page.words("record.import_them"), "/").style(LINK)
 
 
 def _say_ended(page: Page, session: Shelved) -> None:
