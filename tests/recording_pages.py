@@ -59,11 +59,12 @@ def sat(page: Page, name: str) -> None:
     heard(page)
 
 
-def take(page: Page, number: int) -> None:
-    """Make a recording by the space bar."""
+def take(page: Page, number: int, seconds: float = 0.0) -> None:
+    """Make a recording by the space bar; a stop within half a second of the toy's time would be taken for a slip."""
     showing(page, f"idle.{number}.")
     page.keyboard.press("Space")
     showing(page, f"recording.{number}.")
+    page.wait_for_timeout(1000.0 * seconds)
     page.keyboard.press("Space")
     showing(page, "idle.", "finished.")
 
