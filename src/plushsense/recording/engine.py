@@ -120,7 +120,7 @@ class Recorder(Machine):
                 if self._intake.quality().signal == "unreadable":
                     self._say(
                         f"The toy sends lines, but none is a frame of {self.session.layout.name} "
-                        f"({len(self.session.layout.wire)} numbers): is --layout right, and the cable sound?"
+                        f"({len(self.session.layout.wire)} numbers): is the layout right, and the cable sound?"
                     )
                 elif self._intake.silent:
                     self._say("Nothing comes from the toy: is it switched on and near?")

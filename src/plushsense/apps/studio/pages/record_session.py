@@ -176,7 +176,7 @@ class _View:
     async def _main_clicked(self, seen: str) -> None:
         state = seen.partition(".")[0]
         if state in ("finished", "stopped"):
-            if self._sitting.status().state == state:
+            if self._left or self._sitting.status().state == state:
                 await (self._end() if state == "finished" else self._reopen())
         else:
             self._press("p" if state == "paused" else " ", seen)
@@ -198,18 +198,21 @@ class _View:
         with self._page.refusing():
             await run.io_bound(self._desk.close_sitting, self._sitting.name)
             ui.navigate.to(address(self._sitting.name, "ended"))
+            return
+        self._left = False
 
     async def _reopen(self) -> None:
+        """Sit down anew; where that is refused, the first page has other toys to choose from."""
+        if self._left:
+            ui.navigate.to(address(self._sitting.name))
+            return
         self._left = True
         with self._page.refusing():
             await run.io_bound(self._desk.close_sitting, self._sitting.name)
-            try:
-                await run.io_bound(self._desk.resume, self._sitting.name, self._sitting.wanted.device)
-            except Exception:
-                # From the first page another toy can be chosen.
-                self._main.set_visibility(False)
-                raise
+            await run.io_bound(self._desk.resume, self._sitting.name, self._sitting.wanted.device)
             ui.navigate.to(address(self._sitting.name))
+            return
+        self._main.text = self._page.words("record.all_sessions")
 
     # Following ------------------------------------------------------------------------------------------------
 

@@ -84,8 +84,10 @@ class Signals:
             self._light.text = f"{sign} {words(f'record.signal_{s.signal}')}"
             self._light.style(f"background: {colour}; color: #fff").props(f'data-signal="{s.signal}"')
         shares = {"recent": percent(s.bad_share, words.language), "ever": percent(s.bad_ever, words.language)}
-        self._lost.text = words("record.signal_lost", **shares)
-        self._rate.text = words("record.signal_rate", rate=f"{s.rate_hz:.0f}")
+        # Of a toy that is not heard, the last seconds say nothing.
+        hears = s.signal not in ("none", "unreadable")
+        self._lost.text = words("record.signal_lost", **shares) if hears else ""
+        self._rate.text = words("record.signal_rate", rate=f"{s.rate_hz:.0f}") if hears else ""
         counts = {k: getattr(s, k) for k in ("lost", "malformed", "garbage", "gaps", "reconnects")}
         self._more.text = words("record.signal_more", **counts)
 
