@@ -38,7 +38,7 @@ class Signals:
         with ui.column().classes("ps-card w-full").style("gap: 6px"):
             with ui.row().classes("items-center w-full").style("gap: 4px 16px"):
                 ui.label(words("record.signal")).classes("text-bold")
-                self._light = tag(ui.label(), "light").classes("q-px-md q-py-xs rounded-borders text-bold")
+                self._light = tag(ui.label(), "signal").classes("q-px-md q-py-xs rounded-borders text-bold")
                 self._lost = tag(ui.label(), "lost")
                 self._rate = tag(ui.label(), "rate")
             self._more = tag(ui.label(), "counters").classes("ps-dim")
