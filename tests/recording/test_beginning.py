@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -54,7 +55,14 @@ def test_sessions_that_lie_there(tmp_path: Path) -> None:
         shown = recorder.steps()
         assert shown[-1].file == recorder.status().file
         assert all(s.file and not s.skipped and s.aside == 0 for s in shown)
-        assert recorder.status().heard > 0
+        status = recorder.status()
+        assert (status.heard, status.bad_ever, status.bad_share) == (status.rows, 0.0, 0.0)
+        assert replace(status, lost=6, malformed=3, garbage=1, heard=90).bad_ever == 0.1
+        assert replace(status, heard=0).bad_ever == 0.0
+        # What a command may be given upon changes with whatever the command would mean.
+        others = [replace(status, **{key: 1}) for key in ("redone", "skipped", "done")]
+        assert len({s.seen for s in [status, replace(status, state="idle"), *others]}) == 5
+        assert replace(status, rows=1, elapsed_s=2.0, message="x").seen == status.seen
         recorder.redo()
         assert [(bool(s.file), s.aside) for s in recorder.steps()][-1] == (False, 1)
     before = {p: p.read_bytes() for p in folder.iterdir()}

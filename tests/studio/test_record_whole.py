@@ -17,6 +17,7 @@ from plushsense.core.recfile import parse_name
 from plushsense.devices.virtual.session import GESTURES
 from plushsense.recording.sessionfile import SESSION_LOG, SessionHead, read_events
 from pty_toys import check_whole, pty_toy, recordings
+from recording_pages import showing
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -25,16 +26,6 @@ Fixture = Callable[..., Any]
 pytestmark = pytest.mark.usefixtures("pty_possible")
 SPEED = 20.0
 RELOADED, KILLED = 17, 34
-
-
-def showing(page: Page, *starts: str) -> str:
-    """Wait until the page shows one of these states, such as ``idle.3.``; what it shows."""
-    found = page.wait_for_function(
-        "starts => { const at = document.querySelector('[data-seen]'); const seen = at ? at.dataset.seen : '';"
-        " return starts.some(s => seen.startsWith(s)) ? seen : null }",
-        arg=list(starts),
-    )
-    return str(found.json_value())
 
 
 def begin(page: Page, number: int) -> None:

@@ -247,10 +247,14 @@ class Desk:
             head = head_of(wanted, folder, known is None, device.layout, SOFTWARE)
             said = ((PSEUDO, is_pseudo(wanted, known or head)), (NO_CONSENT, lacks_consent(known or head)))
             session = OpenSession(folder, head)
-            recorder = Recorder(session, device, speed=wanted.speed, software=SOFTWARE)
-            prompt_virtual(recorder)
-            recorder.listen(lambda _what, _status: self.bell.ring())
-            recorder.start()
+            try:
+                recorder = Recorder(session, device, speed=wanted.speed, software=SOFTWARE)
+                prompt_virtual(recorder)
+                recorder.listen(lambda _what, _status: self.bell.ring())
+                recorder.start()
+            except BaseException:
+                session.close()
+                raise
         except BaseException:
             device.close()
             raise

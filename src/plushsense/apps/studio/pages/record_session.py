@@ -257,6 +257,8 @@ class _View:
             self._picture.content = self._drawn(s.step.gesture)
         self._repetition.text = words("record.repetition", n=s.step.repetition, m=s.repetitions)
         self._prompt.text = s.step.prompt
+        for element in (self._picture, self._name, self._repetition, self._prompt):
+            element.set_visibility(s.state != "finished")
         self._again.text = words("record.again") if s.already and s.state != "finished" else ""
         self._last.text = words("record.last", file=s.file) if s.file else ""
         self._steps.draw(s)
