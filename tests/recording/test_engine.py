@@ -424,7 +424,7 @@ def check_full(done: subprocess.CompletedProcess[str], out: Path) -> None:
     assert "Traceback" not in done.stderr
     (sentence,) = [line for line in done.stderr.splitlines() if line.startswith("plushsense: ")]
     assert "cannot be written any more" in sentence
-    assert "make room, and give the same command" in sentence
+    assert "make room, and go on with the same session" in sentence
     said = json.loads(done.stdout)
     assert (said["finished"], "cannot be written" in said["stopped"]) == (False, True)
     folder = out / "S01" / "1"

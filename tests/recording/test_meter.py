@@ -73,3 +73,10 @@ def test_values_out_of_range_are_no_good_signal() -> None:
         counters.garbage += 1
         meter.heard(counters, n / 100)
     assert meter.quality(3.0).signal == "poor"
+
+
+def test_the_share_behind_the_word() -> None:
+    assert metered(10, 5).bad_share == 0.0
+    # The first reading is not counted against: 499 frames came after it.
+    assert metered(10, 5, 10, 5).bad_share == pytest.approx(15 / 510, abs=0.001)
+    assert Quality().bad_share == 0.0

@@ -5,7 +5,7 @@ import pytest
 
 from plushsense.core.errors import ConfigError, GestureError
 from plushsense.devices.virtual.session import GESTURES
-from plushsense.recording.protocol import Protocol, load_protocol, protocol_names
+from plushsense.recording.protocol import Protocol, load_protocol, protocol_names, wordings
 
 
 def own(folder: Path, text: str) -> Path:
@@ -42,6 +42,22 @@ def test_words_for_children() -> None:
     assert load_protocol("plush-17", "child").prompts["Hold strong"] == "Give the toy a big hug"
     with pytest.raises(ConfigError, match=r"no wording 'chld'.*Did you mean 'child'"):
         load_protocol("plush-17", "chld")
+
+
+@pytest.mark.parametrize("name", protocol_names())
+def test_every_built_in_prompt_is_there_in_latvian(name: str) -> None:
+    assert {"default", "lv"} <= set(wordings(name))
+    own_words = load_protocol(name)
+    for words in set(wordings(name)) & {"lv", "lv-child"}:
+        latvian = load_protocol(name, words)
+        assert latvian.words == words
+        assert [g for g in latvian.gestures if latvian.prompts[g] == own_words.prompts[g]] == []
+
+
+def test_the_wordings_of_a_protocol(tmp_path: Path) -> None:
+    assert wordings("plush-17") == ("default", "child", "lv", "lv-child")
+    assert wordings(own(tmp_path, '[prompts]\n"Tail pull" = { de = "Zieh" }\n')) == ("default", "de")
+    assert wordings(own(tmp_path, "")) == ("default",)
 
 
 def test_a_users_own(tmp_path: Path) -> None:

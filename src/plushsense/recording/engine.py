@@ -17,7 +17,7 @@ from plushsense.recording.machine import Auto, Listener, Machine
 from plushsense.recording.saving import refusal
 from plushsense.recording.session import OpenSession
 from plushsense.recording.sessionfile import SessionHead
-from plushsense.recording.status import State
+from plushsense.recording.status import State, StepStanding
 from plushsense.recording.writer import StreamFile
 
 __all__ = ["Auto", "Listener", "Recorder"]
@@ -51,6 +51,16 @@ class Recorder(Machine):
         """How long the toy has been heard, by its own clock, in seconds."""
         with self._changed:
             return self._intake.toy_ms / 1000.0
+
+    def steps(self) -> tuple[StepStanding, ...]:
+        """All recordings of the plan, in order, and what came of each."""
+        with self._changed:
+            course = self._course
+            return tuple(
+                StepStanding(s, course.takes.get(k, ""), k in course.skipped, len(course.aside.get(k, ())))
+                for s in course.steps
+                for k in (key_of(s),)
+            )
 
     @property
     def over(self) -> str:
@@ -110,7 +120,7 @@ class Recorder(Machine):
                 if self._intake.quality().signal == "unreadable":
                     self._say(
                         f"The toy sends lines, but none is a frame of {self.session.layout.name} "
-                        f"({len(self.session.layout.wire)} numbers): is --layout right, and the cable sound?"
+                        f"({len(self.session.layout.wire)} numbers): is the layout right, and the cable sound?"
                     )
                 elif self._intake.silent:
                     self._say("Nothing comes from the toy: is it switched on and near?")

@@ -119,6 +119,8 @@ class Machine:
                 message=self._message,
                 failed=self._failed,
                 folder=str(self.session.folder),
+                heard=counters.frames,
+                bad_share=quality.bad_share,
             )
 
     # What happens (always with the lock) ----------------------------------------------------------------------

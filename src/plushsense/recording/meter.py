@@ -28,11 +28,13 @@ SIGNAL = {
 
 @dataclass(frozen=True)
 class Quality:
-    """What a meter says: frames a second, standard deviation of the time between frames, a word of `SIGNAL`."""
+    """What a meter says: frames a second, standard deviation of the time between frames, a word of `SIGNAL`, and the
+    share of the last seconds' lines that were lost, spoilt or out of range."""
 
     rate_hz: float = 0.0
     jitter_ms: float = 0.0
     signal: str = "none"
+    bad_share: float = 0.0
 
 
 class Meter:
@@ -77,4 +79,4 @@ class Meter:
         stands = passed <= 0 and len(steps) > self._rate_hz
         off = stands or (passed > SPAN_MS / 2 and abs(rate - self._rate_hz) > RATE_OFF * self._rate_hz)
         word = "poor" if share > POOR or off else "fair" if share > FAIR else "good"
-        return Quality(round(rate, 1), round(float(steps.std()), 2), word)
+        return Quality(round(rate, 1), round(float(steps.std()), 2), word, share)

@@ -199,6 +199,19 @@ def protocol_names() -> tuple[str, ...]:
     return builtin_names("protocols")
 
 
+def wordings(name_or_path: str | Path) -> tuple[str, ...]:
+    """The wordings of a protocol's prompts, `DEFAULT` first.
+
+    Raises:
+        ConfigError: for an unknown name or an unusable file.
+    """
+    table, _ = read_named(name_or_path, "protocols", "protocol", ConfigError)
+    prompts = table.get("prompts")
+    texts = prompts.values() if isinstance(prompts, Mapping) else ()
+    others = {str(w) for text in texts if isinstance(text, Mapping) for w in text}
+    return (DEFAULT, *sorted(others - {DEFAULT}))
+
+
 def load_protocol(name_or_path: str | Path, words: str | None = None) -> Protocol:
     """A built-in protocol by name, or one of the user's own by the path of its TOML file.
 

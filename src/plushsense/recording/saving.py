@@ -50,5 +50,5 @@ def refusal(session: OpenSession, recordings: int, cause: Exception) -> DatasetE
     return DatasetError(
         f"'{session.folder}' cannot be written any more ({why}): the session has stopped. "
         f"What was recorded until then is kept ({recordings} recordings); "
-        "make room, and give the same command to go on."
+        "make room, and go on with the same session."
     )

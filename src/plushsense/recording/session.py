@@ -236,7 +236,7 @@ def _end_torn_line(path: Path) -> None:
 def _mend(folder: Path, layout: Layout, log: LogFile) -> Standing:
     """Where the session stands, by its log and its files; what a crash left is put right, each time with an event."""
     standing = Standing(resumed=(folder / STREAM_NAME).exists() or any(True for _ in read_events(folder)))
-    started, made = _replay(folder, standing)
+    started, made = replay_log(folder, standing)
     _mend_stream(folder / STREAM_NAME, layout, standing, log)
     for path in sorted(folder.iterdir()):
         if path.name.endswith((PART, NEW)):
@@ -264,7 +264,7 @@ def _key(more: dict[str, Any]) -> Key | None:
     return (gesture, repetition) if isinstance(gesture, str) and isinstance(repetition, int) else None
 
 
-def _replay(folder: Path, standing: Standing) -> tuple[Key | None, dict[str, Key]]:
+def replay_log(folder: Path, standing: Standing) -> tuple[Key | None, dict[str, Key]]:
     """Bring ``standing`` to what the log says.
 
     Returns:

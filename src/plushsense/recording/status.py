@@ -11,6 +11,17 @@ State = Literal["idle", "countdown", "recording", "saving", "paused", "finished"
 
 
 @dataclass(frozen=True)
+class StepStanding:
+    """One recording of the plan and what came of it: the file that counts ("" when there is none yet), whether it was
+    passed over, and how many files were set aside."""
+
+    step: Step
+    file: str
+    skipped: bool
+    aside: int
+
+
+@dataclass(frozen=True)
 class Status:
     """A session at one moment.
 
@@ -25,6 +36,9 @@ class Status:
         lost, malformed, garbage, reconnects, gaps: since this program began.
         rows: of the session's stream.
         file: the last recording that was finished.
+        heard: frames since this program began.
+        bad_share: of the last seconds' lines, how many were lost, spoilt or out of range, 0 to 1; ``bad_ever`` since
+            this program began.
     """
 
     state: State
@@ -53,6 +67,19 @@ class Status:
     message: str
     failed: str
     folder: str
+    heard: int = 0
+    bad_share: float = 0.0
+
+    @property
+    def bad_ever(self) -> float:
+        """See above."""
+        bad = self.lost + self.malformed + self.garbage
+        return bad / max(1, self.heard + bad)
+
+    @property
+    def seen(self) -> str:
+        """A word for what this snapshot asks for: a command given upon it means nothing any more once it differs."""
+        return f"{self.state}.{self.step.number}.{self.done}.{self.skipped}.{self.redone}"
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, ready for JSON."""

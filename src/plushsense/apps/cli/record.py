@@ -14,7 +14,7 @@ from plushsense.core.errors import ConfigError
 if TYPE_CHECKING:
     from plushsense.apps.cli.keys import Keys
     from plushsense.apps.cli.screen import Screen
-    from plushsense.core.signal import Layout
+    from plushsense.recording.beginning import Wanted
     from plushsense.recording.engine import Recorder
     from plushsense.recording.sessionfile import SessionHead
 
@@ -86,28 +86,26 @@ def run(args: argparse.Namespace) -> int:
     from plushsense import __version__
     from plushsense.apps.cli.keys import keys, orderly_end
     from plushsense.apps.cli.screen import Screen
-    from plushsense.core.signal import Layout
+    from plushsense.recording.beginning import head_of, layout_of, place
     from plushsense.recording.engine import Auto, Recorder
     from plushsense.recording.session import OpenSession
     from plushsense.recording.toy import open_toy, prompt_virtual, with_speed
 
-    speed = _speed(args)
-    subject, folder, known = _session(args)
-    layout = args.layout
-    if layout is None and known is not None:
-        layout = Layout.from_dict(known.layout, f"layout in '{folder}'")
-    with open_toy(with_speed(args.device, speed), layout) as device:
-        head = _head(args, subject, folder.name, known is None, device.layout, speed)
-        notices = _notices(args, head, known is None)
+    software = f"plushsense {__version__}"
+    wanted = _wanted(args)
+    folder, known = place(Path(args.out), wanted, args.session, args.new)
+    with open_toy(with_speed(args.device, wanted.speed), layout_of(wanted, folder, known)) as device:
+        head = head_of(wanted, folder, known is None, device.layout, software)
+        notices = _notices(wanted, head, known is None)
         for notice in notices:
             say(f"warning: {notice}")
         session = OpenSession(folder, head)
         for sentence in session.standing.mended:
             say(f"mended: {sentence}")
         auto = Auto(args.auto) if args.auto is not None else None
-        recorder = Recorder(session, device, speed=speed, auto=auto, software=f"plushsense {__version__}")
+        recorder = Recorder(session, device, speed=wanted.speed, auto=auto, software=software)
         prompt_virtual(recorder)
-        title = f"{subject}, session {folder.name}: {session.protocol.title}"
+        title = f"{head.subject}, session {folder.name}: {session.protocol.title}"
         screen = Screen(recorder, title, notices)
         try:
             with orderly_end(), recorder, keys() as typed:
@@ -148,78 +146,34 @@ def _report(args: argparse.Namespace, recorder: Recorder) -> int:
     return 0
 
 
-def _speed(args: argparse.Namespace) -> float:
+def _wanted(args: argparse.Namespace) -> Wanted:
+    from plushsense.recording.beginning import Wanted, check_speed
     from plushsense.recording.toy import speed_of
 
-    speed = speed_of(args.device) if args.speed is None else float(args.speed)
-    if not 0.0 <= speed <= 1000.0:
-        raise ConfigError(f"--speed is {speed:g}; 0 (as fast as it can) to 1000 is accepted.")
     if args.auto is not None and not 0.5 <= args.auto <= 3600.0:
         raise ConfigError(f"--auto is {args.auto:g}; 0.5 to 3600 seconds are accepted.")
-    return speed
-
-
-def _session(args: argparse.Namespace) -> tuple[str, Path, SessionHead | None]:
-    """The person's code, the session's folder, and its head where it is there already."""
-    from plushsense.core.gestures import NOBODY
-    from plushsense.recording.protocol import load_protocol
-    from plushsense.recording.session import check_session, check_subject, new_session, next_session
-    from plushsense.recording.sessionfile import SessionHead
-
-    subject = args.subject
-    if subject is None and args.protocol is not None and load_protocol(args.protocol).needs_nobody:
-        subject = NOBODY
-    if subject is None:
-        raise ConfigError("Whose session is it? Give --subject with the person's code, such as S01.")
-    person = Path(args.out) / check_subject(subject)
-    if args.session is not None:
-        name = check_session(args.session)
-    else:
-        name = new_session(person) if args.new else next_session(person)
-    known = SessionHead.read(person / name)
-    if known is not None and args.new:
-        raise ConfigError(f"The session '{person / name}' is there: leave --new off, or give another --session.")
-    return subject, person / name, known
-
-
-def _head(
-    args: argparse.Namespace, subject: str, session: str, fresh: bool, layout: Layout, speed: float
-) -> SessionHead:
-    """The session as the command line says it; what it leaves out of a session that goes on is empty."""
-    from plushsense import __version__
-    from plushsense.devices.base import now_ms
-    from plushsense.recording.protocol import load_protocol
-    from plushsense.recording.sessionfile import SessionHead
-    from plushsense.recording.toy import is_virtual
-
-    named = args.protocol or ("plush-17" if fresh else None)
-    if named is None and args.words is not None:
-        raise ConfigError("--words goes with --protocol: a session that goes on keeps the words it began with.")
-    protocol = load_protocol(named, args.words) if named is not None else None
-    simulated = args.simulated or is_virtual(args.device) or speed != 1.0
-    return SessionHead(
-        subject=subject,
-        session=session,
-        started_ms=now_ms(),
-        layout=layout.to_dict(),
-        protocol=protocol.to_dict() if protocol is not None else {},
+    return Wanted(
+        device=args.device,
+        subject=args.subject or "",
+        protocol=args.protocol or "",
+        words=args.words or "",
+        layout=args.layout or "",
         age_group=args.age_group,
         gender=args.gender,
         consent=args.consent,
-        device=args.device,
-        software=f"plushsense {__version__}",
-        simulated=simulated,
+        speed=check_speed(speed_of(args.device) if args.speed is None else float(args.speed)),
+        simulated=args.simulated,
     )
 
 
-def _notices(args: argparse.Namespace, head: SessionHead, fresh: bool) -> list[str]:
+def _notices(wanted: Wanted, head: SessionHead, fresh: bool) -> list[str]:
     """What should be known before anything is recorded."""
-    from plushsense.core.gestures import NOBODY
+    from plushsense.recording.beginning import is_pseudo, lacks_consent
 
     said = []
-    if "/dev/pts/" in args.device and not head.simulated:
+    if is_pseudo(wanted, head):
         said.append("This port is a pseudo terminal: if it is `plushsense toy`, quit and add --simulated.")
-    if fresh and not (head.consent or head.subject == NOBODY or head.simulated):
+    if fresh and lacks_consent(head):
         said.append("No consent reference (--consent): recorded as missing, and publishing will refuse it.")
     return said
 

@@ -80,6 +80,8 @@ def run(
         _wait_open(shown, port)
         told(house.invite() if house.invite else address)
 
+    # A bar that nobody has named, for screen readers, at every request.
+    app.config.quasar_config["loadingBar"] = {"skipHijack": True}
     app.on_startup(lambda: threading.Thread(target=tell, daemon=True).start())
     app.on_shutdown(house.close)
     ui.run(

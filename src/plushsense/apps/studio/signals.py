@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from plushsense.apps.studio.house import Bell
 from plushsense.devices.base import Device, Frame
+from plushsense.devices.reconnect import Gap
 
 KEPT_S = 60.0
 
@@ -97,6 +98,16 @@ class TappedDevice(Device):
     def inner(self) -> Device:
         """The device beneath all that is wrapped around it."""
         return getattr(self.device, "inner", self.device)
+
+    @property
+    def state(self) -> str:
+        """Whether the toy is there: as of a `plushsense.devices.reconnect.ReconnectingDevice`."""
+        return str(getattr(self.device, "state", "connected"))
+
+    @property
+    def gaps(self) -> list[Gap]:
+        """Times without the toy."""
+        return list(getattr(self.device, "gaps", ()))
 
     def read(self) -> list[Frame] | None:
         """As the device's; see there."""

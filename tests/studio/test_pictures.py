@@ -1,0 +1,83 @@
+"""The pictures of the gestures: one for each, told apart, with a name."""
+
+from __future__ import annotations
+
+import itertools
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from plushsense.apps.studio.pictures import LARGEST, has_picture, own_picture, picture
+from plushsense.core.gestures import load_gestures
+
+LABELS = load_gestures("plush-18").labels
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+@pytest.mark.parametrize("label", LABELS)
+def test_every_gesture_of_the_toy_has_one(label: str) -> None:
+    assert has_picture(label)
+    root = ElementTree.fromstring(picture(label, f'"{label}" & <so>'))
+    assert root.get("aria-label") == root.findtext(f"{SVG}title") == f'"{label}" & <so>'
+    assert root.get("role") == "img"
+    tags = {e.tag.removeprefix(SVG) for e in root.iter()}
+    assert tags <= {"svg", "title", "g", "path", "ellipse", "circle", "rect"}, "nothing that acts or loads"
+
+
+def test_another_set_gets_the_toy_alone() -> None:
+    assert not has_picture("Throw")
+    assert picture("Throw", "x") == picture("Bowl", "x") != picture("At rest", "x")
+    assert picture("tail_HIT 1", "x") == picture("Tail hit 1", "x")
+
+
+def test_a_child_could_tell_them_apart(chromium: Any) -> None:
+    """Drawn small, any two differ in a good part of the picture."""
+    page = chromium.new_page(viewport={"width": 160, "height": 125})
+    drawn: dict[str, Any] = {}
+    for label in LABELS:
+        page.set_content(f'<body style="margin: 0">{picture(label)}</body>')
+        pixels = page.evaluate(
+            """async () => { const svg = document.querySelector('svg').outerHTML;
+            const image = new Image(); image.src = 'data:image/svg+xml,' + encodeURIComponent(svg);
+            await image.decode(); const canvas = document.createElement('canvas');
+            canvas.width = 160; canvas.height = 125; const on = canvas.getContext('2d');
+            on.drawImage(image, 0, 0, 160, 125);
+            return Array.from(on.getImageData(0, 0, 160, 125).data) }"""
+        )
+        drawn[label] = np.array(pixels, dtype=np.int64).reshape(125, 160, 4)[..., :3]
+    page.close()
+    for one, other in itertools.combinations(LABELS, 2):
+        differs = np.abs(drawn[one] - drawn[other]).max(axis=2) > 60
+        assert differs.mean() > 0.02, (one, other)
+
+
+def test_a_users_own(tmp_path: Path) -> None:
+    assert own_picture(tmp_path, "Tail pull") == ""
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    (folder / "tail_pull.svg").write_text("<svg/>", encoding="utf-8")
+    (folder / "Hold strong.gif").write_bytes(b"GIF")
+    (folder / "At rest.png").write_bytes(b"x" * (LARGEST + 1))
+    outside = tmp_path.parent / "secret.png"
+    outside.write_bytes(b"secret")
+    (folder / "Hold in hands.png").symlink_to(outside)
+    assert own_picture(tmp_path, "Tail pull") == "data:image/svg+xml;base64,PHN2Zy8+"
+    for label in ("Hold strong", "At rest", "Hold in hands", "../secret"):
+        assert own_picture(tmp_path, label) == ""
+
+
+def test_they_are_looked_at(chromium: Any, shots: Callable[..., Path]) -> None:
+    page = chromium.new_page(viewport={"width": 1500, "height": 900})
+    for ground in ("#ffffff", "#121212"):
+        each = "".join(f"<div>{picture(label)}</div>" for label in LABELS)
+        style = "display: grid; grid-template-columns: repeat(6, 1fr); gap: 8px"
+        page.set_content(f'<body style="background: {ground}"><div style="{style}">{each}</div></body>')
+        assert page.locator("svg").count() == 18
+        shots(page, f"pictures-{ground[1:]}")
+    page.close()

@@ -1,0 +1,272 @@
+"""The record page as a session leader uses it: keys, buttons, tabs, lost connections."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from browsing import DESK, TABLET, axe, connected, marked
+from recording_pages import CALM, begun, choose, events, files, heard, sat, showing, take, until, whats
+
+if TYPE_CHECKING:
+    from playwright.sync_api import WebSocketRoute
+
+Fixture = Callable[..., Any]
+SPEED = ("--device", CALM, "--speed", "10")
+
+
+def test_one_press_is_one_command(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
+    server, browser = studio(*SPEED), look()
+    page = begun(browser.open(server.url + "/record"), server.url, "S01")
+    # With the focus on each button in turn: the space starts and stops, and presses none of them.
+    for number, focused in enumerate(("main", "skip", "redo")):
+        marked(page, focused).focus()
+        take(page, number)
+    assert [w for w in whats(tmp_path / "home") if w not in ("open", "take", "gap")] == ["countdown", "start"] * 3
+    # A held key is one press: it neither stops what it started nor cancels it.
+    showing(page, "idle.3.")
+    page.keyboard.down("Space")
+    for _ in range(10):
+        page.keyboard.down("Space")
+    showing(page, "recording.3.")
+    for _ in range(10):
+        page.keyboard.down("Space")
+    page.keyboard.up("Space")
+    page.wait_for_timeout(300)
+    assert showing(page, "").startswith("recording.3.")
+    # A held Enter on the big button is one click.
+    marked(page, "main").focus()
+    for _ in range(5):
+        page.keyboard.down("Enter")
+    page.keyboard.up("Enter")
+    showing(page, "finished.")
+    assert whats(tmp_path / "home").count("take") == 4
+    assert len(files(tmp_path / "home")) == 4
+    assert axe(page) == []
+    assert "Next: end the session" in marked(page, "all-done").inner_text()
+    assert browser.complaints == []
+
+
+def test_what_is_typed_is_no_command(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
+    server, browser = studio(*SPEED), look()
+    page = begun(browser.open(server.url + "/record"), server.url, "S01")
+    take(page, 0)
+    page.keyboard.press("n")
+    page.keyboard.type("so soft, paws & bears")
+    assert marked(page, "note").input_value() == "so soft, paws & bears"
+    page.keyboard.press("Enter")
+    until(lambda: "note" in whats(tmp_path / "home"))
+    note = next(e.more for e in events(tmp_path / "home") if e.what == "note")
+    assert (note["text"], note["gesture"]) == ("so soft, paws & bears", "Head stroke 1")
+    assert note["file"].startswith("Back stroke 1_")
+    assert showing(page, "").startswith("idle.1.1.0.0")
+    page.keyboard.press("Escape")
+    page.keyboard.press("Control+p")
+    page.keyboard.press("Alt+s")
+    page.wait_for_timeout(200)
+    assert showing(page, "").startswith("idle.1.1.0.0")
+    assert browser.complaints == []
+
+
+def test_redo_skip_back_pause_and_going_to_a_step(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
+    server, browser = studio(*SPEED), look()
+    page = begun(browser.open(server.url + "/record"), server.url, "S01")
+    take(page, 0)
+    first = events(tmp_path / "home")[-1].more["file"]
+    assert marked(page, "last").inner_text() == f"Last: {first}"
+    page.keyboard.press("r")
+    showing(page, "idle.0.0.0.1")
+    # Skipped while it is to be made again: the earlier one counts after all.
+    page.keyboard.press("s")
+    showing(page, "idle.1.1.0.0")
+    assert "kept" in marked(page, "message").inner_text()
+    marked(page, "skip").click()
+    showing(page, "idle.2.1.1.0")
+    marked(page, "back").click()
+    showing(page, "idle.1.1.1.0")
+    page.keyboard.press("b")
+    showing(page, "idle.0.1.1.0")
+    assert marked(page, "again").inner_text() != ""
+    page.get_by_text("All recordings: go to one").click()
+    assert marked(page, "step-0").get_attribute("data-step") == "made"
+    assert marked(page, "step-1").get_attribute("data-step") == "skipped"
+    assert "Head stroke 1, 1 of 1: skipped" in str(marked(page, "step-1").get_attribute("aria-label"))
+    assert axe(page) == []
+    marked(page, "step-1").click()
+    showing(page, "idle.1.")
+    page.keyboard.press("p")
+    showing(page, "paused.1.")
+    page.keyboard.press("Space")
+    page.wait_for_function("() => document.querySelector('[data-test=message]').innerText.includes('Paused')")
+    marked(page, "main").click()
+    take(page, 1)
+    showing(page, "idle.2.2.0.0")
+    # Broken off while it runs, and a countdown that is cancelled.
+    page.keyboard.press("Space")
+    showing(page, "recording.2.")
+    marked(page, "redo").click()
+    showing(page, "idle.2.2.0.0")
+    page.keyboard.press("Space")
+    showing(page, "countdown.2.")
+    page.keyboard.press("Space")
+    showing(page, "idle.2.2.0.0")
+    page.keyboard.press("p")
+    showing(page, "paused.2.")
+    page.keyboard.press("p")
+    showing(page, "idle.2.")
+    assert len(files(tmp_path / "home")) == 2
+    assert browser.complaints == []
+
+
+def test_two_tabs_show_and_press_the_same_once(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
+    server, browser = studio(*SPEED), look()
+    frozen: list[bool] = [False]
+    held: list[Callable[[], None]] = []
+
+    def between(page_end: WebSocketRoute) -> None:
+        """A slow network: what the studio says reaches the pages later."""
+        server_end = page_end.connect_to_server()
+
+        def said(message: str | bytes) -> None:
+            if frozen[0]:
+                held.append(lambda: page_end.send(message))
+            else:
+                page_end.send(message)
+
+        server_end.on_message(said)
+
+    browser.context.route_web_socket("**/_nicegui_ws/**", between)
+    one = begun(browser.open(server.url + "/record"), server.url, "S01")
+    # The only session that is open is what the bare address shows.
+    other = browser.open(server.url + "/record")
+    heard(other)
+    showing(other, "idle.0.")
+
+    def both_press() -> None:
+        """Both see the same when they press."""
+        frozen[0] = True
+        for page in (one, other):
+            page.keyboard.press("Space")
+        one.wait_for_timeout(500)
+        assert held
+        frozen[0] = False
+        while held:
+            held.pop(0)()
+
+    both_press()
+    marked(other, "said").get_by_text("came too late").wait_for()
+    for page in (one, other):
+        showing(page, "recording.0.")
+    both_press()
+    for page in (one, other):
+        showing(page, "idle.1.1.0.0")
+    other.wait_for_timeout(300)
+    assert showing(other, "") == "idle.1.1.0.0"
+    made = [w for w in whats(tmp_path / "home") if w in ("countdown", "cancel", "start", "take")]
+    assert made == ["countdown", "start", "take"]
+    # Ended on one, it is ended on the other; what was made is kept, and it is offered again.
+    marked(one, "end").click()
+    marked(one, "end-yes").click()
+    for page in (one, other):
+        page.wait_for_url("**/record?ended=S01/1")
+        connected(page)
+        assert "1 of 4 recorded" in marked(page, "said").inner_text()
+    one.get_by_role("button", name="Go on: S01/1").click()
+    sat(one, "S01/1")
+    assert showing(one, "idle.") == "idle.1.1.0.0"
+    assert browser.complaints == []
+
+
+def test_a_lost_connection_loses_nothing(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
+    server, browser = studio(*SPEED), look()
+    page = begun(browser.open(server.url + "/record"), server.url, "S01")
+    showing(page, "idle.0.")
+    page.keyboard.press("Space")
+    showing(page, "recording.0.")
+    browser.context.set_offline(True)
+    page.evaluate("() => window.socket.io.engine.close()")
+    page.wait_for_function("() => !window.socket.connected")
+    # Nobody hears these, now or later.
+    for _ in range(3):
+        page.keyboard.press("Space")
+    page.wait_for_timeout(500)
+    assert "take" not in whats(tmp_path / "home")
+    browser.context.set_offline(False)
+    page.wait_for_function("() => window.socket && window.socket.connected", timeout=20_000)
+    connected(page)
+    showing(page, "recording.0.", "idle.1.")
+    if showing(page, "").startswith("recording"):
+        page.keyboard.press("Space")
+    showing(page, "idle.1.1.0.0")
+    # A browser that is gone for good leaves the recorder running: the protocol ends the recording.
+    page.keyboard.press("Space")
+    showing(page, "recording.1.")
+    page.close()
+    until(lambda: whats(tmp_path / "home").count("take") == 2)
+    assert [b["ended"] for b in files(tmp_path / "home")][1] == "longest"
+    page = look().open(server.url + "/record")
+    heard(page)
+    assert showing(page, "idle.") == "idle.2.2.0.0"
+    assert "Nobody stopped it" in marked(page, "message").inner_text()
+
+
+def test_it_speaks_latvian_and_fits_a_tablet(studio: Fixture, look: Fixture, shots: Fixture, tmp_path: Path) -> None:
+    server = studio("--device", CALM, "--speed", "3")
+    for number, (language, dark, size) in enumerate((("lv", True, TABLET), ("en", False, DESK))):
+        browser, code = look(size, dark, language, touch=size == TABLET), f"S0{number + 1}"
+        page = browser.open(server.url + "/record?new=1")
+        where = f"record-{language}-{'dark' if dark else 'light'}-{size[0]}"
+        assert axe(page) == []
+        shots(page, f"{where}-new")
+        page.locator('[data-test="code"]').fill("Anna B")
+        marked(page, "begin").click()
+        page.get_by_role("alert").wait_for()
+        assert "no code for a person" in marked(page, "said").inner_text()
+        assert axe(page) == []
+        marked(page, "code").fill(code)
+        choose(page, "protocol", "Izmēģināšanai" if language == "lv" else "To try it")
+        marked(page, "begin").click()
+        sat(page, f"{code}/1")
+        said = "Glaudi rotaļlietai muguru; rotaļlieta stāv uz galda"
+        assert marked(page, "prompt").inner_text() == (
+            said if language == "lv" else "Stroke the toy's back; the toy stands on a table"
+        )
+        if language == "lv":
+            assert marked(page, "gesture").inner_text() == "Muguras glāstīšana 1"
+        assert marked(page, "simulation").is_visible()
+        assert marked(page, "picture").locator("svg").get_attribute("aria-label")
+        page.wait_for_function("() => document.querySelectorAll('[data-test^=plot-] canvas').length === 3")
+        for state in ("idle", "countdown", "recording"):
+            if state == "countdown":
+                marked(page, "main").click()
+            # A busy machine may miss the countdown.
+            seen = showing(page, f"{state}.0.", "recording.0.")
+            if state != "countdown":
+                assert axe(page) == [], state
+            shots(page, f"{where}-{seen.partition('.')[0]}")
+        assert page.evaluate("() => document.documentElement.scrollWidth <= window.innerWidth")
+        marked(page, "main").click()
+        showing(page, "idle.1.")
+        for expected in ("idle.2.", "idle.3.", "finished."):
+            page.keyboard.press("s")
+            showing(page, expected)
+        assert axe(page) == []
+        shots(page, f"{where}-finished")
+        marked(page, "redo").click()
+        showing(page, "idle.0.")
+        page.keyboard.press("p")
+        showing(page, "paused.0.")
+        marked(page, "end").click()
+        marked(page, "end-yes").wait_for()
+        assert axe(page) == []
+        shots(page, f"{where}-paused")
+        marked(page, "end-yes").click()
+        page.wait_for_url(f"**/record?ended={code}/1")
+        connected(page)
+        assert marked(page, f"unfinished-{code}/1").is_visible()
+        assert axe(page) == []
+        shots(page, f"{where}-unfinished")
+        assert browser.complaints == []

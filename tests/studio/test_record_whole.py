@@ -1,0 +1,82 @@
+"""The paper's session, 51 recordings with the space bar of a real browser, over a pseudo terminal: reloaded on the way,
+and the server killed on the way."""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from browsing import connected, marked
+from plushsense.core.recfile import parse_name
+from plushsense.devices.virtual.session import GESTURES
+from plushsense.recording.sessionfile import SESSION_LOG, SessionHead, read_events
+from pty_toys import check_whole, pty_toy, recordings
+from recording_pages import showing
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
+
+Fixture = Callable[..., Any]
+pytestmark = pytest.mark.usefixtures("pty_possible")
+SPEED = 20.0
+RELOADED, KILLED = 17, 34
+
+
+def begin(page: Page, number: int) -> None:
+    """Start a recording by the space bar."""
+    showing(page, f"idle.{number}.")
+    page.keyboard.press("Space")
+    showing(page, f"recording.{number}.")
+
+
+def test_51_recordings_by_the_space_bar(studio: Fixture, look: Fixture, shots: Fixture, tmp_path: Path) -> None:
+    folder = tmp_path / "home" / "recordings" / "S01" / "1"
+    with pty_toy(folder / SESSION_LOG, SPEED) as toy:
+        server = studio("--device", toy.url, "--speed", f"{SPEED:g}")
+        browser = look()
+        page = browser.open(server.url + "/record")
+        marked(page, "code").fill("S01")
+        page.get_by_text("More settings").click()
+        page.get_by_text("This toy is a virtual one").click()
+        marked(page, "begin").click()
+        page.wait_for_url("**/record?session=S01/1")
+        connected(page)
+        for number in range(51):
+            begin(page, number)
+            if number == RELOADED:
+                page.reload()
+                connected(page)
+                # It went on all the while; only a slow machine lets it end by itself.
+                if showing(page, "recording.", "idle.").startswith("idle."):
+                    continue
+            elif number == KILLED:
+                server.kill()
+                server.start()
+                # The page comes back by itself and offers to go on.
+                page.get_by_role("button", name="Go on: S01/1").click()
+                page.wait_for_selector('[data-test="state-box"]')
+                connected(page)
+                assert "broken off" in marked(page, "notice").first.inner_text()
+                begin(page, number)
+            page.keyboard.press("Space")
+            showing(page, f"idle.{number + 1}.", "finished.")
+        showing(page, "finished.50.51.0.0")
+        assert marked(page, "progress").inner_text() == "51 of 51 recorded"
+        marked(page, "main").click()
+        page.wait_for_url("**/record?ended=S01/1")
+        assert "S01/1 is finished: 51 of 51" in marked(page, "said").inner_text()
+    assert check_whole(folder, toy) == 51
+    made = Counter(n.label for p in recordings(folder) if (n := parse_name(p.name)) is not None)
+    assert made == dict.fromkeys(GESTURES, 3)
+    events = Counter(e.what for e in read_events(folder))
+    assert (events["take"], events["redo"], events["unfinished"], events["finished"]) == (51, 0, 1, 1)
+    head = SessionHead.read(folder)
+    assert head is not None and head.simulated
+    # The connection broke once; nothing else was wrong.
+    assert [c for c in browser.complaints if "ERR_CONNECTION_REFUSED" not in c and "WebSocket" not in c] == []
