@@ -32,7 +32,7 @@ from plushsense.reports.quality import scale_of
 from plushsense.reports.quality_figures import line
 
 KEPT = "review.json"
-FULL = 100
+FULL = 1000
 """What `Shape.size` counts as the usual height of a deviation."""
 _BATCH = 25
 _RING_S = 0.3
