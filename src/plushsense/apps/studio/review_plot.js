@@ -36,9 +36,9 @@ export default {
       document.addEventListener("keydown", this.onKey);
       document.addEventListener("click", this.onClick);
     }
+    this.loaded = true;
     for (const late of this.late || []) late();
     this.late = null;
-    this.loaded = true;
   },
   beforeUnmount() {
     document.removeEventListener("keydown", this.onKey);
@@ -72,8 +72,7 @@ export default {
       if (p.lanes.length > 1) {
         y.splits = () => p.lanes.map((lane) => lane[0]);
         y.values = () => p.lanes.map((lane) => lane[1]);
-        y.rotate = -90;
-        y.size = 44;
+        y.size = 96;
         y.grid = { show: false };
         y.ticks = { show: false };
       }

@@ -36,8 +36,10 @@ FULL = 1000
 """What `Shape.size` counts as the usual height of a deviation."""
 _BATCH = 25
 _RING_S = 0.3
-# Between two recordings, so that a page that waits for the interpreter gets it at once.
+# Between two recordings, so that a page that waits for the interpreter gets it at once; longer while somebody works.
 _BREATH_S = 0.0005
+_STEPPED_BACK_S = 0.015
+_BUSY_S = 1.5
 
 
 class _Closed(Exception):
@@ -78,6 +80,7 @@ class Prepared:
     _lock: Any = field(default_factory=threading.Lock, repr=False)
     _closed: bool = False
     _rung_s: float = 0.0
+    _asked_s: float = 0.0
 
     def begin(self, dataset: Dataset) -> None:
         """Make what lacks, and check ``dataset`` with the marks that it was opened with; returns at once.
@@ -90,6 +93,10 @@ class Prepared:
                 return
             self._thread = threading.Thread(target=self._run, args=(dataset,), daemon=True)
             self._thread.start()
+
+    def step_back(self) -> None:
+        """Somebody is at work on the page: let that go first for a while."""
+        self._asked_s = time.monotonic()
 
     def wait(self, seconds: float) -> None:
         """Until all is made, at most so long."""
@@ -125,7 +132,8 @@ class Prepared:
             if self._closed:
                 raise _Closed
             self.progress = (what, before + done, total or of)
-            time.sleep(_BREATH_S)
+            now = time.monotonic()
+            time.sleep(_STEPPED_BACK_S if now - self._asked_s < _BUSY_S else _BREATH_S)
             if time.monotonic() - self._rung_s > _RING_S:
                 self._rung_s = time.monotonic()
                 self.bell.ring()

@@ -244,6 +244,7 @@ class Review:
 
     def signals(self, identity: str) -> Signals:
         """A recording, read; the last ones are kept."""
+        self.prepared.step_back()
         info = self.info(identity)
         known = self._read.get(identity)
         if known is not None and (not len(self.prepared.scale) or not np.isnan(known.activity).any()):

@@ -145,6 +145,7 @@ class Desk:
             if review.dataset.head.simulated:
                 tag(ui.label(words("shell.simulation")).classes("ps-said ps-said-warning"), "simulation")
             self.counts = tag(ui.label().props("role=status"), "counts")
+            self.making = tag(ui.label().classes("ps-dim").props("role=status"), "making")
             ui.space()
             self.who = ui.input(words("review.who"), value=self._who(), on_change=lambda e: self._keep_who(e.value))
             tag(self.who.props("outlined dense").style("width: 170px"), "who")
@@ -154,7 +155,6 @@ class Desk:
             )
         if review.is_labelled:
             tag(ui.label(words("review.labelled")).classes("ps-said ps-said-info w-full"), "labelled")
-        self.making = tag(ui.label().classes("ps-dim").props("role=status"), "making")
         with ui.row().classes("w-full items-center gap-2"):
             toggle = ui.toggle({v: words(f"review.view_{v}") for v in VIEWS}, value=self.view)
             toggle.props(

@@ -28,6 +28,8 @@ SIGNS = {
     "labelled": "▤",
 }
 """A state is told by sign and word."""
+# The broad plus is missing in many fonts.
+AFFECTS = {affect: sign.replace("＋", "+") for affect, sign in AFFECT_SIGNS.items()}
 
 
 class ListView:
@@ -98,7 +100,7 @@ class ListView:
         return {
             "id": row.id,
             "person": desk.person(row.info.subject),
-            "gesture": f"{AFFECT_SIGNS.get(row.affect, '·')} {words.gesture(row.info.gesture)}",
+            "gesture": f"{AFFECTS[row.affect]} {words.gesture(row.info.gesture)}",
             "seconds": f"{row.seconds:.2f} s",
             "findings": findings,
             "state": row.state,

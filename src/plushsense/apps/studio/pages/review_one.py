@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 from nicegui import run, ui
 
-from plushsense.apps.studio.pages.review_list import SIGNS
+from plushsense.apps.studio.pages.review_list import AFFECTS, SIGNS
 from plushsense.apps.studio.pages.review_reason import ask, finding_text
 from plushsense.apps.studio.review_plot import ReviewPlot
 from plushsense.apps.studio.review_shown import ACTIVITY, ALL
-from plushsense.apps.studio.shell import AFFECT_COLOURS, AFFECT_SIGNS, LINES, tag
+from plushsense.apps.studio.shell import AFFECT_COLOURS, LINES, tag
 
 if TYPE_CHECKING:
     from plushsense.apps.studio.pages.review import Desk
@@ -54,9 +54,11 @@ class OneView:
                     self.affect = ui.label().classes("q-px-sm rounded-borders").style("font-weight: 600; color: #fff")
                     self.state = tag(ui.label().classes("ps-chip").props("role=status"), "state")
                 self.about = tag(ui.label().classes("ps-dim ps-number"), "about")
-                self.plot = ReviewPlot(words("review.plot"), on_pick=self.picked, on_key=self.key, on_zoom=self.zoomed)
-                tag(self.plot, "plot")
                 self._actions(trims)
+                self.plot = ReviewPlot(
+                    words("review.plot"), height=310, on_pick=self.picked, on_key=self.key, on_zoom=self.zoomed
+                )
+                tag(self.plot, "plot")
                 if trims:
                     self._marks()
                 self._views()
@@ -171,7 +173,7 @@ class OneView:
         if moved:
             self.plot.remark(row.id, self._lines(), self._cut(), self._label())
         self.heading.set_text(row.id)
-        self.affect.set_text(f"{AFFECT_SIGNS.get(row.affect, '·')} {words.gesture(row.info.gesture)}")
+        self.affect.set_text(f"{AFFECTS[row.affect]} {words.gesture(row.info.gesture)}")
         self.affect.style(f"background: {AFFECT_COLOURS.get(row.affect, '#767676')}")
         self.state.set_text(f"{SIGNS[row.state]} {words(f'review.state_{row.state}')}")
         self.state.props(f'data-state="{row.state}"')
