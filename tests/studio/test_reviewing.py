@@ -163,8 +163,15 @@ def test_findings_are_accepted_with_a_reason_and_taken_back(review: Review) -> N
     assert review.accept_finding(VISIT, finding, ME, "looked at")
     assert finding.check not in [f.check for f in review.rows[odd.id].open]
     assert marks(review.path)[-1] | {"when": ""} == {
-        **{"recording": odd.id, "action": "accept", "who": ME, "why": "looked at", "start": 0, "stop": -1},
-        **{"when": "", "check": finding.check, "how": ""},
+        "recording": odd.id,
+        "action": "accept",
+        "who": ME,
+        "why": "looked at",
+        "start": 0,
+        "stop": -1,
+        "when": "",
+        "check": finding.check,
+        "how": "",
     }
     review.undo(VISIT, ME)
     assert review.rows[odd.id].open == odd.open
@@ -212,9 +219,8 @@ def test_what_is_drawn_is_what_was_recorded(review: Review) -> None:
 
 
 def test_long_recordings_are_thinned_to_their_extremes(house: House) -> None:
-    from reviewed import recording
-
     from plushsense.apps.studio.review_shown import Signals
+    from reviewed import recording
 
     frames = recording(1, 6000, rows=20_000)
     values = frames.values.astype(float)
