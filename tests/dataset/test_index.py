@@ -73,6 +73,23 @@ def test_a_mark_within_the_same_clock_tick_counts(folder: Path) -> None:
     assert len(open_dataset(folder).used) == 1
 
 
+def test_a_mark_reads_no_raw_file_again_and_comes_to_the_same(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second = "ana/Shake_1_60", "ana/Shake_2_60"
+    whole = open_dataset(folder)
+    append_marks(folder, [Mark(first, "trim", "x", start=5, stop=50), Mark(second, "exclude", "x")])
+    with monkeypatch.context() as patched:
+        patched.setattr(index, "build", refuse)
+        marked = open_dataset(folder)
+    assert [(r.start, r.stop, r.excluded) for r in marked.recordings] == [(5, 50, False), (0, 60, True)]
+    again = index.rebuild(folder).dataset
+    assert [replace(r, rate_hz=0.0) for r in again.recordings] == [replace(r, rate_hz=0.0) for r in marked.recordings]
+    assert again.hash == marked.hash
+    with monkeypatch.context() as patched:
+        patched.setattr(index, "build", refuse)
+        (folder / "marks.jsonl").unlink()
+        assert open_dataset(folder).recordings == whole.recordings, "without the marks, as it was"
+
+
 def test_a_raw_file_that_became_unreadable_is_named(folder: Path) -> None:
     (folder / "recordings" / "ana" / "Shake_1_60.csv").write_text("")
     for _ in range(2):

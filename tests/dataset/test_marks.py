@@ -3,7 +3,16 @@ from pathlib import Path
 import pytest
 
 from plushsense.core.errors import DatasetError
-from plushsense.dataset.marks import MARKS, Mark, Standing, append_marks, read_marks
+from plushsense.dataset.marks import (
+    MARKS,
+    FollowedMarks,
+    Mark,
+    Standing,
+    after,
+    append_marks,
+    read_marks,
+    taking_back,
+)
 
 
 def test_marks_are_appended_and_undone(tmp_path: Path) -> None:
@@ -76,3 +85,63 @@ def test_a_finding_is_accepted_and_taken_back(tmp_path: Path) -> None:
     for wrong in (Mark("a", "accept", "x"), Mark("a", "trim", "x", check="gaps")):
         with pytest.raises(DatasetError, match="name a check"):
             append_marks(tmp_path, [wrong])
+
+
+def test_followed_marks_are_those_read_whole(tmp_path: Path) -> None:
+    followed = FollowedMarks(tmp_path)
+    assert followed.standing() == {}
+    assert not followed.changed
+    for number in range(20):
+        append_marks(tmp_path, [Mark(f"r{number % 7}", "trim", "x", start=number), Mark("r3", "exclude", "x")])
+        assert followed.changed
+        assert followed.standing() == read_marks(tmp_path)
+        assert followed.standing() is followed.standing(), "nothing changed"
+    with (tmp_path / MARKS).open("a") as file:
+        file.write('{"recording": "r9", "action": "exclude", "who": "x"')
+    assert "r9" not in followed.standing()
+    with (tmp_path / MARKS).open("a") as file:
+        file.write("}")
+    assert followed.standing()["r9"].excluded, "a mark without a line's end"
+    append_marks(tmp_path, [Mark("r9", "include", "x")])
+    assert followed.standing() == read_marks(tmp_path)
+
+
+def test_a_marks_file_that_was_replaced_is_read_anew(tmp_path: Path) -> None:
+    followed = FollowedMarks(tmp_path)
+    append_marks(tmp_path, [Mark("a", "exclude", "x"), Mark("b", "exclude", "x")])
+    assert set(followed.standing()) == {"a", "b"}
+    other = (tmp_path / MARKS).read_text().replace('"a"', '"c"')
+    (tmp_path / "other").write_text(other + other)
+    (tmp_path / "other").replace(tmp_path / MARKS)
+    assert set(followed.standing()) == {"b", "c"}
+    (tmp_path / MARKS).unlink()
+    assert followed.standing() == {}
+
+
+def test_followed_marks_name_the_line_that_is_none(tmp_path: Path) -> None:
+    append_marks(tmp_path, [Mark("a", "exclude", "x")])
+    followed = FollowedMarks(tmp_path)
+    followed.standing()
+    with (tmp_path / MARKS).open("a") as file:
+        file.write("[1]\n")
+    for _ in range(2):
+        with pytest.raises(DatasetError, match="line 2 is no mark"):
+            followed.standing()
+
+
+@pytest.mark.parametrize(
+    "before", [Standing(), Standing(start=3, stop=9, how="hand"), Standing(True, accepted=frozenset({"gaps"}))]
+)
+@pytest.mark.parametrize(
+    "mark",
+    [
+        Mark("a", "trim", "x", start=5, how="suggested"),
+        Mark("a", "untrim", "x"),
+        Mark("a", "exclude", "x"),
+        Mark("a", "include", "x"),
+        Mark("a", "accept", "x", check="gaps"),
+        Mark("a", "unaccept", "x", check="gaps"),
+    ],
+)
+def test_a_mark_taken_back_leaves_what_was_before(before: Standing, mark: Mark) -> None:
+    assert after(after(before, mark), taking_back(mark, before, "y")) == before

@@ -17,7 +17,7 @@ from plushsense.dataset.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import MARKS, Mark, append_marks
 from plushsense.dataset.store import Dataset
-from plushsense.dataset.trim import Trim, accept, choose, kept_rows, set_trim, trims, undo
+from plushsense.dataset.trim import Trim, accept, choose, kept_rows, set_rows, set_trim, trims, undo
 
 ACCEL = load_layout("accel-3")
 BEGIN_S, END_S = 0.5, 1.8
@@ -129,6 +129,17 @@ def test_setting_what_stands_adds_nothing_and_undo_brings_the_suggestion_back(da
 def test_times_that_cannot_be_are_refused(dataset: Dataset, start: float, stop: float | None, said: str) -> None:
     with pytest.raises(DatasetError, match=said):
         kept_rows(_waves(trims(dataset))[0], start, stop)
+
+
+def test_rows_are_set_as_they_are_given(dataset: Dataset) -> None:
+    wave = _waves(trims(dataset))[0]
+    assert set_rows(dataset, wave, 0, wave.recording.rows, "x"), "keeping all of it is a decision, too"
+    wave = _waves(trims(dataset))[0]
+    assert wave.state == "adjusted" and wave.shown() == (0, wave.recording.rows)
+    assert not set_rows(dataset, wave, 0, wave.recording.rows, "x")
+    for start, stop in ((-1, 5), (5, 5), (0, wave.recording.rows + 1)):
+        with pytest.raises(DatasetError, match="cannot be kept"):
+            set_rows(dataset, wave, start, stop, "x")
 
 
 def test_seconds_are_of_the_device_clock(dataset: Dataset) -> None:

@@ -71,6 +71,15 @@ def is_fresh(folder: Path) -> bool:
     return bool(said == taken(folder) | {"index": _index(folder)})
 
 
+def same_files(folder: Path, now: dict[str, Any]) -> bool:
+    """Whether the index is whole and, but for the marks, was made from what is there ``now`` (`taken`)."""
+    try:
+        said = json.loads((folder / STAMP).read_text(encoding="utf-8"))
+        return bool(said | {"marks": now["marks"]} == now | {"index": _index(folder)})
+    except (FileNotFoundError, ValueError, RecursionError, TypeError):
+        return False
+
+
 def missing_files(folder: Path) -> list[str]:
     """Raw files that the last index was made from and that are not there now; none where there is no stamp."""
     try:

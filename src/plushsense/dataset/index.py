@@ -6,7 +6,7 @@ import contextlib
 import hashlib
 import itertools
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from plushsense.dataset.freshness import (
     is_fresh,
     missing_files,
     raw_files,
+    same_files,
     taken,
     write_stamp,
 )
@@ -84,7 +85,8 @@ def open_dataset(path: str | Path) -> Dataset:
                 f"('{missing[0]}'): bring them back, or delete {STAMP} there to go on without them."
             )
         stamp = taken(folder)
-        built = build(folder, head)
+        # A decision changes no raw file: the index stays, and only the marks are laid over it anew.
+        built = _remarked(folder, head) if same_files(folder, stamp) else build(folder, head)
     except OSError as cause:
         raise DatasetError(f"'{folder}' cannot be read: {cause.strerror or cause} ({cause.filename}).") from None
     if built.unreadable:
@@ -98,6 +100,15 @@ def open_dataset(path: str | Path) -> Dataset:
     with contextlib.suppress(OSError):
         write(built.dataset, stamp)
     return built.dataset
+
+
+def _remarked(folder: Path, head: DatasetHead) -> Rebuilt:
+    """The index on disk with the marks as they stand; for raw files that are as they were when it was made."""
+    bare = [
+        replace(r, start=0, stop=r.rows, excluded=False) for r in read_index(folder / RECORDINGS_INDEX, RecordingInfo)
+    ]
+    streams = read_index(folder / STREAMS_INDEX, StreamInfo)
+    return Rebuilt(Dataset(folder, head, with_marks(bare, read_marks(folder)), streams))
 
 
 def rebuild(folder: Path, head: DatasetHead | None = None, progress: Progress | None = None) -> Rebuilt:

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timezone
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from filelock import FileLock
 
@@ -19,6 +19,7 @@ from plushsense.core.tomlfile import refuse_unknown
 MARKS = "marks.jsonl"
 BY_HAND, SUGGESTED = "hand", "suggested"
 NEEDED = ("recording", "action", "who")
+_LOCK_S = 30.0
 ACTIONS = ("trim", "untrim", "exclude", "include", "accept", "unaccept")
 
 
@@ -116,7 +117,7 @@ def append_marks(folder: Path, marks: Iterable[Mark]) -> None:
         lines.append(json.dumps(table, ensure_ascii=False) + "\n")
     path = folder / MARKS
     try:
-        with FileLock(folder / (MARKS + ".lock")), path.open("a+b") as file:
+        with FileLock(folder / (MARKS + ".lock"), timeout=_LOCK_S), path.open("a+b") as file:
             # What a crash left without an end must not swallow the next mark.
             if file.seek(0, os.SEEK_END) > 0:
                 file.seek(-1, os.SEEK_END)
@@ -136,39 +137,115 @@ def read_marks(folder: Path) -> dict[str, Standing]:
     Raises:
         DatasetError: naming the line.
     """
-    path = folder / MARKS
-    standing: dict[str, Standing] = {}
-    try:
-        lines = path.read_bytes().split(b"\n")
-    except FileNotFoundError:
+    return FollowedMarks(folder).standing()
+
+
+class FollowedMarks:
+    """The marks of a data set, read again only as far as other programs added to them. Not for two threads at once."""
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / MARKS
+        self._standing: dict[str, Standing] = {}
+        self._seen: tuple[int, int, int] | None = None
+        self._lines = self._bytes = 0
+
+    @property
+    def changed(self) -> bool:
+        """Whether the file is another than when `standing` was last asked for."""
+        return self._now() != self._seen
+
+    def standing(self) -> dict[str, Standing]:
+        """As `read_marks`; each call gives a new dictionary where something changed, the same one otherwise.
+
+        Raises:
+            DatasetError: naming the line.
+        """
+        now = self._now()
+        if now == self._seen:
+            return self._given
+        if now is None:
+            # Taken back as a whole, which nothing here does: as if no mark had been.
+            self._standing, self._lines, self._bytes = {}, 0, 0
+            self._seen, self._given = now, {}
+            return self._given
+        try:
+            with self._path.open("rb") as file:
+                if self._seen is None or now[0] != self._seen[0] or now[1] < self._bytes or not self._goes_on(file):
+                    self._standing, self._lines, self._bytes = {}, 0, 0
+                file.seek(self._bytes)
+                *whole, rest = file.read().split(b"\n")
+        except OSError as cause:
+            raise DatasetError(f"'{self._path}' cannot be read: {cause.strerror or cause}.") from None
+        standing = dict(self._standing)
+        for line in whole:
+            self._take(line, self._lines + 1, standing)
+            self._lines += 1
+            self._bytes += len(line) + 1
+        self._standing = dict(standing)
+        # What has no end yet may be a mark, or the beginning of one.
+        self._take(rest, self._lines + 1, standing)
+        self._tail = whole[-1] if whole else self._tail
+        self._seen, self._given = now, standing
         return standing
-    except OSError as cause:
-        raise DatasetError(f"'{path}' cannot be read: {cause.strerror or cause}.") from None
-    for number, line in enumerate(lines, 1):
-        where = f"'{path}' line {number}"
+
+    _given: dict[str, Standing] = {}  # noqa: RUF012 (replaced, never changed)
+    _tail = b""
+
+    def _now(self) -> tuple[int, int, int] | None:
+        try:
+            now = self._path.stat()
+        except FileNotFoundError:
+            return None
+        except OSError as cause:
+            raise DatasetError(f"'{self._path}' cannot be read: {cause.strerror or cause}.") from None
+        return now.st_ino, now.st_size, now.st_mtime_ns
+
+    def _goes_on(self, file: BinaryIO) -> bool:
+        """Whether the last line that was read still stands where it stood."""
+        file.seek(max(0, self._bytes - len(self._tail) - 1))
+        return self._bytes == 0 or file.read(len(self._tail) + 1) == self._tail + b"\n"
+
+    def _take(self, line: bytes, number: int, standing: dict[str, Standing]) -> None:
+        where = f"'{self._path}' line {number}"
         try:
             table: Any = json.loads(line.decode("utf-8"))
         except (ValueError, RecursionError):
-            continue
+            return
         if not isinstance(table, dict):
             raise DatasetError(f"{where} is no mark: each line is one JSON object.")
         refuse_unknown(table, Mark.__dataclass_fields__, where, DatasetError)
         if lacking := [key for key in NEEDED if key not in table]:
             raise DatasetError(f"{where} lacks {', '.join(lacking)}: a mark says at least {', '.join(NEEDED)}.")
         mark = _checked(Mark(**table), where)
-        now = standing.get(mark.recording, Standing())
-        match mark.action:
-            case "trim":
-                now = replace(now, start=mark.start, stop=mark.stop, how=mark.how)
-            case "untrim":
-                now = replace(now, start=0, stop=-1, how="")
-            case "exclude":
-                now = replace(now, excluded=True)
-            case "include":
-                now = replace(now, excluded=False)
-            case "accept":
-                now = replace(now, accepted=now.accepted | {mark.check})
-            case "unaccept":
-                now = replace(now, accepted=now.accepted - {mark.check})
-        standing[mark.recording] = now
-    return standing
+        standing[mark.recording] = after(standing.get(mark.recording, Standing()), mark)
+
+
+def after(now: Standing, mark: Mark) -> Standing:
+    """Where one more mark leaves a recording."""
+    match mark.action:
+        case "trim":
+            return replace(now, start=mark.start, stop=mark.stop, how=mark.how)
+        case "untrim":
+            return replace(now, start=0, stop=-1, how="")
+        case "exclude":
+            return replace(now, excluded=True)
+        case "include":
+            return replace(now, excluded=False)
+        case "accept":
+            return replace(now, accepted=now.accepted | {mark.check})
+        case _:
+            return replace(now, accepted=now.accepted - {mark.check})
+
+
+def taking_back(mark: Mark, before: Standing, who: str, why: str = "") -> Mark:
+    """The mark that undoes ``mark`` where it was made on a recording that stood as ``before``."""
+    match mark.action:
+        case "trim" | "untrim" if before.trimmed:
+            return Mark(mark.recording, "trim", who, why, start=before.start, stop=before.stop, how=before.how)
+        case "trim" | "untrim":
+            return Mark(mark.recording, "untrim", who, why)
+        case "exclude" | "include":
+            return Mark(mark.recording, "exclude" if before.excluded else "include", who, why)
+        case _:
+            action = "accept" if mark.check in before.accepted else "unaccept"
+            return Mark(mark.recording, action, who, why, check=mark.check)

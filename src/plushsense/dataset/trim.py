@@ -123,7 +123,7 @@ def trims(
             said = Suggestion(0, info.rows, False, False, 0.0, 0.0, 1.0, "rest: all of it is the gesture")
         else:
             said = suggest(frames, dataset.layout, _before(dataset, info))
-        found[info.id] = Trim(info, said, standing.get(info.id, Standing()), _seconds(frames))
+        found[info.id] = Trim(info, said, standing.get(info.id, Standing()), seconds_of_rows(frames))
         if progress is not None:
             progress(done, len(chosen))
     return [found[info.id] for info in chosen]
@@ -137,7 +137,8 @@ def _before(dataset: Dataset, info: RecordingInfo) -> Frames | None:
     return dataset.read_stream(info.stream).slice(max(0, first), info.stream_row)
 
 
-def _seconds(frames: Frames) -> NDArray[np.float64]:
+def seconds_of_rows(frames: Frames) -> NDArray[np.float64]:
+    """The device clock since the first row, at each row and at the end, (T + 1,); one that was reset goes on."""
     steps = np.maximum(np.diff(frames.device_ms), 0)
     usual = float(np.median(steps)) if len(steps) else 0.0
     return np.concatenate([[0.0], np.cumsum(steps), [float(steps.sum()) + usual]]) / 1000.0
@@ -204,8 +205,18 @@ def set_trim(
     dataset: Dataset, trim: Trim, start_s: float | None, stop_s: float | None, who: str, why: str = ""
 ) -> bool:
     """Mark `kept_rows` of a recording, as set by hand; False where that stood already."""
+    return set_rows(dataset, trim, *kept_rows(trim, start_s, stop_s), who, why)
+
+
+def set_rows(dataset: Dataset, trim: Trim, start: int, stop: int, who: str, why: str = "") -> bool:
+    """Mark rows ``start`` to ``stop`` of a recording, all of them too, as set by hand; False where that stood already.
+
+    Raises:
+        DatasetError: for rows that are not there, or none.
+    """
     info = trim.recording
-    start, stop = kept_rows(trim, start_s, stop_s)
+    if not 0 <= start < stop <= info.rows:
+        raise DatasetError(f"'{info.id}' has rows 0 to {info.rows}: {start} to {stop} cannot be kept.")
     if trim.state == "adjusted" and trim.shown() == (start, stop):
         return False
     end = stop if stop < info.rows else -1

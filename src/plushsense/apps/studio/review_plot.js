@@ -1,0 +1,199 @@
+// The plot of the review page: curves, what stands dotted, set or cut off, clicks and keys. Keys say what was on screen
+// when they were pressed, so that nothing is decided that nobody saw.
+import { loadResource } from "../../static/utils/resources.js";
+
+const colour = (name) => getComputedStyle(document.body).getPropertyValue(name).trim() || "#555";
+const OURS = ["Enter", "Backspace", "ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown", "Home", "End", "Escape"];
+const LETTERS = ["x", "u", "s", "i", "+", "-", "0", ",", ".", ";", ":", "<", ">"];
+const REPEATED = ["ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown", ",", ".", "<", ">", ";", ":"];
+
+export default {
+  template: '<div role="img" :aria-label="said" tabindex="-1" :data-shown="shown"><div ref="place"></div></div>',
+  props: { label: String, height: Number, legend: Boolean, keyed: Boolean, resourcePath: String },
+  data() {
+    return { said: this.label, shown: "" };
+  },
+  async mounted() {
+    await this.$nextTick();
+    const at = window.path_prefix + this.resourcePath;
+    await Promise.all([loadResource(`${at}/uPlot.min.css`), loadResource(`${at}/uPlot.iife.min.js`)]);
+    this.$el.psPlot = this;
+    this.marks = [];
+    this.times = [];
+    this.resizer = new ResizeObserver(() => {
+      const width = this.$el.clientWidth;
+      if (this.u && width && width !== this.u.width) this.u.setSize({ width, height: this.height });
+    });
+    this.resizer.observe(this.$el);
+    this.lights = new MutationObserver(() => this.p && this.build());
+    this.lights.observe(document.body, { attributes: true, attributeFilter: ["class"] });
+    this.onKey = (event) => this.key(event);
+    this.onClick = (event) => {
+      // After a click of the mouse, keys go to the plot again; whoever tabs to a button stays there.
+      if (event.detail > 0 && event.target.closest("button.ps-act")) this.$el.focus({ preventScroll: true });
+    };
+    if (this.keyed) {
+      document.addEventListener("keydown", this.onKey);
+      document.addEventListener("click", this.onClick);
+    }
+    this.loaded = true;
+    for (const late of this.late || []) late();
+    this.late = null;
+  },
+  beforeUnmount() {
+    document.removeEventListener("keydown", this.onKey);
+    document.removeEventListener("click", this.onClick);
+    this.resizer?.disconnect();
+    this.lights?.disconnect();
+    this.u?.destroy();
+    this.u = null;
+  },
+  methods: {
+    key(event) {
+      const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+      if (event.ctrlKey || event.metaKey || event.altKey || event.defaultPrevented) return;
+      if (!OURS.includes(key) && !LETTERS.includes(key)) return;
+      const on = event.target instanceof Element ? event.target : document.body;
+      if (!this.$el.offsetParent || document.querySelector(".q-dialog__inner, .q-menu")) return;
+      if (on.closest("input, textarea, select, [contenteditable=true], [role=combobox], [role=listbox], [role=slider]")) return;
+      // What has the focus gets its own keys, once.
+      if (key === "Enter" && on.closest("button, a, summary, [role=button], [role=switch], [tabindex='0']")) return;
+      if (key.startsWith("Arrow") && on.closest("[role=tab], [role=radio], [role=radiogroup]")) return;
+      event.preventDefault();
+      if (event.repeat && !REPEATED.includes(key)) return;
+      if (key === "+" || key === "-" || key === "0") return this.zoom(key === "+" ? 0.5 : key === "-" ? 2 : 0);
+      this.pressed = performance.now();
+      this.$emit("key", { key, shift: event.shiftKey, shown: this.shown });
+    },
+    build() {
+      this.u?.destroy();
+      const p = this.p, ink = colour("--ps-ink"), grid = { stroke: colour("--ps-line"), width: 1 };
+      const y = { stroke: ink, grid, ticks: grid, label: p.y || undefined, labelSize: 22, size: 64 };
+      if (p.lanes.length > 1) {
+        y.splits = () => p.lanes.map((lane) => lane[0]);
+        y.values = () => p.lanes.map((lane) => lane[1]);
+        y.size = 96;
+        y.grid = { show: false };
+        y.ticks = { show: false };
+      }
+      const options = {
+        width: this.$el.clientWidth || 600,
+        height: this.height,
+        legend: { show: this.legend, live: false },
+        cursor: { drag: { x: false, y: false }, points: { show: false } },
+        scales: { x: { time: false }, y: p.range ? { range: p.range } : {} },
+        axes: [{ stroke: ink, grid, ticks: grid, label: p.xTitle, labelSize: 22, size: 44 }, y],
+        series: [{ label: p.xTitle }, ...p.series.map((s) => ({ width: 1.4, points: { show: false }, ...s }))],
+        hooks: { drawClear: [(u) => this.drawBehind(u)], draw: [(u) => this.drawMarks(u)] },
+      };
+      this.u = new uPlot(options, p.data, this.$refs.place);
+      const over = this.u.over;
+      over.style.cursor = "crosshair";
+      const pick = (event, button) => {
+        event.preventDefault();
+        const box = over.getBoundingClientRect();
+        const x = this.u.posToVal(event.clientX - box.left, "x"), v = this.u.posToVal(event.clientY - box.top, "y");
+        this.$emit("pick", { x, y: v, button, shift: event.shiftKey, shown: this.shown });
+      };
+      over.addEventListener("click", (event) => pick(event, "left"));
+      over.addEventListener("contextmenu", (event) => pick(event, "right"));
+      over.addEventListener("wheel", (event) => {
+        if (!event.ctrlKey) return;
+        event.preventDefault();
+        const x = this.u.posToVal(event.clientX - over.getBoundingClientRect().left, "x");
+        this.zoom(event.deltaY < 0 ? 0.7 : 1.4, x);
+      }, { passive: false });
+    },
+    drawBehind(u) {
+      // What a start or an end leaves out, and what the stream held before.
+      const { ctx } = u, { left, top, width, height } = u.bbox, x = (v) => u.valToPos(v, "x", true);
+      const fill = (from, to, style) => {
+        const a = Math.max(left, from), b = Math.min(left + width, to);
+        if (b <= a) return;
+        ctx.fillStyle = style;
+        ctx.fillRect(a, top, b - a, height);
+      };
+      ctx.save();
+      if (this.p.from < 0) fill(x(this.p.from), x(0), "rgba(128,128,128,0.28)");
+      for (const [from, to] of this.cut || []) fill(x(from), x(to), "rgba(213,94,0,0.16)");
+      ctx.restore();
+    },
+    drawMarks(u) {
+      const { ctx } = u, { left, top, width, height } = u.bbox;
+      ctx.save();
+      ctx.beginPath();
+      ctx.rect(left, top, width, height);
+      ctx.clip();
+      ctx.textBaseline = "alphabetic";
+      this.marks.forEach((m, i) => {
+        const x = u.valToPos(m.x, "x", true);
+        ctx.strokeStyle = ctx.fillStyle = m.stroke || colour("--ps-ink");
+        ctx.lineWidth = 2 * devicePixelRatio;
+        ctx.setLineDash((m.dash || []).map((v) => v * devicePixelRatio));
+        ctx.beginPath();
+        ctx.moveTo(x, top);
+        ctx.lineTo(x, top + height);
+        ctx.stroke();
+        if (!m.label) return;
+        ctx.font = `${13 * devicePixelRatio}px sans-serif`;
+        ctx.textAlign = "left";
+        const wide = ctx.measureText(m.label).width, pad = 4 * devicePixelRatio;
+        const at = x + pad + wide > left + width ? x - pad - wide : x + pad, line = top + (14 + 16 * (i % 2)) * devicePixelRatio;
+        const ground = getComputedStyle(document.body).backgroundColor;
+        ctx.save();
+        ctx.fillStyle = ground === "rgba(0, 0, 0, 0)" ? "#fff" : ground;
+        ctx.globalAlpha = 0.8;
+        ctx.fillRect(at - 2, line - 12 * devicePixelRatio, wide + 4, 15 * devicePixelRatio);
+        ctx.restore();
+        ctx.fillText(m.label, at, line);
+      });
+      ctx.restore();
+      if (this.pressed && this.drawn !== this.shown) {
+        const since = this.pressed;
+        this.pressed = 0;
+        this.drawn = this.shown;
+        requestAnimationFrame(() => this.times.push(performance.now() - since));
+      }
+    },
+    ready(call) {
+      if (this.loaded) return true;
+      (this.late = this.late || []).push(call);
+      return false;
+    },
+    show(p) {
+      if (!this.ready(() => this.show(p))) return;
+      const same = this.u && JSON.stringify([p.series, p.lanes, p.y, p.range]) === this.kind;
+      const kept = this.u && p.id === this.shown && p.keep ? { ...this.u.scales.x } : null;
+      this.p = p;
+      this.said = p.label;
+      this.marks = p.marks;
+      this.cut = p.cut;
+      this.shown = p.id;
+      if (same) this.u.setData(p.data);
+      else this.build();
+      this.kind = JSON.stringify([p.series, p.lanes, p.y, p.range]);
+      if (kept) this.u.setScale("x", { min: kept.min, max: kept.max });
+    },
+    remark(id, marks, cut, label) {
+      if (!this.ready(() => this.remark(id, marks, cut, label)) || id !== this.shown) return;
+      this.marks = marks;
+      this.cut = cut;
+      this.said = label;
+      this.u?.redraw(false);
+    },
+    zoom(factor, at) {
+      if (!this.u) return;
+      const xs = this.p.data[0], first = xs[0], last = xs[xs.length - 1], { min, max } = this.u.scales.x;
+      let low = first, high = last;
+      if (factor > 0) {
+        const seen = this.marks.find((m) => m.x >= min && m.x <= max);
+        const centre = at ?? (seen ? seen.x : (min + max) / 2);
+        low = Math.max(first, centre - (centre - min) * factor);
+        high = Math.min(last, centre + (max - centre) * factor);
+      }
+      if (high - low < 0.02) return;
+      this.u.setScale("x", { min: low, max: high });
+      if (this.p.thinned) this.$emit("zoomed", { low, high, shown: this.shown });
+    },
+  },
+};

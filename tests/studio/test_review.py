@@ -1,0 +1,552 @@
+"""Reviewing in a real browser: by real clicks, by keys alone, and when something stands in the way."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from browsing import DESK, TABLET, axe, connected, marked
+from plushsense.apps.studio.house import House
+from plushsense.apps.studio.reviewing import Reviews
+from plushsense.dataset.importers import import_recordings
+from plushsense.dataset.index import open_dataset
+from plushsense.dataset.marks import Mark, append_marks, read_marks
+from plushsense.dataset.trim import seconds_of_rows, trims
+from reviewed import ROW_S, made, marks, raw_hash
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
+
+Fixture = Callable[..., Any]
+PLOT = "[data-test=plot]"
+
+
+@pytest.fixture
+def waves(tmp_path: Path) -> Path:
+    """The data set of `reviewed.made` in a studio's folder: 24 recordings."""
+    made(tmp_path / "home" / "datasets" / "waves")
+    return tmp_path / "home" / "datasets" / "waves"
+
+
+def opened(page: Page) -> str:
+    """The id of the recording that is drawn."""
+    page.wait_for_function(
+        f"() => document.querySelector('{PLOT}')?.psPlot?.u && document.querySelector('{PLOT}').dataset.shown"
+    )
+    return shown(page)
+
+
+def shown(page: Page) -> str:
+    return str(page.locator(PLOT).get_attribute("data-shown"))
+
+
+def pressed(page: Page, key: str) -> str:
+    """Press a key and wait for another recording."""
+    was = shown(page)
+    page.keyboard.press(key)
+    page.wait_for_function("([plot, was]) => document.querySelector(plot).dataset.shown !== was", arg=[PLOT, was])
+    return shown(page)
+
+
+def checked(page: Page) -> None:
+    """Until everything was looked at in the background."""
+    page.wait_for_function("() => document.querySelector('[data-test=making]').textContent === ''")
+
+
+def state(page: Page, key: str) -> None:
+    page.wait_for_selector(f"[data-test=state][data-state={key}]")
+
+
+def x_of(page: Page, fraction: float) -> tuple[float, dict[str, int]]:
+    """A place in the plot: its second by the axis, and where to click, in pixels of the plot."""
+    box = page.locator(f"{PLOT} .u-over").bounding_box()
+    assert box is not None
+    low, high = page.evaluate(
+        f"() => {{ const s = document.querySelector('{PLOT}').psPlot.u.scales.x; return [s.min, s.max] }}"
+    )
+    pixel = round(fraction * box["width"])
+    return low + (high - low) * pixel / box["width"], {"x": pixel, "y": int(box["height"] // 2)}
+
+
+@pytest.mark.parametrize("size", [DESK, TABLET, (1600, 900)])
+def test_a_click_moves_the_mark_to_within_a_sample(
+    size: tuple[int, int], waves: Path, studio: Fixture, look: Fixture
+) -> None:
+    browser = look(size, touch=size == TABLET)
+    page = browser.open(studio(home=waves.parents[1]).url + "/review?view=one&gesture=Wave")
+    over = page.locator(f"{PLOT} .u-over")
+    wanted = {}
+
+    def click(fraction: float, **how: Any) -> float:
+        second, at = x_of(page, fraction)
+        over.click(position=at, **how)
+        return second
+
+    first = opened(page)
+    checked(page)
+    start = click(0.217)
+    state(page, "draft")
+    wanted[first] = (start, click(0.83, modifiers=["Shift"]))
+    wait_for_kept(page, wanted[first][1])
+    second = pressed(page, "Enter")
+    # Closer: fewer rows a pixel; then in another width.
+    page.keyboard.press("+")
+    page.keyboard.press("+")
+    start = click(0.341)
+    state(page, "draft")
+    page.keyboard.press("0")
+    wanted[second] = (start, click(0.9, button="right"))
+    wait_for_kept(page, wanted[second][1])
+    page.set_viewport_size({"width": size[0] - 133, "height": size[1]})
+    third = pressed(page, "Enter")
+    page.wait_for_function(
+        f"() => document.querySelector('{PLOT}').psPlot.u.width === document.querySelector('{PLOT}').clientWidth"
+    )
+    start = click(0.5)
+    state(page, "draft")
+    marked(page, "side").get_by_text("End").click()
+    wanted[third] = (start, click(0.77))
+    wait_for_kept(page, wanted[third][1])
+    marked(page, "accept").click()
+    page.wait_for_function("([plot, was]) => document.querySelector(plot).dataset.shown !== was", arg=[PLOT, third])
+
+    dataset, standing = open_dataset(waves), read_marks(waves)
+    assert set(standing) == set(wanted)
+    infos = {r.id: r for r in dataset.recordings}
+    for identity, (begin_s, end_s) in wanted.items():
+        seconds = seconds_of_rows(dataset.read(infos[identity]))
+        begin = next(r for r in trims(dataset, [infos[identity]])).shown()
+        at = (read_marks(waves)[identity].start, read_marks(waves)[identity].stop)
+        assert at == begin
+        assert abs(at[0] * ROW_S - begin_s) <= ROW_S, (identity, at, begin_s)
+        assert abs(at[1] * ROW_S - end_s) <= ROW_S, (identity, at, end_s)
+        assert seconds[1] == pytest.approx(ROW_S)
+        assert standing[identity].how == "hand"
+    assert browser.complaints == []
+
+
+def wait_for_kept(page: Page, stop_s: float) -> None:
+    """Until the page says that what is kept ends there, to a sample."""
+    page.wait_for_function(
+        """(stop) => { const said = document.querySelector('[data-test=about]').textContent.match(/to ([0-9.]+) s/);
+                       return said && Math.abs(parseFloat(said[1]) - stop) <= 0.0151 }""",
+        arg=stop_s,
+    )
+
+
+def test_twenty_recordings_by_keyboard_alone(waves: Path, studio: Fixture, look: Fixture) -> None:
+    before = raw_hash(waves)
+    suggestions = {t.recording.id: t for t in trims(open_dataset(waves))}
+    browser = look()
+    page = browser.open(studio(home=waves.parents[1]).url + "/review")
+    page.wait_for_selector("[data-test=table] tbody tr")
+    checked(page)
+    # To the button and through it with keys alone.
+    for _ in range(60):
+        page.keyboard.press("Tab")
+        if page.evaluate("() => document.activeElement.dataset.test") == "start":
+            break
+    page.keyboard.press("Enter")
+    at = opened(page)
+    expected = []
+    for number in range(20):
+        suggested = suggestions[at].suggestion
+        rows = suggestions[at].recording.rows
+        start, how = (suggested.start, "suggested") if suggested.onset_visible else (0, "hand")
+        if number % 5 == 3:
+            page.keyboard.press("x")
+            page.wait_for_selector("[data-test=reason]")
+            page.wait_for_function("() => document.activeElement.closest('[data-test=reason]')")
+            expected.append((at, "exclude", 0, -1, "", "wrong gesture"))
+            at = pressed(page, "Enter")
+            continue
+        stop = -1
+        if number % 4 == 1:
+            page.keyboard.press("ArrowRight")
+            page.keyboard.press("ArrowRight")
+            page.keyboard.press("Shift+ArrowLeft")
+            page.wait_for_function(
+                "end => document.querySelector('[data-test=about]').textContent.includes(`to ${end} s`)",
+                arg=f"{(rows - 1) * ROW_S:.2f}",
+            )
+            start, stop, how = start + 2, rows - 1, "hand"
+        expected.append((at, "trim", start, stop, how, ""))
+        at = pressed(page, "Enter")
+    said = [(m["recording"], m["action"], m["start"], m["stop"], m["how"], m["why"]) for m in marks(waves)]
+    assert said == expected
+    assert len({recording for recording, *_ in said}) == 20
+    assert marked(page, "counts").inner_text() == "20 of 24 decided, 4 to do"
+    # Back through them, and everything taken back one by one.
+    for recording, *_ in reversed(expected):
+        assert pressed(page, "Backspace") == recording
+    for left in range(19, -1, -1):
+        page.keyboard.press("u")
+        page.wait_for_function(
+            "said => document.querySelector('[data-test=counts]').textContent === said",
+            arg=f"{left} of 24 decided, {24 - left} to do",
+        )
+    assert not any(s.trimmed or s.excluded for s in read_marks(waves).values())
+    assert raw_hash(waves) == before
+    page.keyboard.press("u")
+    page.get_by_text("Nothing of this visit is left").wait_for()
+    assert browser.complaints == []
+
+
+def test_keys_are_no_commands_while_something_else_has_them(waves: Path, studio: Fixture, look: Fixture) -> None:
+    browser = look()
+    page = browser.open(studio(home=waves.parents[1]).url + "/review?view=one&gesture=Wave")
+    first = opened(page)
+    checked(page)
+    name = marked(page, "who")
+    name.fill("Ruta")
+    name.press("x")
+    name.press("Enter")
+    name.press("Backspace")
+    page.wait_for_timeout(300)
+    assert shown(page) == first and marks(waves) == []
+    # A button that has the focus does its own, once.
+    marked(page, "accept").focus()
+    second = pressed(page, "Enter")
+    page.wait_for_timeout(300)
+    assert shown(page) == second
+    assert [(m["recording"], m["who"]) for m in marks(waves)] == [(first, "Ruta")]
+    # After a click of the mouse, keys are commands again.
+    marked(page, "accept").click()
+    page.wait_for_function("([plot, was]) => document.querySelector(plot).dataset.shown !== was", arg=[PLOT, second])
+    third = shown(page)
+    assert pressed(page, "Enter") != third
+    page.wait_for_timeout(300)
+    assert [m["recording"] for m in marks(waves)] == [first, second, third]
+    # Held down, nothing is decided unseen; twice at once, only what was seen.
+    fourth = shown(page)
+    page.evaluate(
+        """() => { for (const repeat of [false, true, true]) document.body.dispatchEvent(
+                   new KeyboardEvent('keydown', {key: 'Enter', repeat, bubbles: true})) }"""
+    )
+    page.wait_for_function("([plot, was]) => document.querySelector(plot).dataset.shown !== was", arg=[PLOT, fourth])
+    page.wait_for_timeout(300)
+    assert [m["recording"] for m in marks(waves)] == [first, second, third, fourth]
+    # The name is kept by the browser; the place by the address.
+    at = shown(page)
+    page.reload()
+    connected(page)
+    assert opened(page) == at
+    assert marked(page, "who").input_value() == "Ruta"
+    page.keyboard.press("u")
+    page.wait_for_function("([plot, was]) => document.querySelector(plot).dataset.shown === was", arg=[PLOT, fourth])
+    assert marks(waves)[-1]["action"] == "untrim", "a visit goes on after a reload"
+    assert browser.complaints == []
+
+
+def test_excluding_needs_a_reason_and_is_taken_back(
+    waves: Path, studio: Fixture, look: Fixture, shots: Fixture
+) -> None:
+    browser = look()
+    page = browser.open(studio(home=waves.parents[1]).url + "/review?view=one")
+    first = opened(page)
+    checked(page)
+    page.keyboard.press("x")
+    marked(page, "reason-go").click()
+    page.get_by_text("This needs a reason").wait_for()
+    assert axe(page) == []
+    shots(page, "review-dialog-en-light")
+    marked(page, "own-reason").fill("a dog barked")
+    marked(page, "own-reason").press("Enter")
+    page.wait_for_function("([plot, was]) => document.querySelector(plot).dataset.shown !== was", arg=[PLOT, first])
+    assert [(m["recording"], m["action"], m["why"]) for m in marks(waves)] == [(first, "exclude", "a dog barked")]
+    assert pressed(page, "Backspace") == first
+    state(page, "excluded")
+    page.keyboard.press("x")
+    state(page, "none" if "Rest" in first else "suggested")
+    page.keyboard.press("u")
+    state(page, "excluded")
+    page.keyboard.press("u")
+    page.wait_for_selector("[data-test=state]:not([data-state=excluded])")
+    assert [m["action"] for m in marks(waves)] == ["exclude", "include", "exclude", "include"]
+    page.keyboard.press("x")
+    page.wait_for_selector("[data-test=reason]")
+    page.keyboard.press("Escape")
+    page.wait_for_selector("[data-test=reason]", state="detached")
+    assert len(marks(waves)) == 4
+    assert browser.complaints == []
+
+
+def test_a_finding_is_accepted_with_a_reason(waves: Path, studio: Fixture, look: Fixture) -> None:
+    browser = look()
+    page = browser.open(studio(home=waves.parents[1]).url + "/review?check=duration&severity=warning")
+    page.wait_for_selector("[data-test=table]")
+    checked(page)
+    page.wait_for_selector("[data-test=table] tbody tr")
+    page.locator(".ps-open").first.click()
+    odd = opened(page)
+    found = page.locator("[data-check=duration]")
+    assert "more than the mean" in found.inner_text()
+    found.get_by_role("button").click()
+    page.get_by_role("button", name="this person's way").click()
+    page.wait_for_selector("[data-check=duration]:has-text('accepted as no fault')")
+    assert [(m["recording"], m["action"], m["check"], m["why"]) for m in marks(waves)] == [
+        (odd, "accept", "duration", "this person's way")
+    ]
+    page.locator("[data-check=duration]").get_by_role("button").click()
+    page.wait_for_selector("[data-check=duration]:has-text('No fault')")
+    assert marks(waves)[-1]["action"] == "unaccept"
+    assert browser.complaints == []
+
+
+def test_the_table_filters_sorts_and_says_what_it_shows(
+    waves: Path, studio: Fixture, look: Fixture, shots: Fixture
+) -> None:
+    append_marks(waves, [Mark(open_dataset(waves).recordings[0].id, "exclude", "x", "y")])
+    url = studio(home=waves.parents[1]).url
+    for language, dark, size in (("en", False, DESK), ("lv", True, TABLET)):
+        browser = look(size, dark, language)
+        page = browser.open(url + "/review")
+        page.wait_for_selector("[data-test=table] tbody tr")
+        checked(page)
+        assert page.evaluate("() => document.documentElement.scrollWidth <= window.innerWidth"), "no sideways scrolling"
+        assert axe(page) == []
+        shots(page, f"review-table-{language}-{'dark' if dark else 'light'}")
+        assert browser.complaints == []
+    page = look().open(url + "/review")
+    rows = page.locator("[data-test=table] tbody tr")
+    rows.first.wait_for()
+    checked(page)
+    assert rows.count() == 24
+    marked(page, "filter-person").click()
+    page.get_by_role("option", name="P2", exact=True).click()
+    page.wait_for_function("() => document.querySelectorAll('[data-test=table] tbody tr').length === 8")
+    marked(page, "filter-text").fill("wave")
+    page.wait_for_function("() => document.querySelectorAll('[data-test=table] tbody tr').length === 7")
+    assert marked(page, "range").inner_text() == "1–7 of 7"
+    page.wait_for_function("() => location.search.includes('person=P2') && location.search.includes('text=wave')")
+    page.reload()
+    connected(page)
+    page.wait_for_function("() => document.querySelectorAll('[data-test=table] tbody tr').length === 7")
+    page = look().open(url + "/review?state=excluded")
+    page.wait_for_function("() => document.querySelectorAll('[data-test=table] tbody tr').length === 1")
+    assert "✕ excluded" in page.locator("[data-test=table] tbody").inner_text()
+    page = look().open(url + "/review")
+    page.get_by_role("button", name="Duration").click()
+    page.get_by_role("button", name="Duration ▲").click()
+    page.wait_for_selector("th[aria-sort=descending]")
+    assert "7.5" in page.locator("[data-test=table] tbody tr").first.inner_text()
+
+
+def test_overlays_name_what_stands_out(waves: Path, studio: Fixture, look: Fixture, shots: Fixture) -> None:
+    url = studio(home=waves.parents[1]).url
+    longest = max(open_dataset(waves).recordings, key=lambda r: r.rows).id
+    for language, dark, size in (("en", False, DESK), ("lv", True, TABLET)):
+        browser = look(size, dark, language)
+        page = browser.open(url + "/review?view=overlay&gesture=Wave")
+        page.wait_for_selector(f"[data-test=odd] :text('{longest}')")
+        assert axe(page) == []
+        shots(page, f"review-overlay-{language}-{'dark' if dark else 'light'}")
+        assert page.evaluate("() => document.documentElement.scrollWidth <= window.innerWidth")
+        assert browser.complaints == []
+    marked(page, "odd").get_by_role("button").first.click()
+    assert opened(page) == longest
+    page = look().open(url + "/review?view=overlay&gesture=Wave")
+    page.wait_for_selector(f"[data-test=odd] :text('{longest}')")
+    over = page.locator("[data-test=overlay-plot] .u-over")
+    box = over.bounding_box()
+    assert box is not None
+    # Where all others have ended, only one is left.
+    over.click(position={"x": int(box["width"] * 0.75), "y": int(box["height"] * 0.5)})
+    assert opened(page) == longest
+
+
+def test_one_recording_has_no_violation_in_any_light(
+    waves: Path, studio: Fixture, look: Fixture, shots: Fixture
+) -> None:
+    url = studio(home=waves.parents[1]).url
+    for language, dark, size in (("en", False, DESK), ("lv", True, TABLET), ("lv", False, DESK), ("en", True, TABLET)):
+        browser = look(size, dark, language, touch=size == TABLET)
+        page = browser.open(url + "/review?view=one&gesture=Wave")
+        opened(page)
+        checked(page)
+        page.keyboard.press("ArrowRight")
+        state(page, "draft")
+        assert axe(page) == []
+        assert page.evaluate("() => document.documentElement.scrollWidth <= window.innerWidth")
+        shots(page, f"review-one-{language}-{'dark' if dark else 'light'}")
+        page.keyboard.press("x")
+        page.wait_for_selector("[data-test=reason]")
+        assert axe(page) == []
+        page.keyboard.press("Escape")
+        page.wait_for_selector("[data-test=reason]", state="detached")
+        page.keyboard.press("s")
+        state(page, "suggested")
+        assert browser.complaints == []
+    assert marks(waves) == []
+
+
+def test_links_from_other_pages(waves: Path, studio: Fixture, look: Fixture) -> None:
+    started = studio(home=waves.parents[1])
+    ids = [r.id for r in open_dataset(waves).recordings if r.gesture == "Wave"]
+    reviews = Reviews(House(waves.parents[1]))
+    browser = look()
+    page = browser.open(started.url + reviews.address(waves, ids[3:6], "Wave taken for Rest"))
+    page.wait_for_function("() => document.querySelectorAll('[data-test=table] tbody tr').length === 3")
+    assert "Only 3 linked recordings. Wave taken for Rest" in marked(page, "selection").inner_text()
+    marked(page, "start").click()
+    assert opened(page) == ids[3]
+    checked(page)
+    pressed(page, "Enter")
+    pressed(page, "Enter")
+    page.keyboard.press("Enter")
+    page.get_by_text("the last recording of this list").wait_for()
+    assert [m["recording"] for m in marks(waves)] == ids[3:6]
+    page = browser.open(started.url + reviews.address(waves, [*ids, *(f"P9/gone_{i}" for i in range(99))], "many"))
+    page.wait_for_function(f"() => document.querySelectorAll('[data-test=table] tbody tr').length === {len(ids)}")
+    assert "99 of the linked recordings are not in this data set" in marked(page, "said").inner_text()
+    page = browser.open(started.url + "/review?recording=P1/none")
+    page.get_by_text("There is no recording 'P1/none'").wait_for()
+    page = browser.open(started.url + "/review?selection=0000")
+    page.get_by_text("There is no selection '0000' any more").wait_for()
+    page = browser.open(started.url + "/review?dataset=/etc")
+    page.get_by_text("lies outside the studio's folders").wait_for()
+    assert browser.complaints == []
+
+
+def test_a_folder_that_cannot_be_written(waves: Path, studio: Fixture, look: Fixture) -> None:
+    browser = look()
+    page = browser.open(studio(home=waves.parents[1]).url + "/review?view=one&gesture=Wave")
+    first = opened(page)
+    checked(page)
+    before = raw_hash(waves)
+    # Root may write anywhere: a folder in the lock's place refuses everybody.
+    lock = waves / "marks.jsonl.lock"
+    lock.unlink(missing_ok=True)
+    lock.mkdir()
+    page.keyboard.press("ArrowRight")
+    state(page, "draft")
+    page.keyboard.press("Enter")
+    page.locator("[role=alert]:has-text('marks.jsonl')").wait_for()
+    assert "cannot be written" in marked(page, "said").inner_text()
+    assert axe(page) == []
+    assert shown(page) == first
+    state(page, "draft")
+    assert marks(waves) == [] and raw_hash(waves) == before
+    lock.rmdir()
+    pressed(page, "Enter")
+    assert [m["recording"] for m in marks(waves)] == [first]
+    assert marked(page, "said").count() == 0
+    assert browser.complaints == []
+
+
+def test_two_tabs_show_the_same_and_do_not_fight(waves: Path, studio: Fixture, look: Fixture) -> None:
+    browser = look()
+    url = studio(home=waves.parents[1]).url + "/review?view=one&gesture=Wave"
+    left = browser.open(url)
+    first = opened(left)
+    checked(left)
+    right = browser.open(url)
+    assert opened(right) == first
+    left.keyboard.press("ArrowRight")
+    state(right, "draft")
+    second = pressed(left, "Enter")
+    state(right, "adjusted")
+    # What stands already is not marked again.
+    assert pressed(right, "Enter") == second
+    assert [m["recording"] for m in marks(waves)] == [first]
+    right.keyboard.press("u")
+    right.get_by_text("Nothing of this visit is left").wait_for()
+    left.keyboard.press("u")
+    left.wait_for_function("([plot, was]) => document.querySelector(plot).dataset.shown === was", arg=[PLOT, first])
+    # Another program's mark is seen by itself.
+    append_marks(waves, [Mark(first, "exclude", "cli", "noise")])
+    state(left, "excluded")
+    assert browser.complaints == []
+
+
+def test_a_broken_data_set_is_a_sentence(waves: Path, studio: Fixture, look: Fixture) -> None:
+    broken = waves.parent / "broken"
+    shutil.copytree(waves, broken)
+    (broken / "dataset.toml").write_text("this is no TOML =")
+    torn = waves.parent / "torn"
+    shutil.copytree(waves, torn)
+    (torn / "marks.jsonl").write_text("[1]\n")
+    browser = look()
+    started = studio(home=waves.parents[1])
+    for name, said in (("broken", "dataset.toml"), ("torn", "line 1 is no mark")):
+        page = browser.open(f"{started.url}/review?dataset=datasets/{name}")
+        assert said in page.locator("[role=alert]").inner_text()
+        assert axe(page) == []
+    marked(page, "dataset").click()
+    page.get_by_role("option", name="waves").first.click()
+    page.wait_for_selector("[data-test=table] tbody tr")
+    assert browser.complaints == []
+
+
+def test_no_data_set_yet(tmp_path: Path, studio: Fixture, look: Fixture) -> None:
+    page = look().open(studio().url + "/review")
+    page.get_by_text("There is no data set yet").wait_for()
+    assert axe(page) == []
+
+
+def test_labelled_recordings_need_no_trimming(real_data: Path, tmp_path: Path, studio: Fixture, look: Fixture) -> None:
+    source = tmp_path / "har"
+    source.mkdir()
+    for subject in ("s01", "s02"):
+        shutil.copytree(real_data / "har-phone" / subject, source / subject)
+    place = tmp_path / "home" / "datasets" / "har"
+    place.parent.mkdir(parents=True)
+    import_recordings(source, place, layout="phone-6")
+    browser = look()
+    page = browser.open(studio(home=tmp_path / "home").url + "/review?view=one")
+    first = opened(page)
+    checked(page)
+    assert "no reaction time to trim" in marked(page, "labelled").inner_text()
+    assert marked(page, "ends").count() == 0
+    page.keyboard.press("ArrowRight")
+    second = pressed(page, "Enter")
+    assert marks(place) == []
+    page.keyboard.press("x")
+    page.get_by_role("button", name="sensor fault").click()
+    page.wait_for_function("([plot, was]) => document.querySelector(plot).dataset.shown !== was", arg=[PLOT, second])
+    assert [(m["recording"], m["action"], m["why"]) for m in marks(place)] == [(second, "exclude", "sensor fault")]
+    assert first != second
+    assert axe(page) == []
+    assert browser.complaints == []
+
+
+def test_real_recordings_one_after_the_other(
+    real_data: Path, tmp_path: Path, studio: Fixture, look: Fixture, shots: Fixture
+) -> None:
+    place = tmp_path / "home" / "datasets" / "real"
+    place.parent.mkdir(parents=True)
+    import_recordings(real_data / "makeability-gestures", place, layout="accel-3")
+    before = raw_hash(place)
+    browser = look()
+    page = browser.open(studio(home=tmp_path / "home").url + "/review?view=one")
+    opened(page)
+    # One can begin before all is looked at; what is not yet is a sentence.
+    page.wait_for_function("() => !document.querySelector('[data-test=making]').textContent.startsWith('Looking')")
+    seen = [shown(page)]
+    for _ in range(25):
+        seen.append(pressed(page, "Enter"))
+    assert [m["recording"] for m in marks(place)] == seen[:25]
+    times = page.evaluate(f"() => document.querySelector('{PLOT}').psPlot.times")
+    assert len(times) == 25
+    shots(page, "review-real-en-light")
+    # The one that nobody stopped, 18907 rows: drawn thinned, closer in full.
+    longest = max(open_dataset(place).recordings, key=lambda r: r.rows)
+    page.goto(page.url.split("?")[0] + f"?recording={longest.id.replace(' ', '%20')}")
+    connected(page)
+    assert opened(page) == longest.id
+    points = "() => document.querySelector('[data-test=plot]').psPlot.p.data[0].length"
+    assert page.evaluate(points) < 3500
+    for _ in range(6):
+        page.keyboard.press("+")
+    page.wait_for_function(
+        "() => { const p = document.querySelector('[data-test=plot]').psPlot, {min, max} = p.u.scales.x;"
+        " return p.p.data[0].filter((x) => x >= min && x <= max).length > 60 * (max - min) }"
+    )
+    assert raw_hash(place) == before
+    assert browser.complaints == []
