@@ -80,8 +80,8 @@ class DetailsView:
         ui.label(said)
         with ui.row():
             path = quote(str(d.row.path), safe="")
-            ui.link(w("train.to_live"), f"/live?model={path}")
-            ui.link(w("train.to_export"), f"/export?model={path}")
+            ui.link(w("train.to_live"), f"/live?model={path}").classes("ps-link")
+            ui.link(w("train.to_export"), f"/export?model={path}").classes("ps-link")
 
     # Confusions -----------------------------------------------------------------------------------------------
 
@@ -151,7 +151,9 @@ class DetailsView:
             tag(ui.label(title).classes("text-weight-bold"), "cell-title").props('role="heading" aria-level="5"')
             if d.row.dataset:
                 linked = [one.recording for one in found[:LINKED]]
-                tag(ui.link(w("train.all_in_review"), review_link(d.row.dataset, linked)), "cell-all")
+                tag(
+                    ui.link(w("train.all_in_review"), review_link(d.row.dataset, linked)).classes("ps-link"), "cell-all"
+                )
                 if len(found) > LINKED:
                     tag(ui.label(w("train.cell_cut", n=LINKED)), "cell-cut")
             box = ui.element("div").classes("ps-wide")
@@ -216,8 +218,8 @@ def as_table(w: Words, confusion: Confusion, by_affect: bool, clickable: bool) -
             percent = f"{100 * share:.0f}"
             text = f"{n}<small>{percent} %</small>"
             if clickable:
-                said = escape(w("train.cell", truth=names[i], said=names[j], n=n, share=percent), quote=True)
-                text = f'<button data-cell="{i},{j}" aria-label="{said}">{text}</button>'
+                said = escape(w("train.cell", truth=names[i], said=names[j]))
+                text = f'<button data-cell="{i},{j}">{text}<span class="ps-unseen">{said}</span></button>'
             shade = f"background: rgba(0, 114, 178, {0.06 + 0.44 * share:.2f})"
             cells.append(f'<td class="{kind}" style="{shade}">{text}</td>')
         rows.append(f'<tr><th scope="row">{escape(names[i])}</th>{"".join(cells)}</tr>')

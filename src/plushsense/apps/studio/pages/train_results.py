@@ -129,7 +129,7 @@ class ResultsView:
 
     def _as_table(self, rows: list[Row]) -> str:
         w = self._words
-        head = []
+        head = [f'<th scope="col">{escape(w("train.columns.open"))}</th>']
         for key in _SORTS:
             on = key == self._sort
             state = f' aria-sort="{"descending" if self._down else "ascending"}"' if on else ""
@@ -137,7 +137,6 @@ class ResultsView:
             kind = ' class="n"' if key in _NUMBERS else ""
             name = escape(w(f"train.columns.{key}"))
             head.append(f'<th scope="col"{kind}{state}><button data-do="sort:{key}">{name}{arrow}</button></th>')
-        head.append(f'<th scope="col">{escape(w("train.columns.open"))}</th>')
         shown = rows if self._all else rows[:_SHOWN]
         body = "".join(self._as_row(row) for row in shown)
         more = ""
@@ -175,8 +174,8 @@ class ResultsView:
         chosen = ' aria-selected="true"' if row.id == self._open else ""
         what = escape(w("train.columns.open"))
         return (
-            f'<tr{chosen} data-row="{escape(row.id, quote=True)}">{columns}'
-            f'<td><button data-do="{link}" aria-label="{label}">{what}</button></td></tr>'
+            f'<tr{chosen} data-row="{escape(row.id, quote=True)}">'
+            f'<td><button data-do="{link}" aria-label="{label}">{what}</button></td>{columns}</tr>'
         )
 
     # Score against size ---------------------------------------------------------------------------------------

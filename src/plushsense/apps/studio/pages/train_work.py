@@ -230,8 +230,8 @@ class _Card:
         with ui.row():
             if job.task == TRAIN:
                 path = quote(r["bundle"], safe="")
-                tag(ui.link(w("train.to_live"), f"/live?model={path}"), "to-live")
-                tag(ui.link(w("train.to_export"), f"/export?model={path}"), "to-export")
+                tag(ui.link(w("train.to_live"), f"/live?model={path}").classes("ps-link"), "to-live")
+                tag(ui.link(w("train.to_export"), f"/export?model={path}").classes("ps-link"), "to-export")
             identity = r["bundle"] if job.task == TRAIN else r["out"]
             if job.task == SWEEP and r["best"]:
                 identity += f"#{r['best'][0]['trial']}"
