@@ -9,11 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from plushsense.apps.config import from_settings
+from plushsense.apps.config import RunConfig, from_settings
 from plushsense.apps.studio.house import BUNDLES, House
 from plushsense.apps.studio.jobs import RUNNING, Jobs
 from plushsense.core.errors import ConfigError
 from plushsense.dataset.store import HEAD
+from plushsense.models.symbol import parse_symbol
 from plushsense.scoring.splits import parse_split
 
 TRAIN, EVALUATE, SWEEP, SEARCH = "train", "evaluate", "sweep", "search"
@@ -95,7 +96,7 @@ def order(house: House, jobs: Jobs, form: Mapping[str, Any]) -> Order:
 
 def _train(house: House, dataset: Path, given: Mapping[str, Any]) -> Order:
     settings = {key: given[key] for key in _SETTINGS if key in given}
-    config = from_settings(**settings)
+    config = _checked(settings)
     out = house.new(BUNDLES, f"{str(given.get('name', '')).strip()}.plush")
     spec: dict[str, Any] = {"dataset": str(dataset), "settings": settings, "out": str(out)}
     command = ["plushsense", "train", str(dataset), "--out", str(out), *_options(settings)]
@@ -114,7 +115,7 @@ def _train(house: House, dataset: Path, given: Mapping[str, Any]) -> Order:
 
 def _evaluate(dataset: Path, given: Mapping[str, Any]) -> Order:
     settings = {key: given[key] for key in (*_SETTINGS, "train_context") if key in given}
-    config = from_settings(**settings)
+    config = _checked(settings)
     split = str(given.get("split", config.evaluation.split))
     parse_split(split)
     spec: dict[str, Any] = {"dataset": str(dataset), "settings": settings, "split": split}
@@ -124,6 +125,12 @@ def _evaluate(dataset: Path, given: Mapping[str, Any]) -> Order:
         command.append("--int8")
     title = f"{dataset.name}: {split}, {config.model.arch}, {config.windows.context}"
     return Order(EVALUATE, spec, title, shlex.join(command))
+
+
+def _checked(settings: Mapping[str, Any]) -> RunConfig:
+    config = from_settings(**settings)
+    parse_symbol(config.model.arch)
+    return config
 
 
 def _of_grid(house: House, kind: str, dataset: Path, given: Mapping[str, Any]) -> Order:
