@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 # Of the held-back windows, the share on which float and 8 bits have to say the same; below it training says so.
 _AGREEMENT = 0.95
-_SAVE_EVERY_S = 1.0
+_SAVE_EVERY_S = 0.5
 
 EpochProgress = Callable[[int, int, dict[str, Any]], None]
 
