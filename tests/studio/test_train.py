@@ -67,8 +67,8 @@ def test_a_training_is_stopped_and_killed_and_ends_in_the_commands_bundle(
 
     def under_way(least: int) -> None:
         page.wait_for_function(
-            "(least) => +((document.querySelector('[data-test=at]')?.textContent.match(/epoch (\\d+) of/) || [])[1] || 0)"
-            " >= least",
+            "(least) => +((document.querySelector('[data-test=at]')?.textContent.match(/epoch (\\d+) of/) || [])[1]"
+            " || 0) >= least",
             arg=least,
             timeout=_LONG_MS,
         )
@@ -157,11 +157,10 @@ def test_a_proof_its_table_and_the_recordings_of_a_cell(
     polars = pytest.importorskip("polars")
     (folder,) = (home / "datasets" / "virtual" / "evaluations").glob("by-subject-5_*")
     table = polars.read_parquet(folder / "predictions.parquet")
-    counts = Counter(zip(table["truth"].to_list(), table["predicted"].to_list(), strict=True))
+    was, told, of = (table[name].to_list() for name in ("truth", "predicted", "recording"))
+    counts = Counter(zip(was, told, strict=True))
     (truth, said), windows = next((k, n) for k, n in counts.most_common() if k[0] != k[1])
-    wanted = set(
-        table.filter((polars.col("truth") == truth) & (polars.col("predicted") == said))["recording"].to_list()
-    )
+    wanted = {r for t, p, r in zip(was, told, of, strict=True) if (t, p) == (truth, said)}
     assert page.locator(".ps-confusion tbody tr").count() == 18
     button = page.locator("[data-cell]").filter(has_text=f"{truth} read as {said}.")
     assert button.inner_text().split()[0] == str(windows)
@@ -186,13 +185,8 @@ def test_a_proof_its_table_and_the_recordings_of_a_cell(
     assert cell.inner_text().split()[0] == str(read["positive", "neutral"])
     cell.click()
     page.get_by_text("positive read as neutral (recordings").wait_for()
-    mixed = {
-        r
-        for t, p, r in zip(
-            table["truth"].to_list(), table["predicted"].to_list(), table["recording"].to_list(), strict=True
-        )
-        if (affect[t], affect[p]) == ("positive", "neutral")
-    }
+    pair = ("positive", "neutral")
+    mixed = {r for t, p, r in zip(was, told, of, strict=True) if (affect[t], affect[p]) == pair}
     listed = page.locator("tr[data-recording]").evaluate_all("rows => rows.map((r) => r.dataset.recording)")
     assert sorted(listed) == sorted(mixed)
     assert browser.complaints == []
@@ -251,7 +245,7 @@ def test_a_sweep_shows_its_cost_first_and_its_front_in_the_end(
     marked(page, "said").get_by_text("Look at the cost first").wait_for()
     marked(page, "estimate").click()
     marked(page, "plan-text").wait_for(timeout=_LONG_MS)
-    assert "4 trials in 4 trainings (1 folds, 1 seeds), 0 done before" in marked(page, "plan-text").inner_text()
+    assert "4 trials in 4 trainings (folds: 1, seeds: 1), 0 done before" in marked(page, "plan-text").inner_text()
     assert marked(page, "plan").get_by_text("leaky", exact=True).is_visible()
     marked(page, "start").click()
     done = state(page, "done")

@@ -34,7 +34,7 @@ _SORTS: dict[str, Callable[[Row], Any]] = {
     "macs": lambda r: r.macs,
     "when": lambda r: r.when_s,
 }
-_NUMBERS = ("over", "accuracy", "macro_f1", "parameters", "macs", "when")
+_NUMBERS = ("over", "accuracy", "macro_f1", "parameters", "macs")
 # The largest first, when they are clicked for the first time.
 _DOWN = ("accuracy", "macro_f1", "when", "over")
 
@@ -163,7 +163,7 @@ class ResultsView:
             "macro_f1": spread(row.macro_f1, row.macro_f1_sd),
             "parameters": f"{row.parameters:,}",
             "macs": f"{row.macs:,}",
-            "when": time.strftime("%Y-%m-%d %H:%M", time.localtime(row.when_s)),
+            "when": time.strftime('<span class="ps-nowrap">%Y-%m-%d</span> %H:%M', time.localtime(row.when_s)),
         }
         name = row.path.stem if row.kind == TRAINING else row.network
         label = escape(w("train.open_row", network=f"{name}, {row.split}"), quote=True)

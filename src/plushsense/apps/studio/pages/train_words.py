@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from html import escape
-from typing import Any
-
 from plushsense.apps.studio.words import Words
 
 
@@ -40,9 +38,4 @@ def marks(words: Words, leaky: bool, simulated: bool) -> str:
 
 def over(words: Words, kind: str, units: int) -> str:
     """What a mean goes over."""
-    return words(f"train.over.{kind}", n=units)
-
-
-def label(words: Words, name: str, affects: Any) -> str:
-    """A gesture's name, or an affect's."""
-    return words.affect(name) if affects else words.gesture(name)
+    return words(f"train.over.{kind}{'_one' if units == 1 else ''}", n=units)
