@@ -20,7 +20,8 @@ from plushsense.apps.studio.house import House
 from plushsense.apps.studio.jobs import Job, Jobs
 from plushsense.apps.studio.orders import Order, free_name, grids, order
 from plushsense.apps.studio.pareto import Point, drawing
-from plushsense.apps.studio.results import TRAINING, Confusion, Results, Row, front, grouped, in_cell
+from plushsense.apps.studio.result_rows import TRAINING, Row, front
+from plushsense.apps.studio.results import Confusion, Results, grouped, in_cell
 from plushsense.apps.studio.tasks.telling import Clock
 from plushsense.core.errors import BadInput, ConfigError, PlushSenseError
 from plushsense.evaluation.predictions import Predictions

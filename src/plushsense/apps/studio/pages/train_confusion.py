@@ -10,7 +10,8 @@ from urllib.parse import quote
 from nicegui import run, ui
 
 from plushsense.apps.studio.pages.train_words import figure, marks, over, spread
-from plushsense.apps.studio.results import EVALUATION, TRAINING, Confusion, Details, Misread, Results, Row
+from plushsense.apps.studio.result_rows import EVALUATION, TRAINING, Row
+from plushsense.apps.studio.results import Confusion, Details, Misread, Results
 from plushsense.apps.studio.shell import AFFECT_SIGNS, Page, tag
 from plushsense.apps.studio.words import Words
 from plushsense.core.gestures import NOBODY

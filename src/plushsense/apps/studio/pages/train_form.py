@@ -242,7 +242,7 @@ class Form:
         held = self._values[self._kind].get(key, "")
         value = held if held in options else next(iter(options))
         label = self._words(f"train.{key}")
-        tag(ui.select(dict(options), label=label, value=value, on_change=self._keeper(key)).classes("w-80"), key)
+        tag(ui.select(dict(options), label=label, value=value, on_change=self._keeper(key)).classes("w-96"), key)
 
     def _keeper(self, key: str, read: Callable[[Any], Any] | None = None) -> Callable[[Any], None]:
         kind = self._kind

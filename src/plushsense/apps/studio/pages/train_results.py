@@ -12,7 +12,8 @@ from nicegui import run, ui
 from plushsense.apps.studio.pages.train_confusion import DetailsView
 from plushsense.apps.studio.pages.train_words import marks, over, spread
 from plushsense.apps.studio.pareto import Point, drawing
-from plushsense.apps.studio.results import EVALUATION, TRAINING, TRIAL, Results, Row, front
+from plushsense.apps.studio.result_rows import EVALUATION, TRAINING, TRIAL, Row, front
+from plushsense.apps.studio.results import Results
 from plushsense.apps.studio.shell import Page, tag
 
 _SHOWN = 60
