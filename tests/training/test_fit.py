@@ -174,4 +174,19 @@ def test_a_training_goes_on_as_if_it_had_never_stopped(made: Make, tmp_path: Pat
         assert np.array_equal(values, went_on.weights[name])
         assert all(np.array_equal(whole.kept[epoch][name], went_on.kept[epoch][name]) for epoch in (3, 5))
     with pytest.raises(TrainingError, match="leave patience out"):
-        fit(train, None, arch(padding=padding), replace(spec, patience=3), start=state)
+        fit(train, made(20, seed=4), arch(padding=padding), replace(spec, patience=3), start=state)
+
+
+@pytest.mark.parametrize("stop_on", ["loss", "accuracy"])
+def test_a_training_that_stops_early_goes_on_as_well(made: Make, tmp_path: Path, stop_on: str) -> None:
+    spec = replace(SPEC, epochs=40, learning_rate=0.05, patience=3, stop_on=stop_on)
+    train, validation, journal = made(30), made(20, seed=4), Journal(tmp_path)
+    states: list[FitState] = []
+    whole = fit(train, validation, arch(), spec, save=states.append, save_every_s=0.0)
+    assert len(whole.history) == whole.best_epoch + 3 < 40
+    # Stopped after any epoch, also between the best one and the end.
+    for state in states:
+        journal.save("stopped", state.to_arrays())
+        went_on = fit(train, validation, arch(), spec, start=FitState.from_arrays(journal.load("stopped")))
+        assert (went_on.history, went_on.best_epoch) == (whole.history, whole.best_epoch)
+        assert all(np.array_equal(values, went_on.weights[name]) for name, values in whole.weights.items())

@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from plushsense import __version__
 from plushsense.apps.config import RunConfig, from_settings
+from plushsense.apps.dividing import WHOLE_PEOPLE, divide
 from plushsense.apps.preparation import Warn, classes_for, opened, outside_streams, silent, windows_for
 from plushsense.apps.reporting import check_place, save_evaluation
+from plushsense.apps.resuming import Kept
 from plushsense.core.errors import ConfigError
 from plushsense.core.gestures import NOBODY
 from plushsense.dataset.importers import import_recordings
@@ -26,7 +27,6 @@ from plushsense.deploy.calibration import calibration, integer_probabilities
 from plushsense.deploy.quantize import QUANTIZE_VERSION, Ranges, quantize, refuse_undeployable
 from plushsense.evaluation.crossval import Evaluation, FoldOutput, FoldProgress
 from plushsense.evaluation.crossval import evaluate as crossvalidate
-from plushsense.evaluation.folds import WindowFold, fold_windows
 from plushsense.evaluation.predictions import gather
 from plushsense.evaluation.scores import FoldRecord
 from plushsense.evaluation.scores import scores as score_predictions
@@ -35,7 +35,7 @@ from plushsense.live.fitting import fit_decisions as fit_on_people
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.runs.journal import Journal
-from plushsense.scoring.splits import VALIDATION_SHARE, Split, parse_split
+from plushsense.scoring.splits import parse_split
 from plushsense.training.spec import TrainSpec
 from plushsense.windows.cut import ANYWHERE, WindowSet
 
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 # Of the held-back windows, the share on which float and 8 bits have to say the same; below it training says so.
 _AGREEMENT = 0.95
-_WHOLE_PEOPLE = "validation-subjects"
+_SAVE_EVERY_S = 0.5
 
 EpochProgress = Callable[[int, int, dict[str, Any]], None]
 
@@ -77,11 +77,16 @@ class TrainAndPredict:
 
 @dataclass(frozen=True)
 class Trained:
-    """A trained network: ``bundle``, the ``history`` of its epochs, and ``scores`` with what they were taken on."""
+    """A trained network: ``bundle``, the ``history`` of its epochs, and ``scores`` with what they were taken on.
+
+    ``seconds``: of training, before a stop and after. The bundle does not hold them: the same data, settings and seed
+    give the same file, byte for byte.
+    """
 
     bundle: Bundle
     history: list[dict[str, Any]]
     scores: dict[str, Any]
+    seconds: float = 0.0
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Save the bundle."""
@@ -105,6 +110,7 @@ def train(
     filters: Sequence[int] | str | None = None,
     quantize_aware: int = 0,
     fit_decisions: bool = True,
+    journal: Journal | None = None,
     progress: EpochProgress | None = None,
     warn: Warn = silent,
     **settings: Any,
@@ -123,7 +129,9 @@ def train(
         quantize_aware: epochs of fine-tuning for 8 bits after the training (see `training.quantized`); 0: none.
         fit_decisions: also fit how decisions are made, on the people who validate (see `live.fitting`). Settings of
             the configuration's table ``live`` that are not the defaults stay.
-        progress: called with (epoch, epochs at most, the epoch's row).
+        journal: where the training keeps how far it is (see `plushsense.apps.resuming`). One that was stopped or killed
+            then goes on from there and ends in the same bundle; what comes after the training is done anew.
+        progress: called with (epoch, epochs at most, the epoch's row); epochs of before a stop are told first.
         warn: called with one sentence for everything that was left out, and when 8 bits change many answers.
     """
     dataset = opened(dataset)
@@ -138,21 +146,29 @@ def train(
     scored = windows
     if config.scored_on != config.windows:
         scored = windows_for(dataset, network, config.scored_on, gestures)
-    division = _divide(windows, config, scored)
+    division = divide(windows, config, scored)
     train_at, test_at = division.train, division.fold.test
-    if division.kind == _WHOLE_PEOPLE:
+    if division.kind == WHOLE_PEOPLE:
         # Decisions are fitted on the whole streams of those who validate.
         train_at = train_at[outside_streams(windows, dataset, division.fold.subjects)[train_at]]
     from plushsense.training.fit import fit, predict
 
-    fitted = fit(windows.take(train_at), scored.take(division.watch), network, config.training, progress)
+    train_on, watched = windows.take(train_at), scored.take(division.watch)
+    state = Kept(journal, network, config.training, train_on, watched)
+    start = state.found()
+    if start is not None and progress is not None:
+        for row in start.history:
+            progress(row["epoch"], config.training.epochs, row)
+    fitted = fit(
+        train_on, watched, network, config.training, progress,
+        start=start, save=None if journal is None else state.save, save_every_s=_SAVE_EVERY_S,
+    )  # fmt: skip
     weights, scaler = fitted.weights, fitted.scaler
     kept = calibration(network, weights, scaler, windows.x[train_at])
     if quantize_aware:
         from plushsense.training.quantized import fine_tune
 
-        mine = windows.take(train_at)
-        tuned = fine_tune(mine, network, weights, scaler, kept, config.training, quantize_aware, progress)
+        tuned = fine_tune(train_on, network, weights, scaler, kept, config.training, quantize_aware, progress)
         weights = tuned.weights
     test = scored.take(test_at)
     probabilities = predict(network, weights, scaler, test, config.training.device)
@@ -203,7 +219,6 @@ def train(
             "preset": config.preset,
             "training": config.training.to_dict(),
             "quantize_aware": quantize_aware,
-            "seconds": round(fitted.seconds, 1),
             "scores": scores,
             "code_version": __version__,
         },
@@ -211,12 +226,13 @@ def train(
     )
     if fit_decisions:
         bundle = _with_decisions(bundle, dataset, config.live, warn)
-    return Trained(bundle, fitted.history, scores)
+    state.forget()
+    return Trained(bundle, fitted.history, scores, state.before_s + fitted.seconds)
 
 
 def _with_decisions(bundle: Bundle, dataset: Dataset, given: DecideSpec, warn: Warn) -> Bundle:
     """The bundle with decision settings fitted on the people who validated; as it is, where there are none."""
-    if bundle.provenance["split"] != _WHOLE_PEOPLE:
+    if bundle.provenance["split"] != WHOLE_PEOPLE:
         warn("decision settings are the defaults: they are fitted on whole people who were held back, and none was")
         return bundle
     validated, trained = (
@@ -226,47 +242,6 @@ def _with_decisions(bundle: Bundle, dataset: Dataset, given: DecideSpec, warn: W
     keep = {f.name for f in fields(DecideSpec) if getattr(given, f.name) != getattr(plain, f.name)}
     decided = fit_on_people(bundle, dataset, validated, training=trained, spec=given, keep=keep)
     return replace(bundle, decision=decided.to_dict())
-
-
-@dataclass(frozen=True)
-class _Division:
-    """What a single training is trained on and scored on; ``said`` in words."""
-
-    split: Split
-    kind: str
-    said: str
-    fold: WindowFold
-    train: NDArray[np.int64]
-    watch: NDArray[np.int64]
-
-
-def _divide(windows: WindowSet, config: RunConfig, scored: WindowSet | None = None) -> _Division:
-    """Hold some people back; of fewer than three, some recordings. Nothing that is scored is trained on.
-
-    ``watch`` and ``test`` are of ``scored``: the same recordings, cut in another way (the same when left out).
-    """
-    scored = windows if scored is None else scored
-    seed = config.evaluation.seed
-    stopped = "" if config.training.patience is None else " but decided when to stop"
-    if config.preset == "search":
-        split = parse_split("windows:holdout")
-        fold = fold_windows(windows, scored, split, seed)[0]
-        said = "15 % of the windows, drawn at random: leaky, windows of one recording stand on both sides"
-        return _Division(split, split.text, said, fold, fold.train, fold.validation)
-    people = set(windows.subject.tolist()) - {NOBODY, UNKNOWN_SUBJECT}
-    if len(people) >= 3:
-        split = parse_split(f"by-subject:{min(len(people), round(1 / VALIDATION_SHARE))}")
-        kind, said = _WHOLE_PEOPLE, f"people who were not trained on{stopped}: "
-    else:
-        recordings = len(np.unique(windows.recording))
-        split = parse_split(f"by-recording:{max(2, min(recordings // 2, round(1 / VALIDATION_SHARE)))}")
-        kind = "validation-recordings"
-        said = f"recordings that were not trained on{stopped}; of the people who were, so flattering"
-    fold = fold_windows(windows, scored, split, seed)[0]
-    if split.apart:
-        said += ", ".join(fold.subjects)
-    rest = np.sort(np.concatenate([fold.train, fold.validation]))
-    return _Division(split, kind, said, fold, rest, fold.test)
 
 
 def _windowing(config: RunConfig) -> dict[str, Any]:

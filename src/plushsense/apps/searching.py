@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from plushsense.apps.estimating import plan_seconds
 from plushsense.apps.preparation import Warn, opened, silent
 from plushsense.apps.search_tables import Prepared, SearchTables, left_out, summed_up, write_summary
 from plushsense.apps.sweep_job import Outcome, outcome, train_all
@@ -205,13 +206,19 @@ def preview_search(
     *,
     asked: Mapping[str, Any] | None = None,
     changes: Mapping[str, Any] | None = None,
+    measure: bool = False,
     warn: Warn = silent,
 ) -> dict[str, Any]:
-    """What `search` would try and spend, without training."""
+    """What `search` would try and spend, without training.
+
+    ``measure``: also ``seconds``, about how long it takes here at most (see `estimating.plan_seconds`).
+    """
     dataset = opened(dataset)
     ready = prepare(dataset, grid, changes, asked, warn)
-    costs = ready.costs
+    costs, last = ready.costs, ready.plans[-1]
+    workers = processes(0, ready.grid.threads)
     return {
+        **({"seconds": plan_seconds(last, costs.bound, workers)} if measure else {}),
         "name": ready.grid.name,
         "id": ready.id,
         "split": ready.plans[-1].split.text,

@@ -31,7 +31,7 @@ from plushsense.windows.cut import WindowSet, shared_gestures
 # Part of every id: raise it when the meaning of a stored training changes.
 _VERSION = 1
 # Forward, and backward to the weights and to the layer before.
-_PASSES = 3
+PASSES = 3
 
 
 class GridProblems(ConfigError):
@@ -110,7 +110,7 @@ class Plan:
         """Multiply-accumulates of a training, about; ``nested`` False: of its trials one by one."""
         task: Task = job.task
         epochs = task.epochs[-1] if nested else sum(task.epochs)
-        return _PASSES * task.arch.macs_per_window * len(self.folds[task.span][task.fold].train) * epochs
+        return PASSES * task.arch.macs_per_window * len(self.folds[task.span][task.fold].train) * epochs
 
 
 def plan(dataset: Dataset, grid: GridSpec, told: Sequence[str] = (), warn: Warn = silent) -> Plan:

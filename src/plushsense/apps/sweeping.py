@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from plushsense import __version__
+from plushsense.apps.estimating import plan_seconds
 from plushsense.apps.places import machine
 from plushsense.apps.preparation import Warn, opened, silent
 from plushsense.apps.sweep_job import JOURNAL, train_all
@@ -221,10 +222,14 @@ def preview(
     dataset: Dataset | str | os.PathLike[str],
     grid: GridSpec | str | os.PathLike[str] = "paper",
     *,
+    measure: bool = False,
     warn: Warn = silent,
     **changes: Any,
 ) -> dict[str, Any]:
-    """What `sweep` would train, without training: counts, cost in multiply-accumulates, and all problems."""
+    """What `sweep` would train, without training: counts, cost in multiply-accumulates, and all problems.
+
+    ``measure``: also ``seconds``, about how long what is not done yet takes here (see `estimating.plan_seconds`).
+    """
     dataset = opened(dataset)
     spec, told = resolve(grid, changes)
     try:
@@ -240,6 +245,10 @@ def preview(
     from plushsense.training.engine import step_bytes
 
     held = [step_bytes(job.task.arch, job.task.spec) for job in planned.jobs]
+    more: dict[str, Any] = {}
+    if measure:
+        left = sum(macs[job.id] for job in planned.jobs if not journal.has(job.id))
+        more["seconds"] = plan_seconds(planned, left, processes(0, spec.threads))
     return {
         "name": spec.name,
         "id": planned.id,
@@ -258,4 +267,5 @@ def preview(
         "cost": dict(sorted(shares.items(), key=lambda item: -item[1])),
         "problems": [],
         "grid": spec.to_dict(),
+        **more,
     }

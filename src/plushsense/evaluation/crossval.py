@@ -56,7 +56,10 @@ class FitPredict(Protocol):
 
 
 class FoldProgress(NamedTuple):
-    """Where an evaluation stands: ``epoch`` of ``epochs`` in ``fold``; epoch 0: that fold is done."""
+    """Where an evaluation stands: ``epoch`` of ``epochs`` in ``fold``; epoch 0: that fold is done.
+
+    ``row``: the epoch's row of the history, where what trains gives one.
+    """
 
     done: int
     folds: int
@@ -64,6 +67,7 @@ class FoldProgress(NamedTuple):
     epoch: int
     epochs: int
     resumed: int
+    row: dict[str, Any] | None = None
 
 
 @dataclass
@@ -191,7 +195,7 @@ class _FoldWork:
         score = train if score is None else score
 
         def progress(epoch: int, epochs: int, row: dict[str, Any]) -> None:
-            report((epoch, epochs))
+            report((epoch, epochs, row))
 
         out = self.fit_predict(train.take(task.train), train.take(task.validation), score.take(task.test), progress)
         found = {"probabilities": out.probabilities}
@@ -225,12 +229,13 @@ class _Teller:
         self._resumed += resumed
         self._tell(job, 0, 0)
 
-    def epoch(self, job: Job, message: tuple[int, int]) -> None:
+    def epoch(self, job: Job, message: tuple[int, int, dict[str, Any]]) -> None:
         self._tell(job, *message)
 
-    def _tell(self, job: Job, epoch: int, epochs: int) -> None:
+    def _tell(self, job: Job, epoch: int, epochs: int, row: dict[str, Any] | None = None) -> None:
         if self._progress is not None:
-            self._progress(FoldProgress(self._done, self._folds, job.task.name, epoch, epochs, self._resumed))
+            at = (self._done, self._folds, job.task.name, epoch, epochs, self._resumed)
+            self._progress(FoldProgress(*at, row))
 
 
 def context_of(windows: WindowSet) -> str:

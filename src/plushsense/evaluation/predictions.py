@@ -11,9 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from plushsense.core.errors import BadInput
 from plushsense.core.extras import need
 from plushsense.scoring.splits import Index
 from plushsense.windows.cut import WindowSet
+
+_P = "p_"
 
 
 @dataclass(frozen=True)
@@ -87,9 +90,38 @@ def write_predictions(path: str | Path, predictions: Predictions) -> Path:
         "predicted": label[predictions.predicted],
     }
     for k, name in enumerate(predictions.labels):
-        columns[f"p_{name}"] = np.ascontiguousarray(predictions.probabilities[:, k])
+        columns[_P + name] = np.ascontiguousarray(predictions.probabilities[:, k])
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(path.name + ".part")
     polars.DataFrame(columns).write_parquet(part)
     os.replace(part, path)
     return path
+
+
+def read_predictions(path: str | Path) -> Predictions:
+    """What `write_predictions` wrote.
+
+    Raises:
+        MissingExtraError: without polars (extra ``train``); BadInput: for a file that is missing, or of something else.
+    """
+    polars = need("polars", extra="train")
+    path = Path(path)
+    again = "evaluate again"
+    if not path.is_file():
+        raise BadInput(f"There are no predictions at '{path}': they were moved or deleted; {again}.")
+    try:
+        table = polars.read_parquet(path)
+        labels = tuple(name.removeprefix(_P) for name in table.columns if name.startswith(_P))
+        of = {name: k for k, name in enumerate(labels)}
+        text = {
+            name: np.array(table[name].to_list(), dtype=np.str_) for name in ("subject", "recording", "context", "fold")
+        }
+        return Predictions(
+            labels,
+            window=table["window"].to_numpy().astype(np.int64),
+            truth=np.array([of[label] for label in table["truth"].to_list()], dtype=np.int64),
+            probabilities=table.select([_P + name for name in labels]).to_numpy().astype(np.float32),
+            **text,
+        )
+    except (OSError, KeyError, polars.exceptions.PolarsError) as cause:
+        raise BadInput(f"'{path}' holds no predictions of an evaluation ({cause}): {again}.") from None

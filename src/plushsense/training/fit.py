@@ -63,7 +63,8 @@ def fit(
 
     ``keep``: epochs after which the weights are kept as well. At a constant rate a long training passes through the
     end of every shorter one. ``start``: go on from there, with the same windows and settings but more epochs; what
-    comes out is to the last bit what a training without a stop gives. ``save`` gets such a state now and then.
+    comes out is to the last bit what a training without a stop gives. ``save`` gets such a state now and then, with
+    early stopping, too.
 
     Raises:
         TrainingError: when the windows do not fit the network, or the loss is no longer a number.
@@ -73,12 +74,15 @@ def fit(
     _check(train, arch, "train on")
     if validation is not None and len(validation):
         _check(validation, arch, "validate on")
-    if start is not None and spec.patience is not None:
-        raise TrainingError("A training with early stopping cannot go on from a state: leave patience out.")
     device = _device(spec.device)
     scaler = Scaler.fit(train.x)
     x, y = _tensors(train, scaler, arch, device)
     watched = None if validation is None or not len(validation) else _tensors(validation, scaler, arch, device)
+    stops = watched is not None and spec.patience is not None
+    if start is not None and stops and not start.best:
+        raise TrainingError(
+            "A training with early stopping cannot go on from a state that holds no best weights: leave patience out."
+        )
     with torch.random.fork_rng(devices=[]), _repeatable(device), _threads(spec.threads, arch, device):
         torch.manual_seed(spec.seed)
         fresh = Net(arch)
@@ -96,6 +100,8 @@ def fit(
             kept = {} if start is None else {epoch: dict(weights) for epoch, weights in start.kept.items()}
             saved = time.perf_counter()
             best_epoch, best_score, best = 0, float("-inf"), net.export_weights()
+            if start is not None and stops:
+                best_epoch, best_score, best = *_best(history, spec), dict(start.best)
             for epoch in range(len(history) + 1, spec.epochs + 1):
                 row: dict[str, Any] = {"epoch": epoch}
                 for group in adam.param_groups:
@@ -111,15 +117,14 @@ def fit(
                     kept[epoch] = net.export_weights()
                 if progress is not None:
                     progress(epoch, spec.epochs, row)
-                if save is not None and spec.patience is None and time.perf_counter() - saved >= save_every_s:
-                    save(_state(adam, net, order, history, kept))
-                    saved = time.perf_counter()
-                if watched is not None and spec.patience is not None:
-                    score = row["validation_accuracy"] if spec.stop_on == "accuracy" else -row["validation_loss"]
-                    if score > best_score:
+                if spec.patience is not None and stops:
+                    if (score := _score(row, spec)) > best_score:
                         best_epoch, best_score, best = epoch, score, net.export_weights()
                     elif epoch - best_epoch >= spec.patience:
                         break
+                if save is not None and time.perf_counter() - saved >= save_every_s:
+                    save(_state(adam, net, order, history, kept, best if best_epoch else None))
+                    saved = time.perf_counter()
             if best_epoch == 0:
                 best_epoch, best = len(history), net.export_weights()
             state = None if spec.patience is not None else _state(adam, net, order, history, kept)
@@ -132,6 +137,7 @@ def _state(
     order: torch.Generator,
     history: list[dict[str, Any]],
     kept: Mapping[int, dict[str, NDArray[np.float32]]],
+    best: dict[str, NDArray[np.float32]] | None = None,
 ) -> FitState:
     held = [adam.state[p] for p in net.parameters if p in adam.state]
     return FitState(
@@ -143,7 +149,19 @@ def _state(
         random=order.get_state().numpy().copy(),
         history=[dict(row) for row in history],
         kept=dict(kept),
+        best=dict(best or {}),
     )
+
+
+def _score(row: Mapping[str, Any], spec: TrainSpec) -> float:
+    """What early stopping goes by: more is better."""
+    return float(row["validation_accuracy"] if spec.stop_on == "accuracy" else -row["validation_loss"])
+
+
+def _best(history: list[dict[str, Any]], spec: TrainSpec) -> tuple[int, float]:
+    """The first epoch of the best score, and the score."""
+    scores = [_score(row, spec) for row in history]
+    return int(np.argmax(scores)) + 1, max(scores)
 
 
 def _restore(adam: torch.optim.Adam, net: Engine, start: FitState) -> None:

@@ -36,6 +36,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from plushsense.apps.api import train
+    from plushsense.apps.resuming import unfinished
 
     if Path(args.out).exists() and not args.force:
         raise ConfigError(f"'{args.out}' is already there: choose another --out, or --force to replace it.")
@@ -44,6 +45,7 @@ def run(args: argparse.Namespace) -> int:
         settings(args),
         quantize_aware=args.quantize_aware,
         fit_decisions=args.fit_decisions,
+        journal=unfinished(args.dataset),
         progress=epochs_shown(),
         warn=warn,
     )

@@ -1,0 +1,306 @@
+"""The train page in a real browser: trained, stopped, killed, gone on with; proved, compared, and refused in words."""
+
+from __future__ import annotations
+
+import shlex
+import shutil
+import sys
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import parse_qs, urlsplit
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from browsing import DESK, TABLET, axe, marked
+from plushsense.apps.cli.main import main
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
+
+Fixture = Callable[..., Any]
+_LONG_MS = 90_000
+
+
+def fill(page: Page, name: str, text: str) -> None:
+    field = page.locator(f'input[data-test="{name}"], [data-test="{name}"] input')
+    field.fill(text)
+    field.press("Tab")
+
+
+def choose(page: Page, name: str, text: str) -> None:
+    page.locator(f'[data-test="{name}"]').locator("xpath=ancestor-or-self::label").click()
+    page.get_by_role("option", name=text).first.click()
+
+
+def kind(page: Page, name: str) -> None:
+    marked(page, "kind").get_by_role("radio", name=name).click()
+
+
+def state(page: Page, wanted: str) -> Any:
+    found = page.locator(f'[data-test="job"][data-state="{wanted}"]').first
+    found.wait_for(timeout=_LONG_MS)
+    return found
+
+
+def command(page: Page) -> list[str]:
+    page.wait_for_function("() => document.querySelector('[data-test=command]').textContent.includes('plushsense')")
+    return shlex.split(marked(page, "command").text_content())
+
+
+def test_a_training_is_stopped_and_killed_and_ends_in_the_commands_bundle(
+    studio: Fixture, look: Fixture, shots: Fixture, home: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    here = studio(home=home)
+    browser = look()
+    page = browser.open(f"{here.url}/train")
+    marked(page, "facts").get_by_text("6 people, 119 recordings, 18 gestures").wait_for()
+    assert marked(page, "facts").get_by_text("simulation", exact=True).is_visible()
+    fill(page, "name", "by page")
+    fill(page, "epochs", "45")
+    page.wait_for_function("() => document.querySelector('[data-test=command]').textContent.includes('--epochs 45')")
+    asked = command(page)
+    marked(page, "start").click()
+    kept = home / "datasets" / "virtual" / "cache" / "unfinished"
+
+    def under_way(least: int) -> None:
+        page.wait_for_function(
+            "(least) => +((document.querySelector('[data-test=at]')?.textContent.match(/epoch (\\d+) of/) || [])[1]"
+            " || 0) >= least",
+            arg=least,
+            timeout=_LONG_MS,
+        )
+        while not list(kept.glob("[!.]*.npz")):
+            page.wait_for_timeout(20)
+
+    under_way(3)
+    assert page.locator('[data-test="curve-loss"] canvas').count() == 1
+    assert axe(page) == []
+    marked(page, "stop").click()
+    state(page, "stopped")
+    shots(page, "train-stopped")
+    # Another tab, and one that comes later, show the same.
+    other = browser.open(f"{here.url}/train")
+    marked(other, "resume").click()
+    under_way(8)
+    here.kill()
+    assert not (home / "bundles" / "by page.plush").exists()
+    other.close()
+    here.start()
+    page.goto(f"{here.url}/train")
+    state(page, "stopped")
+    marked(page, "resume").click()
+    done = state(page, "done")
+    assert done.locator('[data-test="result"]').inner_text().startswith("Saved as “by page”. Accuracy 0.")
+    assert done.get_by_text("simulation", exact=True).is_visible()
+    # The curve begins with the first epoch, though three runs drew it.
+    assert page.locator('[data-column="kind"]').get_by_text("training").count() == 2
+    by_page = (home / "bundles" / "by page.plush").read_bytes()
+    assert not list(kept.glob("[!.]*.npz"))
+    out = home / "bundles" / "by command.plush"
+    asked[asked.index("--out") + 1] = str(out)
+    assert main(asked[1:]) == 0
+    capsys.readouterr()
+    assert out.read_bytes() == by_page
+    assert axe(page) == []
+    shots(page, "train-done")
+    assert [c for c in browser.complaints if "ERR_CONNECTION" not in c and "WebSocket" not in c] == []
+
+
+@pytest.fixture
+def leaky(home: Path) -> Path:
+    """A home that also holds an evaluation over windows."""
+    import plushsense as ps
+
+    folder = home / "datasets" / "virtual"
+    ps.evaluate(folder, split="windows:2", preset="search", epochs=1, workers=1, out=folder / "evaluations" / "leaky")
+    return home
+
+
+def test_a_proof_its_table_and_the_recordings_of_a_cell(
+    studio: Fixture, look: Fixture, shots: Fixture, leaky: Path
+) -> None:
+    home = leaky
+    here = studio(home=home)
+    browser = look()
+    page = browser.open(f"{here.url}/train")
+    kind(page, "Prove it on people left out")
+    choose(page, "split", "windows in 5 groups")
+    marked(page, "split-told").get_by_text("so the score flatters").wait_for()
+    choose(page, "split", "people in 5 groups")
+    fill(page, "epochs", "2")
+    marked(page, "split-told").get_by_text("flatters").wait_for(state="detached")
+    marked(page, "start").click()
+    done = state(page, "done")
+    assert "mean ± standard deviation over 6 people; split by-subject:5, context stream" in done.inner_text()
+    done.locator('[data-test="open-result"]').click()
+    page.locator("[data-cell]").first.wait_for()
+
+    # The table: the leaky one says so, numbers sort as numbers.
+    marks = page.locator(".ps-mark-leaky")
+    assert page.locator('tr[data-row$="/leaky"] .ps-mark-leaky').count() == 1 == marks.count()
+    assert page.locator("[data-test=results] .ps-mark-simulation").count() == 3
+    for column, order in (("accuracy", -1), ("accuracy", 1), ("parameters", 1)):
+        page.locator(f'[data-do="sort:{column}"]').click()
+        page.locator(
+            f'th[aria-sort="{"descending" if order < 0 else "ascending"}"] [data-do="sort:{column}"]'
+        ).wait_for()
+        values = [
+            float(t.split()[0].replace(",", "")) for t in page.locator(f"[data-column={column}]").all_inner_texts()
+        ]
+        assert len(values) == 3
+        assert values == sorted(values, reverse=order < 0)
+
+    # A cell: just those recordings, from the predictions as they lie on disk.
+    polars = pytest.importorskip("polars")
+    (folder,) = (home / "datasets" / "virtual" / "evaluations").glob("by-subject-5_*")
+    table = polars.read_parquet(folder / "predictions.parquet")
+    was, told, of = (table[name].to_list() for name in ("truth", "predicted", "recording"))
+    counts = Counter(zip(was, told, strict=True))
+    (truth, said), windows = next((k, n) for k, n in counts.most_common() if k[0] != k[1])
+    wanted = {r for t, p, r in zip(was, told, of, strict=True) if (t, p) == (truth, said)}
+    assert page.locator(".ps-confusion tbody tr").count() == 18
+    button = page.locator("[data-cell]").filter(has_text=f"{truth} read as {said}.")
+    assert button.inner_text().split()[0] == str(windows)
+    button.click()
+    marked(page, "cell-list").wait_for()
+    listed = page.locator("tr[data-recording]").evaluate_all("rows => rows.map((r) => r.dataset.recording)")
+    assert sorted(listed) == sorted(wanted)
+    asked = urlsplit(marked(page, "cell-all").get_attribute("href"))
+    query = parse_qs(asked.query)
+    assert asked.path == "/review"
+    assert query["dataset"] == [str(home / "datasets" / "virtual")]
+    assert sorted(query["recordings"][0].split(",")) == sorted(wanted)
+    assert axe(page) == []
+    shots(page, "train-confusion")
+
+    # By affect: the sums, and the recordings behind them.
+    marked(page, "by").get_by_role("radio", name="By affect").click()
+    page.wait_for_function("() => document.querySelectorAll('.ps-confusion tbody tr').length === 3")
+    affect = {g: a for a, gs in AFFECTS.items() for g in gs}
+    read = Counter((affect[t], affect[p]) for (t, p), n in counts.items() for _ in range(n))
+    cell = page.locator("[data-cell]").filter(has_text="positive read as ○ neutral")
+    assert cell.inner_text().split()[0] == str(read["positive", "neutral"])
+    cell.click()
+    page.get_by_text("positive read as neutral (recordings").wait_for()
+    pair = ("positive", "neutral")
+    mixed = {r for t, p, r in zip(was, told, of, strict=True) if (affect[t], affect[p]) == pair}
+    listed = page.locator("tr[data-recording]").evaluate_all("rows => rows.map((r) => r.dataset.recording)")
+    assert sorted(listed) == sorted(mixed)
+    assert browser.complaints == []
+
+    # In the dark, in Latvian, on a tablet: the same, and nothing to scroll sideways.
+    for size, dark in ((TABLET, True), (DESK, False)):
+        later = look(size, dark, "lv")
+        page = later.open(f"{here.url}/train")
+        page.locator('[data-do^="open:"]').first.wait_for()
+        page.locator('tr[data-row$="/leaky"] [data-do^="open:"]').click()
+        page.locator("[data-cell]").first.wait_for()
+        assert page.locator(".ps-mark-leaky").first.inner_text() == "noplūde"
+        assert axe(page) == []
+        assert page.evaluate("() => document.documentElement.scrollWidth <= innerWidth")
+        shots(page, f"train-lv-{'dark' if dark else 'light'}")
+        assert later.complaints == []
+
+
+AFFECTS = {
+    "neutral": ["At rest", "Hold in hands"],
+    "negative": ["Tail hit 1", "Tail hit 2", "Tail pull"],
+    "positive": [
+        "Back stroke 1", "Back stroke 2", "Ear scratch 1", "Ear scratch 2", "Head stroke 1", "Head stroke 2",
+        "Hold strong", "Neck scratch 1", "Neck scratch 2", "Tail scratch 1", "Tail scratch 2", "Tail tap 1",
+        "Tail tap 2",
+    ],
+}  # fmt: skip
+
+_GRID = """[grid]
+architectures = ["14d1_5d1", "9d1_5d1"]
+filters = [[4, 4], [8, 8]]
+epochs = [1]
+batches = [64]
+split = "windows:holdout"
+"""
+
+
+def test_a_sweep_shows_its_cost_first_and_its_front_in_the_end(
+    studio: Fixture, look: Fixture, shots: Fixture, home: Path
+) -> None:
+    (home / "tiny.toml").write_text(_GRID, encoding="utf-8")
+    (home / "wrong.toml").write_text('[grid]\nepochs = [0]\narchitectures = ["14x"]\n', encoding="utf-8")
+    browser = look()
+    page = browser.open(f"{studio(home=home).url}/train")
+    kind(page, "Compare many networks")
+    assert marked(page, "split-told").get_by_text("leaky", exact=True).is_visible()
+    choose(page, "grid", "wrong.toml")
+    marked(page, "estimate").click()
+    marked(page, "plan").get_by_role("alert").wait_for(timeout=_LONG_MS)
+    said = marked(page, "plan").inner_text()
+    assert "Epochs 0 cannot be trained" in said
+    assert "14x" in said
+    assert axe(page) == []
+    choose(page, "grid", "tiny.toml")
+    marked(page, "start").click()
+    marked(page, "said").get_by_text("Look at the cost first").wait_for()
+    marked(page, "estimate").click()
+    marked(page, "plan-text").wait_for(timeout=_LONG_MS)
+    assert "4 trials in 4 trainings (folds: 1, seeds: 1), 0 done before" in marked(page, "plan-text").inner_text()
+    assert marked(page, "plan").get_by_text("leaky", exact=True).is_visible()
+    marked(page, "start").click()
+    done = state(page, "done")
+    assert "4 of 4 trials. Most accurate: " in done.inner_text()
+    assert done.get_by_text("leaky", exact=True).is_visible()
+    drawn = marked(page, "pareto")
+    drawn.wait_for()
+    # Leaky ones are hollow diamonds with the word; the front is a line.
+    assert drawn.locator("path.l").count() == 4
+    assert drawn.locator("text", has_text="(leaky)").count() == 4
+    assert marked(page, "pareto-marks").inner_text().split() == ["simulation", "leaky"]
+    done.locator('[data-test="open-result"]').click()
+    marked(page, "confusion").wait_for()
+    assert page.get_by_text("A sweep keeps counts only").is_visible()
+    assert page.locator("[data-cell]").count() == 0
+    assert axe(page) == []
+    shots(page, "train-sweep")
+    assert browser.complaints == []
+
+
+def test_what_is_wrong_is_a_sentence_and_nothing_is_lost(
+    studio: Fixture, look: Fixture, shots: Fixture, home: Path
+) -> None:
+    little = (home / "bundles" / "little.plush").read_bytes()
+    folder = home / "datasets" / "virtual"
+    (folder / "evaluations").write_text("in the way", encoding="utf-8")
+    browser = look()
+    page = browser.open(f"{studio(home=home).url}/train")
+    fill(page, "name", "little")
+    marked(page, "start").click()
+    marked(page, "said").get_by_text("'little.plush' is there already").wait_for()
+    fill(page, "name", "other")
+    fill(page, "epochs", "lots")
+    marked(page, "start").click()
+    marked(page, "said").get_by_text("epochs is 'lots': accepted is a whole number").wait_for()
+    assert axe(page) == []
+    kind(page, "Prove it on people left out")
+    marked(page, "start").click()
+    refused = state(page, "refused").locator('[data-test="refused"]')
+    assert "'evaluations' is a file; give a folder" in refused.inner_text().replace(f"{folder}/", "")
+    shots(page, "train-refused")
+    shutil.move(folder, home / "elsewhere")
+    kind(page, "Train one network")
+    fill(page, "epochs", "2")
+    marked(page, "start").click()
+    marked(page, "said").get_by_text("is no longer there: put it back").wait_for()
+    assert (home / "bundles" / "little.plush").read_bytes() == little
+    assert [path.name for path in (home / "bundles").iterdir()] == ["little.plush"]
+    assert browser.complaints == []
+
+
+def test_a_house_without_data_says_what_to_do(studio: Fixture, look: Fixture) -> None:
+    browser = look()
+    page = browser.open(f"{studio().url}/train")
+    page.get_by_text("There is no data set yet").wait_for()
+    page.get_by_text("No result yet").wait_for()
+    assert axe(page) == []
+    assert browser.complaints == []

@@ -1,0 +1,247 @@
+"""The train page's plain parts: from a form to work, from files to rows, from reports to curves."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from plushsense.apps.cli.main import main
+from plushsense.apps.config import from_settings
+from plushsense.apps.studio.curves import charts
+from plushsense.apps.studio.house import House
+from plushsense.apps.studio.jobs import Job, Jobs
+from plushsense.apps.studio.orders import Order, free_name, grids, order
+from plushsense.apps.studio.pareto import Point, drawing
+from plushsense.apps.studio.result_rows import TRAINING, Row, front
+from plushsense.apps.studio.results import Confusion, Results, grouped, in_cell
+from plushsense.apps.studio.tasks.telling import Clock
+from plushsense.core.errors import BadInput, ConfigError, PlushSenseError
+from plushsense.evaluation.predictions import Predictions
+
+
+def made(house: House, **form: Any) -> Order:
+    return order(house, Jobs(house), {"dataset": str(house.datasets()[0]), **form})
+
+
+# From a form to work ------------------------------------------------------------------------------------------
+
+
+def test_the_command_resolves_to_the_same_settings(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    house = House(home)
+    form = {"kind": "train", "name": "new one", "preset": "loso", "context": "anywhere", "epochs": 7, "seed": 3}
+    form |= {"arch": "14d1_19d2", "filters": "8,12", "padding": "", "classes": "all", "batch": 32, "device": "cpu"}
+    found = made(house, **form, quantize_aware=2, fit_decisions=False)
+    seen: list[Any] = []
+
+    def train(dataset: str, config: Any, **more: Any) -> None:
+        seen.append((dataset, config, more["quantize_aware"], more["fit_decisions"]))
+        raise ConfigError("seen")
+
+    monkeypatch.setattr("plushsense.apps.api.train", train)
+    import shlex
+
+    assert main(shlex.split(found.command)[1:]) == 2
+    assert seen == [(found.spec["dataset"], from_settings(**found.spec["settings"]), 2, False)]
+    assert found.spec["out"] == str(home / "bundles" / "new one.plush")
+
+
+@pytest.mark.parametrize(
+    ("form", "said"),
+    [
+        ({"kind": "train", "name": "little"}, "'little.plush' is there already"),
+        ({"kind": "train", "name": "../x"}, "cannot be a name"),
+        ({"kind": "train", "name": "n", "epochs": "many"}, "epochs is 'many': accepted is a whole number"),
+        ({"kind": "train", "name": "n", "epochs": 0}, "epochs is 0"),
+        ({"kind": "train", "name": "n", "arch": "14x"}, "14x"),
+        ({"kind": "train", "name": "n", "preset": "pepole"}, "people"),
+        ({"kind": "train", "name": "n", "quantize_aware": -1}, "quantize_aware is -1"),
+        ({"kind": "evaluate", "split": "by-people:5"}, "split"),
+        ({"kind": "sweep", "grid": "/etc/passwd"}, "outside the studio's folders"),
+        ({"kind": "train", "name": "n", "dataset": "/tmp"}, "outside the studio's folders"),
+        ({"kind": "train", "name": "n", "dataset": "datasets/gone"}, "no longer there"),
+        ({"kind": "train", "name": "n", "dataset": ""}, "No data set is chosen"),
+    ],
+)
+def test_what_cannot_be_done_is_a_sentence(home: Path, form: dict[str, Any], said: str) -> None:
+    house = House(home)
+    with pytest.raises(PlushSenseError, match=said):
+        made(house, **form)
+
+
+def test_the_same_work_is_not_begun_twice(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    house = House(home)
+    jobs = Jobs(house)
+    monkeypatch.setattr(jobs, "_run", lambda job: None)
+    form = {"dataset": str(house.datasets()[0]), "kind": "train", "name": "one"}
+    first = order(house, jobs, form)
+    jobs.start(first.task, first.spec, first.title)
+    with pytest.raises(ConfigError, match="'one' is being trained right now"):
+        order(house, jobs, form)
+    again = {"dataset": form["dataset"], "kind": "evaluate", "split": "by-subject:5"}
+    proof = order(house, jobs, again)
+    jobs.start(proof.task, proof.dry, proof.title)
+    order(house, jobs, again)
+    jobs.start(proof.task, proof.spec, proof.title)
+    with pytest.raises(ConfigError, match="running already"):
+        order(house, jobs, again)
+
+
+def test_names_and_grids(home: Path) -> None:
+    house = House(home)
+    assert free_name(house, "little") == "little 2"
+    assert free_name(house, "a/b: ž") == "ab ž"
+    assert free_name(house, "///") == "model"
+    (home / "grids").mkdir()
+    (home / "grids" / "b.toml").touch()
+    (home / "a.toml").touch()
+    assert [path.name for path in grids(house)] == ["a.toml", "b.toml"]
+
+
+def test_without_torch_the_task_says_what_to_install(home: Path, tmp_path: Path) -> None:
+    blocked = tmp_path / "blocked" / "torch"
+    blocked.mkdir(parents=True)
+    blocked.joinpath("__init__.py").write_text("raise ModuleNotFoundError('no torch', name='torch')", encoding="utf-8")
+    spec = made(House(home), kind="train", name="x").spec
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(blocked.parent), os.environ.get("PYTHONPATH", "")])}
+    command = [sys.executable, "-m", "plushsense.apps.studio.worker"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=env) as worker:
+        assert worker.stdin is not None and worker.stdout is not None
+        worker.stdin.write(json.dumps({"task": "train", "spec": spec}) + "\n")
+        worker.stdin.flush()
+        said = next(message["refused"] for line in worker.stdout if "refused" in (message := json.loads(line)))
+    assert "'torch', which is not installed: run  pip install 'plushsense[train]'" in said
+
+
+# Telling ------------------------------------------------------------------------------------------------------
+
+
+def test_the_clock_does_not_count_what_was_done_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr("plushsense.apps.studio.tasks.telling.time.monotonic", lambda: now[0])
+    clock = Clock()
+    # Half of it comes at once from the journal, then a tenth each 10 s.
+    assert clock.at(0.1)["left_s"] is None
+    for share in (0.2, 0.3, 0.4, 0.5):
+        now[0] += 0.001
+        clock.at(share)
+    now[0] += 10.0
+    assert clock.at(0.6) == {"share": 0.6, "left_s": 40.0}
+    now[0] += 10.0
+    assert clock.at(0.7)["left_s"] == 30.0
+
+
+def job(task: str, reports: list[dict[str, Any]]) -> Job:
+    return Job("1", task, {}, "", reports=reports)
+
+
+def test_curves_of_a_training() -> None:
+    rows = [
+        {"stage": "training", "epoch": e, "train_loss": 1 / e, "validation_loss": None, "train_accuracy": 0.1 * e}
+        for e in (1, 2, 3)
+    ]
+    loss, accuracy = charts(job("train", [{"stage": "reading"}, *rows, {"stage": "deciding", "epoch": 3}]))
+    assert (loss.what, loss.x, loss.lines[0]) == ("loss", [1.0, 2.0, 3.0], [1.0, 0.5, 1 / 3])
+    assert loss.lines[1] == [None, None, None]
+    assert accuracy.lines[0] == pytest.approx([0.1, 0.2, 0.3])
+
+
+def test_curves_of_folds_and_of_a_search() -> None:
+    folds = [{"fold": "a", "epoch": 1, "train_loss": 3.0}, {"fold": "b", "epoch": 1, "train_loss": 4.0}]
+    folds += [{"fold": "a", "epoch": 2, "train_loss": 2.0}, {"fold": "a", "epoch": 0, "train_loss": None}]
+    loss, _ = charts(job("evaluate", folds))
+    assert (loss.names, loss.x, loss.lines) == (("a", "b"), [1.0, 2.0], [[3.0, 2.0], [4.0, None]])
+    at = [{"rung": 1, "done": 4, "best": None}, {"rung": 2, "done": 1, "best": {"macro_f1": 0.3}}]
+    at += [{"rung": 2, "done": 2, "best": {"macro_f1": 0.3}}, {"rung": 3, "done": 1, "best": {"macro_f1": 0.5}}]
+    (best,) = charts(job("search", at))
+    assert (best.x, best.lines) == ([1.0, 2.0, 3.0], [[0.3, 0.3, 0.5]])
+
+
+# Results ------------------------------------------------------------------------------------------------------
+
+
+def row(name: str, parameters: int, f1: float | None) -> Row:
+    spread = {"spread": "folds", "units": 2, "accuracy": f1, "accuracy_sd": None, "macro_f1": f1, "macro_f1_sd": 0.01}
+    words = dict.fromkeys(("dataset", "data", "schedule", "split", "context", "seeds", "trial"), "")
+    marks = {"leaky": False, "simulated": True}
+    return Row(
+        id=name, kind="trial", path=Path(name), network=name, parameters=parameters, macs=1, when_s=0.0,
+        **words, **marks, **spread,  # type: ignore[arg-type]
+    )  # fmt: skip
+
+
+def test_the_front_holds_what_none_beats() -> None:
+    rows = [row("a", 100, 0.5), row("b", 200, 0.4), row("c", 300, 0.7), row("d", 300, 0.6), row("e", 50, None)]
+    rows += [row("f", 400, 0.7)]
+    assert [r.id for r in front(rows)] == ["a", "c"]
+    # By definition: nobody has at most as many parameters and at least as good a score, and one of them better.
+    for r in rows:
+        beaten = any(
+            o.macro_f1 is not None
+            and r.macro_f1 is not None
+            and o.parameters <= r.parameters
+            and o.macro_f1 >= r.macro_f1
+            and (o.parameters, o.macro_f1) != (r.parameters, r.macro_f1)
+            for o in rows
+        )
+        assert (r in front(rows)) == (not beaten and r.macro_f1 is not None), r.id
+
+
+def test_the_drawing_labels_every_point_and_marks_leaky_ones() -> None:
+    points = [Point(1000 * 3**i, 0.2 + 0.1 * i, 0.05, f"net <{i}>", i > 1, i == 0) for i in range(4)]
+    text = drawing(points, title="a & b", x="Parameters", y="Macro-F1", leaky="leaky")
+    from xml.dom import minidom
+
+    tree = minidom.parseString(text)
+    labels = [t.firstChild.data for t in tree.getElementsByTagName("text") if t.firstChild is not None]  # type: ignore[attr-defined]
+    assert {"net <0> (leaky)", "net <1>", "net <2>", "net <3>", "Parameters", "Macro-F1"} <= set(labels)
+    assert len(tree.getElementsByTagName("circle")) == 3
+    assert len(tree.getElementsByTagName("path")) == 1
+    assert len(tree.getElementsByTagName("polyline")) == 1
+    # One point alone, and points on one spot, can be drawn as well.
+    assert "<svg" in drawing(points[:1] * 3, title="", x="", y="", leaky="")
+
+
+def test_the_recordings_of_a_cell() -> None:
+    labels = ("a", "b")
+    probabilities = np.array([[0.9, 0.1], [0.2, 0.8], [0.1, 0.9], [0.3, 0.7], [0.8, 0.2]], dtype=np.float32)
+    found = Predictions(
+        labels, np.array(["P1", "P1", "P1", "P2", "P2"]), np.array(["r1", "r1", "r1", "r2", "r3"]),
+        np.arange(5), np.array(["loop"] * 5), np.array(["f"] * 5), np.array([0, 0, 0, 0, 1]), probabilities,
+    )  # fmt: skip
+    assert [(m.recording, m.windows, m.of, m.predicted) for m in in_cell(found, ["a"], ["b"])] == [
+        ("r1", 2, 3, ("b",)), ("r2", 1, 1, ("b",)),
+    ]  # fmt: skip
+    assert [m.recording for m in in_cell(found, ["b"], ["a", "b"])] == ["r3"]
+    assert in_cell(found, ["b"], ["b"]) == []
+
+
+def test_affects_are_summed() -> None:
+    found = grouped(Confusion(("a", "b", "c"), ((1, 2, 3), (4, 5, 6), (7, 8, 9))), {"a": "x", "b": None, "c": "x"})
+    assert found == Confusion(("x", "none"), ((20, 10), (10, 5)))
+
+
+def test_rows_of_a_house_and_what_is_broken(home: Path) -> None:
+    house = House(home)
+    results = Results(house)
+    (only,) = results.rows()
+    assert (only.kind, only.simulated, only.leaky, only.context) == (TRAINING, True, False, "anywhere")
+    assert only.dataset == str(home / "datasets" / "virtual")
+    assert results.details(only).facts["fitted"]
+    for name, content in (("broken", "{"), ("other", "[1]"), ("older", '{"split": "by-subject:2"}')):
+        folder = home / "datasets" / "virtual" / "evaluations" / name
+        folder.mkdir(parents=True)
+        folder.joinpath("evaluation.json").write_text(content, encoding="utf-8")
+    (home / "bundles" / "cut.plush").write_bytes(b"abc")
+    assert results.rows() == [only]
+    only.path.unlink()
+    assert results.rows() == []
+    with pytest.raises(BadInput, match="no longer there"):
+        results.row(only.id)
