@@ -72,8 +72,13 @@ def test_what_is_typed_is_no_command(studio: Fixture, look: Fixture, tmp_path: P
 
 
 def test_redo_skip_back_pause_and_going_to_a_step(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
+    own = tmp_path / "home" / "protocols" / "mine.toml"
+    own.parent.mkdir(parents=True)
+    # Long enough to be seen on a busy machine.
+    table = 'name = "mine"\ngesture_set = "plush-18"\nrepetitions = 1\ncountdown_s = 15\ngestures = '
+    own.write_text(table + '["Back stroke 1", "Head stroke 1", "Hold strong", "Tail tap 1"]\n', encoding="utf-8")
     server, browser = studio(*SPEED), look()
-    page = begun(browser.open(server.url + "/record"), server.url, "S01")
+    page = begun(browser.open(server.url + "/record"), server.url, "S01", "mine.toml")
     take(page, 0)
     first = events(tmp_path / "home")[-1].more["file"]
     assert marked(page, "last").inner_text() == f"Last: {first}"
