@@ -72,8 +72,21 @@ def test_what_is_typed_is_no_command(studio: Fixture, look: Fixture, tmp_path: P
 
 
 def test_redo_skip_back_pause_and_going_to_a_step(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
+    own = tmp_path / "home" / "protocols" / "mine.toml"
+    own.parent.mkdir(parents=True)
+    # Long enough to be seen on a busy machine.
+    table = 'name = "mine"\ngesture_set = "plush-18"\nrepetitions = 1\ncountdown_s = 15\ngestures = '
+    own.write_text(table + '["Back stroke 1", "Head stroke 1", "Hold strong", "Tail tap 1"]\n', encoding="utf-8")
+    picture = tmp_path / "home" / "pictures" / "Back stroke 1.svg"
+    picture.parent.mkdir()
+    drawn = '<svg xmlns="http://www.w3.org/2000/svg" width="32" height="20"><script>alert(1)</script></svg>'
+    picture.write_text(drawn, encoding="utf-8")
     server, browser = studio(*SPEED), look()
-    page = begun(browser.open(server.url + "/record"), server.url, "S01")
+    page = begun(browser.open(server.url + "/record"), server.url, "S01", "mine.toml")
+    # A user's own picture, shown and never run.
+    shown = marked(page, "picture").locator("img")
+    assert shown.evaluate("async image => { await image.decode(); return image.naturalWidth }") == 32
+    assert shown.get_attribute("alt") == "Picture: Back stroke 1"
     take(page, 0)
     first = events(tmp_path / "home")[-1].more["file"]
     assert marked(page, "last").inner_text() == f"Last: {first}"
