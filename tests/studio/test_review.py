@@ -98,6 +98,9 @@ def test_a_click_moves_the_mark_to_within_a_sample(
     # Closer: fewer rows a pixel; then in another width.
     page.keyboard.press("+")
     page.keyboard.press("+")
+    page.wait_for_function(
+        "() => { const {min, max} = document.querySelector('[data-test=plot]').psPlot.u.scales.x; return max - min < 1 }"
+    )
     start = click(0.341)
     state(page, "draft")
     page.keyboard.press("0")

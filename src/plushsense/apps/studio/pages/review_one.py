@@ -31,7 +31,7 @@ KEYS = (
 )
 """The keys as they are written, and the word that says what each does; only what works without trimming otherwise."""
 _PLAIN = ("accept", "back", "pass", "exclude", "undo", "zoom")
-_SET, _DRAFT = "#D55E00", "#0072B2"
+_SET, _DRAFT = "--ps-set", "--ps-draft"
 _STEPS = {"ArrowLeft": -1, "ArrowRight": 1, ",": -10, "<": -10, ";": -10, ".": 10, ">": 10, ":": 10}
 _ZOOMS = {"zoom_in": ("zoom_in", 0.5), "zoom_out": ("zoom_out", 2.0), "zoom_all": ("fit_screen", 0.0)}
 _DASHES: tuple[list[int], ...] = ([], [7, 4], [2, 3])
