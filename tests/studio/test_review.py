@@ -98,6 +98,9 @@ def test_a_click_moves_the_mark_to_within_a_sample(
     # Closer: fewer rows a pixel; then in another width.
     page.keyboard.press("+")
     page.keyboard.press("+")
+    page.wait_for_function(
+        "() => { const {min, max} = document.querySelector('[data-test=plot]').psPlot.u.scales.x; return max - min < 1 }"
+    )
     start = click(0.341)
     state(page, "draft")
     page.keyboard.press("0")
@@ -333,9 +336,10 @@ def test_the_table_filters_sorts_and_says_what_it_shows(
     assert "✕ excluded" in page.locator("[data-test=table] tbody").inner_text()
     page = look().open(url + "/review")
     page.get_by_role("button", name="Duration").click()
-    page.get_by_role("button", name="Duration ▲").click()
+    page.wait_for_selector("th[aria-sort=ascending]:has-text('Duration')")
+    page.get_by_role("button", name="Duration").click()
     page.wait_for_selector("th[aria-sort=descending]")
-    assert "7.5" in page.locator("[data-test=table] tbody tr").first.inner_text()
+    assert "7.50 s" in page.locator("[data-test=table] tbody tr").first.inner_text()
 
 
 def test_overlays_name_what_stands_out(waves: Path, studio: Fixture, look: Fixture, shots: Fixture) -> None:
@@ -479,7 +483,7 @@ def test_a_broken_data_set_is_a_sentence(waves: Path, studio: Fixture, look: Fix
         assert said in page.locator("[role=alert]").inner_text()
         assert axe(page) == []
     marked(page, "dataset").click()
-    page.get_by_role("option", name="waves").first.click()
+    page.get_by_role("option", name="(waves)").click()
     page.wait_for_selector("[data-test=table] tbody tr")
     assert browser.complaints == []
 
@@ -526,10 +530,10 @@ def test_real_recordings_one_after_the_other(
     browser = look()
     page = browser.open(studio(home=tmp_path / "home").url + "/review?view=one")
     opened(page)
-    # One can begin before all is looked at; what is not yet is a sentence.
-    page.wait_for_function("() => !document.querySelector('[data-test=making]').textContent.startsWith('Looking')")
     seen = [shown(page)]
     for _ in range(25):
+        # One can begin before all is looked at.
+        page.wait_for_selector("[data-test=state]:not([data-state=looking])")
         seen.append(pressed(page, "Enter"))
     assert [m["recording"] for m in marks(place)] == seen[:25]
     times = page.evaluate(f"() => document.querySelector('{PLOT}').psPlot.times")
@@ -545,8 +549,10 @@ def test_real_recordings_one_after_the_other(
     for _ in range(6):
         page.keyboard.press("+")
     page.wait_for_function(
-        "() => { const p = document.querySelector('[data-test=plot]').psPlot, {min, max} = p.u.scales.x;"
-        " return p.p.data[0].filter((x) => x >= min && x <= max).length > 60 * (max - min) }"
+        "(rate) => { const p = document.querySelector('[data-test=plot]').psPlot, {min, max} = p.u.scales.x;"
+        " return p.p.data[0].filter((x) => x >= min && x <= max).length"
+        " > 0.9 * rate * (max - min) }",
+        arg=longest.rate_hz,
     )
     assert raw_hash(place) == before
     assert browser.complaints == []

@@ -25,7 +25,10 @@ export default {
       if (this.u && width && width !== this.u.width) this.u.setSize({ width, height: this.height });
     });
     this.resizer.observe(this.$el);
-    this.lights = new MutationObserver(() => this.p && this.build());
+    // Other classes of the body come and go with every key.
+    this.lights = new MutationObserver(() => {
+      if (this.p && this.dark !== document.body.classList.contains("body--dark")) this.build();
+    });
     this.lights.observe(document.body, { attributes: true, attributeFilter: ["class"] });
     this.onKey = (event) => this.key(event);
     this.onClick = (event) => {
@@ -67,6 +70,7 @@ export default {
     },
     build() {
       this.u?.destroy();
+      this.dark = document.body.classList.contains("body--dark");
       const p = this.p, ink = colour("--ps-ink"), grid = { stroke: colour("--ps-line"), width: 1 };
       const y = { stroke: ink, grid, ticks: grid, label: p.y || undefined, labelSize: 22, size: 64 };
       if (p.lanes.length > 1) {
@@ -127,7 +131,7 @@ export default {
       ctx.textBaseline = "alphabetic";
       this.marks.forEach((m, i) => {
         const x = u.valToPos(m.x, "x", true);
-        ctx.strokeStyle = ctx.fillStyle = m.stroke || colour("--ps-ink");
+        ctx.strokeStyle = ctx.fillStyle = colour(m.stroke || "--ps-ink");
         ctx.lineWidth = 2 * devicePixelRatio;
         ctx.setLineDash((m.dash || []).map((v) => v * devicePixelRatio));
         ctx.beginPath();
@@ -169,7 +173,7 @@ export default {
       this.marks = p.marks;
       this.cut = p.cut;
       this.shown = p.id;
-      if (same) this.u.setData(p.data);
+      if (same) this.u.setData(p.data, !kept);
       else this.build();
       this.kind = JSON.stringify([p.series, p.lanes, p.y, p.range]);
       if (kept) this.u.setScale("x", { min: kept.min, max: kept.max });

@@ -25,9 +25,8 @@ from plushsense.core.errors import PlushSenseError
 from plushsense.dataset.contents import CACHE
 from plushsense.dataset.onset import SPEC, Suggestion
 from plushsense.dataset.quality.checking import Checked, check
-from plushsense.dataset.quality.examined import seconds_of
 from plushsense.dataset.store import Dataset, RecordingInfo, write_atomically
-from plushsense.dataset.trim import trims
+from plushsense.dataset.trim import seconds_of_rows, trims
 from plushsense.reports.quality import scale_of
 from plushsense.reports.quality_figures import line
 
@@ -194,7 +193,7 @@ def shape_of(dataset: Dataset, info: RecordingInfo, scale: NDArray[np.float64]) 
     frames = dataset.read(replace(info, start=0, stop=info.rows))
     if not len(frames):
         return Shape(0.0, ())
-    found = line(frames, dataset.layout, scale, seconds_of(frames))
+    found = line(frames, dataset.layout, scale, float(seconds_of_rows(frames)[-1]))
     return Shape(round(found.lasts, 3), tuple(np.minimum(np.rint(found.size * FULL), 1e6).astype(int).tolist()))
 
 

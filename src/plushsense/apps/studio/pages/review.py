@@ -316,6 +316,10 @@ class Desk:
 
     async def next(self) -> None:
         """The next recording of the order."""
+        async with self._turn:
+            await self._next()
+
+    async def _next(self) -> None:
         ahead = self.following()
         if ahead:
             await self.go(ahead[0], remember=True)
@@ -325,12 +329,22 @@ class Desk:
 
     async def back(self) -> None:
         """The recording that was shown before, or the one before in the order."""
-        while self.trail and self.trail[-1] not in self.review.infos:
-            self.trail.pop()
-        if self.trail:
-            await self.go(self.trail.pop())
-        elif self.current in self.order and self.order.index(self.current):
-            await self.go(self.order[self.order.index(self.current) - 1])
+        async with self._turn:
+            while self.trail and self.trail[-1] not in self.review.infos:
+                self.trail.pop()
+            if self.trail:
+                await self.go(self.trail.pop())
+            else:
+                await self._previous(remember=False)
+
+    async def previous(self) -> None:
+        """The recording before in the order."""
+        async with self._turn:
+            await self._previous(remember=True)
+
+    async def _previous(self, *, remember: bool) -> None:
+        if self.current in self.order and self.order.index(self.current):
+            await self.go(self.order[self.order.index(self.current) - 1], remember=remember)
 
     # Deciding -----------------------------------------------------------------------------------------------------
 
@@ -349,7 +363,7 @@ class Desk:
             if done:
                 self.page.say("")
             if done and move:
-                await self.next()
+                await self._next()
             else:
                 self.one.refresh()
 

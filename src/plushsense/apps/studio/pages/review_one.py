@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from nicegui import run, ui
+from nicegui import ui
 
 from plushsense.apps.studio.pages.review_list import AFFECTS, SIGNS
 from plushsense.apps.studio.pages.review_reason import ask, finding_text
@@ -31,7 +31,7 @@ KEYS = (
 )
 """The keys as they are written, and the word that says what each does; only what works without trimming otherwise."""
 _PLAIN = ("accept", "back", "pass", "exclude", "undo", "zoom")
-_SET, _DRAFT = "#D55E00", "#0072B2"
+_SET, _DRAFT = "--ps-set", "--ps-draft"
 _STEPS = {"ArrowLeft": -1, "ArrowRight": 1, ",": -10, "<": -10, ";": -10, ".": 10, ">": 10, ":": 10}
 _ZOOMS = {"zoom_in": ("zoom_in", 0.5), "zoom_out": ("zoom_out", 2.0), "zoom_all": ("fit_screen", 0.0)}
 _DASHES: tuple[list[int], ...] = ([], [7, 4], [2, 3])
@@ -270,21 +270,22 @@ class OneView:
     async def key(self, said: dict[str, Any]) -> None:
         """A key of the page, pressed while the recording ``shown`` was on screen."""
         desk, key, shift = self.desk, str(said["key"]), bool(said["shift"])
-        if said["shown"] != desk.current:
-            return
         trims = not desk.review.is_labelled
-        if key == "Enter":
-            await self.accept(str(said["shown"]))
-        elif key == "Backspace":
+        if key == "Backspace":
             await desk.back()
         elif key == "ArrowDown":
             await desk.next()
         elif key == "ArrowUp":
-            await self._before()
-        elif key == "x":
-            await self._exclude()
+            await desk.previous()
         elif key == "u":
             await desk.undo()
+        elif said["shown"] != desk.current:
+            # The next one has come since: nothing is decided about what nobody saw.
+            return
+        elif key == "Enter":
+            await self.accept(str(said["shown"]))
+        elif key == "x":
+            await self._exclude()
         elif trims and key in ("s", "Escape"):
             self._drop()
         elif trims and key == "Home":
@@ -328,11 +329,6 @@ class OneView:
                 identity, lambda: desk.review.accept(desk.visit, identity, desk.name, desk.ends), move=True
             )
 
-    async def _before(self) -> None:
-        order, current = self.desk.order, self.desk.current
-        if current in order and order.index(current):
-            await self.desk.go(order[order.index(current) - 1], remember=True)
-
     async def _exclude(self) -> None:
         desk, identity = self.desk, self.desk.current
         if not identity:
@@ -359,8 +355,7 @@ class OneView:
         self.group = group
         self.draw(keep=True)
 
-    async def zoomed(self, said: dict[str, Any]) -> None:
+    def zoomed(self, said: dict[str, Any]) -> None:
         """Closer to a long recording: its rows there, instead of some of each stretch."""
         if said["shown"] == self.desk.current:
-            await run.io_bound(self.desk.review.signals, self.desk.current)
             self.draw(keep=True, low=float(said["low"]), high=float(said["high"]))

@@ -45,7 +45,8 @@ def ask(desk: Desk, finding: Finding | None = None) -> None:
             await desk.decide(shown, lambda: review.accept_finding(visit, finding, desk.name, why))
 
     with desk.page_slot, ui.dialog() as dialog:
-        dialog.props(f'aria-label="{words("review.reason")}"')
+        # At once: a key that is pressed after it is for the page again.
+        dialog.props(f'aria-label="{words("review.reason")}" transition-duration=0')
         with tag(ui.card().classes("w-full"), "reason"):
             ui.label(title).classes("text-lg font-bold").style("overflow-wrap: anywhere")
             with ui.row().classes("gap-2"):
