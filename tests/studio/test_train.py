@@ -97,6 +97,8 @@ def test_a_training_is_stopped_and_killed_and_ends_in_the_commands_bundle(
     assert done.locator('[data-test="result"]').inner_text().startswith("Saved as “by page”. Accuracy 0.")
     assert done.get_by_text("simulation", exact=True).is_visible()
     # The curve begins with the first epoch, though three runs drew it.
+    (job,) = (json.loads(path.read_text(encoding="utf-8")) for path in (home / "work").glob("*.json"))
+    assert [r["epoch"] for r in job["reports"] if r["stage"] == "training" and "epoch" in r] == list(range(1, 46))
     assert page.locator('[data-column="kind"]').get_by_text("training").count() == 2
     by_page = (home / "bundles" / "by page.plush").read_bytes()
     assert not list(kept.glob("[!.]*.npz"))
