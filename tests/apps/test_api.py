@@ -126,13 +126,13 @@ def long_recordings(folder: Path, people: int, recordings: int) -> Dataset:
     ("people", "kind"), [(1, "validation-recordings"), (2, "validation-recordings"), (3, "validation-subjects")]
 )
 def test_nothing_that_is_scored_was_trained_on(people: int, kind: str, tmp_path: Path) -> None:
-    from plushsense.apps.api import _divide
     from plushsense.apps.config import resolve
+    from plushsense.apps.dividing import divide
 
     dataset = long_recordings(tmp_path, people, 4)
     windows = ps.cut_windows(dataset)
     assert len(windows) == 6 * len(dataset.recordings), "several windows a recording"
-    division = _divide(windows, resolve(None))
+    division = divide(windows, resolve(None))
     trained, scored = (set(windows.recording[i].tolist()) for i in (division.train, division.fold.test))
     assert trained
     assert scored

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 import shutil
 import sys
@@ -96,6 +97,8 @@ def test_a_training_is_stopped_and_killed_and_ends_in_the_commands_bundle(
     assert done.locator('[data-test="result"]').inner_text().startswith("Saved as “by page”. Accuracy 0.")
     assert done.get_by_text("simulation", exact=True).is_visible()
     # The curve begins with the first epoch, though three runs drew it.
+    (job,) = (json.loads(path.read_text(encoding="utf-8")) for path in (home / "work").glob("*.json"))
+    assert [r["epoch"] for r in job["reports"] if r["stage"] == "training" and "epoch" in r] == list(range(1, 46))
     assert page.locator('[data-column="kind"]').get_by_text("training").count() == 2
     by_page = (home / "bundles" / "by page.plush").read_bytes()
     assert not list(kept.glob("[!.]*.npz"))
@@ -221,6 +224,9 @@ filters = [[4, 4], [8, 8]]
 epochs = [1]
 batches = [64]
 split = "windows:holdout"
+
+[search]
+rungs = [1, 2]
 """
 
 
@@ -247,6 +253,7 @@ def test_a_sweep_shows_its_cost_first_and_its_front_in_the_end(
     marked(page, "plan-text").wait_for(timeout=_LONG_MS)
     assert "4 trials in 4 trainings (folds: 1, seeds: 1), 0 done before" in marked(page, "plan-text").inner_text()
     assert marked(page, "plan").get_by_text("leaky", exact=True).is_visible()
+    assert axe(page) == []
     marked(page, "start").click()
     done = state(page, "done")
     assert "4 of 4 trials. Most accurate: " in done.inner_text()
@@ -263,6 +270,21 @@ def test_a_sweep_shows_its_cost_first_and_its_front_in_the_end(
     assert page.locator("[data-cell]").count() == 0
     assert axe(page) == []
     shots(page, "train-sweep")
+
+    # A search among them, within a limit.
+    kind(page, "Find a small network")
+    choose(page, "grid", "tiny.toml")
+    choose(page, "split", "15 % of the windows")
+    fill(page, "max_parameters", "1400")
+    marked(page, "estimate").click()
+    marked(page, "plan-text").get_by_text("networks compared after 1, 2 epochs, 1 beyond").wait_for(timeout=_LONG_MS)
+    marked(page, "start").click()
+    page.locator('[data-test="result"]', has_text="Best: ").wait_for(timeout=_LONG_MS)
+    (found,) = (home / "datasets" / "virtual" / "evaluations").glob("search-tiny-*")
+    best = json.loads((found / "search.json").read_text(encoding="utf-8"))["winner"]
+    assert best["parameters"] <= 1400
+    text = page.locator('[data-test="result"]', has_text="Best: ").inner_text()
+    assert text.startswith(f"Best: {best['arch']} {best['filters']}, macro-F1 {best['macro_f1']:.3f}")
     assert browser.complaints == []
 
 
@@ -281,6 +303,9 @@ def test_what_is_wrong_is_a_sentence_and_nothing_is_lost(
     fill(page, "epochs", "lots")
     marked(page, "start").click()
     marked(page, "said").get_by_text("epochs is 'lots': accepted is a whole number").wait_for()
+    marked(page, "advanced").get_by_text("Advanced settings").click()
+    page.locator('[data-test="quantize_aware"]').wait_for()
+    page.wait_for_timeout(400)  # until it has unfolded
     assert axe(page) == []
     kind(page, "Prove it on people left out")
     marked(page, "start").click()

@@ -94,11 +94,15 @@ def test_the_same_work_is_not_begun_twice(home: Path, monkeypatch: pytest.Monkey
         order(house, jobs, again)
 
 
-def test_names_and_grids(home: Path) -> None:
+def test_names_and_grids(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     house = House(home)
-    assert free_name(house, "little") == "little 2"
-    assert free_name(house, "a/b: ž") == "ab ž"
-    assert free_name(house, "///") == "model"
+    jobs = Jobs(house)
+    monkeypatch.setattr(jobs, "_run", lambda job: None)
+    assert free_name(house, jobs, "little") == "little 2"
+    jobs.start("train", {"out": str(home / "bundles" / "little 2.plush")}, "")
+    assert free_name(house, jobs, "little") == "little 3"
+    assert free_name(house, jobs, "a/b: ž") == "ab ž"
+    assert free_name(house, jobs, "///") == "model"
     (home / "grids").mkdir()
     (home / "grids" / "b.toml").touch()
     (home / "a.toml").touch()

@@ -54,11 +54,12 @@ def grids(house: House) -> list[Path]:
     return sorted([*house.folder.glob("*.toml"), *(house.folder / GRIDS).glob("*.toml")])
 
 
-def free_name(house: House, wanted: str) -> str:
-    """A name for a bundle that nothing has yet."""
+def free_name(house: House, jobs: Jobs, wanted: str) -> str:
+    """A name for a bundle that nothing has yet, nor will have once what runs is done."""
+    coming = {Path(job.spec["out"]).stem for job in jobs.all(TRAIN) if job.state == RUNNING and "out" in job.spec}
     plain = "".join(c for c in wanted if c.isalnum() or c in " _-").strip()[:50] or "model"
     name, number = plain, 2
-    while (house.folder / BUNDLES / f"{name}.plush").exists():
+    while name in coming or (house.folder / BUNDLES / f"{name}.plush").exists():
         name, number = f"{plain} {number}", number + 1
     return name
 

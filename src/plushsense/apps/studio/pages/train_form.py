@@ -160,7 +160,7 @@ class Form:
 
     def _of_train(self) -> None:
         title = self._datasets[self._dataset]
-        self._values[TRAIN].setdefault("name", free_name(self._page.house, title))
+        self._values[TRAIN].setdefault("name", free_name(self._page.house, self._jobs, title))
         with ui.row().classes("w-full"):
             self._field("name", wide=True)
             self._select("context", self._contexts())
@@ -300,17 +300,7 @@ class Form:
             self._agreed = ""
             self._plan.clear()
             self._values[TRAIN].pop("name", None)
-            if now.task == TRAIN:
-                self._values[TRAIN]["name"] = self._next_name(now)
             self._build()
-
-    def _next_name(self, begun: Order) -> str:
-        """A name beside the one that is being trained, whose file is not there yet."""
-        stem, number = Path(begun.spec["out"]).stem, 2
-        base, _, last = stem.rpartition(" ")
-        if base and last.isdigit():
-            stem, number = base, int(last) + 1
-        return free_name(self._page.house, f"{stem} {number}")
 
     def close(self) -> None:
         """End what only looks."""
