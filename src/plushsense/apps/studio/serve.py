@@ -52,11 +52,13 @@ def run(
     need("nicegui", "studio")
     from nicegui import app, ui
 
+    from plushsense.apps.studio.downloads import router
     from plushsense.apps.studio.shell import PAGES
 
     port = _free_port(host, port)
     for name, path in PAGES.items():
         ui.page(path, response_timeout=30.0)(_page(house, name))
+    app.include_router(router(house))
     everywhere = host in _EVERYWHERE
     if everywhere:
         names = (*names, socket.gethostname(), *_addresses())
