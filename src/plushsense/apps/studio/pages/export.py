@@ -14,7 +14,18 @@ from plushsense.apps.studio.house import EXPORTS
 from plushsense.apps.studio.jobs import Job, Jobs
 from plushsense.apps.studio.pages.export_cost import show_cost
 from plushsense.apps.studio.pages.export_proof import Proof, state_of
-from plushsense.apps.studio.pages.export_shown import Cell, WorkShown, facts, link, moment, size, style, table, text
+from plushsense.apps.studio.pages.export_shown import (
+    Cell,
+    WorkShown,
+    facts,
+    link,
+    moment,
+    scroll_to,
+    size,
+    style,
+    table,
+    text,
+)
 from plushsense.apps.studio.shell import Page, tag
 from plushsense.deploy.convert import CONVERTERS
 from plushsense.deploy.package import ARDUINO, IDF, IDF_EXAMPLE, SKETCH
@@ -40,7 +51,7 @@ class _Exporting:
         text(self.words("export.about"), classes="ps-dim")
         await self._form()
         self.work = WorkShown(self.page, _TASKS, self._said, self._ended, self._allow)
-        self._detail = tag(ui.column().classes("w-full q-gutter-md"), "detail")
+        self._detail = tag(ui.column().classes("w-full"), "detail")
         self._list = tag(ui.column().classes("w-full"), "exports")
         name = self.asked.get("name", "")
         if name:
@@ -52,7 +63,7 @@ class _Exporting:
     async def _form(self) -> None:
         words = self.words
         bundles = await run.io_bound(self.house.bundles) or []
-        with tag(ui.column().classes("ps-card w-full q-gutter-sm"), "new"):
+        with tag(ui.column().classes("ps-card w-full"), "new"):
             text(words("export.new"), "h2")
             if not bundles:
                 tag(text(words("export.no_bundle")), "no-bundle")
@@ -124,11 +135,11 @@ class _Exporting:
         words, scores = self.words, found.scores
         rows = [
             (words("export.network"), words("export.network_value", title=found.title, padding=found.padding)),
-            (words("export.gestures"), words("export.count_gestures", n=len(found.gestures))),
+            (words("export.gestures"), str(len(found.gestures))),
             (words("export.layout"), found.layout),
             (words("export.trained_on"), words("export.trained_value", dataset=found.dataset, people=found.people)),
             (words("export.adapted_to"), found.adapted_to),
-            (words("export.bytes"), size(found.bytes)),
+            (words("export.size"), size(found.bytes)),
         ]
         if not scores:
             return [*rows, (words("export.scores"), words("export.no_scores"))]
@@ -173,12 +184,13 @@ class _Exporting:
             self.page.say(self.words("export.done", name=name), "good")
             self._name.set_value(self._free(name))
         if job.task == "export" or name == self.open:
-            await self._show(name, job)
+            await self._show(name)
+            scroll_to("verdict" if job.task == "verify" else "detail")
         await self._refresh_list()
 
     # One export -----------------------------------------------------------------------------------------------
 
-    async def _show(self, name: str, job: Job | None = None) -> None:
+    async def _show(self, name: str) -> None:
         words = self.words
         with self.page.refusing():
             folder = below(self.house, EXPORTS, name)
@@ -208,7 +220,7 @@ class _Exporting:
 
     def _whole(self, found: ExportFacts, made: Job | None) -> None:
         words, told = self.words, found.facts
-        with tag(ui.column().classes("ps-card w-full q-gutter-sm"), "export-facts"):
+        with tag(ui.column().classes("ps-card w-full"), "export-facts"):
             if told.get("simulated"):
                 text(words("shell.simulation"), classes="ps-said ps-said-warning w-full")
             for warning in made.warnings if made else ():
@@ -216,7 +228,7 @@ class _Exporting:
             facts(
                 [
                     (words("export.network"), str(told["title"])),
-                    (words("export.gestures"), words("export.count_gestures", n=told["classes"])),
+                    (words("export.gestures"), str(told["classes"])),
                     (words("export.layout"), str(told.get("layout", ""))),
                     (words("export.flash"), words("export.flash_value", n=f"{found.flash_bytes:,}")),
                     (words("export.ram"), words("export.ram_value", n=f"{found.ram_bytes:,}")),
@@ -241,7 +253,7 @@ class _Exporting:
 
     def _next(self, found: ExportFacts) -> None:
         words = self.words
-        with tag(ui.column().classes("ps-card w-full q-gutter-sm"), "next"):
+        with tag(ui.column().classes("ps-card w-full"), "next"):
             text(words("export.next"), "h3")
             with ui.element("ol").classes("ps-steps"):
                 for key in ("arduino", "idf", "plain", "read"):

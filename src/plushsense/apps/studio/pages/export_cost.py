@@ -24,7 +24,7 @@ def show_cost(page: Page, work: WorkShown, export: ExportFacts, counted: Job | N
     async def again() -> None:
         await work.start("profile", {"place": str(export.folder)}, words("export.counting", name=export.name))
 
-    with tag(ui.column().classes("ps-card w-full q-gutter-sm"), "cost"):
+    with tag(ui.column().classes("ps-card w-full"), "cost"):
         text(words("export.cost"), "h3")
         if not found:
             text(words("export.not_counted"))

@@ -34,10 +34,10 @@ class Proof:
     async def build(self) -> None:
         words = self.words
         lacking = await run.io_bound(targets) or {}
-        with tag(ui.column().classes("ps-card w-full q-gutter-sm"), "proof"):
+        with tag(ui.column().classes("ps-card w-full"), "proof"):
             text(words("export.prove"), "h3")
             text(words("export.prove_about"), classes="ps-dim")
-            with ui.row().classes("q-gutter-sm"):
+            with ui.row().classes("w-full"):
                 for name in (n for n, lacks in lacking.items() if not lacks):
                     self._chosen[name] = ui.checkbox(self._title(name), value=True)
                     tag(self._chosen[name], f"target-{name}")
@@ -77,20 +77,20 @@ class Proof:
 
     def _shown(self, proof: Job) -> None:
         words, found = self.words, proof.result
-        with tag(ui.column().classes("w-full q-gutter-sm"), "verdict"):
+        with tag(ui.column().classes("w-full"), "verdict"):
             if found["digest"] != self.export.digest:
                 text(
                     words("export.changed_since", when=moment(proof.ended_s)), classes="ps-said ps-said-warning w-full"
                 )
             good = bool(found["passed"])
-            with ui.row().classes("items-center q-gutter-sm"):
+            with ui.row().classes("items-center"):
                 ui.html(verdict(good, words("export.equal" if good else "export.unequal")), sanitize=False)
                 text(self._sum(found), "span")
             for sentence in self._sentences(found):
                 text(sentence, classes=f"ps-said ps-said-{'warning' if good else 'error'} w-full")
             rows = [
                 (
-                    self._title(r["target"]),
+                    words("export.host_short") if r["target"] == "host" else self._title(r["target"]),
                     r["compiler"],
                     r["flags"],
                     f"{r['vectors']:,}",
@@ -104,8 +104,8 @@ class Proof:
             caption = words("export.runs_caption", when=moment(proof.ended_s))
             tag(table(caption, [words(f"export.{k}") for k in keys], rows, (3, 4, 5)), "runs")
             fed = [(s["name"], f"{s['samples']:,}", f"{s['frames']:,}", f"{s['answers']:,}") for s in found["streams"]]
-            keys = ("stream", "samples", "frames", "answers")
-            tag(table(words("export.streams_caption"), [words(f"export.{k}") for k in keys], fed, (1, 2, 3)), "streams")
+            head = [words(f"export.{k}") for k in ("stream", "samples", "frames", "answers")]
+            tag(table(words("export.streams_caption"), head, fed, (1, 2, 3)), "streams")
             for each in found["not_run"]:
                 text(words("export.not_run", what=each["what"], why=each["why"]), classes="ps-dim")
             self._planted(found)

@@ -27,7 +27,10 @@ _STYLE = """
 .ps-verdict-none { background: #e3e6eb; color: #2b2f36; }
 .ps-link { color: #0b4f8a; text-decoration: underline; } body.body--dark .ps-link { color: #9ccbff; }
 .ps-steps { margin: 0; padding-left: 1.4rem; list-style: decimal; } .ps-steps li { margin-bottom: 4px; }
-.ps-path { font-family: monospace; overflow-wrap: anywhere; }
+.ps-work { position: sticky; top: 84px; z-index: 10; background: #fff; }
+body.body--dark .ps-work { background: #121212; }
+body.body--dark .q-btn--outline { color: #9ccbff !important; }
+[data-test] { scroll-margin-top: 100px; }
 """
 _RECENT_S = 900.0
 
@@ -35,6 +38,13 @@ _RECENT_S = 900.0
 def style() -> None:
     """Once a page."""
     ui.add_css(_STYLE)
+    # White words on NiceGUI's own blue are too faint.
+    ui.colors(primary="#1f5f99")
+
+
+def scroll_to(name: str) -> None:
+    """Bring what is tagged so into view."""
+    ui.run_javascript(f"document.querySelector('[data-test=\"{name}\"]')?.scrollIntoView()")
 
 
 def text(said: str, kind: str = "p", classes: str = "") -> ui.html:
@@ -122,7 +132,7 @@ class WorkShown:
         self._closed: set[str] = set()
         self._shown: tuple[Any, ...] | None = None
         self._bars: dict[str, tuple[ui.linear_progress, ui.label]] = {}
-        self._box = tag(ui.column().classes("w-full"), "work")
+        self._box = tag(ui.column().classes("ps-work w-full"), "work")
         # Whose children are not cleared with the box.
         self._after = ui.element("div").classes("hidden")
         on_ring(self._jobs.bell, self.refresh)
@@ -168,7 +178,7 @@ class WorkShown:
         self._bars = {}
         with self._box:
             for job in running:
-                with ui.column().classes("ps-card w-full q-gutter-xs"):
+                with ui.column().classes("ps-card w-full"):
                     with ui.row().classes("w-full items-center"):
                         text(job.title, "h2", "col-grow")
                         stop = ui.button(words("export.stop"), icon="stop", on_click=lambda job=job: self._stop(job))
