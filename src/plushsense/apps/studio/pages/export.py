@@ -51,6 +51,7 @@ class _Exporting:
         text(self.words("export.about"), classes="ps-dim")
         await self._form()
         self.work = WorkShown(self.page, _TASKS, self._said, self._ended, self._allow)
+        self._allow()
         self._detail = tag(ui.column().classes("w-full"), "detail")
         self._list = tag(ui.column().classes("w-full"), "exports")
         name = self.asked.get("name", "")
@@ -169,7 +170,7 @@ class _Exporting:
             dataset = str(self.house.inside(self._dataset.value)) if self._dataset.value else ""
             also = [name for name, box in self._formats.items() if box.value]
             spec = {"bundle": str(bundle), "place": str(place), "also": also, "dataset": dataset}
-            await self.work.start("export", spec, self.words("export.doing", name=place.name))
+            await self.work.start("export", spec)
 
     # What runs ------------------------------------------------------------------------------------------------
 

@@ -22,7 +22,7 @@ def show_cost(page: Page, work: WorkShown, export: ExportFacts, counted: Job | N
     fresh = found.get("digest") == export.digest
 
     async def again() -> None:
-        await work.start("profile", {"place": str(export.folder)}, words("export.counting", name=export.name))
+        await work.start("profile", {"place": str(export.folder)})
 
     with tag(ui.column().classes("ps-card w-full"), "cost"):
         text(words("export.cost"), "h3")

@@ -73,7 +73,7 @@ class Proof:
             dataset = str(self.page.house.inside(self._dataset.value)) if self._dataset.value else ""
             faults = bool(self._faults.value)
             spec = {"place": str(self.export.folder), "targets": chosen, "dataset": dataset, "faults": faults}
-            await self.work.start("verify", spec, words("export.verifying", name=self.export.name))
+            await self.work.start("verify", spec)
 
     def _shown(self, proof: Job) -> None:
         words, found = self.words, proof.result

@@ -5,12 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Awaitable, Callable, Sequence
 from html import escape
+from pathlib import Path
 from typing import Any
 
 from nicegui import run, ui
 
 from plushsense.apps.studio.jobs import DONE, REFUSED, RUNNING, Job, Jobs
 from plushsense.apps.studio.shell import Page, on_ring, tag
+from plushsense.apps.studio.words import Words
 
 _STYLE = """
 .ps-main h3 { font-size: 1.05rem; line-height: 1.5rem; font-weight: 600; margin: 8px 0 0 0; }
@@ -20,7 +22,7 @@ _STYLE = """
 .ps-table { border-collapse: collapse; }
 .ps-table caption { text-align: left; color: var(--ps-dim); padding-bottom: 4px; }
 .ps-table th, .ps-table td { text-align: left; padding: 4px 12px 4px 0; border-bottom: 1px solid var(--ps-line);
-  vertical-align: top; overflow-wrap: anywhere; }
+  vertical-align: top; overflow-wrap: break-word; }
 .ps-table th { font-weight: 600; } .ps-table .ps-number { text-align: right; font-variant-numeric: tabular-nums; }
 .ps-verdict { border-radius: 6px; padding: 1px 8px; font-weight: 600; white-space: nowrap; }
 .ps-verdict-good { background: #dff3ea; color: #0b3d2c; } .ps-verdict-bad { background: #fbe3da; color: #5c1d00; }
@@ -33,6 +35,14 @@ body.body--dark .q-btn--outline { color: #9ccbff !important; }
 [data-test] { scroll-margin-top: 100px; }
 """
 _RECENT_S = 900.0
+_TITLES = {
+    "export": "export.doing",
+    "profile": "export.counting",
+    "verify": "export.verifying",
+    "publish": "publish.doing",
+    "validate": "publish.checking",
+    "pseudonymise": "publish.renaming",
+}
 
 
 def style() -> None:
@@ -108,6 +118,11 @@ def size(count: int) -> str:
     return f"{count} B"
 
 
+def title_of(words: Words, job: Job) -> str:
+    """What a job does, in the language of whoever looks, which need not be that of who began it."""
+    return words(_TITLES[job.task], name=Path(job.spec["place"]).name)
+
+
 class WorkShown:
     """The running work of some tasks with its progress and a button that stops it, and how the last one ended.
 
@@ -142,9 +157,10 @@ class WorkShown:
         """Whether work of these tasks runs."""
         return any(j.state == RUNNING for j in self._jobs.all(*tasks))
 
-    async def start(self, task: str, spec: dict[str, Any], title: str) -> Job:
+    async def start(self, task: str, spec: dict[str, Any]) -> Job:
         """Begin work."""
         self._closed |= {j.id for j in self._jobs.all(*self._tasks) if j.state != RUNNING}
+        title = self._page.words(_TITLES[task], name=Path(spec["place"]).name)
         job = await run.io_bound(lambda: self._jobs.start(task, spec, title))
         assert job is not None
         self._watched.add(job.id)
@@ -180,16 +196,18 @@ class WorkShown:
             for job in running:
                 with ui.column().classes("ps-card w-full"):
                     with ui.row().classes("w-full items-center"):
-                        text(job.title, "h2", "col-grow")
+                        text(title_of(words, job), "h2", "col-grow")
                         stop = ui.button(words("export.stop"), icon="stop", on_click=lambda job=job: self._stop(job))
                         tag(stop.props("outline no-caps"), "stop")
                     # Not read out at every step.
                     where = ui.label("").classes("ps-dim")
-                    bar = ui.linear_progress(0.0, show_value=False, size="12px").props(f'aria-label="{job.title}"')
+                    bar = ui.linear_progress(0.0, show_value=False, size="12px").props(
+                        f'aria-label="{escape(title_of(words, job))}"'
+                    )
                     self._bars[job.id] = (bar, tag(where, "where"))
             if last is not None:
                 bad = last.state == REFUSED
-                said = last.said if bad else words("export.stopped", title=last.title)
+                said = last.said if bad else words("export.stopped", title=title_of(words, last))
                 row = ui.row().classes(f"ps-said ps-said-{'error' if bad else 'warning'} w-full items-center no-wrap")
                 with tag(row.props(f'role="{"alert" if bad else "status"}"'), "ended"):
                     ui.label(said).classes("flex-grow").style("overflow-wrap: anywhere")

@@ -46,6 +46,7 @@ class _Publishing:
             tag(text(words("publish.missing_publish"), classes="ps-said ps-said-error w-full"), "missing-publish")
         await self._form()
         self.work = WorkShown(self.page, _TASKS, self._said, self._ended, self._allow)
+        self._allow()
         self.packages = Packages(self.page, self.work, self.lacking)
         await self.packages.build(self.asked.get("name", ""))
 
@@ -160,7 +161,7 @@ class _Publishing:
                 "columns": [name for name, box in self._columns.items() if box.value],
                 "key": str(self._key_place()) if self._keep.value else "",
             }
-            await self.work.start("publish", spec, self.words("publish.doing", name=place.name))
+            await self.work.start("publish", spec)
 
     def _key_place(self) -> Path:
         """The key's file: a new one, or one of before."""
@@ -180,7 +181,7 @@ class _Publishing:
             kept = self.house.inside(there) if one_of_before else self.house.new(KEYS, key)
             spec = {"dataset": str(self.house.inside(found.path)), "place": str(place), "key": str(kept)}
             spec |= {"words": words, "drop_notes": drop_notes}  # type: ignore[dict-item]
-            await self.work.start("pseudonymise", spec, self.words("publish.renaming", name=name))
+            await self.work.start("pseudonymise", spec)
 
     # What runs ------------------------------------------------------------------------------------------------
 

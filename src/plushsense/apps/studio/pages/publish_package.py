@@ -126,7 +126,7 @@ class Packages:
         self.page.say("")
         with self.page.refusing():
             spec = {"place": str(self.house.inside(found.place)), "thorough": bool(self._thorough.value)}
-            await self.work.start("validate", spec, self.words("publish.checking", name=found.name))
+            await self.work.start("validate", spec)
 
     def _contents(self, found: PackageFacts) -> None:
         words = self.words

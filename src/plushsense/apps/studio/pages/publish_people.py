@@ -37,7 +37,7 @@ class Statements:
         ]
         said = words("publish.lacks", what=", ".join(lacking)) if lacking else words("publish.lacks_nothing")
         tag(text(said), "lacks")
-        known = {each.spdx: f"{each.spdx}: {each.title}" for each in LICENCES.values()}
+        known = {s: s if s == each.title else f"{s}: {each.title}" for s, each in LICENCES.items()}
         value = found.licence or last.get("licence") or None
         if value is not None and value not in known:
             # One that the library will refuse stays to be seen.
