@@ -31,7 +31,7 @@ _STYLE = """
 .ps-steps { margin: 0; padding-left: 1.4rem; list-style: decimal; } .ps-steps li { margin-bottom: 4px; }
 .ps-work { position: sticky; top: 84px; z-index: 10; background: #fff; }
 body.body--dark .ps-work { background: #121212; }
-body.body--dark .q-btn--outline { color: #9ccbff !important; }
+body.body--dark .q-btn--outline { --q-primary: #9ccbff; }
 [data-test] { scroll-margin-top: 100px; }
 """
 _RECENT_S = 900.0
