@@ -25,6 +25,7 @@ from plushsense.apps.studio.pages.export_shown import (
     style,
     table,
     text,
+    titles,
 )
 from plushsense.apps.studio.shell import Page, tag
 from plushsense.deploy.convert import CONVERTERS
@@ -101,9 +102,7 @@ class _Exporting:
             missing = ", ".join(n for n, lacks in lacking.items() if lacks == extra)
             text(words("export.format_missing", names=missing, extra=extra), classes="ps-dim")
         text(words("export.calibrate"), "h3")
-        options = {"": words("export.calibrate_kept")} | {
-            str(p): self.house.title(p) for p in await run.io_bound(self.house.datasets) or []
-        }
+        options = {"": words("export.calibrate_kept")} | await titles(self.house)
         self._dataset = ui.select(options, value="", label=words("export.calibrate_on")).classes("w-full")
 
     async def _choose(self, path: str) -> None:
@@ -134,11 +133,12 @@ class _Exporting:
 
     def _facts_of(self, found: BundleFacts) -> list[tuple[str, str]]:
         words, scores = self.words, found.scores
+        trained = words("export.trained_value", dataset=found.dataset, people=found.people)
         rows = [
             (words("export.network"), words("export.network_value", title=found.title, padding=found.padding)),
             (words("export.gestures"), str(len(found.gestures))),
             (words("export.layout"), found.layout),
-            (words("export.trained_on"), words("export.trained_value", dataset=found.dataset, people=found.people)),
+            (words("export.trained_on"), trained if found.dataset else words("export.not_told")),
             (words("export.adapted_to"), found.adapted_to),
             (words("export.size"), size(found.bytes)),
         ]

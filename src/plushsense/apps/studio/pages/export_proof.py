@@ -8,7 +8,7 @@ from nicegui import run, ui
 
 from plushsense.apps.studio.exports import ExportFacts, newest, targets
 from plushsense.apps.studio.jobs import Job, Jobs
-from plushsense.apps.studio.pages.export_shown import Cell, WorkShown, moment, table, text, verdict
+from plushsense.apps.studio.pages.export_shown import Cell, WorkShown, moment, table, text, titles, verdict
 from plushsense.apps.studio.shell import Page, tag
 from plushsense.apps.studio.words import Words
 from plushsense.deploy.targets import TARGETS
@@ -46,9 +46,7 @@ class Proof:
                     said = words("export.target_missing", target=self._title(name), packages=" ".join(lacks))
                     tag(text(said, classes="ps-dim"), f"missing-{name}")
             with ui.expansion(words("export.more")).classes("w-full"):
-                options = {"": words("export.recorded_none")} | {
-                    str(p): self.page.house.title(p) for p in await run.io_bound(self.page.house.datasets) or []
-                }
+                options = {"": words("export.recorded_none")} | await titles(self.page.house)
                 self._dataset = ui.select(options, value="", label=words("export.recorded")).classes("w-full")
                 self._faults = tag(ui.checkbox(words("export.faults")), "faults")
             button = ui.button(words("export.verify"), icon="fact_check", on_click=self._start).props("no-caps")

@@ -10,6 +10,7 @@ from typing import Any
 
 from nicegui import run, ui
 
+from plushsense.apps.studio.house import House
 from plushsense.apps.studio.jobs import DONE, REFUSED, RUNNING, Job, Jobs
 from plushsense.apps.studio.shell import Page, on_ring, tag
 from plushsense.apps.studio.words import Words
@@ -32,6 +33,7 @@ _STYLE = """
 .ps-work { position: sticky; top: 84px; z-index: 10; background: #fff; }
 body.body--dark .ps-work { background: #121212; }
 body.body--dark .q-btn--outline { --q-primary: #9ccbff; }
+@media (max-width: 1023px) { .ps-work { top: 140px; } }
 [data-test] { scroll-margin-top: 100px; }
 """
 _RECENT_S = 900.0
@@ -121,6 +123,11 @@ def size(count: int) -> str:
 def title_of(words: Words, job: Job) -> str:
     """What a job does, in the language of whoever looks, which need not be that of who began it."""
     return words(_TITLES[job.task], name=Path(job.spec["place"]).name)
+
+
+async def titles(house: House) -> dict[str, str]:
+    """The data sets to choose from: path to name."""
+    return await run.io_bound(lambda: {str(p): f"{house.title(p)} ({p.name})" for p in house.datasets()}) or {}
 
 
 class WorkShown:

@@ -9,7 +9,7 @@ from nicegui import context, run, ui
 from plushsense.apps.studio.house import DATASETS, PACKAGES
 from plushsense.apps.studio.jobs import Job
 from plushsense.apps.studio.packages import KEYS, DatasetFacts, missing_extras
-from plushsense.apps.studio.pages.export_shown import WorkShown, facts, scroll_to, style, text
+from plushsense.apps.studio.pages.export_shown import WorkShown, facts, scroll_to, style, text, titles
 from plushsense.apps.studio.pages.publish_package import Packages
 from plushsense.apps.studio.pages.publish_people import Pseudonyms, Statements
 from plushsense.apps.studio.shell import Page, tag
@@ -54,17 +54,16 @@ class _Publishing:
 
     async def _form(self) -> None:
         words = self.words
-        found = await run.io_bound(self.house.datasets) or []
+        found = await titles(self.house)
         with tag(ui.column().classes("ps-card w-full"), "new"):
             text(words("publish.new"), "h2")
             if not found:
                 tag(text(words("publish.no_dataset")), "no-dataset")
                 return
-            titles = await run.io_bound(lambda: {str(p): f"{self.house.title(p)} ({p.name})" for p in found}) or {}
             wanted = self.asked.get("dataset", "")
-            first = wanted if wanted in titles else str(found[0])
+            first = wanted if wanted in found else next(iter(found))
             chosen = ui.select(
-                titles, value=first, label=words("publish.dataset"), on_change=lambda e: self._choose(e.value)
+                found, value=first, label=words("publish.dataset"), on_change=lambda e: self._choose(e.value)
             )
             tag(chosen.classes("w-full"), "dataset")
             self._rest = ui.column().classes("w-full")
