@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import sys
@@ -125,6 +126,23 @@ def test_pseudonyms_refusals_and_stop(studio: Fixture, look: Fixture, shots: Fix
     connected(page)
     assert "There is no package 'nothing'" in marked(page, "said").inner_text()
     assert browser.complaints == []
+
+
+def test_missing_extras_are_named(
+    studio: Fixture, look: Fixture, few: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # As where they were never installed.
+    (tmp_path / "without").mkdir()
+    (tmp_path / "without" / "sitecustomize.py").write_text(
+        "import sys\nsys.modules['mlcroissant'] = sys.modules['sklearn'] = None\n", "utf-8"
+    )
+    before = os.environ.get("PYTHONPATH")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path / "without"), *([before] if before else [])]))
+    page = look().open(f"{studio(home=few).url}/publish")
+    assert "pip install 'plushsense[publish]'" in marked(page, "missing-publish").inner_text()
+    assert "pip install 'plushsense[baselines]'" in marked(page, "missing-baselines").inner_text()
+    assert marked(page, "do").is_disabled()
+    assert axe(page) == []
 
 
 def test_without_a_data_set(studio: Fixture, look: Fixture) -> None:
