@@ -8,11 +8,12 @@ from urllib.parse import quote
 
 from nicegui import context, run, ui
 
-from plushsense.apps.studio.downloads import address, below
+from plushsense.apps.studio.downloads import below
 from plushsense.apps.studio.exports import BundleFacts, ExportFacts, exports_of, formats, newest
 from plushsense.apps.studio.house import EXPORTS
 from plushsense.apps.studio.jobs import Job, Jobs
 from plushsense.apps.studio.pages.export_cost import show_cost
+from plushsense.apps.studio.pages.export_one import show_facts, show_next
 from plushsense.apps.studio.pages.export_proof import Proof, state_of
 from plushsense.apps.studio.pages.export_shown import (
     Cell,
@@ -29,7 +30,6 @@ from plushsense.apps.studio.pages.export_shown import (
 )
 from plushsense.apps.studio.shell import Page, tag
 from plushsense.deploy.convert import CONVERTERS
-from plushsense.deploy.package import ARDUINO, IDF, IDF_EXAMPLE, SKETCH
 
 _TASKS = ("export", "profile", "verify")
 
@@ -212,54 +212,14 @@ class _Exporting:
                 if found.problem:
                     text(found.problem, classes="ps-said ps-said-error w-full")
                     return
-                self._whole(
-                    found, made if made and made.result.get("profile", {}).get("digest") == found.digest else None
+                show_facts(
+                    self.page,
+                    found,
+                    made if made and made.result.get("profile", {}).get("digest") == found.digest else None,
                 )
                 show_cost(self.page, self.work, found, counted)
                 await Proof(self.page, self.work, found).build()
-                self._next(found)
-
-    def _whole(self, found: ExportFacts, made: Job | None) -> None:
-        words, told = self.words, found.facts
-        with tag(ui.column().classes("ps-card w-full"), "export-facts"):
-            if told.get("simulated"):
-                text(words("shell.simulation"), classes="ps-said ps-said-warning w-full")
-            for warning in made.warnings if made else ():
-                text(warning, classes="ps-said ps-said-warning w-full")
-            facts(
-                [
-                    (words("export.network"), str(told["title"])),
-                    (words("export.gestures"), str(told["classes"])),
-                    (words("export.layout"), str(told.get("layout", ""))),
-                    (words("export.flash"), words("export.flash_value", n=f"{found.flash_bytes:,}")),
-                    (words("export.ram"), words("export.ram_value", n=f"{found.ram_bytes:,}")),
-                    (
-                        words("export.step"),
-                        words("export.step_value", ms=f"{told['step_ms']:g}", macs=f"{told['macs_per_step']:,}"),
-                    ),
-                    (words("export.made"), moment(found.made_s)),
-                    (words("export.place"), str(found.folder)),
-                ]
-            )
-            for name, each in told.get("conversions", {}).items():
-                apart = each.get("largest_difference")
-                said = words("export.converted", file=each["file"], n=f"{each['bytes']:,}", name=name)
-                text(said if apart is None else f"{said} {words('export.apart', d=f'{apart:.1g}')}")
-            with ui.expansion(words("export.files", n=len(found.files), size=size(sum(found.files.values())))) as files:
-                rows = [(name, f"{bytes_:,}") for name, bytes_ in found.files.items()]
-                table(words("export.files_caption"), (words("export.file"), words("export.bytes")), rows, (1,))
-            tag(files.classes("w-full"), "files")
-            down = ui.link(words("export.download"), address(EXPORTS, found.name)).classes("ps-link")
-            tag(down.props("download"), "download")
-
-    def _next(self, found: ExportFacts) -> None:
-        words = self.words
-        with tag(ui.column().classes("ps-card w-full"), "next"):
-            text(words("export.next"), "h3")
-            with ui.element("ol").classes("ps-steps"):
-                for key in ("arduino", "idf", "plain", "read"):
-                    said = words(f"export.next_{key}", arduino=ARDUINO, sketch=SKETCH, idf=IDF, example=IDF_EXAMPLE)
-                    text(said, "li")
+                show_next(self.page)
 
     # All of them ----------------------------------------------------------------------------------------------
 
