@@ -98,7 +98,7 @@ def test_export_verify_and_break(
     assert sideways(tablet) == 0 and axe(tablet) == []
     shots(tablet, "export-lv-dark-tablet")
     marked(tablet, "stop").click()
-    marked(page, "ended").wait_for()
+    marked(page, "ended").wait_for(timeout=60_000)
     assert "Stopped: Verify 'one'" in marked(page, "ended").inner_text()
     assert browser.complaints == [] and other.complaints == []
 
@@ -115,6 +115,7 @@ def test_each_refusal_is_a_sentence(studio: Fixture, look: Fixture, shots: Fixtu
     assert "train 5d1_4d3 with --padding stream" in marked(page, "bundle-cannot").inner_text()
     marked(page, "name").fill("mirror")
     marked(page, "do").click()
+    marked(page, "ended").wait_for(timeout=90_000)
     assert "train 5d1_4d3 with --padding stream" in marked(page, "ended").inner_text()
     assert marked(page, "ended").get_attribute("role") == "alert"
     assert not (home / "exports" / "mirror").exists()
@@ -138,7 +139,7 @@ def test_each_refusal_is_a_sentence(studio: Fixture, look: Fixture, shots: Fixtu
     (home / "exports").write_text("")
     marked(page, "name").fill("nowhere")
     marked(page, "do").click()
-    page.get_by_text("cannot be written").wait_for()
+    page.get_by_text("cannot be written").wait_for(timeout=90_000)
     page.goto(f"{url}/export?name=nothing")
     connected(page)
     marked(page, "detail").get_by_text("There is no export").wait_for()
