@@ -103,7 +103,8 @@ class Look:
 def connected(page: Page) -> None:
     """Wait until the page has its connection: what is pressed before is lost."""
     page.wait_for_function(
-        "() => window.socket && window.socket.connected && !document.querySelector('#popup[aria-hidden=\"false\"]')"
+        "() => window.socket && window.socket.connected && window.did_handshake "
+        "&& !document.querySelector('#popup[aria-hidden=\"false\"]')"
     )
     page.wait_for_selector("h1")
 

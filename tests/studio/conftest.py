@@ -114,3 +114,17 @@ def furniture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def home(furniture: Path, tmp_path: Path) -> Path:
     """A furnished folder of one's own."""
     return Path(shutil.copytree(furniture, tmp_path / "home"))
+
+
+@pytest.fixture
+def few(furniture: Path, tmp_path: Path) -> Path:
+    """A home of one's own with a data set of three virtual people and nine recordings, quick to publish."""
+    dataset = tmp_path / "home" / "datasets" / "virtual"
+    shutil.copytree(furniture / "datasets" / "virtual", dataset)
+    for folder in (dataset / "streams", dataset / "cache", dataset / "evaluations"):
+        shutil.rmtree(folder, ignore_errors=True)
+    (dataset / "index.json").unlink()
+    for person in (dataset / "recordings").iterdir():
+        for extra in sorted(person.rglob("*.csv"))[3 if person.name in ("P01", "P02", "P03") else 0 :]:
+            extra.unlink()
+    return tmp_path / "home"

@@ -93,7 +93,13 @@ def publish_dataset(
         tell=tell,
     )
     if save:
-        save_head(dataset, head)
+        try:
+            save_head(dataset, head)
+        except OSError as cause:
+            # The package stands: that is no reason to say that it was refused.
+            done.warnings.append(
+                f"licence, contact and consent could not be written into '{dataset.path}': {cause.strerror or cause}"
+            )
     return done
 
 

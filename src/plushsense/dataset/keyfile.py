@@ -43,6 +43,11 @@ class Pseudonym:
         return self.shift_s * 1000
 
 
+def is_drawn(code: str) -> bool:
+    """Whether a person's code looks like one that was drawn here, and not like one that somebody thought of."""
+    return len(code) == 5 and code[0] == "S" and all(sign in _SIGNS for sign in code[1:])
+
+
 def read_key(path: Path) -> dict[str, Pseudonym]:
     """The pseudonyms of a key file by original; none where there is no such file.
 

@@ -57,12 +57,14 @@ def run(
     os.environ.pop("NICEGUI_REDIS_URL", None)
     from nicegui import app, ui
 
+    from plushsense.apps.studio.downloads import router
     from plushsense.apps.studio.shell import PAGES
 
     alone = _alone(house)
     port = _free_port(host, port)
     for name, path in PAGES.items():
         ui.page(path, response_timeout=30.0)(_page(house, name))
+    app.include_router(router(house))
     everywhere = host in _EVERYWHERE
     if everywhere:
         names = (*names, socket.gethostname(), *_addresses())

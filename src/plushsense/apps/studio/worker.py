@@ -28,6 +28,9 @@ TASKS = {
     "export": "plushsense.apps.studio.tasks.export",
     "verify": "plushsense.apps.studio.tasks.verify",
     "simulate": "plushsense.apps.studio.tasks.simulating",
+    "profile": "plushsense.apps.studio.tasks.profile",
+    "validate": "plushsense.apps.studio.tasks.validate",
+    "pseudonymise": "plushsense.apps.studio.tasks.pseudonymise",
 }
 """Task to the module with its ``run(spec, tell) -> result``, plain values all; ``tell`` is a `Tell`."""
 

@@ -1,0 +1,152 @@
+"""The export page in a real browser: the same files as the command's, the verifier's answers, every refusal."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from browsing import TABLET, axe, connected, marked
+from exported import bundle_of, flip, sums
+
+Fixture = Callable[..., Any]
+
+
+def only(page: Any, target: str) -> None:
+    """Of the machines that can be compiled for here, this one."""
+    for name in {"host", "xtensa", "cortex-m4", "cortex-m0", "riscv32"} - {target}:
+        if marked(page, f"target-{name}").count():
+            marked(page, f"target-{name}").click()
+
+
+def sideways(page: Any) -> int:
+    """By how many pixels the page is wider than its window."""
+    return int(page.evaluate("() => document.documentElement.scrollWidth - document.documentElement.clientWidth"))
+
+
+def test_export_verify_and_break(
+    studio: Fixture, look: Fixture, shots: Fixture, home: Path, target_here: Fixture, tmp_path: Path
+) -> None:
+    target_here("host"), target_here("cortex-m4")
+    url = studio(home=home).url
+    browser = look()
+    page = browser.open(f"{url}/export")
+    assert "Simulation" in marked(page, "new").inner_text() and "of virtual people" in marked(page, "new").inner_text()
+    marked(page, "name").fill("one")
+    marked(page, "do").click()
+    marked(page, "export-facts").wait_for(timeout=60_000)
+    command = [sys.executable, "-m", "plushsense.apps.cli.main", "export", str(home / "bundles" / "little.plush")]
+    subprocess.run([*command, str(tmp_path / "two")], check=True, capture_output=True)
+    assert sums(home / "exports" / "one") == sums(tmp_path / "two")
+    assert "8,330 bytes" in marked(page, "export-facts").inner_text()
+    assert "arduino/PlushSense" in marked(page, "next").inner_text()
+    with page.expect_download() as loaded:
+        marked(page, "download").click()
+    with zipfile.ZipFile(io.BytesIO(Path(loaded.value.path()).read_bytes())) as archive:
+        got = {n.removeprefix("one/"): hashlib.sha256(archive.read(n)).hexdigest() for n in archive.namelist()}
+    assert got == sums(tmp_path / "two")
+    for name in ("..", "%2e%2e", "bundles", "one%2fgolden"):
+        with pytest.raises(urllib.error.HTTPError) as refused:
+            urllib.request.urlopen(f"{url}/download/exports/{name}.zip", timeout=20)
+        assert refused.value.code == 404
+
+    only(page, "host")
+    marked(page, "verify").click()
+    marked(page, "verdict").wait_for(timeout=90_000)
+    assert "✓ equal" in marked(page, "verdict").inner_text()
+    assert "sanitizers" in marked(page, "runs").inner_text() and "clang" in marked(page, "runs").inner_text()
+    assert "drill" in marked(page, "streams").inner_text()
+    assert "✓ equal" in marked(page, "exports").inner_text()
+    assert axe(page) == []
+    shots(page, "export-verified")
+
+    flip(home / "exports" / "one" / "plush_model.c")
+    page.reload()
+    connected(page)
+    assert "changed since" in marked(page, "exports").inner_text(), "the old verdict is no longer shown as one"
+    only(page, "cortex-m4")
+    marked(page, "verify").click()
+    page.get_by_text("✗ not equal").first.wait_for(timeout=90_000)
+    said = marked(page, "verdict").inner_text()
+    assert "answers differ" in said and "On cortex-m4" in said and "arduino/PlushSense/src/plush_model.c" in said
+    assert axe(page) == []
+    shots(page, "export-broken")
+
+    # What takes minutes is still there after a reload, for another browser too, and can be stopped.
+    only(page, "cortex-m4")
+    marked(page, "proof").get_by_text("More choices").click()
+    marked(page, "faults").click()
+    flip(home / "exports" / "one" / "plush_model.c")
+    marked(page, "verify").click()
+    marked(page, "stop").wait_for()
+    page.reload()
+    connected(page)
+    assert "Verify 'one'" in marked(page, "work").inner_text()
+    other = look(TABLET, dark=True, language="lv", touch=True)
+    tablet = other.open(f"{url}/export?name=one")
+    assert "Pārbaude: “one”" in marked(tablet, "work").inner_text()
+    assert sideways(tablet) == 0 and axe(tablet) == []
+    shots(tablet, "export-lv-dark-tablet")
+    marked(tablet, "stop").click()
+    marked(page, "ended").wait_for(timeout=60_000)
+    assert "Stopped: Verify 'one'" in marked(page, "ended").inner_text()
+    assert browser.complaints == [] and other.complaints == []
+
+
+def test_each_refusal_is_a_sentence(studio: Fixture, look: Fixture, shots: Fixture, tmp_path: Path) -> None:
+    home = tmp_path / "home"
+    bundle_of(padding="mirror").save(home / "bundles" / "mirror.plush")
+    bundle_of().save(home / "bundles" / "fine.plush")
+    (home / "bundles" / "broken.plush").write_bytes((home / "bundles" / "fine.plush").read_bytes()[:-9])
+    (home / "exports" / "taken").mkdir(parents=True)
+    url = studio(home=home).url
+    browser = look()
+    page = browser.open(f"{url}/export?bundle={home / 'bundles' / 'mirror.plush'}")
+    assert "train 5d1_4d3 with --padding stream" in marked(page, "bundle-cannot").inner_text()
+    marked(page, "name").fill("mirror")
+    marked(page, "do").click()
+    marked(page, "ended").wait_for(timeout=90_000)
+    assert "train 5d1_4d3 with --padding stream" in marked(page, "ended").inner_text()
+    assert marked(page, "ended").get_attribute("role") == "alert"
+    assert not (home / "exports" / "mirror").exists()
+    assert axe(page) == []
+    shots(page, "export-refused")
+
+    page.goto(f"{url}/export?bundle={home / 'bundles' / 'broken.plush'}")
+    connected(page)
+    assert "bytes are missing at its end" in marked(page, "bundle-problem").inner_text()
+    assert marked(page, "do").is_disabled()
+    page.goto(f"{url}/export?bundle={home / 'bundles' / 'fine.plush'}")
+    connected(page)
+    for name, said in (("taken", "is there already"), ("../out", "cannot be a name"), ("", "cannot be a name")):
+        marked(page, "name").fill(name)
+        marked(page, "do").click()
+        marked(page, "said").get_by_text(said).wait_for()
+        marked(page, "said").get_by_role("button").click()
+    # A home that cannot be written to, for root too.
+    (home / "exports" / "taken").rmdir()
+    (home / "exports").rmdir()
+    (home / "exports").write_text("")
+    marked(page, "name").fill("nowhere")
+    marked(page, "do").click()
+    page.get_by_text("cannot be written").wait_for(timeout=90_000)
+    page.goto(f"{url}/export?name=nothing")
+    connected(page)
+    marked(page, "detail").get_by_text("There is no export").wait_for()
+    assert browser.complaints == []
+
+
+def test_an_empty_studio_says_what_to_do(studio: Fixture, look: Fixture) -> None:
+    page = look(dark=True).open(f"{studio().url}/export")
+    assert "train one first" in marked(page, "no-bundle").inner_text()
+    assert axe(page) == []

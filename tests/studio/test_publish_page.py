@@ -1,0 +1,151 @@
+"""The publish page in a real browser: the same package as the command's, the validators' answers, every refusal."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from browsing import TABLET, axe, connected, marked
+from plushsense.dataset.publish.checking import VALIDATORS
+
+Fixture = Callable[..., Any]
+pytestmark = pytest.mark.usefixtures("publish_tools")
+
+
+def test_publish_check_and_break(studio: Fixture, look: Fixture, shots: Fixture, few: Path, tmp_path: Path) -> None:
+    url = studio(home=few).url
+    browser = look()
+    page = browser.open(f"{url}/publish")
+    assert "Nothing is uploaded" in marked(page, "danger").inner_text()
+    assert "does not say yet: contact" in marked(page, "lacks").inner_text()
+    marked(page, "do").click()
+    assert "cannot be published without licence, contact and consent" in marked(page, "said").inner_text()
+    assert axe(page) == []
+    marked(page, "contact-name").fill("Ada")
+    marked(page, "contact-mail").fill("nonsense")
+    marked(page, "do").click()
+    marked(page, "said").get_by_text("cannot be used").wait_for()
+    marked(page, "contact-mail").fill("ada@example.org")
+    marked(page, "with-key").click()
+    marked(page, "name").fill("one")
+    marked(page, "do").click()
+    # What runs is there again after a reload.
+    marked(page, "stop").wait_for()
+    page.reload()
+    connected(page)
+    marked(page, "validators").wait_for(timeout=90_000)
+    answers = marked(page, "validators").inner_text()
+    assert all(name in answers for name in VALIDATORS) and answers.count("✓ passed") == len(VALIDATORS)
+    assert "names the right one of 3 people" in marked(page, "recognised").inner_text()
+    assert "virtual people" in marked(page, "recognised").inner_text()
+    assert "Ada (" in marked(page, "citation").inner_text()
+    assert axe(page) == []
+    shots(page, "publish-done")
+    key, made = few / "keys" / "virtual.key", few / "packages" / "one.zip"
+    command = [sys.executable, "-m", "plushsense.apps.cli.main", "publish", str(few / "datasets" / "virtual")]
+    said = ("--contact", "Ada <ada@example.org>", "--key", str(key))
+    subprocess.run([*command, str(tmp_path / "two"), *said], check=True, capture_output=True)
+    assert made.read_bytes() == (tmp_path / "two.zip").read_bytes(), "the command makes the same package, byte for byte"
+    with page.expect_download() as loaded:
+        marked(page, "download").click()
+    assert Path(loaded.value.path()).read_bytes() == made.read_bytes()
+
+    # Taken names, also that of a zip alone; then a package that somebody changed.
+    for name, taken in (("one", "is there already"), ("two", "is there already")):
+        shutil.copy(made, few / "packages" / "two.zip")
+        marked(page, "name").fill(name)
+        marked(page, "do").click()
+        marked(page, "said").get_by_text(taken).wait_for()
+        marked(page, "said").get_by_role("button").click()
+    made.unlink()
+    (few / "packages" / "one" / "gestures.csv").write_text("Shake\n", "utf-8")
+    other = look(TABLET, dark=True, language="lv", touch=True)
+    tablet = other.open(f"{url}/publish?name=one")
+    marked(tablet, "check").click()
+    marked(tablet, "problems").wait_for(timeout=90_000)
+    assert "✗ nederīga" in marked(tablet, "answers").inner_text()
+    assert "gestures.csv" in marked(tablet, "problems").inner_text()
+    assert axe(tablet) == []
+    assert tablet.evaluate("() => document.documentElement.scrollWidth - document.documentElement.clientWidth") == 0
+    shots(tablet, "publish-lv-dark-tablet")
+    assert browser.complaints == [] and other.complaints == []
+
+
+def test_pseudonyms_refusals_and_stop(studio: Fixture, look: Fixture, shots: Fixture, few: Path) -> None:
+    head = few / "datasets" / "virtual" / "dataset.toml"
+    silent = head.read_text("utf-8").replace('consent = "nobody: a simulation"', 'consent = ""')
+    head.write_text(silent.replace('licence = "MIT"', 'licence = ""'), "utf-8")
+    url = studio(home=few).url
+    browser = look()
+    page = browser.open(f"{url}/publish")
+    assert "licence, contact, consent statement" in marked(page, "lacks").inner_text()
+    marked(page, "do").click()
+    assert "consent = " in marked(page, "said").inner_text()
+    marked(page, "rename").get_by_text("Make a copy under pseudonyms").click()
+    marked(page, "rename-name").fill("shared")
+    marked(page, "rename-key").fill("../people.csv")
+    marked(page, "rename-do").click()
+    marked(page, "said").get_by_text("cannot be a name").wait_for()
+    marked(page, "rename-key").fill("people.csv")
+    assert axe(page) == []
+    shots(page, "publish-pseudonyms")
+    marked(page, "rename-do").click()
+    marked(page, "go-renamed").wait_for(timeout=60_000)
+    assert (few / "keys" / "people.csv").is_file() and not list((few / "datasets" / "shared").rglob("people.csv"))
+    marked(page, "go-renamed").click()
+    marked(page, "renamed-already").wait_for()
+
+    marked(page, "licence").click()
+    page.get_by_role("option", name="CC-BY-4.0: ").click()
+    marked(page, "contact-name").fill("Ada")
+    marked(page, "contact-mail").fill("ada@example.org")
+    marked(page, "consent").fill("all agreed")
+    marked(page, "name").fill("stopped")
+    marked(page, "do").click()
+    marked(page, "stop").click()
+    marked(page, "ended").get_by_text("Stopped").wait_for(timeout=60_000)
+    assert not (few / "packages" / "stopped.zip").exists()
+    # What was said is still there, and the disk's refusal is a sentence.
+    shutil.rmtree(few / "packages", ignore_errors=True)
+    (few / "packages").write_text("")
+    page.reload()
+    connected(page)
+    assert marked(page, "contact-mail").input_value() == "ada@example.org"
+    marked(page, "with-reidentification").click()
+    marked(page, "do").click()
+    marked(page, "ended").get_by_text("cannot be made").wait_for(timeout=60_000)
+    page.goto(f"{url}/publish?name=nothing")
+    connected(page)
+    assert "There is no package 'nothing'" in marked(page, "said").inner_text()
+    assert browser.complaints == []
+
+
+def test_missing_extras_are_named(
+    studio: Fixture, look: Fixture, few: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # As where they were never installed.
+    (tmp_path / "without").mkdir()
+    (tmp_path / "without" / "sitecustomize.py").write_text(
+        "import sys\nsys.modules['mlcroissant'] = sys.modules['sklearn'] = None\n", "utf-8"
+    )
+    before = os.environ.get("PYTHONPATH")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path / "without"), *([before] if before else [])]))
+    page = look().open(f"{studio(home=few).url}/publish")
+    assert "pip install 'plushsense[publish]'" in marked(page, "missing-publish").inner_text()
+    assert "pip install 'plushsense[baselines]'" in marked(page, "missing-baselines").inner_text()
+    assert marked(page, "do").is_disabled()
+    assert axe(page) == []
+
+
+def test_without_a_data_set(studio: Fixture, look: Fixture) -> None:
+    page = look(dark=True).open(f"{studio().url}/publish")
+    assert "record or import one first" in marked(page, "no-dataset").inner_text()
+    assert axe(page) == []
