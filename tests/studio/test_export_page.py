@@ -111,7 +111,7 @@ def test_each_refusal_is_a_sentence(studio: Fixture, look: Fixture, shots: Fixtu
     (home / "exports" / "taken").mkdir(parents=True)
     url = studio(home=home).url
     browser = look()
-    page = browser.open(f"{url}/export?bundle={home / 'bundles' / 'mirror.plush'}")
+    page = browser.open(f"{url}/export?model={home / 'bundles' / 'mirror.plush'}")
     assert "train 5d1_4d3 with --padding stream" in marked(page, "bundle-cannot").inner_text()
     marked(page, "name").fill("mirror")
     marked(page, "do").click()
@@ -122,11 +122,11 @@ def test_each_refusal_is_a_sentence(studio: Fixture, look: Fixture, shots: Fixtu
     assert axe(page) == []
     shots(page, "export-refused")
 
-    page.goto(f"{url}/export?bundle={home / 'bundles' / 'broken.plush'}")
+    page.goto(f"{url}/export?model={home / 'bundles' / 'broken.plush'}")
     connected(page)
     assert "bytes are missing at its end" in marked(page, "bundle-problem").inner_text()
     assert marked(page, "do").is_disabled()
-    page.goto(f"{url}/export?bundle={home / 'bundles' / 'fine.plush'}")
+    page.goto(f"{url}/export?model={home / 'bundles' / 'fine.plush'}")
     connected(page)
     for name, said in (("taken", "is there already"), ("../out", "cannot be a name"), ("", "cannot be a name")):
         marked(page, "name").fill(name)

@@ -35,7 +35,7 @@ _TASKS = ("export", "profile", "verify")
 
 
 async def show(page: Page) -> None:
-    """Build the page. ``?bundle=PATH`` chooses a bundle, ``?name=NAME`` opens an export."""
+    """Build the page. ``?model=PATH`` chooses a bundle, ``?name=NAME`` opens an export."""
     await _Exporting(page).build()
 
 
@@ -72,7 +72,7 @@ class _Exporting:
                 ui.link(words("pages.train"), "/train").classes("ps-link")
                 return
             named = {str(p): self._named(p) for p in bundles}
-            wanted = self.asked.get("bundle", "")
+            wanted = self.asked.get("model", "")
             first = wanted if wanted in named else str(bundles[0])
             choice = ui.select(
                 named, value=first, label=words("export.bundle"), on_change=lambda e: self._choose(e.value)

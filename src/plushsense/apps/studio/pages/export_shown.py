@@ -32,7 +32,6 @@ _STYLE = """
 .ps-steps { margin: 0; padding-left: 1.4rem; list-style: decimal; } .ps-steps li { margin-bottom: 4px; }
 .ps-work { position: sticky; top: 84px; z-index: 10; background: #fff; }
 body.body--dark .ps-work { background: #121212; }
-body.body--dark .q-btn--outline { --q-primary: #9ccbff; }
 @media (max-width: 1023px) { .ps-work { top: 140px; } }
 [data-test] { scroll-margin-top: 100px; }
 """
@@ -50,8 +49,6 @@ _TITLES = {
 def style() -> None:
     """Once a page."""
     ui.add_css(_STYLE)
-    # White words on NiceGUI's own blue are too faint.
-    ui.colors(primary="#1f5f99")
 
 
 def scroll_to(name: str) -> None:
