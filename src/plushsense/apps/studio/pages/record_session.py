@@ -129,8 +129,8 @@ class _View:
                 on_click(button, partial(self._press, key))
                 self._small[key] = button
             ui.space()
-            end = tag(ui.button(words("record.end"), color=None, on_click=self._ask_end), "end").props("no-caps flat")
-            end.style("min-height: 48px; ")
+            self._end_button = ui.button(words("record.end"), color=None, on_click=self._ask_end)
+            tag(self._end_button, "end").props("no-caps flat").style("min-height: 48px")
         self._ending = tag(ui.row().classes("ps-said ps-said-warning w-full items-center"), "ending")
         with self._ending:
             self._end_text = ui.label().classes("flex-grow")
@@ -293,6 +293,8 @@ class _View:
         self._small["s"].set_visibility(state not in ("finished", "stopped"))
         for key in "rb":
             self._small[key].set_visibility(state != "stopped")
+        # The big button ends it then.
+        self._end_button.set_visibility(state != "finished")
         if state == "finished":
             folder = str(self._sitting.recorder.session.folder.relative_to(self._page.house.folder))
             counts = {"done": s.done, "skipped": s.skipped, "redone": s.redone}

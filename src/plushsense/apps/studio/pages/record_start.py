@@ -17,6 +17,7 @@ from plushsense.devices.listing import list_devices
 from plushsense.recording.beginning import PROTOCOL, Wanted
 from plushsense.recording.protocol import DEFAULT, wordings
 from plushsense.recording.shelf import Shelved
+from plushsense.recording.toy import is_virtual
 
 _LISTED = 8
 _SCAN_S = 3.0
@@ -34,6 +35,11 @@ def protocol_title(words: Words, name: str, title: str) -> str:
     """A protocol's title in the page's language, where it is a built-in one."""
     key = f"record.protocol_{name}"
     return words(key) if words.has(key) else title
+
+
+def toy_name(words: Words, url: str) -> str:
+    """A toy in a list: its address, and a word where it is a virtual one."""
+    return f"{words('record.virtual_toy')} · {url}" if is_virtual(url) else url
 
 
 def unfolding(text: str) -> None:
@@ -113,7 +119,8 @@ def _one_unfinished(page: Page, desk: Desk, session: Shelved) -> None:
             title += f" · {words('record.simulated')}" if session.head.simulated else ""
             ui.label(title).classes("ps-dim")
         toys = list(dict.fromkeys([session.head.device, *desk.toys()]))
-        toy = ui.select(toys, value=toys[0], label=words("record.toy")).classes("w-72")
+        named = {u: toy_name(words, u) for u in toys}
+        toy = ui.select(named, value=toys[0], label=words("record.toy")).style("width: 24rem; max-width: 100%")
         toy.props(f'outlined dense aria-label="{words("record.toy")}: {name}"')
         button = (
             ui.button(words("record.go_on"), color=None)
@@ -156,7 +163,7 @@ class _Form:
                 self._words = self._select({DEFAULT: DEFAULT}, "wording", DEFAULT)
             with ui.row().classes("w-full items-start"):
                 toys = desk.toys()
-                self._toy = self._select({u: u for u in toys}, "toy", toys[0])
+                self._toy = self._select({u: toy_name(words, u) for u in toys}, "toy", toys[0])
                 self._look = ui.button(words("record.look"), color=None, on_click=self._look_for_toys).props(
                     "no-caps outline"
                 )
@@ -185,7 +192,7 @@ class _Form:
         label = self._page.words(f"record.{key}")
         value = value if value in options else next(iter(options))
         field = ui.select(options, value=value, label=label).props(f'outlined aria-label="{label}"')
-        return tag(field, key).classes("w-80")
+        return tag(field, key).style("width: 27rem; max-width: 100%")
 
     def _choose_words(self) -> None:
         """The wordings of this protocol; first the one in the page's language."""
@@ -209,7 +216,9 @@ class _Form:
         if found is None:
             return
         known = dict.fromkeys(self._desk.toys())
-        options = {u: u for u in known} | {d.url: f"{d.name} · {d.url}" for d in found.devices if d.url not in known}
+        options = {u: toy_name(words, u) for u in known} | {
+            d.url: f"{d.name} · {d.url}" for d in found.devices if d.url not in known
+        }
         self._toy.set_options(options, value=self._toy.value)
         self._page.say(" ".join([words("record.found", n=len(options)), *found.notes]))
 
