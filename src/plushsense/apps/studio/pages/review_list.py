@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 from nicegui import ui
 
 from plushsense.apps.studio.pages.review_reason import ask, finding_text
+from plushsense.apps.studio.review_row import Row
 from plushsense.apps.studio.review_table import ReviewTable
-from plushsense.apps.studio.reviewing import Row
 from plushsense.apps.studio.shell import AFFECT_SIGNS, tag
 
 if TYPE_CHECKING:
-    from plushsense.apps.studio.pages.review import Desk
+    from plushsense.apps.studio.pages.review_desk import Desk
 
 PER_PAGE = 50
 _SPARK = 40
