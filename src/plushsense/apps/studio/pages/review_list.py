@@ -100,7 +100,7 @@ class ListView:
         return {
             "id": row.id,
             "person": desk.person(row.info.subject),
-            "gesture": f"{AFFECTS[row.affect]} {words.gesture(row.info.gesture)}",
+            "gesture": f"{AFFECTS[row.affect]}\u00a0{words.gesture(row.info.gesture)}",
             "seconds": f"{row.seconds:.2f} s",
             "findings": findings,
             "state": row.state,
