@@ -13,7 +13,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from browsing import DESK, TABLET, axe, connected, marked
 from plushsense.apps.studio.house import House
-from plushsense.apps.studio.reviewing import Reviews
+from plushsense.apps.studio.reviews import Reviews
 from plushsense.dataset.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks, read_marks
@@ -99,7 +99,8 @@ def test_a_click_moves_the_mark_to_within_a_sample(
     page.keyboard.press("+")
     page.keyboard.press("+")
     page.wait_for_function(
-        "() => { const {min, max} = document.querySelector('[data-test=plot]').psPlot.u.scales.x; return max - min < 1 }"
+        "() => { const {min, max} = document.querySelector('[data-test=plot]').psPlot.u.scales.x;"
+        " return max - min < 1 }"
     )
     start = click(0.341)
     state(page, "draft")

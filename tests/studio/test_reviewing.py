@@ -14,7 +14,8 @@ from plushsense.apps.studio import review_prepared
 from plushsense.apps.studio.house import House
 from plushsense.apps.studio.review_filter import DONE, NO_FINDING, TO_DO, Filter, chosen
 from plushsense.apps.studio.review_shown import ACTIVITY, ALL
-from plushsense.apps.studio.reviewing import Review, Reviews
+from plushsense.apps.studio.reviewing import Review
+from plushsense.apps.studio.reviews import Reviews
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, Standing, append_marks, read_marks

@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, fields
 from typing import Any
 
-from plushsense.apps.studio.reviewing import STATES, Row
+from plushsense.apps.studio.review_row import STATES, Row
 from plushsense.dataset.quality.finding import SEVERITIES
 
 TO_DO, DONE = "todo", "done"

@@ -6,22 +6,30 @@ accepted or dropped, so that a reload or a second tab shows it. Every decision i
 
 from __future__ import annotations
 
-import hashlib
-import json
-import os
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlencode
 
 import numpy as np
 
-from plushsense.apps.studio.house import Bell, House
+from plushsense.apps.studio.house import Bell
 from plushsense.apps.studio.review_prepared import Prepared
+from plushsense.apps.studio.review_row import (
+    ACCEPTED,
+    ADJUSTED,
+    DRAFT,
+    EXCLUDED,
+    LABELLED,
+    LOOKING,
+    NONE,
+    SUGGESTED,
+    Decision,
+    Row,
+    aspect,
+)
 from plushsense.apps.studio.review_shown import Overlay, Signals, curve, overlay, signals
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.dataset import trim
@@ -30,63 +38,13 @@ from plushsense.dataset.index import open_dataset, with_marks
 from plushsense.dataset.marks import SUGGESTED as BY_SUGGESTION
 from plushsense.dataset.marks import FollowedMarks, Mark, Standing, append_marks, taking_back
 from plushsense.dataset.onset import Suggestion
-from plushsense.dataset.quality import deciding
-from plushsense.dataset.quality.finding import SEVERITIES, Finding
-from plushsense.dataset.store import Dataset, RecordingInfo, write_atomically
+from plushsense.dataset.quality.finding import Finding
+from plushsense.dataset.store import Dataset, RecordingInfo
 
-LOOKING, NONE, SUGGESTED, DRAFT = "looking", "none", "suggested", "draft"
-ACCEPTED, ADJUSTED, EXCLUDED, LABELLED = "accepted", "adjusted", "excluded", "labelled"
-STATES = (LOOKING, SUGGESTED, NONE, DRAFT, ACCEPTED, ADJUSTED, EXCLUDED, LABELLED)
-DECIDED = (ACCEPTED, ADJUSTED, EXCLUDED)
 ODD = ("never-stopped", "duration", "no-onset", "several-gestures", "stuck", "flat")
 """Checks whose findings make a recording stand out among the others of its gesture."""
 _SIGNALS_KEPT = 48
-_REVIEWS_KEPT = 3
 _VISITS_KEPT = 50
-_LONGEST_ADDRESS = 1500
-
-
-@dataclass(frozen=True)
-class Row:
-    """One recording as the table shows it. ``open``: findings of errors and warnings that nobody accepted."""
-
-    info: RecordingInfo
-    state: str
-    seconds: float
-    findings: tuple[Finding, ...]
-    confidence: float
-    affect: str
-
-    @property
-    def id(self) -> str:
-        """The recording's."""
-        return self.info.id
-
-    @property
-    def open(self) -> list[Finding]:
-        """Findings that ask for a look."""
-        return [f for f in self.findings if not f.accepted and f.severity != "info"]
-
-    @property
-    def worst(self) -> str:
-        """The severity of the most urgent finding that nobody accepted; "" for none."""
-        return min((f.severity for f in self.findings if not f.accepted), key=SEVERITIES.index, default="")
-
-    @property
-    def done(self) -> bool:
-        """Whether nothing is to be decided any more."""
-        return self.state in DECIDED or (self.state == LABELLED and not self.open)
-
-
-@dataclass(frozen=True)
-class Decision:
-    """One decision of a visit: what stood before, and after it."""
-
-    recording: str
-    action: str
-    before: Standing
-    after: Standing
-    check: str = ""
 
 
 class Review:
@@ -406,7 +364,7 @@ class Review:
                 return None
             self._standing = self._marks.standing()
             last, now = history[-1], self.standing(history[-1].recording)
-            if _aspect(last, now) != _aspect(last, last.after):
+            if aspect(last, now) != aspect(last, last.after):
                 history.pop()
                 raise DatasetError(
                     f"'{last.recording}' was decided anew since, in another window or program: that stays as it is."
@@ -440,86 +398,3 @@ def _reason(why: str) -> str:
     if not why.strip():
         raise ConfigError("This needs a reason: say why, in a few words.")
     return why.strip()
-
-
-def _aspect(decision: Decision, standing: Standing) -> Any:
-    """What a decision is about, of all that stands."""
-    if decision.check:
-        return decision.check in standing.accepted
-    if decision.action in ("exclude", "include"):
-        return standing.excluded
-    return standing.start, standing.stop, standing.how
-
-
-class Reviews:
-    """The data sets under review, and selections of recordings that other pages link to."""
-
-    def __init__(self, house: House) -> None:
-        self._house = house
-        self._lock = threading.Lock()
-        self._opened: OrderedDict[Path, Review] = OrderedDict()
-
-    def open(self, path: str | os.PathLike[str]) -> Review:
-        """The review of a data set, which lies inside the studio's folders; takes its time.
-
-        Raises:
-            ConfigError: for a place outside. DatasetError: for what is no data set, or a broken one.
-        """
-        place = self._house.inside(path)
-        with self._lock:
-            review = self._opened.get(place)
-            if review is None:
-                review = self._opened[place] = Review(place)
-            else:
-                review.renew()
-            self._opened.move_to_end(place)
-            gone = [self._opened.popitem(last=False)[1] for _ in range(len(self._opened) - _REVIEWS_KEPT)]
-        for each in gone:
-            each.close()
-        return review
-
-    def close(self) -> None:
-        """Stop all that goes on in the background."""
-        for review in self._opened.values():
-            review.close()
-
-    @cached_property
-    def _selections(self) -> Path:
-        return self._house.folder / "selections"
-
-    def address(self, dataset: Path, recordings: Sequence[str], title: str = "") -> str:
-        """Where the review page shows just these recordings, for a link.
-
-        A long list is kept in ``<home>/selections/`` by its hash, so that the address stays short and lasts.
-
-        Args:
-            title: what they have in common, said above the table.
-        """
-        said = {"dataset": str(dataset), "recordings": list(recordings), "title": title}
-        short = urlencode([("dataset", str(dataset)), ("title", title), *(("recordings", r) for r in recordings)])
-        if len(short) <= _LONGEST_ADDRESS:
-            return f"/review?{short}"
-        text = json.dumps(said, ensure_ascii=False)
-        key = hashlib.sha256(text.encode()).hexdigest()[:16]
-        self._selections.mkdir(parents=True, exist_ok=True)
-        write_atomically(self._selections / f"{key}.json", text)
-        return f"/review?{urlencode({'dataset': str(dataset), 'selection': key})}"
-
-    def selection(self, key: str) -> tuple[str, list[str]]:
-        """A kept selection: its title and the ids.
-
-        Raises:
-            ConfigError: for a key that is none.
-        """
-        try:
-            if not key.isalnum():
-                raise ValueError
-            said = json.loads((self._selections / f"{key}.json").read_text(encoding="utf-8"))
-            return str(said["title"]), [str(r) for r in said["recordings"]]
-        except (OSError, ValueError, KeyError, TypeError):
-            raise ConfigError(f"There is no selection '{key}' any more: go back to where the link was.") from None
-
-
-def signed(who: str) -> str:
-    """Who decides: the name given, else the login name; ConfigError where there is neither."""
-    return deciding.signed(who.strip() or None)

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 from nicegui import ui
 
 from plushsense.apps.studio.pages.review_reason import ask, finding_text
+from plushsense.apps.studio.review_row import Row
 from plushsense.apps.studio.review_table import ReviewTable
-from plushsense.apps.studio.reviewing import Row
 from plushsense.apps.studio.shell import AFFECT_SIGNS, tag
 
 if TYPE_CHECKING:
-    from plushsense.apps.studio.pages.review import Desk
+    from plushsense.apps.studio.pages.review_desk import Desk
 
 PER_PAGE = 50
 _SPARK = 40
@@ -100,7 +100,7 @@ class ListView:
         return {
             "id": row.id,
             "person": desk.person(row.info.subject),
-            "gesture": f"{AFFECTS[row.affect]} {words.gesture(row.info.gesture)}",
+            "gesture": f"{AFFECTS[row.affect]}\u00a0{words.gesture(row.info.gesture)}",
             "seconds": f"{row.seconds:.2f} s",
             "findings": findings,
             "state": row.state,

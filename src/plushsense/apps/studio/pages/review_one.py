@@ -13,7 +13,7 @@ from plushsense.apps.studio.review_shown import ACTIVITY, ALL
 from plushsense.apps.studio.shell import AFFECT_COLOURS, LINES, tag
 
 if TYPE_CHECKING:
-    from plushsense.apps.studio.pages.review import Desk
+    from plushsense.apps.studio.pages.review_desk import Desk
 
 START, STOP = "start", "stop"
 KEYS = (

@@ -12,7 +12,7 @@ from plushsense.apps.studio.review_shown import Overlay
 from plushsense.apps.studio.shell import LINES, tag
 
 if TYPE_CHECKING:
-    from plushsense.apps.studio.pages.review import Desk
+    from plushsense.apps.studio.pages.review_desk import Desk
 
 _NAMED = 30
 _USUAL = "#8a9099"

@@ -11,7 +11,7 @@ from plushsense.apps.studio.words import Words
 from plushsense.dataset.quality.finding import Finding
 
 if TYPE_CHECKING:
-    from plushsense.apps.studio.pages.review import Desk
+    from plushsense.apps.studio.pages.review_desk import Desk
 
 SEVERITY_SIGNS = {"error": "✖", "warning": "▲", "info": "ℹ"}
 _EXCLUDING = ("wrong", "nothing", "disturbed", "sensor", "twice", "broken_off")
