@@ -35,7 +35,6 @@ _CSS = Path(__file__).parents[1] / "review.css"
 async def show(page: Page) -> None:
     """Build the page."""
     ui.add_css(_CSS.read_text(encoding="utf-8"))
-    ui.colors(primary="#12659e")
     words, request = page.words, context.client.request
     query = request.query_params if request is not None else {}
     asked = {key: str(value) for key, value in query.items()}
