@@ -22,7 +22,15 @@ export default {
       if (this.u && width && width !== this.u.width) this.u.setSize({ width, height: this.height });
     });
     this.resizer.observe(this.$el);
-    this.lights = new MutationObserver(() => this.build());
+    this.dark = document.body.classList.contains("body--dark");
+    this.lights = new MutationObserver(() => {
+      // Other classes come and go with every key.
+      const dark = document.body.classList.contains("body--dark");
+      if (dark !== this.dark) {
+        this.dark = dark;
+        this.build();
+      }
+    });
     this.lights.observe(document.body, { attributes: true, attributeFilter: ["class"] });
     for (const late of this.late || []) late();
     this.late = null;
