@@ -71,6 +71,8 @@ export default {
       document.head.append(css);
     }
     this.stats = window.plushsenseLive = { updates: 0, drawn: 0, drawMs: 0, samples: 0, scenes: 0, delays: [], shown: [] };
+    // Made once: a formatter is dear.
+    this.digits = new Intl.NumberFormat(this.locale, { maximumFractionDigits: 2 });
     this.build();
     this.scene(this.start);
     this.resizer = new ResizeObserver(() => {
@@ -312,6 +314,7 @@ export default {
       const end = this.xs.length ? this.xs[this.xs.length - 1] : 0, begin = end - this.windowS;
       const x = (s) => left + ((s - begin) / this.windowS) * (right - left);
       c.font = "12px sans-serif";
+      c.lineJoin = "bevel";
       c.strokeStyle = k.line;
       c.fillStyle = k.dim;
       c.lineWidth = 1;
@@ -338,7 +341,7 @@ export default {
         if (low > high) return;
         const value = (ys[ys.length - 1] * channel.step - channel.offset) * channel.scale;
         c.fillStyle = k.dim;
-        c.fillText(`${value.toLocaleString(this.locale, { maximumFractionDigits: 2 })} ${channel.unit === "count" ? this.words.unit_count : channel.unit}`, 0, mid + 13);
+        c.fillText(`${this.digits.format(value)} ${channel.unit === "count" ? this.words.unit_count : channel.unit}`, 0, mid + 13);
         // A lane keeps its scale until the signal leaves it or has long been small in it.
         const kept = this.range[i], span = Math.max(high - low, 8);
         if (!kept || low < kept[0] || high > kept[1] || kept[1] - kept[0] > 3 * span) this.range[i] = [low - 0.15 * span, high + 0.15 * span];
