@@ -59,6 +59,7 @@ def test_the_last_seconds_are_kept_as_they_came(house: House) -> None:
     assert (clip.labels, clip.added) == ((), ())
     rows = clips.rows(clip)
     assert len(rows) == clip.rows
+    assert clip.seconds == pytest.approx((rows.device_ms[-1] - rows.device_ms[0]) / 1000.0, abs=0.02)
     assert 9_900 <= rows.device_ms[-1] - rows.device_ms[0] <= 10_000
     # The very rows that the ring held, in the order of the toy's clock.
     assert listening.device is not None
@@ -164,6 +165,18 @@ def test_what_cannot_be_is_refused_in_a_sentence(house: House, virtual: Path, tm
     with pytest.raises(ConfigError, match="No toy is being read"):
         clips.begin(listening, "S01")
     assert clips.keep(listening, 5.0, "S01") == "S01/live-2", "also after the end, while it is on the screen"
+
+
+def test_a_replay_of_a_simulation_stays_one(house: House) -> None:
+    listening, clips = house.part(Listening), house.part(Clips)
+    key = clips.keep(listening, 10.0, "S01")
+    listening.start(
+        Choice(f"replay://{(house.recordings / key).as_posix()}/fulldatastream.csv", listening.choice.bundle)
+    )
+    until(lambda: not listening.now.running)
+    again = clips.get(clips.keep(listening, 5.0, "S02"))
+    assert again.head.device.startswith("replay://")
+    assert again.head.simulated
 
 
 def test_a_full_disk_ends_the_clip_with_a_sentence_and_the_toy_is_read_on(

@@ -54,11 +54,13 @@ class Label:
 
 @dataclass(frozen=True)
 class Clip:
-    """One clip as it lies on disk. ``added``: names of the data sets that have its recordings, all so far."""
+    """One clip as it lies on disk. ``seconds``: by the toy's clock, or by its rate where a crash ended it. ``added``:
+    names of the data sets that have its recordings, all so far."""
 
     folder: Path
     head: SessionHead
     rows: int
+    seconds: float
     labels: tuple[Label, ...] = ()
     added: tuple[str, ...] = ()
 
@@ -126,7 +128,7 @@ class Clips:
             stream = StreamFile(running.session.folder / STREAM_NAME, running.session.layout)
             with contextlib.closing(stream):
                 stream.write([running.intake.take_in(frame).frame for frame in frames])
-                running.session.log.write([_event("close", rows=running.intake.rows, lost=running.intake.lost)])
+                running.session.log.write([_closing(running.intake)])
         except OSError as cause:
             raise _refused(running.session.folder, cause) from None
         finally:
@@ -172,7 +174,7 @@ class Clips:
             running.over = True
             assert running.keeper is not None
             with running.lock:
-                running.keeper.do(_event("close", rows=running.intake.rows, lost=running.intake.lost))
+                running.keeper.do(_closing(running.intake))
             running.keeper.close()
             running.session.close()
             self.failed = running.failed
@@ -267,8 +269,11 @@ class Clips:
             return None
         labels: dict[str, Label] = {}
         added: list[str] = []
+        seconds: float | None = None
         for event in read_events(folder):
             more = event.more
+            if event.what == "close" and isinstance(more.get("seconds"), int | float):
+                seconds = float(more["seconds"])
             if event.what == "take":
                 file, first = str(more.get("file")), _first_row(folder / str(more.get("file")))
                 labels[file] = Label(file, str(more.get("gesture")), first, first + int(more.get("rows") or 0))
@@ -277,7 +282,9 @@ class Clips:
                 added.append(str(more.get("dataset")))
         stream = folder / STREAM_NAME
         rows = stream.read_bytes().count(b"\n") if stream.is_file() else 0
-        return Clip(folder, head, rows, tuple(labels.values()), tuple(added))
+        if seconds is None:
+            seconds = rows / Layout.from_dict(head.layout, f"layout of '{folder}'").rate_hz
+        return Clip(folder, head, rows, seconds, tuple(labels.values()), tuple(added))
 
     def rows(self, clip: Clip) -> Frames:
         """What the toy sent in a clip."""
@@ -339,6 +346,10 @@ class Clips:
             session.log.write([_event("added", dataset=dataset.name, recordings=done.added["recordings"])])
         self.bell.ring()
         return done
+
+
+def _closing(intake: Intake) -> Event:
+    return _event("close", rows=intake.rows, lost=intake.lost, seconds=round(intake.toy_ms / 1000.0, 2))
 
 
 def _first_row(recording: Path) -> int:

@@ -15,15 +15,17 @@ from plushsense.apps.engines import classifier_of
 from plushsense.apps.studio.felt import Choice, Now, Span, Voice
 from plushsense.apps.studio.house import Bell, House
 from plushsense.apps.studio.signals import TappedDevice
-from plushsense.core.errors import ConfigError, PlushSenseError
-from plushsense.devices.opening import open_device
+from plushsense.core.errors import ConfigError, DatasetError, PlushSenseError
+from plushsense.dataset.sources import is_simulation
+from plushsense.devices.opening import open_device, parse_url
 from plushsense.live.decide import DecideSpec
 from plushsense.live.loop import Run
 from plushsense.live.loop import run as run_on
 from plushsense.live.react import Reactor, load_reactions
 from plushsense.live.stream import Decision, Event
 from plushsense.models.bundle import Bundle
-from plushsense.recording.toy import is_virtual, speed_of, with_speed
+from plushsense.recording.sessionfile import SessionHead
+from plushsense.recording.toy import is_virtual, with_speed
 
 KEPT_SPANS = 200
 KEPT_SPAN_S = 600.0
@@ -89,8 +91,7 @@ class Listening:
             except BaseException:
                 device.close()
                 raise
-            simulated = choice.simulated or is_virtual(url) or speed_of(url) != 1.0
-            self.choice = replace(choice, simulated=simulated)
+            self.choice = replace(choice, simulated=choice.simulated or _simulated(url))
             with self._lock:
                 self._spans.clear()
                 self.device, self.bundle, self._next = device, bundle, reader
@@ -320,6 +321,18 @@ def _trouble(device: TappedDevice, before: str) -> str:
             "which the bundle reads: choose a bundle that was made for this toy, and look whether the cable is sound."
         )
     return before
+
+
+def _simulated(url: str) -> bool:
+    """Whether this is the virtual toy, or a recording of one."""
+    address = parse_url(url)
+    if address.scheme != "replay":
+        return is_virtual(url)
+    place = Path(address.place).resolve().parent
+    head = None
+    with contextlib.suppress(DatasetError):
+        head = SessionHead.read(place)
+    return head.simulated if head is not None else is_simulation(place, [])
 
 
 def _classifier(bundle: Bundle, engine: str) -> Any:

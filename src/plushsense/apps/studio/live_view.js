@@ -9,7 +9,7 @@ const el = (tag, cls, text) => {
 };
 const say = (node, text) => { if (node.textContent !== text) node.textContent = text; };
 const fill = (text, values) => text.replace(/\{(\w+)\}/g, (_, key) => values[key]);
-const LANE = 50, SPOKEN_MS = 2500, KEPT_DELAYS = 600;
+const SPOKEN_MS = 2500, KEPT_DELAYS = 600;
 
 const EYES = {
   // Round and lifted; narrowed under slanted brows; closed: told apart by shape as much as by colour.
@@ -71,6 +71,8 @@ export default {
       document.head.append(css);
     }
     this.stats = window.plushsenseLive = { updates: 0, drawn: 0, drawMs: 0, samples: 0, scenes: 0, delays: [], shown: [] };
+    // Made once: a formatter is dear.
+    this.digits = new Intl.NumberFormat(this.locale, { maximumFractionDigits: 2 });
     this.build();
     this.scene(this.start);
     this.resizer = new ResizeObserver(() => {
@@ -151,7 +153,8 @@ export default {
       n.list.dataset.test = "events";
       n.list.setAttribute("tabindex", "0");
       n.list.setAttribute("aria-label", w.events);
-      line.append(n.strip, el("p", "lv-dim", w.gate_mark), n.list);
+      n.mark = el("p", "lv-dim", w.gate_mark);
+      line.append(n.strip, n.mark, n.list);
       this.$el.append(root);
     },
     inks() {
@@ -168,13 +171,14 @@ export default {
         canvas.getContext("2d").setTransform(ratio, 0, 0, ratio, 0, 0);
         return { width, height };
       };
-      this.signalsAt = fit(this.n.signals, Math.max(2, this.channels.length) * LANE + 24);
+      this.signalsAt = fit(this.n.signals, Math.max(2, this.channels.length) * this.lane + 24);
       this.stripAt = fit(this.n.strip, 96);
     },
     scene(s) {
       if (this.gone) return;
       this.stats.scenes++;
       Object.assign(this, { channels: s.channels, classes: s.classes, windowS: s.window, stripS: s.strip, gateRules: s.gate_rules });
+      this.lane = Math.min(140, Math.max(50, Math.round(600 / Math.max(4, s.channels.length))));
       this.xs = [];
       this.ys = this.channels.map(() => []);
       this.range = this.channels.map(() => null);
@@ -185,6 +189,7 @@ export default {
       this.net = null;
       this.names = Object.fromEntries(this.classes.map((c) => [c.label, c.name]));
       this.n.signals.setAttribute("aria-label", fill(this.words.signals_label, { n: this.channels.length, s: s.window }));
+      this.n.mark.hidden = !this.gateRules;
       this.buildBars();
       this.inks();
       this.size();
@@ -308,10 +313,11 @@ export default {
     drawSignals() {
       const { width, height } = this.signalsAt, c = this.n.signals.getContext("2d"), k = this.ink;
       c.clearRect(0, 0, width, height);
-      const left = Math.min(150, width * 0.3), right = width - 4, bottom = this.channels.length * LANE;
+      const left = Math.min(150, width * 0.3), right = width - 4, lane = this.lane, bottom = this.channels.length * lane;
       const end = this.xs.length ? this.xs[this.xs.length - 1] : 0, begin = end - this.windowS;
       const x = (s) => left + ((s - begin) / this.windowS) * (right - left);
       c.font = "12px sans-serif";
+      c.lineJoin = "bevel";
       c.strokeStyle = k.line;
       c.fillStyle = k.dim;
       c.lineWidth = 1;
@@ -326,7 +332,7 @@ export default {
       let from = 0;
       while (from < this.xs.length && this.xs[from] < begin) from++;
       this.channels.forEach((channel, i) => {
-        const ys = this.ys[i], top = i * LANE, mid = top + LANE / 2;
+        const ys = this.ys[i], top = i * lane, mid = top + lane / 2;
         let low = Infinity, high = -Infinity;
         for (let j = from; j < ys.length; j++) {
           if (ys[j] < low) low = ys[j];
@@ -338,15 +344,15 @@ export default {
         if (low > high) return;
         const value = (ys[ys.length - 1] * channel.step - channel.offset) * channel.scale;
         c.fillStyle = k.dim;
-        c.fillText(`${value.toLocaleString(this.locale, { maximumFractionDigits: 2 })} ${channel.unit === "count" ? this.words.unit_count : channel.unit}`, 0, mid + 13);
+        c.fillText(`${this.digits.format(value)} ${channel.unit === "count" ? this.words.unit_count : channel.unit}`, 0, mid + 13);
         // A lane keeps its scale until the signal leaves it or has long been small in it.
         const kept = this.range[i], span = Math.max(high - low, 8);
         if (!kept || low < kept[0] || high > kept[1] || kept[1] - kept[0] > 3 * span) this.range[i] = [low - 0.15 * span, high + 0.15 * span];
-        const [a, b] = this.range[i], y = (v) => top + 3 + (1 - (v - a) / (b - a)) * (LANE - 6);
+        const [a, b] = this.range[i], y = (v) => top + 3 + (1 - (v - a) / (b - a)) * (lane - 6);
         c.strokeStyle = k.line;
         c.beginPath();
-        c.moveTo(0, top + LANE);
-        c.lineTo(right, top + LANE);
+        c.moveTo(0, top + lane);
+        c.lineTo(right, top + lane);
         c.stroke();
         c.strokeStyle = k.dark ? "#8cc4f0" : this.lines[0];
         c.lineWidth = 1.5;

@@ -139,7 +139,6 @@ def _keeping(page: Page, listening: Listening, clips: Clips) -> None:
 
 def _row(page: Page, clips: Clips, clip: Clip, opened: Any) -> None:
     words = page.words
-    seconds = clip.rows / clip.layout.rate_hz
     when = time.strftime("%Y-%m-%d %H:%M", time.localtime(clip.head.started_ms / 1000.0))
     if clip.key == clips.recording:
         state = words("live.clip_recording")
@@ -151,7 +150,7 @@ def _row(page: Page, clips: Clips, clip: Clip, opened: Any) -> None:
     with ui.row().classes("w-full items-center ps-tight").style("border-bottom: 1px solid var(--ps-line)") as row:
         tag(row, f"clip-{clip.key}")
         ui.label(clip.key).classes("font-bold")
-        ui.label(f"{when}, {words.number(seconds, 1)} s").classes("ps-dim")
+        ui.label(f"{when}, {words.number(clip.seconds, 1)} s").classes("ps-dim")
         ui.label(state).classes("flex-grow")
         if clip.head.simulated:
             ui.label(words("live.simulated_short")).classes("ps-simulated")
