@@ -29,6 +29,7 @@ CHROMIUM = [
 ]
 _START_S = 60.0
 _WAIT_MS = 20_000
+_SETTLE_MS = 200
 DESK, TABLET = (1280, 800), (820, 1180)
 
 
@@ -107,6 +108,8 @@ def connected(page: Page) -> None:
         "&& !document.querySelector('#popup[aria-hidden=\"false\"]')"
     )
     page.wait_for_selector("h1")
+    # What was set while the page was being built may still be on its way, and would overwrite what is typed now.
+    page.wait_for_timeout(_SETTLE_MS)
 
 
 def is_own(url: str) -> bool:
