@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Awaitable, Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Awaitable, Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from copy import copy
 from dataclasses import dataclass
 from html import escape
@@ -208,6 +208,15 @@ def asked(key: str) -> str:
     """What this page's address says of ``key``; "" where it says nothing. Paths go through `House.inside`."""
     request = context.client.request
     return str(request.query_params.get(key, "")) if request is not None else ""
+
+
+def asked_path(house: House, key: str, among: Iterable[str]) -> str:
+    """The path that this page's address names, where it is one of these; else the first of them, or ""."""
+    there = list(among)
+    with suppress(PlushSenseError):
+        if (path := str(house.inside(asked(key)))) in there:
+            return path
+    return next(iter(there), "")
 
 
 def tag(element: E, name: str) -> E:

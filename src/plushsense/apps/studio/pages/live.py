@@ -16,7 +16,7 @@ from plushsense.apps.studio.house import VIRTUAL, House
 from plushsense.apps.studio.listening import Listening
 from plushsense.apps.studio.live_view import LiveView
 from plushsense.apps.studio.pages import live_clips
-from plushsense.apps.studio.shell import Page, on_ring, tag
+from plushsense.apps.studio.shell import Page, asked, asked_path, on_ring, tag
 from plushsense.apps.studio.toys import Toys
 from plushsense.core.errors import PlushSenseError
 from plushsense.live.react import reaction_names
@@ -91,7 +91,9 @@ def _controls(page: Page, listening: Listening) -> None:
     toys = house.part(Toys)
     choice = listening.choice
     bundles = {str(path): path.stem for path in house.bundles()}
-    chosen = str(choice.bundle) if choice.bundle else next(iter(bundles), None)
+    chosen = str(choice.bundle) if choice.bundle else None
+    if chosen is None or (asked("model") and not listening.now.running):
+        chosen = asked_path(house, "model", bundles) or None
     first = choice.toy if listening.now.running else house.toy or VIRTUAL
     with ui.element("div").classes("w-full").style(_GRID):
         toy = ui.select(

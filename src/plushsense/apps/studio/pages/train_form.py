@@ -24,7 +24,7 @@ from plushsense.apps.studio.orders import (
 )
 from plushsense.apps.studio.pages.train_words import lasting, marks
 from plushsense.apps.studio.results import Results
-from plushsense.apps.studio.shell import Page, tag
+from plushsense.apps.studio.shell import Page, asked_path, tag
 from plushsense.core.errors import PlushSenseError
 from plushsense.models.arch import DEFAULT_FILTERS, DEFAULT_SYMBOL, NORMS, PADDINGS
 from plushsense.scoring.splits import parse_split
@@ -67,7 +67,7 @@ class Form:
         self._datasets = {str(path): page.house.title(path) for path in page.house.datasets()}
         self._kind = TRAIN
         self._values: dict[str, dict[str, Any]] = {kind: {} for kind in KINDS}
-        self._dataset = next(iter(self._datasets), "")
+        self._dataset = asked_path(page.house, "dataset", self._datasets)
         self._values[TRAIN] |= {"context": ANYWHERE, "preset": "people", "fit_decisions": True}
         self._values[EVALUATE] |= {"split": SPLITS[0], "preset": "people"}
         self._values[SWEEP] |= {"grid": PAPER}
