@@ -18,11 +18,13 @@ from typing import Any
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
+import plushsense as ps
 from browsing import DESK, TABLET, Look, Studio, axe, connected, marked
 from conftest import missing
 from plushsense.apps.studio.house import House
 from plushsense.apps.studio.shell import PAGES
 from recorded import record
+from recording_pages import begun, sat, showing
 
 Fixture = Callable[..., Any]
 KEPT = os.environ.get("PLUSHSENSE_SHOTS", "")
@@ -47,7 +49,7 @@ VIEWS = (
 )
 
 
-def _home(page: Any) -> None:
+def _home(page: Any, studio: Studio) -> None:
     """A toy that was tested, a data set that was checked, a session that waits."""
     page.locator("[data-test=toy] [role=status]").wait_for(state="detached")
     if not marked(page, "chosen").count():
@@ -60,20 +62,71 @@ def _home(page: Any) -> None:
     page.locator(".ps-said-good").wait_for()
 
 
-def _as_it_opens(page: Any) -> None:
-    """Nothing to wait for but the title."""
-    marked(page, "title").wait_for()
+def _record(page: Any, studio: Studio) -> None:
+    """A session whose second gesture is asked for."""
+    if not (studio.home / "recordings" / "S02").exists():
+        begun(page, studio.url, "S02", "plush-17")
+        for _ in range(2):
+            page.keyboard.press("Space")
+            showing(page, "recording.")
+            page.wait_for_timeout(200)
+            page.keyboard.press("Space")
+            showing(page, "idle.")
+    page.goto(f"{studio.url}/record?session=S02/1")
+    sat(page, "S02/1")
+    page.wait_for_timeout(700)
 
 
-SCENES: dict[str, Callable[[Any], None]] = {
+def _review(page: Any, studio: Studio) -> None:
+    """One recording, with what is suggested for it."""
+    page.goto(f"{studio.url}/review?dataset=datasets/virtual&view=one&gesture=Back%20stroke%201")
+    connected(page)
+    page.wait_for_function("() => document.querySelector('[data-test=making]').textContent === ''")
+    page.wait_for_selector("[data-test=plot][data-shown] .uplot")
+
+
+def _train(page: Any, studio: Studio) -> None:
+    """What a proof on people left out came to."""
+    page.locator('[data-do^="open:"], tr[data-row] button').first.click()
+    page.locator("[data-cell]").first.wait_for()
+    marked(page, "results").scroll_into_view_if_needed()
+
+
+def _live(page: Any, studio: Studio) -> None:
+    """A virtual toy is read, and something was felt."""
+    if marked(page, "start").is_enabled():
+        marked(page, "start").click()
+    marked(page, "events").locator("li[data-id]").first.wait_for(state="attached")
+    page.wait_for_timeout(1500)
+
+
+def _export(page: Any, studio: Studio) -> None:
+    """An export, with what it costs."""
+    if not (studio.home / "exports" / "little").exists():
+        marked(page, "name").fill("little")
+        marked(page, "do").click()
+        marked(page, "export-facts").wait_for(timeout=90_000)
+    page.goto(f"{studio.url}/export?name=little")
+    connected(page)
+    marked(page, "export-facts").wait_for()
+
+
+def _publish(page: Any, studio: Studio) -> None:
+    """What the data set does not say yet."""
+    marked(page, "new").wait_for()
+
+
+SCENES: dict[str, Callable[[Any, Studio], None]] = {
     "home": _home,
-    "record": _as_it_opens,
-    "review": _as_it_opens,
-    "train": _as_it_opens,
-    "live": _as_it_opens,
-    "export": _as_it_opens,
-    "publish": _as_it_opens,
+    "record": _record,
+    "review": _review,
+    "train": _train,
+    "live": _live,
+    "export": _export,
+    "publish": _publish,
 }
+_SCROLLED = {"train": "results", "export": "detail"}
+"""What the picture begins with, where that is not the top."""
 
 # Text that does not fit its box, and boxes that reach over the right edge, but for what may be scrolled.
 _CUT = """() => {
@@ -99,6 +152,10 @@ def furnished(furniture: Path, tmp_path_factory: pytest.TempPathFactory) -> Iter
     """One studio for all pictures: a data set, a bundle, a session, a toy at ten times the speed."""
     home = Path(shutil.copytree(furniture, tmp_path_factory.mktemp("pictures") / "home"))
     record(House(home), "S01")
+    data = home / "datasets" / "virtual"
+    ps.evaluate(
+        data, split="by-subject:3", preset="loso", epochs=8, workers=1, out=data / "evaluations" / "by-subject-3"
+    )
     one = Studio(home, ("--speed", "10")).start()
     yield one
     one.stop()
@@ -127,7 +184,7 @@ def test_every_page_has_a_scene() -> None:
 def test_a_page_reads_well(name: str, view: View, furnished: Studio, look: Fixture) -> None:
     browser: Look = look(view.size, view.dark, view.language, touch=view.size == TABLET)
     page = browser.open(furnished.url + PAGES[name])
-    SCENES[name](page)
+    SCENES[name](page, furnished)
     connected(page)
     page.evaluate("document.fonts.ready")
     assert axe(page) == []
@@ -136,6 +193,8 @@ def test_a_page_reads_well(name: str, view: View, furnished: Studio, look: Fixtu
     assert page.evaluate("document.body.classList.contains('body--dark')") is view.dark
     assert page.evaluate("document.documentElement.lang")[:2] == view.language
     page.evaluate("scrollTo(0, 0)")
+    if name in _SCROLLED:
+        marked(page, _SCROLLED[name]).evaluate("e => scrollTo(0, e.getBoundingClientRect().top + scrollY - 80)")
     png = page.screenshot(animations="disabled")
     assert browser.complaints == []
     if KEPT:
