@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Coroutine
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 from urllib.parse import urlsplit
 
 if TYPE_CHECKING:
     from playwright.sync_api import BrowserContext, Page
 
+T = TypeVar("T")
 HERE = Path(__file__).parent
 AXE = HERE / "studio" / "vendor" / "axe.min.js"
 CHROMIUM = [
@@ -110,6 +114,12 @@ def connected(page: Page) -> None:
     page.wait_for_selector("h1")
     # What was set while the page was being built may still be on its way, and would overwrite what is typed now.
     page.wait_for_timeout(_SETTLE_MS)
+
+
+def alone(coroutine: Coroutine[Any, Any, T]) -> T:
+    """`asyncio.run` in a thread of its own: Playwright may be running in this one."""
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(asyncio.run, coroutine).result()
 
 
 def is_own(url: str) -> bool:

@@ -39,9 +39,9 @@ def studio(tmp_path: Path) -> Iterator[Callable[..., Studio]]:
     )
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def chromium() -> Iterator[Browser]:
-    """Debian's Chromium, headless, driven by Playwright."""
+    """Debian's Chromium, headless, driven by Playwright, whose loop stays in this thread while it lives: a module."""
     found = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if found is None:
         missing("browser", "chromium is not installed")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import http.client
 import sys
 from collections.abc import Callable, Iterable
@@ -13,7 +12,7 @@ from urllib.parse import parse_qs, urlsplit
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from browsing import Studio, marked
+from browsing import Studio, alone, marked
 from conftest import missing
 from plushsense.apps.studio import guard
 from plushsense.apps.studio.guard import BODY_BYTES, CONTENT_POLICY, COOKIE, UPLOAD_BYTES, Guard, Visitors, is_loopback
@@ -68,7 +67,7 @@ def ask(
         "query_string": query.encode(),
         "headers": [(k.encode(), v.encode()) for k, v in given.items()],
     }
-    asyncio.run(Guard(app, visitors)(scope, receive, send))
+    alone(Guard(app, visitors)(scope, receive, send))
     if kind == "websocket":
         return sent[0].get("code", 101), {}, b""
     start = sent[0]

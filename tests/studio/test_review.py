@@ -481,7 +481,7 @@ def test_a_broken_data_set_is_a_sentence(waves: Path, studio: Fixture, look: Fix
     started = studio(home=waves.parents[1])
     for name, said in (("broken", "dataset.toml"), ("torn", "line 1 is no mark")):
         page = browser.open(f"{started.url}/review?dataset=datasets/{name}")
-        assert said in page.locator("[role=alert]").inner_text()
+        assert said in marked(page, "said").inner_text()
         assert axe(page) == []
     marked(page, "dataset").click()
     page.get_by_role("option", name="(waves)").click()

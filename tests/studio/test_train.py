@@ -238,7 +238,7 @@ def test_a_sweep_shows_its_cost_first_and_its_front_in_the_end(
     browser = look()
     page = browser.open(f"{studio(home=home).url}/train")
     kind(page, "Compare many networks")
-    assert marked(page, "split-told").get_by_text("leaky", exact=True).is_visible()
+    marked(page, "split-told").get_by_text("leaky", exact=True).first.wait_for()
     choose(page, "grid", "wrong.toml")
     marked(page, "estimate").click()
     marked(page, "plan").get_by_role("alert").wait_for(timeout=_LONG_MS)
@@ -252,12 +252,12 @@ def test_a_sweep_shows_its_cost_first_and_its_front_in_the_end(
     marked(page, "estimate").click()
     marked(page, "plan-text").wait_for(timeout=_LONG_MS)
     assert "4 trials in 4 trainings (folds: 1, seeds: 1), 0 done before" in marked(page, "plan-text").inner_text()
-    assert marked(page, "plan").get_by_text("leaky", exact=True).is_visible()
+    marked(page, "plan").get_by_text("leaky", exact=True).first.wait_for()
     assert axe(page) == []
     marked(page, "start").click()
     done = state(page, "done")
     assert "4 of 4 trials. Most accurate: " in done.inner_text()
-    assert done.get_by_text("leaky", exact=True).is_visible()
+    done.get_by_text("leaky", exact=True).first.wait_for()
     drawn = marked(page, "pareto")
     drawn.wait_for()
     # Leaky ones are hollow diamonds with the word; the front is a line.

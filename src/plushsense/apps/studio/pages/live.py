@@ -103,7 +103,8 @@ def _controls(page: Page, listening: Listening) -> None:
             with_input=True,
             new_value_mode="add-unique",
         )
-        tag(toy.props("outlined dense"), "toy")
+        hint = words("live.toy_hint")
+        tag(toy.props(f'outlined dense hint="{hint}"'), "toy")
         bundle = ui.select(bundles, value=chosen, label=words("live.bundle"))
         tag(bundle.props("outlined dense"), "bundle")
         engines = {"float": words("live.engine_float"), "int8": words("live.engine_int8")}
