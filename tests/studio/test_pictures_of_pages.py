@@ -94,7 +94,7 @@ def _train(page: Any, studio: Studio) -> None:
 
 def _live(page: Any, studio: Studio) -> None:
     """A virtual toy is read, and something was felt."""
-    if marked(page, "start").is_enabled():
+    if marked(page, "start").is_visible():
         marked(page, "start").click()
     marked(page, "events").locator("li[data-id]").first.wait_for(state="attached")
     page.wait_for_timeout(1500)
