@@ -27,6 +27,7 @@ from plushsense.apps.studio.results import Confusion, Results, grouped, in_cell
 from plushsense.apps.studio.tasks.telling import Clock
 from plushsense.core.errors import BadInput, ConfigError, PlushSenseError
 from plushsense.evaluation.predictions import Predictions
+from plushsense.models.bundle import Bundle
 
 
 def made(house: House, **form: Any) -> Order:
@@ -272,6 +273,13 @@ def test_rows_of_a_house_and_what_is_broken(home: Path) -> None:
         folder.joinpath("evaluation.json").write_text(content, encoding="utf-8")
     (home / "bundles" / "cut.plush").write_bytes(b"abc")
     assert results.rows() == [only]
+    assert (only.spread, only.units) == ("held_back", 1)
+    bundle = Bundle.load(only.path)
+    same = replace(bundle, provenance={**bundle.provenance, "scores": {"split": "windows:holdout"}})
+    same.save(home / "bundles" / "same.plush")
+    # Its people were trained on, too: nobody was held back.
+    assert [(r.spread, r.units) for r in results.rows() if r.split == "windows:holdout"] == [("trainings", 1)]
+    (home / "bundles" / "same.plush").unlink()
     only.path.unlink()
     assert results.rows() == []
     with pytest.raises(BadInput, match="no longer there"):

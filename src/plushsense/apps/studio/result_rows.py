@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from plushsense.apps.dividing import WHOLE_PEOPLE
 from plushsense.apps.sweep_tables import SUMMARY as SWEEP
 from plushsense.core.errors import BadInput
 from plushsense.core.gestures import NOBODY
@@ -30,7 +31,7 @@ class Row:
         path: the evaluation's or sweep's folder, or the bundle. ``trial``: within a sweep.
         dataset: its folder, "" where it is not in this studio; ``data``: its name.
         spread: what mean and sd go over: ``units`` of `SUBJECTS`, `FOLDS`, `TRAININGS` (folds times seeds); of a
-            training, the people `HELD_BACK`.
+            single training, the people `HELD_BACK` where there are any.
         macs: multiply-accumulates for a decision, every 50 ms.
         when_s: seconds since 1970.
         apart: what else must be the same where two are compared: the data set's hash, the classes, who was held back.
@@ -161,6 +162,7 @@ def of_bundle(path: Path, known: Any) -> list[Row]:
     scores, training = kept.get("scores", {}), kept.get("training", {})
     arch = bundle.arch
     name = str(kept.get("dataset", "?"))
+    split = str(scores.get("split", kept.get("split", "?")))
     context = bundle.windowing.get("context", "?")
     if context == ANYWHERE:
         # As an evaluation says it: what is trained anywhere is scored on whole gestures.
@@ -176,13 +178,13 @@ def of_bundle(path: Path, known: Any) -> list[Row]:
             name,
             f"{arch.symbol} {'/'.join(map(str, arch.filters))} {arch.padding}",
             f"{kept.get('preset', '?')}, {training.get('epochs', '?')}",
-            str(scores.get("split", kept.get("split", "?"))),
+            split,
             str(context),
             bool(scores.get("leaky")),
             bool(kept.get("simulated")),
             str(training.get("seed", "?")),
-            HELD_BACK,
-            len(held_back),
+            # Where recordings or windows are held back, their people were trained on.
+            *((HELD_BACK, len(held_back)) if split == WHOLE_PEOPLE else (TRAININGS, 1)),
             scores.get("accuracy"),
             None,
             scores.get("macro_f1"),

@@ -11,7 +11,7 @@ from urllib.parse import quote, urlencode
 from nicegui import run, ui
 
 from plushsense.apps.studio.pages.train_words import figure, marks, over, spread
-from plushsense.apps.studio.result_rows import EVALUATION, TRAINING, Row
+from plushsense.apps.studio.result_rows import EVALUATION, HELD_BACK, TRAINING, Row
 from plushsense.apps.studio.results import Confusion, Details, Misread, Results
 from plushsense.apps.studio.reviews import Reviews
 from plushsense.apps.studio.shell import AFFECT_SIGNS, Page, tag
@@ -72,7 +72,7 @@ class DetailsView:
         w, facts = self._words, d.facts
         checked = sorted(set(facts.get("validation_subjects", [])) - {NOBODY, UNKNOWN_SUBJECT})
         said = w(
-            "train.facts_training",
+            "train.facts_training" if d.row.spread == HELD_BACK else "train.facts_same",
             trained=len(set(facts.get("subjects", [])) - {NOBODY, UNKNOWN_SUBJECT}),
             checked=len(checked),
             names=", ".join(checked) or "–",
