@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -71,3 +73,15 @@ def test_a_place_that_cannot_be_written_costs_nothing(dataset: Dataset) -> None:
     journal.folder.parent.mkdir(parents=True, exist_ok=True)
     journal.folder.write_text("a file", encoding="utf-8")
     assert ps.train(dataset, journal=journal, epochs=2, **SMALL).history
+
+
+def test_what_was_given_up_long_ago_goes(dataset: Dataset) -> None:
+    kept = unfinished(dataset)
+    for name in ("old", "new"):
+        kept.save(name, {"epoch": 1})
+    part = kept.folder / ".torn.0123.part"
+    part.touch()
+    for path in (kept.path("old"), part):
+        os.utime(path, (time.time() - 31 * 24 * 3600,) * 2)
+    ps.train(dataset, journal=kept, epochs=1, **SMALL)
+    assert [path.name for path in kept.folder.iterdir()] == ["new.npz"]

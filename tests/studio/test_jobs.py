@@ -263,3 +263,25 @@ def test_a_worker_that_is_asked_nonsense_refuses(line: str) -> None:
     assert worker.wait(60) == 2
     worker.stdin.close()
     worker.stdout.close()
+
+
+def test_names_that_may_not_be_left_anywhere_are_not_left_in_the_work_folder(house: House, jobs: Jobs) -> None:
+    place = str(house.folder / "datasets" / "copy")
+    given = {"dataset": str(house.folder), "place": place, "key": str(house.folder / "key"), "words": ["Annabelle"]}
+    job = ended(jobs.start("pseudonymise", given, "Copy"))
+    assert job.state == REFUSED and job.spec["words"] == ["Annabelle"]
+    assert not [p for p in house.folder.rglob("*") if p.is_file() and "Annabelle" in p.read_text(encoding="utf-8")]
+    # A studio that was started again has them no more: doing without would leave the names in.
+    later = Jobs(house)
+    again = ended(later.resume(job.id))
+    assert (again.state, again.said) == (
+        REFUSED,
+        "Words that may not be left anywhere are not kept: give them again on the publish page.",
+    )
+
+
+def test_what_only_looks_is_not_kept(house: House, jobs: Jobs) -> None:
+    job = ended(jobs.start("train", {"dataset": str(house.folder), "dry": True}, "Looking"))
+    assert job.state == REFUSED and job.said
+    until(lambda: job not in jobs.all())
+    assert not list((house.folder / WORK).glob("*.json"))

@@ -42,7 +42,7 @@ def test_pseudonyms_then_the_advice_is_gone(few: Path) -> None:
     assert (found.people, found.recordings, found.simulated, found.problem) == (3, 9, True, "")
     assert found.own_codes == ("P01", "P02", "P03") and found.own_dates
     place, key = house.new("datasets", "shared"), house.folder / "keys" / "people.csv"
-    result, reports = told(pseudonymise_task, dataset=str(found.path), place=str(place), key=str(key))
+    result, reports = told(pseudonymise_task, dataset=str(found.path), place=str(place), key=str(key), words=[])
     renamed = DatasetFacts.of(place)
     assert (renamed.own_codes, renamed.own_dates, renamed.recordings) == ((), False, 9)
     assert reports[-1]["progress"] == {"stage": "rewriting", "done": 9, "total": 9}

@@ -175,7 +175,16 @@ def test_a_proof_its_table_and_the_recordings_of_a_cell(
     query = parse_qs(asked.query)
     assert asked.path == "/review"
     assert query["dataset"] == [str(home / "datasets" / "virtual")]
-    assert sorted(query["recordings"][0].split(",")) == sorted(wanted)
+    assert sorted(query["recordings"]) == sorted(wanted)
+    assert query["title"] == [marked(page, "cell-title").inner_text()]
+    review = browser.open(f"{here.url}{marked(page, 'cell-all').get_attribute('href')}")
+    marked(review, "selection").wait_for()
+    review.wait_for_function(
+        "(n) => document.querySelectorAll('[data-test=table] tbody tr').length === n", arg=len(wanted)
+    )
+    for recording in wanted:
+        assert review.locator("[data-test=table]").get_by_text(recording, exact=True).count() == 1, recording
+    review.close()
     assert axe(page) == []
     shots(page, "train-confusion")
 

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +20,14 @@ from plushsense.apps.studio.curves import charts
 from plushsense.apps.studio.house import House
 from plushsense.apps.studio.jobs import Job, Jobs
 from plushsense.apps.studio.orders import Order, free_name, grids, order
+from plushsense.apps.studio.pages.train_results import comparable
 from plushsense.apps.studio.pareto import Point, drawing
-from plushsense.apps.studio.result_rows import TRAINING, Row, front
+from plushsense.apps.studio.result_rows import TRAINING, Row, front, over_trainings
 from plushsense.apps.studio.results import Confusion, Results, grouped, in_cell
 from plushsense.apps.studio.tasks.telling import Clock
 from plushsense.core.errors import BadInput, ConfigError, PlushSenseError
 from plushsense.evaluation.predictions import Predictions
+from plushsense.models.bundle import Bundle
 
 
 def made(house: House, **form: Any) -> Order:
@@ -63,7 +66,13 @@ def test_the_command_resolves_to_the_same_settings(home: Path, monkeypatch: pyte
         ({"kind": "train", "name": "n", "arch": "14x"}, "14x"),
         ({"kind": "train", "name": "n", "preset": "pepole"}, "people"),
         ({"kind": "train", "name": "n", "quantize_aware": -1}, "quantize_aware is -1"),
+        ({"kind": "train", "name": "n", "quantize_aware": "many"}, "quantize_aware is 'many'"),
         ({"kind": "evaluate", "split": "by-people:5"}, "split"),
+        ({"kind": "sweep", "seeds": "many"}, "seeds is 'many': accepted are whole numbers from 1"),
+        ({"kind": "sweep", "seeds": 0}, "seeds is 0"),
+        ({"kind": "search", "max_parameters": "few"}, "max_parameters is 'few'"),
+        ({"kind": "search", "share": "half"}, "share is 'half'"),
+        ({"kind": "search", "share": "nan"}, "share is 'nan'"),
         ({"kind": "sweep", "grid": "/etc/passwd"}, "outside the studio's folders"),
         ({"kind": "train", "name": "n", "dataset": "/tmp"}, "outside the studio's folders"),
         ({"kind": "train", "name": "n", "dataset": "datasets/gone"}, "no longer there"),
@@ -198,6 +207,25 @@ def test_the_front_holds_what_none_beats() -> None:
         assert (r in front(rows)) == (not beaten and r.macro_f1 is not None), r.id
 
 
+def test_only_the_same_people_and_gestures_are_compared() -> None:
+    # Two seeds hold other people back; the data set was changed between the last two.
+    rows = [replace(row(f"{i}", 100 + i, 0.5), kind=TRAINING, data="d", apart=("h", "S01")) for i in range(2)]
+    rows += [replace(row(f"other {i}", 10, 0.9), kind=TRAINING, data="d", apart=("h", "S02")) for i in range(3)]
+    rows += [replace(row("changed", 1, 1.0), kind=TRAINING, data="d", apart=("i", "S01"))]
+    found = comparable(rows, str)
+    assert [sorted(r.id for r in several) for several in found.values()] == [
+        ["0", "1"],
+        ["other 0", "other 1", "other 2"],
+    ]
+    assert list(found) == ["d · training ·  · ", "d · training ·  ·  (2)"]
+
+
+def test_what_a_trials_spread_goes_over() -> None:
+    assert over_trainings({"folds": "5", "seeds": "1"}) == ("folds", 5)
+    assert over_trainings({"folds": 1, "seeds": 3}) == ("trainings", 3)
+    assert over_trainings({"folds": 5, "seeds": 3}) == ("trainings", 15)
+
+
 def test_the_drawing_labels_every_point_and_marks_leaky_ones() -> None:
     points = [Point(1000 * 3**i, 0.2 + 0.1 * i, 0.05, f"net <{i}>", i > 1, i == 0) for i in range(4)]
     text = drawing(points, title="a & b", x="Parameters", y="Macro-F1", leaky="leaky")
@@ -236,7 +264,7 @@ def test_rows_of_a_house_and_what_is_broken(home: Path) -> None:
     house = House(home)
     results = Results(house)
     (only,) = results.rows()
-    assert (only.kind, only.simulated, only.leaky, only.context) == (TRAINING, True, False, "anywhere")
+    assert (only.kind, only.simulated, only.leaky, only.context) == (TRAINING, True, False, "anywhere → stream")
     assert only.dataset == str(home / "datasets" / "virtual")
     assert results.details(only).facts["fitted"]
     for name, content in (("broken", "{"), ("other", "[1]"), ("older", '{"split": "by-subject:2"}')):
@@ -245,6 +273,13 @@ def test_rows_of_a_house_and_what_is_broken(home: Path) -> None:
         folder.joinpath("evaluation.json").write_text(content, encoding="utf-8")
     (home / "bundles" / "cut.plush").write_bytes(b"abc")
     assert results.rows() == [only]
+    assert (only.spread, only.units) == ("held_back", 1)
+    bundle = Bundle.load(only.path)
+    same = replace(bundle, provenance={**bundle.provenance, "scores": {"split": "windows:holdout"}})
+    same.save(home / "bundles" / "same.plush")
+    # Its people were trained on, too: nobody was held back.
+    assert [(r.spread, r.units) for r in results.rows() if r.split == "windows:holdout"] == [("trainings", 1)]
+    (home / "bundles" / "same.plush").unlink()
     only.path.unlink()
     assert results.rows() == []
     with pytest.raises(BadInput, match="no longer there"):

@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from plushsense.training.state import FitState
 
 
+# So long a training that was stopped can go on.
+_KEPT_S = 30 * 24 * 3600.0
+
+
 def unfinished(dataset: Dataset | str | os.PathLike[str]) -> Journal:
     """Where trainings on a data set keep how far they are: in its cache."""
     return Journal((dataset.path if isinstance(dataset, Dataset) else Path(dataset)).joinpath(*UNFINISHED))
@@ -38,6 +42,8 @@ class Kept:
         from plushsense.training.fit import placed
 
         settings = {"arch": network.to_dict(), "training": placed(spec).key(), "vectors": train.vectors}
+        # Most that was given up is never taken up again, and it was trained on people.
+        journal.prune(_KEPT_S)
         prints = [windows_print(train), windows_print(watched)]
         self._job = job_id({"what": "training", **settings, "windows": prints})
 

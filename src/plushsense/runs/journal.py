@@ -10,6 +10,7 @@ import hashlib
 import json
 import os
 import secrets
+import time
 import zipfile
 from collections.abc import Mapping
 from contextlib import suppress
@@ -121,6 +122,14 @@ class Journal:
                     f"A result cannot be kept in {self.folder} ({cause.strerror or cause}): make room or the folder "
                     "writable, then run again; finished jobs are kept."
                 ) from cause
+
+    def prune(self, older_s: float) -> None:
+        """Discard what nobody has touched for so many seconds, also unfinished writes of those that were killed."""
+        with suppress(OSError):
+            for path in [*self.folder.glob("*.npz"), *self.folder.glob(".*.part")]:
+                with suppress(OSError):
+                    if time.time() - path.stat().st_mtime > older_s:
+                        path.unlink()
 
     def discard(self, job: str) -> None:
         """Forget the result of a job, if there is one and it lets itself be removed (Windows: nobody reads it)."""

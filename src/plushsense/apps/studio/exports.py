@@ -11,8 +11,10 @@ from typing import Any
 from plushsense.apps.studio.house import EXPORTS, House
 from plushsense.apps.studio.jobs import DONE, Job, Jobs
 from plushsense.core.errors import PlushSenseError
+from plushsense.core.gestures import NOBODY
 from plushsense.dataset.freshness import sha256_of
 from plushsense.dataset.publish.archive import files_of
+from plushsense.dataset.store import UNKNOWN_SUBJECT
 from plushsense.deploy.calibration import integer_model
 from plushsense.deploy.convert import CONVERTERS
 from plushsense.deploy.emit import FACTS, TOY_BYTES, read_facts
@@ -68,7 +70,7 @@ class BundleFacts:
             layout=bundle.layout.name,
             gestures=tuple(bundle.gestures.labels),
             dataset=str(origin.get("dataset", "")),
-            people=len([p for p in people if p != "none"]) if isinstance(people, list) else int(people or 0),
+            people=len(set(people) - {NOBODY, UNKNOWN_SUBJECT}) if isinstance(people, list) else int(people or 0),
             simulated=bool(origin.get("simulated", False)),
             adapted_to=bundle.adapted_to or "",
             scores=dict(scores) if isinstance(scores, dict) and "accuracy" in scores else {},

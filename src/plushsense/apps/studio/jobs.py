@@ -22,6 +22,8 @@ UNFINISHED = ".unfinished-"
 """How folders in the work folder begin that hold what is made on the way; they are removed at the next start."""
 RUNNING, DONE, REFUSED, STOPPED = "running", "done", "refused", "stopped"
 _KEPT = 2000
+# Of a spec, what is for the worker's ears only: words that may not be left anywhere, such as people's names.
+_UNKEPT = ("words",)
 _STOP_S = 10.0
 
 
@@ -53,7 +55,10 @@ class Job:
 
 
 class Jobs:
-    """All work of a studio, kept in ``<house>/work/<id>.json``. `bell` rings at every report."""
+    """All work of a studio, kept in ``<house>/work/<id>.json``. `bell` rings at every report.
+
+    Work whose spec says ``dry`` only looks: once it has ended, it is in the hands of whoever began it, and not kept.
+    """
 
     def __init__(self, house: House) -> None:
         self.bell = Bell()
@@ -67,6 +72,9 @@ class Jobs:
             with contextlib.suppress(OSError, ValueError, TypeError, RecursionError):
                 job = Job(**json.loads(path.read_text(encoding="utf-8")))
                 if job.id != path.stem:
+                    continue
+                if job.spec.get("dry"):
+                    path.unlink()
                     continue
                 # What was running ended with the studio that ran it.
                 job.state = STOPPED if job.state == RUNNING else job.state
@@ -207,12 +215,18 @@ class Jobs:
             job.state = STOPPED
         with contextlib.suppress(OSError):
             # Done is done, also where the disk has no room to say so.
-            self._keep(job)
+            if job.spec.get("dry"):
+                self.drop(job.id)
+            else:
+                self._keep(job)
         self.bell.ring()
 
     def _keep(self, job: Job) -> None:
         self._folder.mkdir(parents=True, exist_ok=True)
-        write_atomically(self._folder / f"{job.id}.json", json.dumps(asdict(job), default=str))
+        said = asdict(job)
+        for key in _UNKEPT:
+            said["spec"].pop(key, None)
+        write_atomically(self._folder / f"{job.id}.json", json.dumps(said, default=str))
 
 
 def _end(process: subprocess.Popen[str]) -> None:

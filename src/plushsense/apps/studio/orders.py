@@ -26,7 +26,7 @@ SPLITS = ("leave-one-subject-out", "by-subject:5", "by-recording:5", "windows:5"
 # Settings of train and evaluate that the form has, each an option of the command of the same name.
 _SETTINGS = ("preset", "context", "arch", "filters", "padding", "norm", "classes", "epochs", "batch", "seed", "device")
 _CHANGES = ("split", "epochs", "batches", "architectures", "filters", "padding", "context", "classes", "device")
-_LIMITS = ("max_parameters", "max_state_bytes", "max_macs_per_step", "share")
+_LIMITS = ("max_parameters", "max_state_bytes", "max_macs_per_step")
 
 
 @dataclass(frozen=True)
@@ -101,9 +101,7 @@ def _train(house: House, dataset: Path, given: Mapping[str, Any]) -> Order:
     out = house.new(BUNDLES, f"{str(given.get('name', '')).strip()}.plush")
     spec: dict[str, Any] = {"dataset": str(dataset), "settings": settings, "out": str(out)}
     command = ["plushsense", "train", str(dataset), "--out", str(out), *_options(settings)]
-    tuning = int(given.get("quantize_aware", 0))
-    if tuning < 0:
-        raise ConfigError(f"quantize_aware is {tuning}: accepted are 0 (off) and more epochs.")
+    tuning = _whole("quantize_aware", given.get("quantize_aware", 0), 0)
     if tuning:
         spec["quantize_aware"] = tuning
         command += ["--quantize-aware", str(tuning)]
@@ -141,15 +139,36 @@ def _of_grid(house: House, kind: str, dataset: Path, given: Mapping[str, Any]) -
     changes: dict[str, Any] = {key: str(given[key]) for key in _CHANGES if key in given}
     command = ["plushsense", kind, str(dataset), "--grid", grid, *_options(changes)]
     if "seeds" in given:
-        changes["seeds"] = list(range(int(given["seeds"])))
-        command += ["--seeds", str(int(given["seeds"]))]
+        seeds = _whole("seeds", given["seeds"], 1)
+        changes["seeds"] = list(range(seeds))
+        command += ["--seeds", str(seeds)]
     spec: dict[str, Any] = {"dataset": str(dataset), "grid": grid, "changes": changes}
     if kind == SEARCH:
-        spec["asked"] = {key: given[key] for key in _LIMITS if key in given}
+        asked: dict[str, Any] = {key: _whole(key, given[key], 1) for key in _LIMITS if key in given}
+        if "share" in given:
+            asked["share"] = _share(given["share"])
+        spec["asked"] = asked
         command += _options(spec["asked"])
     name = PAPER if grid == PAPER else Path(grid).stem
     title = f"{dataset.name}: {name}" + (f", {given['split']}" if "split" in given else "")
     return Order(kind, spec, title, shlex.join(command))
+
+
+def _whole(name: str, value: Any, least: int) -> int:
+    """A whole number from ``least`` up, of a field that says nothing wrong to a library that takes only numbers."""
+    if not isinstance(value, int) or value < least:
+        raise ConfigError(f"{name} is {value!r}: accepted are whole numbers from {least} up.")
+    return value
+
+
+def _share(value: Any) -> float:
+    try:
+        share = float(str(value).replace(",", "."))
+    except ValueError:
+        share = 0.0
+    if not 0.0 < share <= 1.0:
+        raise ConfigError(f"share is {value!r}: accepted is above 0, up to 1.")
+    return share
 
 
 def _options(settings: Mapping[str, Any]) -> list[str]:

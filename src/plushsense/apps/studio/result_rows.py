@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from plushsense.apps.dividing import WHOLE_PEOPLE
 from plushsense.apps.sweep_tables import SUMMARY as SWEEP
 from plushsense.core.errors import BadInput
 from plushsense.core.gestures import NOBODY
 from plushsense.dataset.store import UNKNOWN_SUBJECT
 from plushsense.models.bundle import Bundle
+from plushsense.windows.cut import ANYWHERE
 
 EVALUATION, TRIAL, TRAINING = "evaluation", "trial", "training"
-SUBJECTS, FOLDS, HELD_BACK = "subjects", "folds", "held_back"
+SUBJECTS, FOLDS, TRAININGS, HELD_BACK = "subjects", "folds", "trainings", "held_back"
+_HASH = 6
 
 
 @dataclass(frozen=True)
@@ -27,9 +30,11 @@ class Row:
         id: of the row; ``kind``: `EVALUATION`, `TRIAL` (of a sweep or search) or `TRAINING`.
         path: the evaluation's or sweep's folder, or the bundle. ``trial``: within a sweep.
         dataset: its folder, "" where it is not in this studio; ``data``: its name.
-        spread: what mean and sd go over: ``units`` of `SUBJECTS`, `FOLDS`; of a training, the people `HELD_BACK`.
+        spread: what mean and sd go over: ``units`` of `SUBJECTS`, `FOLDS`, `TRAININGS` (folds times seeds); of a
+            single training, the people `HELD_BACK` where there are any.
         macs: multiply-accumulates for a decision, every 50 ms.
         when_s: seconds since 1970.
+        apart: what else must be the same where two are compared: the data set's hash, the classes, who was held back.
     """
 
     id: str
@@ -54,6 +59,7 @@ class Row:
     parameters: int
     macs: int
     when_s: float
+    apart: tuple[str, ...] = ()
 
 
 def front(rows: Sequence[Row]) -> list[Row]:
@@ -103,6 +109,7 @@ def of_evaluation(path: Path, dataset: Any) -> list[Row]:
             model["parameters"],
             model["macs_per_step"],
             path.stat().st_mtime,
+            (str(table["dataset"]["hash"])[:_HASH], *(str(one["label"]) for one in table["per_class"])),
         )
     ]
 
@@ -113,6 +120,7 @@ def of_trials(path: Path, dataset: Any) -> list[Row]:
     table = read_json(folder / SWEEP)
     grid, when = table["grid"], path.stat().st_mtime
     seeds = ", ".join(map(str, grid["seeds"]))
+    apart = (str(table.get("dataset_hash", ""))[:_HASH], *map(str, table.get("labels", ())))
     rows = []
     with path.open(encoding="utf-8", newline="") as file:
         for trial in csv.DictReader(file):
@@ -133,8 +141,7 @@ def of_trials(path: Path, dataset: Any) -> list[Row]:
                     trial["leaky"] == "true",
                     trial["simulated"] == "true",
                     seeds,
-                    FOLDS,
-                    int(trial["folds"]),
+                    *over_trainings(trial),
                     float(trial["accuracy"]),
                     _number(trial["accuracy_sd"]),
                     _number(trial["macro_f1"]),
@@ -142,6 +149,7 @@ def of_trials(path: Path, dataset: Any) -> list[Row]:
                     int(trial["parameters"]),
                     int(trial["macs_per_step"]),
                     when,
+                    apart,
                 )
             )
     return rows
@@ -154,7 +162,12 @@ def of_bundle(path: Path, known: Any) -> list[Row]:
     scores, training = kept.get("scores", {}), kept.get("training", {})
     arch = bundle.arch
     name = str(kept.get("dataset", "?"))
+    split = str(scores.get("split", kept.get("split", "?")))
     context = bundle.windowing.get("context", "?")
+    if context == ANYWHERE:
+        # As an evaluation says it: what is trained anywhere is scored on whole gestures.
+        context = f"{ANYWHERE} → stream"
+    held_back = sorted(set(kept.get("validation_subjects", ())) - {NOBODY, UNKNOWN_SUBJECT})
     return [
         Row(
             str(path),
@@ -165,13 +178,13 @@ def of_bundle(path: Path, known: Any) -> list[Row]:
             name,
             f"{arch.symbol} {'/'.join(map(str, arch.filters))} {arch.padding}",
             f"{kept.get('preset', '?')}, {training.get('epochs', '?')}",
-            str(scores.get("split", kept.get("split", "?"))),
+            split,
             str(context),
             bool(scores.get("leaky")),
             bool(kept.get("simulated")),
             str(training.get("seed", "?")),
-            HELD_BACK,
-            len(set(kept.get("validation_subjects", ())) - {NOBODY, UNKNOWN_SUBJECT}),
+            # Where recordings or windows are held back, their people were trained on.
+            *((HELD_BACK, len(held_back)) if split == WHOLE_PEOPLE else (TRAININGS, 1)),
             scores.get("accuracy"),
             None,
             scores.get("macro_f1"),
@@ -179,8 +192,15 @@ def of_bundle(path: Path, known: Any) -> list[Row]:
             arch.parameters,
             arch.macs_per_step,
             path.stat().st_mtime,
+            (str(kept.get("dataset_hash", ""))[:_HASH], *bundle.gestures.labels, *held_back),
         )
     ]
+
+
+def over_trainings(trial: Mapping[str, Any]) -> tuple[str, int]:
+    """What a trial's mean and sd go over: a figure of each fold under each seed."""
+    folds, seeds = int(trial["folds"]), int(trial["seeds"])
+    return (FOLDS, folds) if seeds == 1 else (TRAININGS, folds * seeds)
 
 
 def read_json(path: Path) -> Any:

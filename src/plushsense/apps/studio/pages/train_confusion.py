@@ -4,21 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from html import escape
+from pathlib import Path
 from typing import Any
-from urllib.parse import quote
+from urllib.parse import quote, urlencode
 
 from nicegui import run, ui
 
 from plushsense.apps.studio.pages.train_words import figure, marks, over, spread
-from plushsense.apps.studio.result_rows import EVALUATION, TRAINING, Row
+from plushsense.apps.studio.result_rows import EVALUATION, HELD_BACK, TRAINING, Row
 from plushsense.apps.studio.results import Confusion, Details, Misread, Results
+from plushsense.apps.studio.reviews import Reviews
 from plushsense.apps.studio.shell import AFFECT_SIGNS, Page, tag
 from plushsense.apps.studio.words import Words
 from plushsense.core.gestures import NOBODY
 from plushsense.dataset.store import UNKNOWN_SUBJECT
 
-# So many recordings go into a link at most.
-LINKED = 200
 _CLICKS = '(e) => { const b = e.target.closest("[data-cell]"); if (b) emit(b.dataset.cell); }'
 
 
@@ -72,7 +72,7 @@ class DetailsView:
         w, facts = self._words, d.facts
         checked = sorted(set(facts.get("validation_subjects", [])) - {NOBODY, UNKNOWN_SUBJECT})
         said = w(
-            "train.facts_training",
+            "train.facts_training" if d.row.spread == HELD_BACK else "train.facts_same",
             trained=len(set(facts.get("subjects", [])) - {NOBODY, UNKNOWN_SUBJECT}),
             checked=len(checked),
             names=", ".join(checked) or "–",
@@ -128,12 +128,23 @@ class DetailsView:
         self._asked += 1
         mine = self._asked
         with self._page.refusing():
-            found = await run.io_bound(
-                self._results.misread, d.row, self._gestures(shown.labels[i]), self._gestures(shown.labels[j])
-            )
+            truth, said = shown.labels[i], shown.labels[j]
+            found = await run.io_bound(self._results.misread, d.row, self._gestures(truth), self._gestures(said))
+            if found is None:
+                return
+            name = self._words.affect if self._by == "affect" else self._words.gesture
+            windows = sum(one.windows for one in found)
+            title = self._words("train.cell_title", truth=name(truth), said=name(said), n=len(found), windows=windows)
+            link = await run.io_bound(self._link, d.row.dataset, [one.recording for one in found], title)
             # A later click, or another row, has the word.
-            if found is not None and mine == self._asked and self._found is d:
-                self._list(d, shown.labels[i], shown.labels[j], found)
+            if link is not None and mine == self._asked and self._found is d:
+                self._list(d, title, link, found)
+
+    def _link(self, dataset: str, recordings: list[str], title: str) -> str:
+        """Where Review shows them; "" for data that is not here."""
+        if not dataset:
+            return ""
+        return self._page.house.part(Reviews).address(Path(dataset), recordings, title)
 
     def _gestures(self, label: str) -> list[str]:
         """The gestures that a label of the table stands for."""
@@ -142,21 +153,13 @@ class DetailsView:
             return [label]
         return [gesture for gesture, affect in d.affects.items() if (affect or "none") == label]
 
-    def _list(self, d: Details, truth: str, said: str, found: Sequence[Misread]) -> None:
+    def _list(self, d: Details, title: str, link: str, found: Sequence[Misread]) -> None:
         w = self._words
-        name = w.affect if self._by == "affect" else w.gesture
-        windows = sum(one.windows for one in found)
         self._cell.clear()
         with self._cell:
-            title = w("train.cell_title", truth=name(truth), said=name(said), n=len(found), windows=windows)
             tag(ui.label(title).classes("text-weight-bold"), "cell-title").props('role="heading" aria-level="5"')
-            if d.row.dataset:
-                linked = [one.recording for one in found[:LINKED]]
-                tag(
-                    ui.link(w("train.all_in_review"), review_link(d.row.dataset, linked)).classes("ps-link"), "cell-all"
-                )
-                if len(found) > LINKED:
-                    tag(ui.label(w("train.cell_cut", n=LINKED)), "cell-cut")
+            if link:
+                tag(ui.link(w("train.all_in_review"), link).classes("ps-link"), "cell-all")
             box = ui.element("div").classes("ps-wide")
             with box.props(f'role="region" tabindex="0" aria-label="{title}"'):
                 tag(ui.html(_recordings(w, d.row.dataset, found), sanitize=False), "cell-list")
@@ -191,11 +194,6 @@ class DetailsView:
         with ui.element("div").classes("ps-wide").props(f'role="region" tabindex="0" aria-label="{w("train.people")}"'):
             table = f'<table class="ps-table"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>'
             tag(ui.html(table, sanitize=False), "people")
-
-
-def review_link(dataset: str, recordings: Sequence[str]) -> str:
-    """Where the review page shows these recordings of a data set."""
-    return f"/review?dataset={quote(dataset, safe='')}&recordings={quote(','.join(recordings), safe='')}"
 
 
 def as_table(w: Words, confusion: Confusion, by_affect: bool, clickable: bool) -> str:
@@ -240,7 +238,8 @@ def _recordings(w: Words, dataset: str, found: Sequence[Misread]) -> str:
     for one in found:
         link = escape(one.recording)
         if dataset:
-            where = escape(review_link(dataset, [one.recording]), quote=True)
+            query = urlencode({"dataset": dataset, "recording": one.recording})
+            where = escape(f"/review?{query}", quote=True)
             label = escape(f"{w('train.in_review')}: {one.recording}", quote=True)
             link = f'<a href="{where}" aria-label="{label}">{link}</a>'
         said = ", ".join(w.gesture(label) for label in one.predicted)

@@ -369,7 +369,7 @@ def _power(value: float) -> str:
 def _whole(text: Any) -> Any:
     """A whole number where it is one; anything else stays, and is refused by whoever reads it."""
     plain = str(text).strip()
-    return int(plain) if plain.lstrip("-").isdigit() else plain
+    return int(plain) if plain.removeprefix("-").isdecimal() else plain
 
 
 def _text(text: Any) -> str:

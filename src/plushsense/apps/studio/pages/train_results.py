@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from html import escape
 from typing import Any
 
@@ -182,15 +182,9 @@ class ResultsView:
     # Score against size ---------------------------------------------------------------------------------------
 
     def _draw_pareto(self, rows: list[Row]) -> None:
-        """Only what can be compared stands in one drawing: the same data, kind of score, split and context."""
+        """Only what can be compared stands in one drawing."""
         w = self._words
-        groups: dict[str, list[Row]] = {}
-        for row in rows:
-            if row.macro_f1 is not None:
-                groups.setdefault(
-                    " · ".join((row.data, w(f"train.rows.{row.kind}"), row.split, row.context)), []
-                ).append(row)
-        groups = {name: several for name, several in groups.items() if len(several) > 1}
+        groups = comparable(rows, lambda kind: w(f"train.rows.{kind}"))
         self._pareto.clear()
         if not groups:
             return
@@ -236,6 +230,29 @@ class ResultsView:
             y=w("train.pareto_y"),
             leaky=w("train.leaky"),
         )
+
+
+def comparable(rows: Sequence[Row], kind: Callable[[str], str]) -> dict[str, list[Row]]:
+    """Rows of the same data, kind of score, split, context and classes, on the same people; of two and more.
+
+    Groups that would read alike are numbered: the same data set before and after it was changed, say.
+    """
+    found: dict[tuple[Any, ...], list[Row]] = {}
+    for row in rows:
+        if row.macro_f1 is not None:
+            found.setdefault((row.data, row.kind, row.split, row.context, *row.apart), []).append(row)
+    groups: dict[str, list[Row]] = {}
+    for key, several in sorted(found.items(), key=lambda item: -max(row.when_s for row in item[1])):
+        if len(several) < 2:
+            continue
+        data, which, split, context = key[:4]
+        name = plain = " · ".join((data, kind(which), split, context))
+        number = 1
+        while name in groups:
+            number += 1
+            name = f"{plain} ({number})"
+        groups[name] = several
+    return groups
 
 
 CLICKS = '(e) => { const b = e.target.closest("[data-do]"); if (b) emit(b.dataset.do); }'

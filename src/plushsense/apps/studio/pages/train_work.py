@@ -15,6 +15,7 @@ from plushsense.apps.studio.jobs import DONE, REFUSED, RUNNING, STOPPED, Job, Jo
 from plushsense.apps.studio.orders import EVALUATE, KINDS, SEARCH, SWEEP, TRAIN
 from plushsense.apps.studio.pages.train_words import figure, lasting, marks, over, spread
 from plushsense.apps.studio.plot import Plot
+from plushsense.apps.studio.result_rows import over_trainings
 from plushsense.apps.studio.shell import LINES, Page, tag
 from plushsense.apps.studio.words import Words
 
@@ -272,6 +273,7 @@ def result_text(w: Words, job: Job) -> str:
     found = {"arch": best["arch"], "filters": best["filters"], "parameters": f"{best['parameters']:,}"}
     found |= {"accuracy": spread(best["accuracy"], best.get("accuracy_sd"))}
     found |= {"macro_f1": spread(best["macro_f1"], best.get("macro_f1_sd"))}
+    found |= {"over": over(w, *over_trainings(best))}
     counts = {"done": r.get("done"), "trials": r.get("trials", r.get("candidates"))}
     return w(f"train.result_{job.task}", **found, **counts, **where)
 
