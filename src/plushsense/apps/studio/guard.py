@@ -73,14 +73,18 @@ class Visitors:
 
     def strange(self, headers: dict[str, str]) -> str:
         """Why a request is none of ours; "" for one that is. A foreign page must not reach us under another name."""
-        host = urlsplit(f"//{headers.get('host', '')}").hostname or ""
+        origin = headers.get("origin")
+        try:
+            host = urlsplit(f"//{headers.get('host', '')}").hostname or ""
+            asking = urlsplit(origin or "").netloc
+        except ValueError:
+            return "This request names no address that there can be: use the one that the studio printed."
         if host.lower() not in self._names and f"[{host.lower()}]" not in self._names:
             return f"This studio is not called '{host}': use the address that it printed."
-        origin = headers.get("origin")
         # Browsers say whose page asks; a link that somebody follows to us is no harm.
         if headers.get("sec-fetch-site") == "cross-site" and headers.get("sec-fetch-mode") != "navigate":
             return "Another page asked for this: open the studio by its own address."
-        if origin and urlsplit(origin).netloc.lower() != headers.get("host", "").lower():
+        if origin and asking.lower() != headers.get("host", "").lower():
             return "Another page asked for this: open the studio by its own address."
         return ""
 
