@@ -276,7 +276,9 @@ class Clips:
                 seconds = float(more["seconds"])
             if event.what == "take":
                 file, first = str(more.get("file")), _first_row(folder / str(more.get("file")))
-                labels[file] = Label(file, str(more.get("gesture")), first, first + int(more.get("rows") or 0))
+                held = more.get("rows")
+                last = first + (held if isinstance(held, int) else 0)
+                labels[file] = Label(file, str(more.get("gesture")), first, last)
                 added = []
             elif event.what == "added" and more.get("dataset") not in added:
                 added.append(str(more.get("dataset")))
