@@ -32,7 +32,7 @@ CHROMIUM = [
     "--disable-sync",
 ]
 _START_S = 60.0
-_WAIT_MS = 20_000
+_WAIT_MS = 60_000
 _SETTLE_MS = 200
 DESK, TABLET = (1280, 800), (820, 1180)
 

@@ -81,17 +81,17 @@ def look(chromium: Browser) -> Iterator[Callable[..., Look]]:
 
 
 @pytest.fixture
-def shots(request: pytest.FixtureRequest) -> Callable[[Page, str], Path]:
-    """Takes a screenshot of the whole page; they lie in ``PLUSHSENSE_SHOTS`` where that is set, for looking at."""
-    folder = Path(os.environ.get("PLUSHSENSE_SHOTS") or request.getfixturevalue("tmp_path"))
+def shots() -> Callable[[Page, str], None]:
+    """Takes a screenshot of the whole page into ``PLUSHSENSE_SHOTS``, for looking at; nothing where that is not set."""
+    folder = os.environ.get("PLUSHSENSE_SHOTS")
 
-    def take(page: Page, name: str) -> Path:
-        folder.mkdir(parents=True, exist_ok=True)
-        path = folder / f"{name}.png"
+    def take(page: Page, name: str) -> None:
+        if not folder:
+            return
+        Path(folder).mkdir(parents=True, exist_ok=True)
         with contextlib.suppress(Exception):
             page.wait_for_load_state("networkidle", timeout=2000)
-        page.screenshot(path=str(path), full_page=True)
-        return path
+        page.screenshot(path=str(Path(folder) / f"{name}.png"), full_page=True)
 
     return take
 

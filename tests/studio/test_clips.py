@@ -24,7 +24,7 @@ from plushsense.dataset.index import open_dataset
 from plushsense.dataset.making import ImportSummary
 from plushsense.recording import writer
 from plushsense.recording.session import next_session
-from plushsense.recording.sessionfile import read_events
+from plushsense.recording.sessionfile import SESSION_LOG, read_events
 
 
 @pytest.fixture
@@ -72,6 +72,10 @@ def test_the_last_seconds_are_kept_as_they_came(house: House) -> None:
     assert [c.key for c in clips.all()] == ["S01/live-2", "S01/live-1"]
     # No recorder takes it up as a session that it would have to go on with.
     assert next_session(house.recordings / "S01") == "1"
+    # A log that somebody spoilt hides no other clip.
+    with (house.recordings / "S01" / "live-2" / SESSION_LOG).open("a", encoding="utf-8") as log:
+        log.write('{"what": "take", "at_ms": 1, "file": 7, "gesture": [], "rows": "many"}\n')
+    assert "S01/live-1" in [c.key for c in clips.all()]
 
 
 def test_from_now_on_rows_are_on_disk_within_a_second(house: House) -> None:

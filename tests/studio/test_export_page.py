@@ -55,7 +55,7 @@ def test_export_verify_and_break(
     with zipfile.ZipFile(io.BytesIO(Path(loaded.value.path()).read_bytes())) as archive:
         got = {n.removeprefix("one/"): hashlib.sha256(archive.read(n)).hexdigest() for n in archive.namelist()}
     assert got == sums(tmp_path / "two")
-    for name in ("..", "%2e%2e", "bundles", "one%2fgolden"):
+    for name in ("..", "%2e%2e", "bundles", "one%2fgolden", "a" * 300):
         with pytest.raises(urllib.error.HTTPError) as refused:
             urllib.request.urlopen(f"{url}/download/exports/{name}.zip", timeout=20)
         assert refused.value.code == 404

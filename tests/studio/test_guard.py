@@ -105,6 +105,8 @@ def test_this_machine_needs_no_token() -> None:
         {"host": "evil.example"},
         {"host": "127.0.0.1.evil.example"},
         {"host": ""},
+        {"host": "[::1"},
+        {"origin": "http://["},
         {"origin": "http://evil.example"},
         {"origin": "null"},
         {"origin": "http://127.0.0.1:9999"},

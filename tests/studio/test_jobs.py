@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from plushsense.apps.studio.house import WORK, House
-from plushsense.apps.studio.jobs import DONE, REFUSED, RUNNING, STOPPED, UNFINISHED, Job, Jobs
+from plushsense.apps.studio.jobs import DONE, INCOMING, REFUSED, RUNNING, STOPPED, UNFINISHED, Job, Jobs
 from plushsense.core.errors import ConfigError
 
 SIMULATE = {"people": 2, "repetitions": 1}
@@ -141,6 +141,19 @@ def test_an_id_that_is_none_is_refused(jobs: Jobs) -> None:
         with pytest.raises(ConfigError, match="no work"):
             call("nothing")
     jobs.stop("nothing")
+
+
+def test_files_that_nobody_waits_for_are_removed(house: House) -> None:
+    sent = house.folder / WORK / INCOMING
+    sent.mkdir(parents=True)
+    for name in ("half.zip", "imported.zip", "stopped.zip"):
+        (sent / name).write_bytes(b"PK")
+    for number, state, name in ((1, DONE, "imported.zip"), (2, RUNNING, "stopped.zip")):
+        spec = {"archive": str(sent / name)}
+        job = {"id": str(number), "task": "import", "spec": spec, "title": name, "state": state}
+        (house.folder / WORK / f"{number}.json").write_text(json.dumps(job), encoding="utf-8")
+    assert [j.state for j in Jobs(house).all()] == [STOPPED, DONE]
+    assert [p.name for p in sent.iterdir()] == ["stopped.zip"]
 
 
 @pytest.mark.parametrize(

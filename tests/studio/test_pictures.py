@@ -72,7 +72,7 @@ def test_a_users_own(tmp_path: Path) -> None:
         assert own_picture(tmp_path, label) == ""
 
 
-def test_they_are_looked_at(chromium: Any, shots: Callable[..., Path]) -> None:
+def test_they_are_looked_at(chromium: Any, shots: Callable[..., None]) -> None:
     page = chromium.new_page(viewport={"width": 1500, "height": 900})
     for ground in ("#ffffff", "#121212"):
         each = "".join(f"<div>{picture(label)}</div>" for label in LABELS)

@@ -208,7 +208,7 @@ def test_a_lost_connection_loses_nothing(studio: Fixture, look: Fixture, tmp_pat
     page.wait_for_timeout(500)
     assert "take" not in whats(tmp_path / "home")
     browser.context.set_offline(False)
-    page.wait_for_function("() => window.socket && window.socket.connected", timeout=20_000)
+    page.wait_for_function("() => window.socket && window.socket.connected")
     connected(page)
     showing(page, "recording.0.", "idle.1.")
     if showing(page, "").startswith("recording"):

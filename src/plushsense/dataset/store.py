@@ -18,6 +18,7 @@ import html
 import io
 import json
 import os
+import threading
 from collections.abc import Iterable
 from dataclasses import dataclass, field, fields
 from functools import cached_property
@@ -128,8 +129,8 @@ class StreamInfo(_Row):
 
 
 def write_atomically(path: Path, text: str) -> None:
-    """Replace a text file in one step: readers see the old one or the new one."""
-    part = path.with_name(f"{path.name}.{os.getpid()}.part")
+    """Replace a text file in one step: readers see the old one or the new one, also where threads write it at once."""
+    part = path.with_name(f"{path.name}.{os.getpid()}-{threading.get_ident()}.part")
     try:
         part.write_text(text, encoding="utf-8", newline="\n")
         os.replace(part, path)

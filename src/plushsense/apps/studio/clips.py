@@ -163,12 +163,13 @@ class Clips:
         self.bell.ring()
         return _key(running.session.folder)
 
-    def end(self) -> str:
-        """End the clip that is being recorded; its key, or "" where none was."""
+    def end(self, only: _Running | None = None) -> str:
+        """End the clip that is being recorded, or ``only`` this one; its key, or "" where none was."""
         with self._lock:
-            running, self._running = self._running, None
-            if running is None:
+            running = self._running
+            if running is None or only not in (None, running):
                 return ""
+            self._running = None
             with contextlib.suppress(ValueError):
                 running.device.taps.remove(self._tap)
             running.over = True
@@ -200,12 +201,12 @@ class Clips:
                     running.keeper.do(_event("gap", **gap))
             running.over = running.intake.toy_ms >= 1000.0 * LONGEST_S
         if running.over:
-            threading.Thread(target=self.end, daemon=True).start()
+            threading.Thread(target=self.end, args=(running,), daemon=True).start()
 
     def _fail(self, running: _Running, cause: Exception) -> None:
         running.failed = str(_refused(running.session.folder, cause))
         running.over = True
-        threading.Thread(target=self.end, daemon=True).start()
+        threading.Thread(target=self.end, args=(running,), daemon=True).start()
 
     def _open(self, listening: Listening, device: TappedDevice, bundle: Bundle, subject: str) -> _Running:
         """A new session; with the lock."""
@@ -276,7 +277,9 @@ class Clips:
                 seconds = float(more["seconds"])
             if event.what == "take":
                 file, first = str(more.get("file")), _first_row(folder / str(more.get("file")))
-                labels[file] = Label(file, str(more.get("gesture")), first, first + int(more.get("rows") or 0))
+                held = more.get("rows")
+                last = first + (held if isinstance(held, int) else 0)
+                labels[file] = Label(file, str(more.get("gesture")), first, last)
                 added = []
             elif event.what == "added" and more.get("dataset") not in added:
                 added.append(str(more.get("dataset")))

@@ -18,6 +18,8 @@ from plushsense.dataset.publish.archive import files_of
 from plushsense.deploy.emit import FACTS
 
 _PIECE = 1 << 16
+_LONGEST_NAME = 255
+"""Bytes of a file's name; file systems refuse longer ones in ways of their own."""
 
 
 def address(kind: str, name: str) -> str:
@@ -60,7 +62,7 @@ def below(house: House, kind: str, name: str) -> Path:
         ConfigError: for a name that leads elsewhere, also by way of a link.
     """
     place = house.inside(house.folder / kind / name)
-    if place.parent != house.folder / kind:
+    if place.parent != house.folder / kind or len(place.name.encode()) > _LONGEST_NAME:
         raise ConfigError(f"'{name}' is no name in '{house.folder / kind}'.")
     return place
 

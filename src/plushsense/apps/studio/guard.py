@@ -25,6 +25,8 @@ UPLOAD_BYTES = 501_000_000
 """The largest body of a request that brings a file."""
 BODY_BYTES = 4_000_000
 """The largest body of any other request."""
+_UNANSWERED = "No response returned"
+"""What Starlette fails with where the visitor left before the answer was made."""
 _LOOPBACK = ("127.0.0.1", "localhost", "[::1]", "::1")
 
 # NiceGUI's Vue templates are compiled in the browser, which needs eval; nothing may come from elsewhere.
@@ -73,14 +75,18 @@ class Visitors:
 
     def strange(self, headers: dict[str, str]) -> str:
         """Why a request is none of ours; "" for one that is. A foreign page must not reach us under another name."""
-        host = urlsplit(f"//{headers.get('host', '')}").hostname or ""
+        origin = headers.get("origin")
+        try:
+            host = urlsplit(f"//{headers.get('host', '')}").hostname or ""
+            asking = urlsplit(origin or "").netloc
+        except ValueError:
+            return "This request names no address that there can be: use the one that the studio printed."
         if host.lower() not in self._names and f"[{host.lower()}]" not in self._names:
             return f"This studio is not called '{host}': use the address that it printed."
-        origin = headers.get("origin")
         # Browsers say whose page asks; a link that somebody follows to us is no harm.
         if headers.get("sec-fetch-site") == "cross-site" and headers.get("sec-fetch-mode") != "navigate":
             return "Another page asked for this: open the studio by its own address."
-        if origin and urlsplit(origin).netloc.lower() != headers.get("host", "").lower():
+        if origin and asking.lower() != headers.get("host", "").lower():
             return "Another page asked for this: open the studio by its own address."
         return ""
 
@@ -148,13 +154,14 @@ async def _bounded(app: App, scope: Scope, receive: Receive, send: Send, headers
     if not length.isdecimal() or int(length) > most:
         await _refuse(scope, send, 413, said)
         return
-    came, over, begun = 0, False, False
+    came, over, begun, gone = 0, False, False, False
 
     async def receiving() -> dict[str, Any]:
-        nonlocal came, over
+        nonlocal came, over, gone
         if over:
             return {"type": "http.disconnect"}
         message = await receive()
+        gone = gone or message["type"] == "http.disconnect"
         came += len(message.get("body", b""))
         if came > most:
             over = True
@@ -172,9 +179,9 @@ async def _bounded(app: App, scope: Scope, receive: Receive, send: Send, headers
 
     try:
         await app(scope, receiving, sending)
-    except Exception:
-        # Whatever reads a body takes its end for the visitor's leaving.
-        if not over:
+    except Exception as cause:
+        # Whatever reads a body takes its end for the visitor's leaving; and one who left needs no answer.
+        if not over and not (gone and _UNANSWERED in str(cause)):
             raise
     if over and not begun:
         await _refuse(scope, send, 413, said)

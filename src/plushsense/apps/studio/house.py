@@ -47,6 +47,7 @@ class House:
     speed: float = 1.0
     invite: Callable[[], str] | None = None
     _parts: dict[type, Any] = field(default_factory=dict, repr=False)
+    _titles: dict[Path, tuple[tuple[int, int], str]] = field(default_factory=dict, repr=False)
     _lock: Any = field(default_factory=threading.RLock, repr=False)
 
     def __post_init__(self) -> None:
@@ -146,7 +147,13 @@ class House:
     def title(self, dataset: Path) -> str:
         """A data set's name, with a word where it is a simulation; its folder's name where it cannot be read."""
         try:
-            return DatasetHead.read(dataset).name
+            now = (dataset / _HEAD).stat()
+            seen = now.st_mtime_ns, now.st_size
+            # Pages ask on their loop, for every data set that there is.
+            known = self._titles.get(dataset)
+            if known is None or known[0] != seen:
+                known = self._titles[dataset] = (seen, DatasetHead.read(dataset).name)
+            return known[1]
         except Exception:  # noqa: BLE001 (a page that lists data sets must list the broken one, too)
             return dataset.name
 

@@ -20,6 +20,8 @@ from plushsense.dataset.store import write_atomically
 
 UNFINISHED = ".unfinished-"
 """How folders in the work folder begin that hold what is made on the way; they are removed at the next start."""
+INCOMING = "incoming"
+"""In the work folder: files that visitors sent, until they are settled; nobody's are removed at the next start."""
 RUNNING, DONE, REFUSED, STOPPED = "running", "done", "refused", "stopped"
 _KEPT = 2000
 # Of a spec, what is for the worker's ears only: words that may not be left anywhere, such as people's names.
@@ -79,6 +81,12 @@ class Jobs:
                 # What was running ended with the studio that ran it.
                 job.state = STOPPED if job.state == RUNNING else job.state
                 self._jobs[job.id] = job
+        # Sent while the studio was killed; what stopped work would go on with stays.
+        wanted = {str(job.spec.get("archive")) for job in self._jobs.values() if job.state == STOPPED}
+        for sent in self._folder.glob(f"{INCOMING}/*"):
+            if str(sent) not in wanted:
+                with contextlib.suppress(OSError):
+                    sent.unlink()
 
     def all(self, *tasks: str) -> list[Job]:
         """The newest first; of these tasks, or of all."""

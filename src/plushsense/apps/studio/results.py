@@ -85,8 +85,9 @@ class Results:
                     path = folder / name
                     if path.is_file():
                         yield from self._once(path, read, dataset) or ()
+        known = self._known()
         for path in self._house.bundles():
-            yield from self._once(path, of_bundle, self._known()) or ()
+            yield from self._once(path, of_bundle, known) or ()
 
     def _known(self) -> dict[str, str]:
         """The data sets by name, to know those of bundles again."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import inspect
+import logging
 import os
 import socket
 import threading
@@ -82,6 +83,8 @@ def run(
         _wait_open(shown, port)
         told(house.invite() if house.invite else address)
 
+    # At the end NiceGUI's own loops may miss that they are to stop; that is nothing for people.
+    logging.getLogger("nicegui").addFilter(lambda record: "Could not cancel" not in str(record.msg))
     # A bar that nobody has named, for screen readers, at every request.
     app.config.quasar_config["loadingBar"] = {"skipHijack": True}
     app.on_startup(lambda: threading.Thread(target=tell, daemon=True).start())

@@ -64,9 +64,11 @@ class Toys:
         threading.Thread(target=self._look, args=(scan_s,), daemon=True).start()
 
     def _look(self, scan_s: float) -> None:
-        found = list_devices(scan_s)
-        self.listing, self.looked, self.looking = found, True, False
-        self.bell.ring()
+        try:
+            self.listing, self.looked = list_devices(scan_s), True
+        finally:
+            self.looking = False
+            self.bell.ring()
 
     def choose(self, url: str) -> str:
         """Make this the toy of all pages; returns its URL.

@@ -12,7 +12,7 @@ from nicegui import run, ui
 
 from plushsense.apps.studio.house import House
 from plushsense.apps.studio.jobs import DONE, REFUSED, RUNNING, Job, Jobs
-from plushsense.apps.studio.shell import Page, on_ring, tag
+from plushsense.apps.studio.shell import Page, named, on_ring, tag
 from plushsense.apps.studio.words import Words
 
 _STYLE = """
@@ -92,9 +92,7 @@ def table(caption: str, head: Sequence[str], rows: Sequence[Sequence[str]], numb
     body = "".join(cells(row, "td") for row in rows)
     inner = f"<caption>{escape(caption)}</caption><thead>{cells(head, 'th')}</thead><tbody>{body}</tbody>"
     # What scrolls sideways must be reachable by keyboard.
-    with (
-        ui.element("div").classes("ps-wide").props(f'tabindex="0" role="region" aria-label="{escape(caption)}"') as box
-    ):
+    with named(ui.element("div").classes("ps-wide").props('tabindex="0" role="region"'), caption) as box:
         ui.html(inner, sanitize=False, tag="table").classes("ps-table")
     return box
 
@@ -205,9 +203,8 @@ class WorkShown:
                         tag(stop.props("outline no-caps"), "stop")
                     # Not read out at every step.
                     where = ui.label("").classes("ps-dim")
-                    bar = ui.linear_progress(0.0, show_value=False, size="12px").props(
-                        f'aria-label="{escape(title_of(words, job))}"'
-                    )
+                    bar = ui.linear_progress(0.0, show_value=False, size="12px")
+                    named(bar, title_of(words, job))
                     self._bars[job.id] = (bar, tag(where, "where"))
             if last is not None:
                 bad = last.state == REFUSED

@@ -10,7 +10,7 @@ from nicegui import events, run, ui
 
 from plushsense.apps.studio.guard import UPLOAD_BYTES
 from plushsense.apps.studio.house import BUNDLES, DATASETS, WORK
-from plushsense.apps.studio.jobs import Jobs
+from plushsense.apps.studio.jobs import INCOMING, Jobs
 from plushsense.apps.studio.overview import Seen
 from plushsense.apps.studio.pages.home_data import section, simulated
 from plushsense.apps.studio.shell import Page, address, named, tag
@@ -21,7 +21,6 @@ from plushsense.models.bundle import Bundle
 ARCHIVE_BYTES = UPLOAD_BYTES - 1_000_000
 """What a zip may weigh: the request holds a little more than the file."""
 BUNDLE_BYTES = 64_000_000
-_INCOMING = "incoming"
 
 
 def bundles(page: Page) -> Callable[[Seen], None]:
@@ -64,7 +63,7 @@ def incoming(page: Page, jobs: Jobs, changed: Callable[[], Awaitable[None]]) -> 
         name = Path(file.file.name.replace("\\", "/")).name
         kind = Path(name).suffix.lower()
         uploader.reset()
-        folder = page.house.folder / WORK / _INCOMING
+        folder = page.house.folder / WORK / INCOMING
         with page.refusing():
             if kind not in (".zip", ".plush"):
                 raise ConfigError(f"'{name}' is neither a .zip of recordings nor a .plush bundle: choose one of these.")

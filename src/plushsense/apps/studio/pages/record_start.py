@@ -10,7 +10,7 @@ from urllib.parse import quote
 from nicegui import run, ui
 
 from plushsense.apps.studio.desk import Desk, Sitting
-from plushsense.apps.studio.shell import Page, tag
+from plushsense.apps.studio.shell import Page, named, tag
 from plushsense.apps.studio.words import Words
 from plushsense.core.errors import ConfigError, PlushSenseError
 from plushsense.devices.listing import list_devices
@@ -87,7 +87,7 @@ def _open_ones(page: Page, desk: Desk) -> None:
             ui.label(page.words("record.open_now", name=sitting.name)).classes("flex-grow text-bold")
             there = page.words("record.show")
             button = ui.button(there, color=None, on_click=lambda s=sitting: ui.navigate.to(address(s.name)))
-            button.props(f'aria-label="{there}: {sitting.name}" no-caps unelevated').style(STRONG)
+            named(button.props("no-caps unelevated").style(STRONG), f"{there}: {sitting.name}")
 
 
 def _unfinished(page: Page, desk: Desk, sessions: list[Shelved]) -> None:
@@ -119,14 +119,11 @@ def _one_unfinished(page: Page, desk: Desk, session: Shelved) -> None:
             title += f" · {words('record.simulated')}" if session.head.simulated else ""
             ui.label(title).classes("ps-dim")
         toys = list(dict.fromkeys([session.head.device, *desk.toys()]))
-        named = {u: toy_name(words, u) for u in toys}
-        toy = ui.select(named, value=toys[0], label=words("record.toy")).style("width: 24rem; max-width: 100%")
-        toy.props(f'outlined dense aria-label="{words("record.toy")}: {name}"')
-        button = (
-            ui.button(words("record.go_on"), color=None)
-            .style(STRONG)
-            .props(f'no-caps unelevated aria-label="{words("record.go_on")}: {name}"')
-        )
+        titles = {u: toy_name(words, u) for u in toys}
+        toy = ui.select(titles, value=toys[0], label=words("record.toy")).style("width: 24rem; max-width: 100%")
+        named(toy.props("outlined dense"), f"{words('record.toy')}: {name}")
+        button = ui.button(words("record.go_on"), color=None).style(STRONG).props("no-caps unelevated")
+        named(button, f"{words('record.go_on')}: {name}")
         button.on_click(lambda: _sit_down(page, button, lambda: desk.resume(name, str(toy.value))))
 
 
@@ -191,7 +188,8 @@ class _Form:
     def _select(self, options: dict[str, str], key: str, value: str) -> ui.select:
         label = self._page.words(f"record.{key}")
         value = value if value in options else next(iter(options))
-        field = ui.select(options, value=value, label=label).props(f'outlined aria-label="{label}"')
+        field = ui.select(options, value=value, label=label).props("outlined")
+        named(field, label)
         return tag(field, key).style("width: 27rem; max-width: 100%")
 
     def _choose_words(self) -> None:

@@ -10,7 +10,7 @@ from nicegui import ui
 from plushsense.apps.studio.desk import Sitting
 from plushsense.apps.studio.keys import on_click
 from plushsense.apps.studio.pages.record_start import unfolding
-from plushsense.apps.studio.shell import Page, tag
+from plushsense.apps.studio.shell import Page, named, tag
 from plushsense.recording.status import Status, StepStanding
 
 _MOST = 400
@@ -66,5 +66,5 @@ class Steps:
             where = words("record.repetition", n=standing.step.repetition, m=status.repetitions)
             signs = _SIGNS[state] + (f" {_SIGNS['now']}" if now else "")
             self._buttons[n].text = f"{standing.step.repetition} {signs}"
-            label = f"{words.gesture(standing.step.gesture)}, {where}: {said}".replace('"', "'")
-            self._buttons[n].props(f'aria-label="{label}" data-step="{state}"')
+            label = f"{words.gesture(standing.step.gesture)}, {where}: {said}"
+            named(self._buttons[n].props(f'data-step="{state}"'), label)

@@ -14,7 +14,7 @@ from plushsense.apps.studio.pages.train_words import figure, marks, over, spread
 from plushsense.apps.studio.result_rows import EVALUATION, HELD_BACK, TRAINING, Row
 from plushsense.apps.studio.results import Confusion, Details, Misread, Results
 from plushsense.apps.studio.reviews import Reviews
-from plushsense.apps.studio.shell import AFFECT_SIGNS, Page, tag
+from plushsense.apps.studio.shell import AFFECT_SIGNS, Page, named, tag
 from plushsense.apps.studio.words import Words
 from plushsense.core.gestures import NOBODY
 from plushsense.dataset.store import UNKNOWN_SUBJECT
@@ -161,7 +161,7 @@ class DetailsView:
             if link:
                 tag(ui.link(w("train.all_in_review"), link).classes("ps-link"), "cell-all")
             box = ui.element("div").classes("ps-wide")
-            with box.props(f'role="region" tabindex="0" aria-label="{title}"'):
+            with named(box.props('role="region" tabindex="0"'), title):
                 tag(ui.html(_recordings(w, d.row.dataset, found), sanitize=False), "cell-list")
 
     # People ---------------------------------------------------------------------------------------------------
@@ -185,8 +185,8 @@ class DetailsView:
             for key in ("person", "recordings", "windows", "accuracy", "macro_f1", "by_recording")
         )
         body = "".join(
-            f'<tr><th scope="row">{escape(one["subject"])}</th><td class="n">{one["recordings"]}</td>'
-            f'<td class="n">{one["windows"]}</td><td class="n">{figure(one["accuracy"])}</td>'
+            f'<tr><th scope="row">{escape(one["subject"])}</th><td class="n">{escape(str(one["recordings"]))}</td>'
+            f'<td class="n">{escape(str(one["windows"]))}</td><td class="n">{figure(one["accuracy"])}</td>'
             f'<td class="n">{figure(one["macro_f1"])}</td>'
             f'<td class="n">{figure(one["by_recording_accuracy"])}</td></tr>'
             for one in d.people

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Sequence
 from html import escape
@@ -260,8 +261,7 @@ CLICKS = '(e) => { const b = e.target.closest("[data-do]"); if (b) emit(b.datase
 
 def refocus(what: str) -> None:
     """Give the focus back to a button whose table was drawn anew."""
-    safe = what.replace("\\", "\\\\").replace('"', '\\"')
     ui.run_javascript(
         f"setTimeout(() => [...document.querySelectorAll('[data-do]')]"
-        f'.find((b) => b.dataset.do === "{safe}")?.focus(), 60)'
+        f".find((b) => b.dataset.do === {json.dumps(what)})?.focus(), 60)"
     )

@@ -16,7 +16,7 @@ from plushsense.apps.studio.orders import EVALUATE, KINDS, SEARCH, SWEEP, TRAIN
 from plushsense.apps.studio.pages.train_words import figure, lasting, marks, over, spread
 from plushsense.apps.studio.plot import Plot
 from plushsense.apps.studio.result_rows import over_trainings
-from plushsense.apps.studio.shell import LINES, Page, tag
+from plushsense.apps.studio.shell import LINES, Page, named, tag
 from plushsense.apps.studio.words import Words
 
 _LISTED = 30
@@ -91,7 +91,7 @@ class Work:
             show = ui.button(w("train.show"), on_click=lambda: self.open(job.id), color=None).props(
                 "flat dense no-caps"
             )
-            show.props(f'aria-label="{w("train.show")}: {_safe(job.title)}"')
+            named(show, f"{w('train.show')}: {job.title}")
 
     def open(self, identity: str) -> None:
         """Show a job's card."""
@@ -127,7 +127,7 @@ class _Card:
         self._text: ui.label | None = None
         self._warned = -1
         with tag(ui.element("article").classes("ps-card w-full column q-gutter-xs"), "job") as box:
-            box.props(f'data-job="{job.id}" data-state="{job.state}" aria-label="{_safe(job.title)}"')
+            named(box.props(f'data-job="{job.id}" data-state="{job.state}"'), job.title)
             with ui.row().classes("w-full items-center"):
                 tag(_badge(w, job.state), "state")
                 ui.label(f"{w(f'train.kinds.{job.task}')}: {job.title}").classes("text-weight-bold")
@@ -135,7 +135,7 @@ class _Card:
                 ui.label(_when(job.begun_s)).classes("ps-dim")
             if job.state == RUNNING:
                 self._bar = ui.linear_progress(0.0, show_value=False, size="14px", color="blue-8").classes("w-full")
-                self._bar.props(f'aria-label="{_safe(w("train.progress", title=job.title))}" instant-feedback')
+                named(self._bar.props("instant-feedback"), w("train.progress", title=job.title))
                 tag(self._bar, "progress")
                 self._text = tag(ui.label(), "at")
             elif job.state == STOPPED:
@@ -161,7 +161,7 @@ class _Card:
         unit = {LOSS: "", ACCURACY: " (0–1)", BEST: " (0–1)"}[chart.what]
         x = w("train.trainings") if chart.what == BEST else w("train.epoch")
         drawn = self._lines(chart)
-        plot = Plot(f"{title}: {_safe(self._job.title)}", drawn, x=x, y=title + unit, height=220)
+        plot = Plot(f"{title}: {self._job.title}", drawn, x=x, y=title + unit, height=220)
         tag(plot, f"curve-{chart.what}").begin(chart.x, chart.lines)
         self._plots.append((chart.what, plot, chart.names))
 
@@ -218,7 +218,7 @@ class _Card:
                 hide = ui.button(w("train.hide"), on_click=lambda: self._work.close(job.id), color=None).props(
                     "flat no-caps"
                 )
-                hide.props(f'aria-label="{w("train.hide")}: {_safe(job.title)}"')
+                named(hide, f"{w('train.hide')}: {job.title}")
 
     def _result(self) -> None:
         job, r, w = self._job, self._job.result, self._words
@@ -303,8 +303,3 @@ def _badge(w: Words, state: str) -> ui.label:
 
 def _when(seconds: float) -> str:
     return time.strftime("%Y-%m-%d %H:%M", time.localtime(seconds)) if seconds else ""
-
-
-def _safe(text: str) -> str:
-    """Text as a property takes it."""
-    return text.replace('"', "'").replace("\\", "/")
