@@ -137,7 +137,7 @@ class _View:
                 "no-caps unelevated color=deep-orange-10"
             )
             tag(yes, "end-yes")
-            no = ui.button(words("record.end_no")).props("no-caps outline")
+            no = ui.button(words("record.end_no"), color=None).props("no-caps outline")
             no.on_click(self._stay)
             self._no = tag(no, "end-no")
         self._ending.set_visibility(False)
