@@ -91,7 +91,7 @@ def test_export_verify_and_break(
     marked(page, "stop").wait_for()
     page.reload()
     connected(page)
-    assert "Verify 'one'" in marked(page, "work").inner_text()
+    assert "Verify “one”" in marked(page, "work").inner_text()
     other = look(TABLET, dark=True, language="lv", touch=True)
     tablet = other.open(f"{url}/export?name=one")
     assert "Pārbaude: “one”" in marked(tablet, "work").inner_text()
@@ -99,7 +99,7 @@ def test_export_verify_and_break(
     shots(tablet, "export-lv-dark-tablet")
     marked(tablet, "stop").click()
     marked(page, "ended").wait_for(timeout=60_000)
-    assert "Stopped: Verify 'one'" in marked(page, "ended").inner_text()
+    assert "Stopped: Verify “one”" in marked(page, "ended").inner_text()
     assert browser.complaints == [] and other.complaints == []
 
 

@@ -110,21 +110,21 @@ def test_another_bundle_while_it_runs_and_one_that_does_not_fit(studio: Fixture,
     url = studio(*VIRTUAL, home=home).url
     browser = look()
     page = live(browser, url)
-    choose(page, "Bundle", "little")
+    choose(page, "Network", "little")
     marked(page, "start").click()
     marked(page, "state").get_by_text("Reading").wait_for()
     for name, told in (("circus", "knows no gesture of"), ("accel", "accel-3")):
-        choose(page, "Bundle", name)
+        choose(page, "Network", name)
         marked(page, "said").get_by_text(told).wait_for()
         assert axe(page) == []
         page.wait_for_function("(n) => window.plushsenseLive.updates > n + 20", arg=look_at(page)["updates"])
         assert marked(page, "state").inner_text() == "Reading"
         assert (
             marked(page, "bundle").locator("span", has_text="little").count()
-            or page.get_by_label("Bundle", exact=True).input_value() == "little"
+            or page.get_by_label("Network", exact=True).input_value() == "little"
         )
     scenes = look_at(page)["scenes"]
-    choose(page, "Bundle", "few")
+    choose(page, "Network", "few")
     page.wait_for_function("(n) => window.plushsenseLive.scenes > n", arg=scenes)
     marked(page, "bars").locator("li").nth(2).wait_for(state="detached")
     assert sorted(marked(page, "bars").locator("li").evaluate_all("rows => rows.map(r => r.dataset.label)")) == [
@@ -134,7 +134,7 @@ def test_another_bundle_while_it_runs_and_one_that_does_not_fit(studio: Fixture,
     marked(page, "state").get_by_text("Reading").wait_for()
     choose(page, "Computed", "as the chip does (int8)")
     marked(page, "said").get_by_text("calibration").wait_for()
-    choose(page, "Bundle", "little")
+    choose(page, "Network", "little")
     marked(page, "bars").locator("li").nth(17).wait_for()
     choose(page, "Computed", "as the chip does (int8)")
     page.wait_for_function("(n) => window.plushsenseLive.scenes > n + 2", arg=scenes)
@@ -231,6 +231,10 @@ def test_a_hard_case_is_kept_labelled_and_in_the_data_set(
     browser = look()
     page = started(browser, url)
     page.wait_for_function("() => window.plushsenseLive.samples > 1000")
+    marked(page, "keep").click()
+    marked(page, "said").get_by_text("First say whose touch this is").wait_for()
+    page.wait_for_function("document.activeElement.getAttribute('aria-label') === \"The person's code\"")
+    page.keyboard.type("Anna")
     marked(page, "keep").click()
     marked(page, "said").get_by_text("no code for a person").wait_for()
     page.get_by_label("The person's code").fill("S77")

@@ -120,6 +120,8 @@ def test_a_simulation_imported_from_elsewhere_stays_one(tmp_path: Path) -> None:
 
 REAL = DatasetSeen(Path("d"), "real", recordings=9)
 LOOKED = DatasetSeen(Path("d"), "real", recordings=9, reviewed=True)
+ALONE = DatasetSeen(Path("a"), "alone", people=1, recordings=4, reviewed=True)
+MANY = DatasetSeen(Path("v"), "many", people=6, recordings=50, reviewed=True)
 TRIED = DatasetSeen(Path("v"), "virtual", simulated=True, recordings=9)
 BROKEN = DatasetSeen(Path("b"), "broken", "It is broken.")
 NET = BundleSeen(Path("m.plush"), "m")
@@ -143,6 +145,8 @@ KEPT = SessionSeen(Path("s"), "S01", "1", recordings=4, finished=True, kept=("re
         (Seen(datasets=(BROKEN, REAL)), "", "review", "review"),
         (Seen(datasets=(REAL,), sessions=(KEPT,)), "", "review", "review"),
         (Seen(datasets=(LOOKED,)), "", "train", "train"),
+        (Seen(datasets=(ALONE,)), "", "more", "record"),
+        (Seen(datasets=(ALONE, MANY)), "", "train", "train"),
         (Seen(datasets=(TRIED,)), "", "train", "train"),
         (Seen(datasets=(TRIED,), bundles=(TOY_NET,)), "", "live", "live"),
         (Seen(datasets=(TRIED, REAL), bundles=(TOY_NET,)), "", "review", "review"),

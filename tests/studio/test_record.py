@@ -63,6 +63,7 @@ def test_what_is_typed_is_no_command(studio: Fixture, look: Fixture, tmp_path: P
     assert (note["text"], note["gesture"]) == ("so soft, paws & bears", "Head stroke 1")
     assert note["file"].startswith("Back stroke 1_")
     assert showing(page, "").startswith("idle.1.1.0.0")
+    page.wait_for_function("document.activeElement.dataset.test === 'main'")
     page.keyboard.press("Escape")
     page.keyboard.press("Control+p")
     page.keyboard.press("Alt+s")

@@ -26,6 +26,8 @@ from plushsense.recording.sessionfile import SessionHead
 INDEX = "recordings.csv"
 # Marks that programs set do not say that anybody looked.
 _NOT_PEOPLE = (RECORDER,)
+# A whole session of the paper: with less, one person is only a beginning.
+_ENOUGH = 51
 
 
 @dataclass(frozen=True)
@@ -133,7 +135,10 @@ def next_step(seen: Seen, *, toy: str = "", virtual: bool = False, making: bool 
     if not bundles:
         if unreviewed:
             return Next("review", "review", {"name": unreviewed[0].name})
-        return Next("train", "train", {"name": readable[0].name})
+        best = max(readable, key=lambda d: (d.people, d.recordings))
+        if best.people == 1 and best.recordings < _ENOUGH:
+            return Next("more", "record", {"name": best.name})
+        return Next("train", "train", {"name": best.name})
     if unreviewed and all(b.simulated for b in bundles):
         # The bundles are of the virtual toy: the real work goes on.
         return Next("review", "review", {"name": unreviewed[0].name})

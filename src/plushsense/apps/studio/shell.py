@@ -48,6 +48,10 @@ _BEAR = (
     'r="1.8"/><circle cx="20.5" cy="16" r="1.8"/><ellipse cx="16" cy="21" rx="3" ry="2"/></g></svg>'
 )
 
+# One look of all fields.
+for _field in (ui.input, ui.number, ui.select, ui.textarea):
+    _field.default_props("outlined dense")
+
 E = TypeVar("E", bound=ui.element)
 Kind = Literal["info", "good", "warning", "error"]
 
@@ -229,6 +233,11 @@ def named(element: E, label: str) -> E:
     """Give an element a name for screen readers, whatever characters that holds."""
     element.props["aria-label"] = label
     return element
+
+
+def focus(element: ui.element) -> None:
+    """Give an element the keyboard, as soon as it is shown."""
+    ui.run_javascript(f"setTimeout(() => getHtmlElement({element.id})?.focus())")
 
 
 def affect_badge(words: Words, affect: str | None) -> ui.label:

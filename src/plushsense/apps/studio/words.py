@@ -36,6 +36,10 @@ class Words:
         """A gesture's name for people; the label itself where the language has no other."""
         return self._texts.get(f"gestures.{label}", label)
 
+    def unit(self, unit: str) -> str:
+        """A unit's name for people, such as that of plain counts; others are written alike everywhere."""
+        return self._texts.get(f"units.{unit}", unit)
+
     def affect(self, affect: str | None) -> str:
         """An affect's name; "none" and None read the same."""
         return self._texts[f"affects.{affect or 'none'}"]

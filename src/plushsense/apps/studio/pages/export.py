@@ -146,8 +146,8 @@ class _Exporting:
             return [*rows, (words("export.scores"), words("export.no_scores"))]
         value = words(
             "export.scores_value",
-            accuracy=f"{scores['accuracy']:.2f}",
-            f1=f"{scores.get('macro_f1', float('nan')):.2f}",
+            accuracy=words.number(scores["accuracy"], 2),
+            f1=words.number(scores.get("macro_f1", float("nan")), 2),
             windows=scores.get("windows", "?"),
             split=scores.get("split", "?"),
         )

@@ -28,7 +28,6 @@ _STYLE = """
 .ps-verdict { border-radius: 6px; padding: 1px 8px; font-weight: 600; white-space: nowrap; }
 .ps-verdict-good { background: #dff3ea; color: #0b3d2c; } .ps-verdict-bad { background: #fbe3da; color: #5c1d00; }
 .ps-verdict-none { background: #e3e6eb; color: #2b2f36; }
-.ps-link { color: #0b4f8a; text-decoration: underline; } body.body--dark .ps-link { color: #9ccbff; }
 .ps-steps { margin: 0; padding-left: 1.4rem; list-style: decimal; } .ps-steps li { margin-bottom: 4px; }
 .ps-work { position: sticky; top: 84px; z-index: 10; background: #fff; }
 body.body--dark .ps-work { background: #121212; }

@@ -176,7 +176,7 @@ class Sessions:
             words("home.finished" if one.finished else "home.unfinished"),
         ]
         if one.kept:
-            facts.append(words("home.kept", names=", ".join(f"'{n}'" for n in one.kept)))
+            facts.append(words("home.kept", names=", ".join(f"“{n}”" for n in one.kept)))
         return " · ".join(facts)
 
     def _choose(self, one: SessionSeen, chosen: bool) -> None:

@@ -75,7 +75,7 @@ def _keeping(page: Page, listening: Listening, clips: Clips) -> None:
     """Whose it is, and the buttons that keep it."""
     words = page.words
     with ui.row().classes("w-full items-end ps-tight"):
-        person = ui.input(words("live.person"), placeholder="S01").props("outlined dense")
+        person = ui.input(words("live.person"), placeholder="S01").props("outlined dense maxlength=40")
         tag(person, "person")
         seconds = ui.select({s: words("live.seconds", s=s) for s in _KEEP_S}, value=10, label=words("live.keep_last"))
         tag(seconds.props("outlined dense"), "keep-seconds").classes("w-32")
@@ -89,12 +89,24 @@ def _keeping(page: Page, listening: Listening, clips: Clips) -> None:
         )
         length = tag(ui.label("").props('role="timer"').classes("ps-dim"), "record-length")
 
+    def unnamed() -> bool:
+        """Whether it is not yet said whose it is; then that is asked."""
+        if str(person.value or "").strip():
+            return False
+        page.say(words("live.person_first"), "warning")
+        person.run_method("focus")
+        return True
+
     async def kept() -> None:
+        if unnamed():
+            return
         with page.refusing():
             key = await asyncio.to_thread(clips.keep, listening, float(seconds.value), str(person.value or ""))
             page.say(words("live.kept", clip=key), "good")
 
     async def begun() -> None:
+        if unnamed():
+            return
         with page.refusing():
             await asyncio.to_thread(clips.begin, listening, str(person.value or ""))
 

@@ -12,10 +12,10 @@ from nicegui import run, ui
 from plushsense.apps.studio.desk import Desk, Sitting
 from plushsense.apps.studio.keys import Keys, on_click
 from plushsense.apps.studio.pages.record_signals import Signals
-from plushsense.apps.studio.pages.record_start import LINK, address, protocol_title
+from plushsense.apps.studio.pages.record_start import address, protocol_title
 from plushsense.apps.studio.pages.record_steps import Steps
 from plushsense.apps.studio.pictures import has_picture, own_picture, picture
-from plushsense.apps.studio.shell import Page, on_ring, tag
+from plushsense.apps.studio.shell import Page, focus, on_ring, tag
 from plushsense.recording.status import Status
 
 _DRAW_S = 0.1
@@ -63,8 +63,7 @@ class _View:
             ui.label(words("record.session", subject=head.subject, session=head.session)).classes("text-bold")
             ui.label(protocol_title(words, head.protocol["name"], head.protocol["title"])).classes("ps-dim")
             if head.simulated:
-                simulated = ui.label(f"◇ {words('shell.simulation')}").classes("q-px-sm rounded-borders")
-                tag(simulated, "simulation").style("background: #5b2d82; color: #fff; font-weight: 600")
+                tag(ui.label(words("shell.simulation")).classes("ps-simulated"), "simulation")
         self._notices(words, sitting)
         with ui.column().classes("w-full").style("gap: 4px"):
             self._progress = tag(ui.label(), "progress").classes("text-bold")
@@ -124,12 +123,12 @@ class _View:
                 ("b", "back", "back"),
                 ("p", "pause", "pause"),
             ):
-                button = tag(ui.button(words(f"record.{text}"), color=None).props("no-caps outline"), name)
+                button = tag(ui.button(words(f"record.{text}")).props("no-caps outline"), name)
                 button.style("min-height: 48px")
                 on_click(button, partial(self._press, key))
                 self._small[key] = button
             ui.space()
-            self._end_button = ui.button(words("record.end"), color=None, on_click=self._ask_end)
+            self._end_button = ui.button(words("record.end"), on_click=self._ask_end)
             tag(self._end_button, "end").props("no-caps flat").style("min-height: 48px")
         self._ending = tag(ui.row().classes("ps-said ps-said-warning w-full items-center"), "ending")
         with self._ending:
@@ -139,7 +138,8 @@ class _View:
             )
             tag(yes, "end-yes")
             no = ui.button(words("record.end_no"), color=None).props("no-caps outline")
-            no.on_click(lambda: self._ending.set_visibility(False))
+            no.on_click(self._stay)
+            self._no = tag(no, "end-no")
         self._ending.set_visibility(False)
 
     def _finished(self) -> None:
@@ -149,8 +149,8 @@ class _View:
             self._done_text = ui.label().classes("text-bold").style("overflow-wrap: anywhere")
             ui.label(words("record.what_next"))
             with ui.row():
-                ui.link(words("record.to_home"), "/").style(LINK)
-                ui.link(words("record.to_review"), "/review").style(LINK)
+                ui.link(words("record.to_home"), "/").classes("ps-link")
+                ui.link(words("record.to_review"), "/review").classes("ps-link")
         self._done.set_visibility(False)
 
     def _note_row(self) -> None:
@@ -160,7 +160,7 @@ class _View:
                 ui.input(label=words("record.note")).props("outlined dense maxlength=500 name=note"), "note"
             )
             self._note.classes("flex-grow").on("keydown.enter", self._keep_note)
-            keep = ui.button(words("record.keep_note"), color=None, on_click=self._keep_note).props("no-caps outline")
+            keep = ui.button(words("record.keep_note"), on_click=self._keep_note).props("no-caps outline")
             tag(keep, "keep-note")
 
     # Commands -------------------------------------------------------------------------------------------------
@@ -186,12 +186,19 @@ class _View:
         if text:
             self._sitting.recorder.note(text)
             self._note.value = ""
+        # The space bar is for the toy again.
+        focus(self._main)
 
     def _ask_end(self) -> None:
         words = self._page.words
         running = self._sitting.status().state == "recording"
         self._end_text.text = words("record.end_running" if running else "record.end_really")
         self._ending.set_visibility(True)
+        focus(self._no)
+
+    def _stay(self) -> None:
+        self._ending.set_visibility(False)
+        focus(self._end_button)
 
     async def _end(self) -> None:
         self._left = True

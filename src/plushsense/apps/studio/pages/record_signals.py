@@ -68,7 +68,7 @@ class Signals:
                         label,
                         series,
                         x=words("record.live_x"),
-                        y=f"{title} ({channels[which[0]].unit})",
+                        y=f"{title} ({words.unit(channels[which[0]].unit)})",
                         height=190,
                         window_s=_WINDOW_S * speed,
                     )

@@ -21,8 +21,6 @@ from plushsense.recording.toy import is_virtual
 
 _LISTED = 8
 _SCAN_S = 3.0
-LINK = "color: var(--ps-ink); text-decoration: underline"
-STRONG = "background: #0b4f9e; color: #fff"
 """The button that is meant first, readable in both lights."""
 
 
@@ -69,7 +67,7 @@ async def show_start(page: Page, desk: Desk, asked: str, ended: str) -> None:
     if done:
         with ui.row().classes("items-baseline"):
             ui.label(page.words("record.finished_ones", n=done)).classes("ps-dim")
-            ui.link(page.words("record.import_them"), "/").style(LINK)
+            ui.link(page.words("record.import_them"), "/").classes("ps-link")
 
 
 def _say_ended(page: Page, session: Shelved) -> None:
@@ -86,8 +84,8 @@ def _open_ones(page: Page, desk: Desk) -> None:
         with tag(ui.row().classes("ps-card w-full items-center"), "open-session"):
             ui.label(page.words("record.open_now", name=sitting.name)).classes("flex-grow text-bold")
             there = page.words("record.show")
-            button = ui.button(there, color=None, on_click=lambda s=sitting: ui.navigate.to(address(s.name)))
-            named(button.props("no-caps unelevated").style(STRONG), f"{there}: {sitting.name}")
+            button = ui.button(there, on_click=lambda s=sitting: ui.navigate.to(address(s.name)))
+            named(button.props("no-caps unelevated"), f"{there}: {sitting.name}")
 
 
 def _unfinished(page: Page, desk: Desk, sessions: list[Shelved]) -> None:
@@ -122,7 +120,7 @@ def _one_unfinished(page: Page, desk: Desk, session: Shelved) -> None:
         titles = {u: toy_name(words, u) for u in toys}
         toy = ui.select(titles, value=toys[0], label=words("record.toy")).style("width: 24rem; max-width: 100%")
         named(toy.props("outlined dense"), f"{words('record.toy')}: {name}")
-        button = ui.button(words("record.go_on"), color=None).style(STRONG).props("no-caps unelevated")
+        button = ui.button(words("record.go_on")).props("no-caps unelevated")
         named(button, f"{words('record.go_on')}: {name}")
         button.on_click(lambda: _sit_down(page, button, lambda: desk.resume(name, str(toy.value))))
 
@@ -161,9 +159,7 @@ class _Form:
             with ui.row().classes("w-full items-start"):
                 toys = desk.toys()
                 self._toy = self._select({u: toy_name(words, u) for u in toys}, "toy", toys[0])
-                self._look = ui.button(words("record.look"), color=None, on_click=self._look_for_toys).props(
-                    "no-caps outline"
-                )
+                self._look = ui.button(words("record.look"), on_click=self._look_for_toys).props("no-caps outline")
                 self._other = self._input("other_toy", "other_toy_hint")
             with ui.element("details").classes("w-full"):
                 unfolding(words("record.more"))
@@ -172,8 +168,8 @@ class _Form:
                     self._layout = self._select(layouts, "layout", "")
                     self._simulated = ui.checkbox(words("record.is_virtual"))
                     self._anew = ui.checkbox(words("record.anew"))
-            self._begin = ui.button(words("record.begin"), color=None, on_click=self._sit)
-            tag(self._begin, "begin").props("no-caps unelevated size=lg").style(STRONG)
+            self._begin = ui.button(words("record.begin"), on_click=self._sit)
+            tag(self._begin, "begin").props("no-caps unelevated size=lg")
         self._choose_words()
 
     def _named(self, what: str, key: str, name: str) -> str:

@@ -45,7 +45,7 @@ class Steps:
             self._shown = [""] * len(steps)
 
     def _button(self, number: int, go: Callable[[int, str], Any]) -> ui.button:
-        button = tag(ui.button(color=None).props("no-caps outline dense"), f"step-{number}").style("min-width: 3.2rem")
+        button = tag(ui.button().props("no-caps outline dense"), f"step-{number}").style("min-width: 3.2rem")
         on_click(button, lambda seen: go(number, seen))
         return button
 

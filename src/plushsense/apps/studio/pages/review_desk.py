@@ -90,10 +90,7 @@ class Desk:
             tag(ui.label(words("review.labelled")).classes("ps-said ps-said-info w-full"), "labelled")
         with ui.row().classes("w-full items-center gap-2"):
             toggle = ui.toggle({v: words(f"review.view_{v}") for v in VIEWS}, value=self.view)
-            toggle.props(
-                f"no-caps unelevated color=blue-grey-9 toggle-color=blue-grey-1 toggle-text-color=black "
-                f'aria-label="{words("review.view")}"'
-            )
+            toggle.props(f'no-caps unelevated aria-label="{words("review.view")}"').classes("ps-toggle")
             self.views = tag(toggle, "view")
             self.views.on_value_change(lambda e: self.turn_to(str(e.value)))
             self._filters()

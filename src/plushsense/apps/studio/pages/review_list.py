@@ -101,7 +101,7 @@ class ListView:
             "id": row.id,
             "person": desk.person(row.info.subject),
             "gesture": f"{AFFECTS[row.affect]}\u00a0{words.gesture(row.info.gesture)}",
-            "seconds": f"{row.seconds:.2f} s",
+            "seconds": f"{desk.words.number(row.seconds, 2)} s",
             "findings": findings,
             "state": row.state,
             "said": f"{SIGNS[row.state]} {words(f'review.state_{row.state}')}",

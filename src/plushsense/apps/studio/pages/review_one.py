@@ -91,10 +91,7 @@ class OneView:
         words = self.desk.words
         with ui.row().classes("w-full items-center gap-2"):
             side = ui.toggle({START: words("review.sets_start"), STOP: words("review.sets_stop")}, value=START)
-            side.props(
-                "no-caps dense unelevated color=blue-grey-9 toggle-color=blue-grey-1 toggle-text-color=black "
-                f'aria-label="{words("review.sets")}"'
-            )
+            side.props(f'no-caps dense unelevated aria-label="{words("review.sets")}"').classes("ps-toggle")
             tag(side, "side").on_value_change(lambda e: setattr(self, "side", str(e.value)))
             for sign, by in (("−10", -10), ("−1", -1), ("+1", 1), ("+10", 10)):
                 button = ui.button(sign, on_click=lambda by=by: self.step(by, self.side == STOP))
@@ -111,10 +108,7 @@ class OneView:
         groups = [ALL, *(kinds if len(kinds) > 1 else []), ACTIVITY]
         with ui.row().classes("w-full items-center gap-2"):
             shown = ui.toggle({g: self._kind(g) for g in groups}, value=ALL)
-            shown.props(
-                "no-caps dense unelevated color=blue-grey-9 toggle-color=blue-grey-1 toggle-text-color=black "
-                f'aria-label="{words("review.group")}"'
-            )
+            shown.props(f'no-caps dense unelevated aria-label="{words("review.group")}"').classes("ps-toggle")
             tag(shown, "group").on_value_change(lambda e: self._grouped(str(e.value)))
             for key, (icon, factor) in _ZOOMS.items():
                 button = ui.button(icon=icon, on_click=lambda factor=factor: self.plot.zoom(factor))
@@ -141,7 +135,7 @@ class OneView:
             {"label": n, "stroke": LINES[i % len(LINES)], "dash": _DASHES[i // len(LINES) % len(_DASHES)]}
             for i, n in enumerate(names)
         ]
-        y_title = words("review.y_axis", unit=shown["unit"]) if shown["unit"] else ""
+        y_title = words("review.y_axis", unit=words.unit(shown["unit"])) if shown["unit"] else ""
         self.plot.show(
             identity,
             self._label(),
@@ -188,12 +182,14 @@ class OneView:
         desk, words = self.desk, self.desk.words
         row, at = desk.review.rows[desk.current], desk.review.signals(desk.current).seconds
         place = desk.order.index(row.id) + 1 if row.id in desk.order else 0
-        said = words("review.about", person=desk.person(row.info.subject), seconds=f"{at[-1]:.2f}", rows=row.info.rows)
+        said = words(
+            "review.about", person=desk.person(row.info.subject), seconds=words.number(at[-1], 2), rows=row.info.rows
+        )
         said += f" · {words('review.place', at=place, of=len(desk.order))}" if place else ""
         if desk.review.is_labelled:
             return said
         start, stop = desk.review.shown(row.id, desk.ends)
-        said += " · " + words("review.kept", start=f"{at[start]:.2f}", stop=f"{at[stop]:.2f}")
+        said += " · " + words("review.kept", start=words.number(at[start], 2), stop=words.number(at[stop], 2))
         if row.state == "suggested":
             said += " · " + words("review.confidence", percent=f"{100 * row.confidence:.0f}")
         return said
@@ -216,13 +212,13 @@ class OneView:
             colour = _DRAFT if draft else _SET
             for key, row, edge in ((START, start, 0), (STOP, stop, rows)):
                 if row != edge or (key == START and draft):
-                    said = words(f"review.mark_{key}", at=f"{at[row]:.2f}")
+                    said = words(f"review.mark_{key}", at=words.number(at[row], 2))
                     lines.append({"x": float(at[row]), "label": said, "stroke": colour, "edge": key})
         taken = {line["x"] for line in lines}
         for key, row, visible in ((START, s.start, s.onset_visible), (STOP, s.stop, s.offset_visible)):
             if visible and float(at[row]) not in taken:
                 sure = key == START or desk.ends
-                said = words(f"review.suggested_{key}", at=f"{at[row]:.2f}") if sure else ""
+                said = words(f"review.suggested_{key}", at=words.number(at[row], 2)) if sure else ""
                 lines.append({"x": float(at[row]), "label": said, "dash": [2, 4] if sure else [1, 7], "edge": key})
         return lines
 

@@ -48,7 +48,7 @@ class DetailsView:
         if d is None:
             return
         row = d.row
-        with self._place, ui.element("section").classes("ps-card w-full column q-gutter-sm") as card:
+        with self._place, ui.element("section").classes("ps-card w-full column no-wrap ps-tight") as card:
             card.props(f'aria-label="{w("train.details")}"')
             with ui.row().classes("w-full items-center"):
                 title = f"{row.data} · {row.network} · {row.split} · {row.context}"

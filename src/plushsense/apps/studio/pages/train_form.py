@@ -76,7 +76,11 @@ class Form:
         self._asked: Order | None = None
         self._agreed = ""
         w = self._words
-        with ui.element("section").classes("ps-card w-full column q-gutter-sm").props(f'aria-label="{w("train.new")}"'):
+        with (
+            ui.element("section")
+            .classes("ps-card w-full column no-wrap ps-tight")
+            .props(f'aria-label="{w("train.new")}"')
+        ):
             ui.label(w("train.new")).classes("text-lg").props('role="heading" aria-level="2"')
             if not self._datasets:
                 ui.label(w("train.no_data"))
@@ -89,20 +93,18 @@ class Form:
             radio = ui.radio(kinds, value=self._kind, on_change=self._kind_chosen).props("inline")
             tag(radio, "kind").props(f'aria-label="{w("train.kind")}"')
             self._told = tag(ui.label().classes("ps-dim"), "told")
-            self._fields = ui.column().classes("w-full q-gutter-sm")
+            self._fields = ui.column().classes("w-full ps-tight")
             self._buttons()
         self._build()
 
     def _buttons(self) -> None:
         w = self._words
         with ui.row().classes("items-center"):
-            look = ui.button(w("train.estimate"), icon="schedule", on_click=self._estimate, color=None).props(
-                "outline no-caps"
-            )
+            look = ui.button(w("train.estimate"), icon="schedule", on_click=self._estimate).props("outline no-caps")
             tag(look, "estimate")
-            start = ui.button(w("train.start"), icon="play_arrow", on_click=self._start).props("no-caps color=blue-10")
+            start = ui.button(w("train.start"), icon="play_arrow", on_click=self._start).props("unelevated no-caps")
             tag(start, "start")
-        self._plan = tag(ui.column().classes("w-full q-gutter-xs").props('role="status"'), "plan")
+        self._plan = tag(ui.column().classes("w-full ps-tight").props('role="status"'), "plan")
         with ui.expansion(w("train.command"), icon="terminal").classes("w-full"):
             self._command = tag(ui.label().classes("ps-code"), "command")
 

@@ -52,7 +52,9 @@ class ResultsView:
         self._all = False
         self._open = ""
         w = self._words
-        with ui.element("section").classes("w-full column q-gutter-sm").props(f'aria-label="{w("train.results")}"'):
+        with (
+            ui.element("section").classes("w-full column no-wrap ps-tight").props(f'aria-label="{w("train.results")}"')
+        ):
             ui.label(w("train.results")).classes("text-lg").props('role="heading" aria-level="2"')
             ui.label(w("train.results_told")).classes("ps-dim")
             with ui.row().classes("items-center"):

@@ -36,7 +36,7 @@ class Work:
         self._done: set[str] = set()
         with (
             ui.element("section")
-            .classes("w-full column q-gutter-sm")
+            .classes("w-full column no-wrap ps-tight")
             .props(f'aria-label="{self._words("train.work")}"')
         ):
             ui.label(self._words("train.work")).classes("text-lg").props('role="heading" aria-level="2"')
@@ -88,9 +88,7 @@ class Work:
             _badge(w, job.state)
             ui.label(f"{w(f'train.kinds.{job.task}')}: {job.title}").classes("flex-grow")
             ui.label(_when(job.begun_s)).classes("ps-dim")
-            show = ui.button(w("train.show"), on_click=lambda: self.open(job.id), color=None).props(
-                "flat dense no-caps"
-            )
+            show = ui.button(w("train.show"), on_click=lambda: self.open(job.id)).props("flat dense no-caps")
             named(show, f"{w('train.show')}: {job.title}")
 
     def open(self, identity: str) -> None:
@@ -126,7 +124,7 @@ class _Card:
         self._bar: ui.linear_progress | None = None
         self._text: ui.label | None = None
         self._warned = -1
-        with tag(ui.element("article").classes("ps-card w-full column q-gutter-xs"), "job") as box:
+        with tag(ui.element("article").classes("ps-card w-full column no-wrap ps-tight"), "job") as box:
             named(box.props(f'data-job="{job.id}" data-state="{job.state}"'), job.title)
             with ui.row().classes("w-full items-center"):
                 tag(_badge(w, job.state), "state")
@@ -134,7 +132,7 @@ class _Card:
                 ui.space()
                 ui.label(_when(job.begun_s)).classes("ps-dim")
             if job.state == RUNNING:
-                self._bar = ui.linear_progress(0.0, show_value=False, size="14px", color="blue-8").classes("w-full")
+                self._bar = ui.linear_progress(0.0, show_value=False, size="14px").classes("w-full")
                 named(self._bar.props("instant-feedback"), w("train.progress", title=job.title))
                 tag(self._bar, "progress")
                 self._text = tag(ui.label(), "at")
@@ -207,17 +205,13 @@ class _Card:
         job, w = self._job, self._words
         with ui.row():
             if job.state == RUNNING:
-                stop = ui.button(w("train.stop"), icon="stop", on_click=lambda: self._work.stop(job.id), color=None)
+                stop = ui.button(w("train.stop"), icon="stop", on_click=lambda: self._work.stop(job.id))
                 tag(stop.props("outline no-caps"), "stop")
             else:
                 if job.state in (STOPPED, REFUSED):
-                    resume = ui.button(
-                        w("train.resume"), icon="play_arrow", on_click=lambda: self._work.resume(job.id), color=None
-                    )
+                    resume = ui.button(w("train.resume"), icon="play_arrow", on_click=lambda: self._work.resume(job.id))
                     tag(resume.props("outline no-caps"), "resume")
-                hide = ui.button(w("train.hide"), on_click=lambda: self._work.close(job.id), color=None).props(
-                    "flat no-caps"
-                )
+                hide = ui.button(w("train.hide"), on_click=lambda: self._work.close(job.id)).props("flat no-caps")
                 named(hide, f"{w('train.hide')}: {job.title}")
 
     def _result(self) -> None:
@@ -238,7 +232,7 @@ class _Card:
                 identity += f"#{r['best'][0]['trial']}"
             if job.task == SEARCH:
                 identity += f"#{r['winner']['trial']}"
-            show = ui.button(w("train.open_result"), on_click=lambda: self._work.opened(identity), color=None)
+            show = ui.button(w("train.open_result"), on_click=lambda: self._work.opened(identity))
             tag(show.props("flat dense no-caps"), "open-result")
 
 
