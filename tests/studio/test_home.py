@@ -92,7 +92,7 @@ def test_sessions_become_a_data_set_and_what_is_new_is_added(studio: Fixture, lo
     marked(page, "make").click()
     marked(page, "dataset").get_by_text("recordings: 4").wait_for()
     assert marked(page, "said").count() == 0
-    marked(page, "sessions").get_by_text("in the data set 'autumn'").wait_for()
+    marked(page, "sessions").get_by_text("in the data set “autumn”").wait_for()
     record(house, "S02")
     page.reload()
     marked(page, "add").click()

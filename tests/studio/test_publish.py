@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +70,7 @@ def test_a_package_by_the_tasks(few: Path, publish_tools: None) -> None:
     place, key = house.new(PACKAGES, "one"), house.folder / "keys" / "virtual.key"
     spec = {"dataset": str(house.datasets()[0]), "place": str(place), "key": str(key), "reidentification": False}
     # Where the statements cannot be kept, the package stands all the same, and says so.
-    (house.datasets()[0] / f"dataset.toml.{os.getpid()}.part").mkdir()
+    (house.datasets()[0] / f"dataset.toml.{os.getpid()}-{threading.get_ident()}.part").mkdir()
     result, reports = told(publish_task, **spec, **SAID, save=True)
     assert any("could not be written into" in said for said in result["warnings"])
     assert result["valid"] and [v["validator"] for v in result["validators"]] == list(VALIDATORS)

@@ -147,5 +147,5 @@ def test_missing_extras_are_named(
 
 def test_without_a_data_set(studio: Fixture, look: Fixture) -> None:
     page = look(dark=True).open(f"{studio().url}/publish")
-    assert "record or import one first" in marked(page, "no-dataset").inner_text()
+    assert "There is no data set yet" in marked(page, "no-dataset").inner_text()
     assert axe(page) == []
