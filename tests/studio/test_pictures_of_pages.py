@@ -63,17 +63,18 @@ def _home(page: Any, studio: Studio) -> None:
 
 
 def _record(page: Any, studio: Studio) -> None:
-    """A session whose second gesture is asked for."""
-    if not (studio.home / "recordings" / "S02").exists():
-        begun(page, studio.url, "S02", "plush-17")
+    """A session whose third recording is asked for, in the words of the page's language."""
+    code = "S02" if page.evaluate("document.documentElement.lang")[:2] == "en" else "S03"
+    if not (studio.home / "recordings" / code).exists():
+        begun(page, studio.url, code, "plush-17")
         for _ in range(2):
             page.keyboard.press("Space")
             showing(page, "recording.")
             page.wait_for_timeout(200)
             page.keyboard.press("Space")
             showing(page, "idle.")
-    page.goto(f"{studio.url}/record?session=S02/1")
-    sat(page, "S02/1")
+    page.goto(f"{studio.url}/record?session={code}/1")
+    sat(page, f"{code}/1")
     page.wait_for_timeout(700)
 
 

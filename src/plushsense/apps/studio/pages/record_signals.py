@@ -63,12 +63,13 @@ class Signals:
                 label = words("record.live_label", s=f"{_WINDOW_S * speed:g}", channels=names)
                 series = [{"label": channels[n].name, "stroke": LINES[i % len(LINES)]} for i, n in enumerate(which)]
                 wide = "2 1 420px" if len(which) > 5 else "1 1 260px"
-                with ui.column().style(f"flex: {wide}; min-width: 0"):
+                with ui.column().classes("gap-0").style(f"flex: {wide}; min-width: 0"):
+                    ui.label(title).classes("text-bold")
                     plot = Plot(
                         label,
                         series,
                         x=words("record.live_x"),
-                        y=f"{title} ({words.unit(channels[which[0]].unit)})",
+                        y=words.unit(channels[which[0]].unit),
                         height=190,
                         window_s=_WINDOW_S * speed,
                     )
