@@ -82,7 +82,7 @@ def _review(page: Any, studio: Studio) -> None:
     """One recording, with what is suggested for it."""
     page.goto(f"{studio.url}/review?dataset=datasets/virtual&view=one&gesture=Back%20stroke%201")
     connected(page)
-    page.wait_for_function("() => document.querySelector('[data-test=making]').textContent === ''")
+    page.wait_for_function("() => document.querySelector('[data-test=making]')?.textContent === ''")
     page.wait_for_selector("[data-test=plot][data-shown] .uplot")
 
 

@@ -56,7 +56,7 @@ def pressed(page: Page, key: str) -> str:
 
 def checked(page: Page) -> None:
     """Until everything was looked at in the background."""
-    page.wait_for_function("() => document.querySelector('[data-test=making]').textContent === ''")
+    page.wait_for_function("() => document.querySelector('[data-test=making]')?.textContent === ''")
 
 
 def state(page: Page, key: str) -> None:
