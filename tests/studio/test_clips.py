@@ -14,7 +14,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 from bundles import odd_bundle
 from test_listening import until
 
-from plushsense.apps.studio.clips import LONGEST_S, PROTOCOL, Clips
+from plushsense.apps.studio.clip import PROTOCOL
+from plushsense.apps.studio.clips import LONGEST_S, Clips
 from plushsense.apps.studio.felt import Choice
 from plushsense.apps.studio.house import House
 from plushsense.apps.studio.listening import Listening

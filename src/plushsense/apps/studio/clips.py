@@ -7,13 +7,13 @@ of the stream into a recording beside it. The stream itself never changes.
 from __future__ import annotations
 
 import contextlib
-import json
 import threading
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from plushsense import __version__
+from plushsense.apps.studio.clip import PROTOCOL, Clip, Label, read_clip
 from plushsense.apps.studio.house import Bell, House
 from plushsense.apps.studio.listening import Listening
 from plushsense.apps.studio.signals import TappedDevice
@@ -30,49 +30,14 @@ from plushsense.recording.keeper import Keeper
 from plushsense.recording.protocol import Protocol, Step
 from plushsense.recording.saving import keep_take
 from plushsense.recording.session import OpenSession, check_subject
-from plushsense.recording.sessionfile import SIDECAR, Event, SessionHead, read_events
+from plushsense.recording.sessionfile import Event, SessionHead
 from plushsense.recording.take import Take, gap_entry
 from plushsense.recording.toy import speed_of, with_speed
 from plushsense.recording.writer import StreamFile
 
-PROTOCOL = "live"
-"""What the sessions of clips name as their protocol: nobody was asked for anything."""
 LONGEST_S = 600.0
 """A clip that nobody ends does so by itself, by the toy's clock."""
 _SOFTWARE = f"plushsense {__version__}"
-
-
-@dataclass(frozen=True)
-class Label:
-    """A recording cut from a clip: rows ``first`` to before ``last`` of its stream."""
-
-    file: str
-    gesture: str
-    first: int
-    last: int
-
-
-@dataclass(frozen=True)
-class Clip:
-    """One clip as it lies on disk. ``seconds``: by the toy's clock, or by its rate where a crash ended it. ``added``:
-    names of the data sets that have its recordings, all so far."""
-
-    folder: Path
-    head: SessionHead
-    rows: int
-    seconds: float
-    labels: tuple[Label, ...] = ()
-    added: tuple[str, ...] = ()
-
-    @property
-    def key(self) -> str:
-        """A name for pages: subject/session."""
-        return f"{self.folder.parent.name}/{self.folder.name}"
-
-    @property
-    def layout(self) -> Layout:
-        """Of its rows."""
-        return Layout.from_dict(self.head.layout, f"layout of '{self.folder}'")
 
 
 @dataclass
@@ -247,7 +212,7 @@ class Clips:
             if folder.name.startswith("live-"):
                 # A damaged one must not hide the others; `plushsense import` names it.
                 with contextlib.suppress(BadInput, OSError):
-                    clip = self._read(folder)
+                    clip = read_clip(folder)
                     if clip is not None:
                         found.append(clip)
         return sorted(found, key=lambda clip: -clip.head.started_ms)
@@ -259,35 +224,10 @@ class Clips:
             ConfigError: where there is none.
         """
         folder = self._house.inside(self._house.recordings / key)
-        clip = self._read(folder)
+        clip = read_clip(folder)
         if clip is None:
             raise ConfigError(f"There is no clip '{key}': it may have been moved.")
         return clip
-
-    def _read(self, folder: Path) -> Clip | None:
-        head = SessionHead.read(folder)
-        if head is None or head.protocol.get("name") != PROTOCOL:
-            return None
-        labels: dict[str, Label] = {}
-        added: list[str] = []
-        seconds: float | None = None
-        for event in read_events(folder):
-            more = event.more
-            if event.what == "close" and isinstance(more.get("seconds"), int | float):
-                seconds = float(more["seconds"])
-            if event.what == "take":
-                file, first = str(more.get("file")), _first_row(folder / str(more.get("file")))
-                held = more.get("rows")
-                last = first + (held if isinstance(held, int) else 0)
-                labels[file] = Label(file, str(more.get("gesture")), first, last)
-                added = []
-            elif event.what == "added" and more.get("dataset") not in added:
-                added.append(str(more.get("dataset")))
-        stream = folder / STREAM_NAME
-        rows = stream.read_bytes().count(b"\n") if stream.is_file() else 0
-        if seconds is None:
-            seconds = rows / Layout.from_dict(head.layout, f"layout of '{folder}'").rate_hz
-        return Clip(folder, head, rows, seconds, tuple(labels.values()), tuple(added))
 
     def rows(self, clip: Clip) -> Frames:
         """What the toy sent in a clip."""
@@ -353,14 +293,6 @@ class Clips:
 
 def _closing(intake: Intake) -> Event:
     return _event("close", rows=intake.rows, lost=intake.lost, seconds=round(intake.toy_ms / 1000.0, 2))
-
-
-def _first_row(recording: Path) -> int:
-    """Where in its session's stream a recording begins, as its sidecar says."""
-    try:
-        return int(json.loads(recording.with_suffix(SIDECAR).read_text(encoding="utf-8"))["stream_row"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return 0
 
 
 def _key(folder: Path) -> str:

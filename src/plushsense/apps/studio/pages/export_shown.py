@@ -19,7 +19,6 @@ _STYLE = """
 .ps-main h3 { font-size: 1.05rem; line-height: 1.5rem; font-weight: 600; margin: 8px 0 0 0; }
 .ps-facts { display: grid; grid-template-columns: minmax(9rem, max-content) 1fr; gap: 2px 16px; margin: 0; }
 .ps-facts dt { color: var(--ps-dim); } .ps-facts dd { margin: 0; overflow-wrap: anywhere; }
-.ps-wide { width: 100%; overflow-x: auto; flex: none; }
 .ps-table { border-collapse: collapse; }
 .ps-table caption { text-align: left; color: var(--ps-dim); padding-bottom: 4px; }
 .ps-table th, .ps-table td { text-align: left; padding: 4px 12px 4px 0; border-bottom: 1px solid var(--ps-line);
@@ -91,7 +90,7 @@ def table(caption: str, head: Sequence[str], rows: Sequence[Sequence[str]], numb
     body = "".join(cells(row, "td") for row in rows)
     inner = f"<caption>{escape(caption)}</caption><thead>{cells(head, 'th')}</thead><tbody>{body}</tbody>"
     # What scrolls sideways must be reachable by keyboard.
-    with named(ui.element("div").classes("ps-wide").props('tabindex="0" role="region"'), caption) as box:
+    with named(ui.element("div").classes("ps-sideways").props('tabindex="0" role="region"'), caption) as box:
         ui.html(inner, sanitize=False, tag="table").classes("ps-table")
     return box
 

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from nicegui import ui
 
-from plushsense.apps.studio.clips import Clip, Clips
+from plushsense.apps.studio.clip import Clip
+from plushsense.apps.studio.clips import Clips
 from plushsense.apps.studio.listening import Listening
 from plushsense.apps.studio.plot import Plot
 from plushsense.apps.studio.shell import LINES, Page, named, on_ring, tag

@@ -95,7 +95,7 @@ class DetailsView:
         tag(radio, "by").props(f'aria-label="{w("train.confusion")}"')
         box = (
             ui.element("div")
-            .classes("ps-wide")
+            .classes("ps-sideways")
             .props(f'role="region" tabindex="0" aria-label="{w("train.confusion")}"')
         )
         tag(box, "confusion").on("click", self._clicked, js_handler=_CLICKS)
@@ -160,7 +160,7 @@ class DetailsView:
             tag(ui.label(title).classes("text-weight-bold"), "cell-title").props('role="heading" aria-level="5"')
             if link:
                 tag(ui.link(w("train.all_in_review"), link).classes("ps-link"), "cell-all")
-            box = ui.element("div").classes("ps-wide")
+            box = ui.element("div").classes("ps-sideways")
             with named(box.props('role="region" tabindex="0"'), title):
                 tag(ui.html(_recordings(w, d.row.dataset, found), sanitize=False), "cell-list")
 
@@ -191,7 +191,11 @@ class DetailsView:
             f'<td class="n">{figure(one["by_recording_accuracy"])}</td></tr>'
             for one in d.people
         )
-        with ui.element("div").classes("ps-wide").props(f'role="region" tabindex="0" aria-label="{w("train.people")}"'):
+        with (
+            ui.element("div")
+            .classes("ps-sideways")
+            .props(f'role="region" tabindex="0" aria-label="{w("train.people")}"')
+        ):
             table = f'<table class="ps-table"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>'
             tag(ui.html(table, sanitize=False), "people")
 

@@ -66,7 +66,7 @@ class ResultsView:
                 tag(self._by_kind.classes("w-64"), "filter-kind").on_value_change(self._filtered)
             self._table = (
                 ui.element("div")
-                .classes("ps-wide")
+                .classes("ps-sideways")
                 .props(f'role="region" tabindex="0" aria-label="{w("train.results")}"')
             )
             tag(self._table, "results")
