@@ -1,7 +1,8 @@
 # Everything from a bare checkout, with only Python 3.11+ and make.
 #   make demo    install, then the whole path on a virtual toy (a simulation)
 #   make test    install, then all tests
-#   make check   formatting, lint, types, layers
+#   make test-quick   install, then the tests that need no browser, compiler, emulator or cluster
+#   make check   formatting, lint, types, layers, rules of the code base
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -13,7 +14,7 @@ BIN := $(VENV)/bin
 endif
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt
 
-.PHONY: demo test check setup clean
+.PHONY: demo test test-quick check setup clean
 
 $(VENV)/.python:
 	@$(PYTHON) -c "import sys; sys.exit(0 if sys.version_info >= (3, 11) else 'PlushSense needs Python 3.11 or newer, this is ' + sys.version.split()[0] + ': run  make PYTHON=/path/to/python3.11 ...')"
@@ -41,11 +42,15 @@ demo: $(VENV)/.train
 test: $(VENV)/.dev
 	$(BIN)/python -m pytest -n auto $(PYTEST_FLAGS)
 
+test-quick: $(VENV)/.dev
+	$(BIN)/python -m pytest -n auto -m "not slow" $(PYTEST_FLAGS)
+
 check: $(VENV)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python -m pytest -p no:xdist tests/test_architecture.py
 
 clean:
 	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

@@ -1,4 +1,4 @@
-"""What a live step costs: bytes to event, beside `continual-inference` on the same network, and a hundred toys at once.
+"""Measure the cost of a live step from bytes to event, against `continual-inference`, and of a hundred toys at once.
 
     pip install continual-inference      (brings PyTorch; without it its rows are left out)
     python bench/live.py [--bundle BUNDLE] [--rounds 15] [--toys 100 --seconds 30] [--json]
@@ -32,20 +32,19 @@ from typing import Any
 import numpy as np
 
 from plushsense.core.gestures import load_gestures
-from plushsense.core.signal import Layout, load_layout
-from plushsense.deploy.calibration import calibrated, integer_model
+from plushsense.core.layouts import Layout, load_layout
+from plushsense.deploy.quantize import calibrated, integer_model
 from plushsense.devices.base import Frame
 from plushsense.devices.opening import open_device
 from plushsense.devices.virtual.device import VirtualDevice
 from plushsense.devices.virtual.stream import ToySpec, ToyStream
 from plushsense.devices.wire import LineParser
-from plushsense.live.integer import IntegerClassifier
-from plushsense.live.many import run_many
-from plushsense.live.stream import StreamClassifier, StreamReader
+from plushsense.live.loop import run_many
 from plushsense.models.arch import NORM_EPSILON, Arch
 from plushsense.models.bundle import Bundle
 from plushsense.models.reference import random_weights
-from plushsense.windows.clock import Clock
+from plushsense.runtime.classifier import IntegerClassifier, StreamClassifier, StreamReader
+from plushsense.windows.clock import SampleClock
 from plushsense.windows.features import SampleInputs, Scaler
 
 STEPS = 200  # a round
@@ -53,20 +52,20 @@ UNDILATED = "14_19_19"
 
 
 def lines_of(layout: Layout, count: int) -> list[bytes]:
-    """What a virtual toy sends, as bytes."""
+    """Return the bytes that a virtual toy sends."""
     stream = iter(ToyStream(ToySpec(person=7, seed=3, lost=0.0, garbled=0.0, glitch=0.0), layout))
     return [next(stream).data for _ in range(count)]
 
 
 def samples_of(layout: Layout, lines: list[bytes]) -> np.ndarray:
-    """(T, I) what a network reads of them."""
-    parser, clock, inputs = LineParser(layout), Clock(layout), SampleInputs(layout)
+    """Return the samples (T, I) that a network reads from them."""
+    parser, clock, inputs = LineParser(layout), SampleClock(layout), SampleInputs(layout)
     frames = [frame for line in lines for frame in parser.feed(line)]
     return np.array([inputs(row) for frame in frames for row in clock.rows(frame.device_ms, frame.values)])
 
 
 def made_up(layout: Layout, symbol: str = "14d1_19d2_19d4") -> Bundle:
-    """A network of random weights, calibrated on the virtual toy so that it runs in whole numbers too."""
+    """Return a network with random weights, calibrated on the virtual toy so that it also runs as integers."""
     gestures = load_gestures("plush-18")
     arch = Arch.parse(symbol, (8, 12, 16), channels=layout.n_inputs, classes=len(gestures))
     x = samples_of(layout, lines_of(layout, 6000)).T
@@ -75,15 +74,14 @@ def made_up(layout: Layout, symbol: str = "14d1_19d2_19d4") -> Bundle:
 
 
 def bytes_to_event(reader: StreamReader, lines: list[bytes]) -> dict[str, Any]:
-    """Milliseconds of the steps with an answer, by the clock on the wall and of the processor alone (what is left when
-    other programs want it too); microseconds of the processor a frame."""
+    """Measure the steps with a decision, in ms of wall-clock and processor time, and processor microseconds a frame."""
     parser = LineParser(reader.layout)
     wall, own = [], []
     began = time.process_time()
     for line in lines:
         arrived, worked = time.perf_counter(), time.process_time()
-        said = [d for f in parser.feed(line) for d in reader.push(Frame(0, f.device_ms, f.values))]
-        if any(d.answer is not None for d in said):
+        decisions = [d for f in parser.feed(line) for d in reader.push(Frame(0, f.device_ms, f.values))]
+        if any(d.answer is not None for d in decisions):
             own.append(time.process_time() - worked)
             wall.append(time.perf_counter() - arrived)
     each = (time.process_time() - began) / len(lines)
@@ -91,13 +89,13 @@ def bytes_to_event(reader: StreamReader, lines: list[bytes]) -> dict[str, Any]:
 
 
 def spread(seconds: list[float]) -> dict[str, float]:
-    """In milliseconds."""
+    """Return the quantiles in milliseconds."""
     p50, p95, p99 = (round(1000 * float(v), 3) for v in np.percentile(seconds, (50, 95, 99)))
     return {"p50": p50, "p95": p95, "p99": p99, "longest": round(1000 * max(seconds), 3)}
 
 
 def theirs(bundle: Bundle) -> tuple[Any, Any]:
-    """The same network of continual-inference's layers, and PyTorch."""
+    """Return the same network built from continual-inference's layers, and PyTorch."""
     import continual as co
     import torch
     from torch import nn
@@ -125,7 +123,7 @@ def theirs(bundle: Bundle) -> tuple[Any, Any]:
 
 
 def beside(bundle: Bundle, lines: list[bytes], rounds: int) -> dict[str, Any]:
-    """Microseconds a step of ours and theirs, ratios within a round, and how far the logits are apart."""
+    """Measure microseconds a step of ours and theirs, ratios within a round, and the difference of the logits."""
     arch, step = bundle.arch, bundle.arch.step
     raw = samples_of(bundle.layout, lines)
     whole, scaled = raw.astype(np.int64), bundle.scaler.apply_sample(raw)
@@ -169,8 +167,8 @@ def beside(bundle: Bundle, lines: list[bytes], rounds: int) -> dict[str, Any]:
                 out = net.forward_steps(x[:, :, at])[0].numpy().T
                 for t in range(at.start, at.stop):
                     if t % step == shift:
-                        wanted = mine[(t + 1 - arch.span) // step]
-                        apart = max(apart, float(np.abs(out[t - at.start] - wanted).max()))
+                        expected = mine[(t + 1 - arch.span) // step]
+                        apart = max(apart, float(np.abs(out[t - at.start] - expected).max()))
             if not apart < 1e-3:
                 raise SystemExit(f"The two networks do not answer alike: their logits are {apart} apart.")
             times = timed(ways, blocks, rounds)
@@ -191,7 +189,7 @@ def beside(bundle: Bundle, lines: list[bytes], rounds: int) -> dict[str, Any]:
 
 
 def timed(ways: dict[str, Any], blocks: list[slice], rounds: int) -> dict[str, list[float]]:
-    """Seconds a step, of each way in each round; the first round warms up and does not count."""
+    """Measure seconds a step of each method in each round; the first round warms up and does not count."""
     times: dict[str, list[float]] = {name: [] for name in ways}
     for _ in range(rounds + 1):
         for name, (begin, push) in ways.items():

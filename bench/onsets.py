@@ -1,4 +1,4 @@
-"""How far suggested onsets and offsets lie from marks made by eye, and from the truth of the virtual toy.
+"""Measure the error of suggested onsets and offsets against marks made by eye and the truth of the virtual toy.
 
     python bench/onsets.py RECORDINGS [--marks tests/dataset/onsets.csv] [--simulation] [--json]
 
@@ -18,13 +18,12 @@ from pathlib import Path
 
 import numpy as np
 
-from plushsense.dataset.importers import import_recordings
+from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.store import Dataset
-from plushsense.dataset.trim import Trim, trims
-from plushsense.devices.virtual.holding import APPROACH_S, LEAVE_S
-from plushsense.devices.virtual.people import draw_person
-from plushsense.devices.virtual.session import GESTURES, Session
-from plushsense.devices.virtual.world import WORLD
+from plushsense.dataset.trimming import Trim, suggest_trims
+from plushsense.devices.virtual.motions import APPROACH_S, LEAVE_S
+from plushsense.devices.virtual.session import GESTURES, VirtualSession
+from plushsense.devices.virtual.world import WORLD, draw_person
 from plushsense.recording.simulate import simulate
 
 PEOPLE, SEED, REPETITIONS = 6, 11, 3
@@ -34,7 +33,7 @@ SURE = (0.0, 0.5, 0.8, 1.01)
 
 @dataclass(frozen=True)
 class Compared:
-    """One suggested edge against one marked: seconds too late, and what the confidence was."""
+    """A suggested edge against a marked one: seconds too late, and the confidence."""
 
     recording: str
     error_s: float
@@ -55,7 +54,7 @@ def share(errors: list[float]) -> dict[str, float | int]:
 
 
 def by_confidence(compared: list[Compared]) -> dict[str, dict[str, float | int]]:
-    """`share` of all and of each band of confidence."""
+    """Return `share` of all edges and of each band of confidence."""
     out = {"all": share([c.error_s for c in compared])}
     for low, high in pairwise(SURE):
         band = [c.error_s for c in compared if low <= c.confidence < high]
@@ -64,7 +63,7 @@ def by_confidence(compared: list[Compared]) -> dict[str, dict[str, float | int]]
 
 
 def edges(trim: Trim) -> dict[str, tuple[float, float, bool]]:
-    """Suggested seconds, confidence and visibility, of both edges; where nothing is seen the recording's own edge."""
+    """Return suggested seconds, confidence and visibility of both edges; else the recording's own edge."""
     s = trim.suggestion
     return {
         "onset": (float(trim.seconds[s.start]), s.onset_confidence, s.onset_visible),
@@ -73,10 +72,10 @@ def edges(trim: Trim) -> dict[str, tuple[float, float, bool]]:
 
 
 def against_marks(dataset: Dataset, marks: Path) -> dict[str, object]:
-    """The figures of docs/trim.md."""
+    """Compute the figures of docs/trim.md."""
     with marks.open(encoding="utf-8", newline="") as file:
         rows = {row["recording"]: row for row in csv.DictReader(file)}
-    found = {t.recording.id: t for t in trims(dataset, [r for r in dataset.recordings if r.id in rows])}
+    found = {t.recording.id: t for t in suggest_trims(dataset, [r for r in dataset.recordings if r.id in rows])}
     result: dict[str, object] = {"recordings": len(found)}
     for edge in ("onset", "offset"):
         seen = [i for i in found if rows[i][f"{edge}_visible"] == "yes"]
@@ -99,15 +98,17 @@ def against_marks(dataset: Dataset, marks: Path) -> dict[str, object]:
 
 
 def against_simulation(work: Path) -> dict[str, object]:
-    """The virtual toy: what the hand did, to the sample. Says nothing about a real toy."""
+    """Compare with the virtual toy's known movements.
+
+    This says nothing about a real toy."""
     simulate(work / "recordings", PEOPLE, SEED, REPETITIONS)
     dataset = import_recordings(work / "recordings", work / "SIM", layout="plush-15").dataset
     mine: dict[tuple[str, str], list[Trim]] = {}
-    for t in trims(dataset):
+    for t in suggest_trims(dataset):
         mine.setdefault((t.recording.file.split("/")[1], t.recording.gesture), []).append(t)
     errors: dict[str, list[Compared]] = {name: [] for name in ("near", "works", "stops", "away")}
     for who in range(1, PEOPLE + 1):
-        session = Session(draw_person(who, SEED, WORLD), SEED, 0, WORLD)
+        session = VirtualSession(draw_person(who, SEED, WORLD), SEED, 0, WORLD)
         session.idle(2.0)
         for label in GESTURES:
             marks = session.perform(label, REPETITIONS).marks

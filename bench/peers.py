@@ -1,4 +1,4 @@
-"""What one decision costs, every 50 ms: our C against the same network in other runtimes, side by side.
+"""Measure the cost of one decision every 50 ms: our C against the same network in other runtimes.
 
     THERE/bin/pip install tflite-micro ai-edge-litert ai-edge-quantizer torch==2.13.0 executorch onnxruntime onnx
     python bench/peers.py --python THERE/bin/python [--onnx2c PATH] [--json]
@@ -8,8 +8,9 @@ interpreter, and without it the one that runs this is asked. What is not install
 gcc is needed; valgrind (with its headers) for the instructions; onnx2c is built from github.com/kraiskil/onnx2c.
 
 Every runtime gets the same weights, normalisation folded in, quantized by its own tool on the same windows, one thread,
-warm, input already in place: only its own call is timed and counted. They have no streaming state, so each decision
-computes its window again. They may read the window in whichever form takes fewer multiply-accumulates (`--form`):
+warm, input already in place: only its own call is timed and counted. The others are given the windowed network:
+each decision computes its window again. They could stream, with state as variables or as inputs and outputs, in another
+graph; that is not measured. They may read the window in the form that takes fewer multiply-accumulates (`--form`):
 `window`, 250 samples with zeros before the first, or `span`, exactly the samples that our streaming decision knows;
 where the two differ, each answer is checked against the float answer of its own form. Our C reads five frames
 (validity, clock, magnitude, scaling), runs the network, smooths and decides. Times are taken in turn, round by round;
@@ -70,7 +71,7 @@ def say(text: str) -> None:
 
 
 def python_entry(peer: str, python: str, shop: Workshop) -> Entry:
-    """A peer of Python's world, its model made by itself."""
+    """Return the entry of a Python runtime that builds its own model."""
     title, family, packages = PEERS[peer]
     command = [python, str(WORKER)]
     try:
@@ -92,18 +93,18 @@ def python_entry(peer: str, python: str, shop: Workshop) -> Entry:
 
 
 def entries(args: argparse.Namespace, case: Case, shop: Workshop) -> tuple[list[Entry], dict[str, str]]:
-    """What can be run here, and what cannot, with the reason."""
-    wanted = args.only.split(",") if args.only else [*PEERS, "onnx2c", "plain"]
+    """Return what can be run here, and the reasons for what cannot."""
+    peers = args.only.split(",") if args.only else [*PEERS, "onnx2c", "plain"]
     found, absent = programs.ours(case, shop), {}
-    for peer in (p for p in PEERS if p in wanted):
+    for peer in (p for p in PEERS if p in peers):
         say(f"{PEERS[peer][0]} …")
         try:
             found.append(python_entry(peer, args.python, shop))
         except CannotBuild as reason:
             absent[PEERS[peer][0]] = str(reason)
-    if "plain" in wanted:
+    if "plain" in peers:
         found += programs.plain_window(case, shop)
-    if "onnx2c" in wanted:
+    if "onnx2c" in peers:
         model = shop.folder / "float.onnx"
         try:
             if not model.exists():
@@ -115,7 +116,7 @@ def entries(args: argparse.Namespace, case: Case, shop: Workshop) -> tuple[list[
 
 
 def checked(entry: Entry, process: Running, case: Case) -> dict[str, float] | None:
-    """How near its answers are to the floats'; None for the network alone, which reads made-up inputs."""
+    """Compare its logits with the float ones; None for the network alone, which reads random inputs."""
     if entry.reads == "stream":
         return None
     logits = process.check(Path(entry.command[-1]), case.arch.classes)
@@ -131,7 +132,7 @@ def checked(entry: Entry, process: Running, case: Case) -> dict[str, float] | No
 
 
 def measure(found: list[Entry], absent: dict[str, str], args: argparse.Namespace, case: Case) -> list[dict[str, Any]]:
-    """One row an entry: checked, timed in turn, counted."""
+    """Check, time and count every entry; return one row for each."""
     rows: list[dict[str, Any]] = []
     with contextlib.ExitStack() as open_:
         running: list[tuple[dict[str, Any], Running, int]] = []
@@ -168,7 +169,7 @@ def measure(found: list[Entry], absent: dict[str, str], args: argparse.Namespace
 
 
 def compare(rows: list[dict[str, Any]]) -> None:
-    """Medians, spreads, and how many times ours goes into each."""
+    """Return medians, spreads, and ratios to ours."""
     ours = next(row for row in rows if row["name"] == OUR_ROW)
     for row in rows:
         us = 1e6 * np.array(row["seconds"])
@@ -184,15 +185,15 @@ def compare(rows: list[dict[str, Any]]) -> None:
 
 
 def verdicts(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The targets of this library, on the fewest instructions that any such peer took."""
-    told = []
+    """Compare with this library's targets, on the fewest instructions of any such runtime."""
+    results = []
     for family, least, who, ours in TARGETS:
         mine = next(row for row in rows if row["name"] == ours)["instructions"]
         them = [row for row in rows if row["family"] == family and row["instructions"] is not None]
         nearest = min(them, key=lambda row: row["instructions"], default=None)
         known = nearest is not None and mine is not None
         ratio = nearest["instructions"] / mine if known else None
-        told.append(
+        results.append(
             {
                 "who": who,
                 "at_least": least,
@@ -202,11 +203,11 @@ def verdicts(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
                 "reached": ratio >= least if known else None,
             }
         )
-    return told
+    return results
 
 
 def machine() -> dict[str, Any]:
-    """The computer, in words."""
+    """Describe the computer."""
     cpu = platform.processor() or platform.machine()
     with contextlib.suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text().splitlines()
@@ -220,7 +221,7 @@ def _whole(value: int | None) -> str:
 
 
 def table(report: dict[str, Any]) -> Iterable[str]:
-    """The lines of the table and what has to be said with it."""
+    """Yield the lines of the table and its notes."""
     case = report["case"]
     yield (
         f"{case['title']}, {case['channels']} channels, {case['classes']} classes: one decision every "
@@ -257,18 +258,18 @@ def table(report: dict[str, Any]) -> Iterable[str]:
         "code B of C without a model file holds the weights; a runtime's own library is not counted, nor memory that "
         "it does not tell."
     )
-    yield "The others have no streaming state: each of their decisions computes its whole window again."
+    yield "The others run the windowed network: each decision computes its whole window; streaming was not tried."
     for row in report["rows"]:
         if row["check"] is not None and row["check"]["agreement"] < FAITHFUL:
             yield f"BROKEN: {row['name']} agrees with the floats in {100 * row['check']['agreement']:.0f} % only."
-    for told in report["targets"]:
-        if told["ratio"] is None:
-            yield f"Target, {told['at_least']:g}× fewer instructions than {told['who']}: not measured."
+    for target in report["targets"]:
+        if target["ratio"] is None:
+            yield f"Target, {target['at_least']:g}× fewer instructions than {target['who']}: not measured."
         else:
-            word = "reached" if told["reached"] else "MISSED"
+            word = "reached" if target["reached"] else "MISSED"
             yield (
-                f"Target, {told['at_least']:g}× fewer instructions than {told['who']}: {word}, {told['ratio']:.2f}× "
-                f"({told['against']})."
+                f"Target, {target['at_least']:g}× fewer instructions than {target['who']}: {word}, "
+                f"{target['ratio']:.2f}× ({target['against']})."
             )
     computer = report["machine"]
     load = "" if computer["load"] is None else f", load {computer['load'][0]:.1f} before"
@@ -277,7 +278,7 @@ def table(report: dict[str, Any]) -> Iterable[str]:
 
 
 def bench(args: argparse.Namespace) -> dict[str, Any]:
-    """Everything, as plain values."""
+    """Run everything and return plain values."""
     case = make_case(
         args.arch, args.filters, layout=args.layout, gestures=args.gestures, window=args.window, form=args.form,
         bundle=args.bundle,

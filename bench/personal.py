@@ -1,4 +1,4 @@
-"""Is the personal touch safe where it is used badly? Wrong labels, half of the gestures, people who were trained on.
+"""Measure personal adaptation under misuse: wrong labels, half of the gestures, people from the training set.
 
     plushsense adapt --evaluate DATASET --split by-subject:5     (once: trains the networks that this reads)
     python bench/personal.py DATASET [--choices 3] [--json]
@@ -16,11 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
-from plushsense.apps.preparation import opened, windows_for
 from plushsense.core.errors import BadInput
-from plushsense.live.personal import judge, personalise
+from plushsense.dataset.index import as_dataset
+from plushsense.live.adaptation import judge, personalise
 from plushsense.models.bundle import Bundle
 from plushsense.windows.cut import WindowSet, WindowSpec
+from plushsense.workflow.preparation import windows_for
 
 USE = 2
 
@@ -31,7 +32,7 @@ def main() -> None:
     parser.add_argument("--choices", type=int, default=3, help="choices of recordings a person and case (3)")
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
-    dataset = opened(args.dataset)
+    dataset = as_dataset(args.dataset)
     bundles = [Bundle.load(p) for p in sorted((Path(args.dataset) / "cache" / "adapting").glob("*.plush"))]
     if not bundles:
         raise SystemExit(f"no network in {args.dataset}/cache/adapting: run  plushsense adapt --evaluate first")
@@ -43,21 +44,21 @@ def main() -> None:
         for person in strangers:
             mine = windows.take(np.flatnonzero(windows.subject == person))
             for chosen in choices(mine, args.choices, draw):
-                cases.add("strangers, all gestures shown", bundle, mine, chosen)
+                cases.add("new people, all gestures recorded", bundle, mine, chosen)
                 cases.add("strangers, labels shuffled", bundle, mine, chosen, shuffle=draw)
-                for shown in (9, 7, 5):
-                    some = draw.permutation(len(mine.labels))[:shown]
+                for count in (9, 7, 5):
+                    some = draw.permutation(len(mine.labels))[:count]
                     part = chosen & np.isin(mine.y, some)
-                    cases.add(f"strangers, {shown} of 10 gestures shown", bundle, mine, part, tested=~chosen)
+                    cases.add(f"new people, {count} of 10 gestures recorded", bundle, mine, part, tested=~chosen)
         for person in bundle.provenance["subjects"][::6]:
             mine = windows.take(np.flatnonzero(windows.subject == person))
             for chosen in choices(mine, args.choices, draw):
                 cases.add("people trained on", bundle, mine, chosen)
-    print(json.dumps(cases.told()) if args.json else cases)
+    print(json.dumps(cases.to_dict()) if args.json else cases)
 
 
 def choices(mine: WindowSet, many: int, draw: np.random.Generator) -> list[np.ndarray]:
-    """Windows of two recordings of each gesture, (N,) true, for some of the ten pairs of numbers."""
+    """Yield masks (N,) of the windows of two recordings of each gesture, for some of the ten pairs."""
     by_class = [np.unique(mine.recording[mine.y == k]) for k in np.unique(mine.y)]
     pairs = list(itertools.combinations(range(max(map(len, by_class))), USE))
     found = []
@@ -68,7 +69,7 @@ def choices(mine: WindowSet, many: int, draw: np.random.Generator) -> list[np.nd
 
 
 class Cases:
-    """What each case did: accepted or not, recordings more right."""
+    """The outcomes by case: accepted or not, and how many more recordings were right."""
 
     def __init__(self) -> None:
         self.rows: dict[str, list[tuple[bool, int]]] = {}
@@ -97,8 +98,8 @@ class Cases:
         )
         self.rows.setdefault(name, []).append((done.accepted, after - before))
 
-    def told(self) -> dict[str, dict[str, float]]:
-        """By case, as plain values."""
+    def to_dict(self) -> dict[str, dict[str, float]]:
+        """Return plain values by case."""
         return {
             name: {
                 "cases": len(rows),
@@ -115,7 +116,7 @@ class Cases:
         lines = [
             f"{name:<34}{r['cases']:>5}{r['adapted']:>9.0%}{r['more_right']:>12.1f}{r['worst']:>7}"
             f"{r['worse_by_more_than_one']:>7.1%}"
-            for name, r in self.told().items()
+            for name, r in self.to_dict().items()
         ]
         return "\n".join([head, *lines])
 

@@ -1,4 +1,4 @@
-"""What reading recordings costs: ours against `np.loadtxt` alone, and the whole import, side by side.
+"""Measure the time of reading recordings, against `np.loadtxt` alone and within the whole import.
 
 1326 recordings of 700 rows × 15 columns, as many as the paper's, are written once. In every round each way reads all of
 them in turn; a ratio is taken within its round, so that a machine whose speed drifts does not matter much. The import
@@ -22,16 +22,16 @@ from pathlib import Path
 
 import numpy as np
 
-from plushsense.core.recfile import Frames, parse_name, read_recording, recording_filename, write_recording
-from plushsense.core.signal import Layout, load_layout
-from plushsense.dataset.importers import import_recordings
+from plushsense.core.layouts import Layout, load_layout
+from plushsense.core.recorder_csv import Frames, parse_name, read_recording, recording_filename, write_recording
+from plushsense.dataset.importing.importers import import_recordings
 
 ROWS = 700
 PEOPLE = 26
 
 
 def write(folder: Path, files: int, layout: Layout) -> None:
-    """Recordings with the noise of a toy at rest: what a number costs depends on its digits."""
+    """Write recordings with the noise of a toy at rest: the time to parse a number depends on its digits."""
     rng = np.random.default_rng(0)
     for number in range(files):
         person = folder / f"P{number % PEOPLE:02d}"
@@ -43,12 +43,12 @@ def write(folder: Path, files: int, layout: Layout) -> None:
 
 
 def layout_gesture(number: int) -> str:
-    """A gesture of plush-18, in turn."""
+    """Return a gesture of plush-18, in turn."""
     return ("Tail pull", "Hold strong", "Back stroke 1", "Ear scratch 2")[number % 4]
 
 
 def loadtxt_all(files: list[Path]) -> None:
-    """The floor: NumPy's reader, told where the header ends and what separates."""
+    """Read with NumPy alone, given header and delimiter: the lower bound."""
     for path in files:
         with path.open() as file:
             separator = ";" if ";" in file.readline() else ","

@@ -1,4 +1,4 @@
-"""How long the next recording takes on the review page: from the key to the drawn plot, in a real Chromium.
+"""Measure the time from the key to the drawn plot of the next recording on the review page, in Chromium.
 
     python bench/review.py DATASET [--recordings 200]
 
@@ -18,7 +18,7 @@ import tempfile
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from browsing import CHROMIUM, Look, Studio
+from support.browsing import CHROMIUM, Look, Studio
 
 PLOT = "document.querySelector('[data-test=plot]')"
 
@@ -53,14 +53,14 @@ def main() -> None:
         finally:
             browser.close()
             studio.stop()
-    said = {
+    result = {
         "recordings": len(times),
         "median_ms": round(statistics.median(times), 1),
         "p95_ms": round(times[int(0.95 * len(times))], 1),
         "max_ms": round(times[-1], 1),
         "load": [round(x, 1) for x in os.getloadavg()],
     }
-    sys.stdout.write(json.dumps(said) + "\n")
+    sys.stdout.write(json.dumps(result) + "\n")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Does the search find what the whole grid finds, for a quarter of its cost?
+"""Compare the search with the whole grid: does it find the same network for a quarter of the cost?
 
     python bench/search.py DATASET [--epochs 60] [--rungs 4,15,60] [--split by-subject:3] [--seeds 3] [--workers 2]
 
@@ -31,14 +31,13 @@ import polars
 from numpy.typing import NDArray
 
 import plushsense as ps
-from plushsense.apps.cli.search import search_shown
-from plushsense.apps.searching import prepare
-from plushsense.apps.sweep_shown import live_table
-from plushsense.apps.sweeping import Sweep
+from plushsense.cli.search import report_search
 from plushsense.core.errors import PlushSenseError
+from plushsense.experiments.search.halving import Costs, Rung, Scores, SearchSpec, halving
+from plushsense.experiments.search.run import prepare
+from plushsense.experiments.sweep.run import Sweep, report_jobs
 from plushsense.models.arch import PAPER_ARCHITECTURES
-from plushsense.training.grid import GridSpec
-from plushsense.training.search import Costs, Rung, Scores, SearchSpec, halving
+from plushsense.trials.grid import GridSpec
 
 FILTERS = "4/6/8/8,8/12/16/16"
 # Other ways to search, replayed where the grid was scored at their rungs: rungs as (first, second), eta, folds.
@@ -79,7 +78,7 @@ class Scored:
         }
 
     def replay(self, costs: Costs, seeds: list[int]) -> tuple[int, float]:
-        """What a search with some of the seeds would have chosen, and its share of the grid's cost."""
+        """Return what a search with some of the seeds would have chosen, and its share of the grid's cost."""
 
         def score(rung: Rung) -> Scores:
             found = self.by_epochs[rung.epochs][list(rung.entered)][:, seeds, : rung.folds]
@@ -91,7 +90,7 @@ class Scored:
 
 
 def compare(final: NDArray[np.float64], joint: int, chosen: list[int]) -> dict[str, Any]:
-    """``final`` (networks, seeds) F; ``joint`` chosen by the search with all seeds, ``chosen`` with each alone."""
+    """Compare ``final`` F1 (networks, seeds), ``joint`` chosen with all seeds and ``chosen`` with each alone."""
     seeds = final.shape[1]
     means = final.mean(axis=1)
     best = int(means.argmax())
@@ -119,7 +118,7 @@ def compare(final: NDArray[np.float64], joint: int, chosen: list[int]) -> dict[s
 
 
 def by_chance(final: NDArray[np.float64], cost: NDArray[np.float64], share: float) -> float:
-    """The gap, on average, of training networks drawn at random to the end while a share of the cost lasts."""
+    """Return the mean gap of training networks drawn at random to the end within a share of the cost."""
     random, gaps, means = np.random.default_rng(0), [], final.mean(axis=1)
     for _ in range(DRAWS):
         order = random.permutation(len(cost))
@@ -144,7 +143,7 @@ def main() -> int:
     parser.add_argument("--out", help="JSON of all figures (default: DATASET/evaluations/search-proof.json)")
     args = parser.parse_args()
     if args.seeds < 2:
-        parser.error("--seeds is at least 2: a standard error over seeds is asked for")
+        parser.error("--seeds is at least 2: a standard error over seeds needs two")
     try:
         return prove(args)
     except PlushSenseError as refusal:
@@ -159,21 +158,23 @@ def prove(args: argparse.Namespace) -> int:
         context="stream", classes="shared",
     )  # fmt: skip
     changes = {"architectures": args.architectures, "filters": args.filters}
-    asked = {"rungs": args.rungs, "share": args.share, "eta": args.eta}
-    ready = prepare(dataset, grid, changes, asked)
+    limits = {"rungs": args.rungs, "share": args.share, "eta": args.eta}
+    ready = prepare(dataset, grid, changes, limits)
     names = [(p.trial.arch.symbol, "/".join(map(str, p.trial.arch.filters))) for p in ready.plans[-1].trials]
-    said = [f"{arch} {filters}" for arch, filters in names]
+    labels = [f"{arch} {filters}" for arch, filters in names]
 
     every = tuple(range(args.seeds))
     began, searches = time.monotonic(), []
     for seeds in (every, *((seed,) for seed in every)):
         say(f"search with {'seed' if len(seeds) == 1 else 'seeds'} {', '.join(map(str, seeds))}")
-        found = ps.search(dataset, grid, **asked, **changes, seeds=seeds, workers=args.workers, progress=search_shown())
+        found = ps.search(
+            dataset, grid, **limits, **changes, seeds=seeds, workers=args.workers, progress=report_search()
+        )
         searches.append(found.summary)
     say(f"searches: {time.monotonic() - began:.0f} s; now the grid")
     at = tuple(sorted({*args.rungs, *(e for e in args.at if e < last)}))
     swept = ps.sweep(
-        dataset, grid, **changes, epochs=at, seeds=every, workers=args.workers, table=live_table,
+        dataset, grid, **changes, epochs=at, seeds=every, workers=args.workers, table=report_jobs,
     )  # fmt: skip
     if swept.summary["done"] < swept.summary["trials"]:
         say(f"{swept.summary['trials'] - swept.summary['done']} trials of the grid failed: no comparison.")
@@ -208,7 +209,7 @@ def prove(args: argparse.Namespace) -> int:
         marks = ["search with all seeds"] * int(n == joint)
         marks += [f"search with seed {seed}" for seed, network in enumerate(chosen) if network == n]
         each = " ".join(f"{value:.4f}" for value in final[n])
-        print(f"  {rank:2} {said[n]:34} {final[n].mean():.4f}  ({each})  {', '.join(marks)}")
+        print(f"  {rank:2} {labels[n]:34} {final[n].mean():.4f}  ({each})  {', '.join(marks)}")
     print("replayed from the grid's scores, the searches with all seeds, and with one (mean of them):")
     replays = []
     for rungs, eta, folds in ((args.rungs[:-1], args.eta, ()), *OTHERS):
@@ -225,7 +226,7 @@ def prove(args: argparse.Namespace) -> int:
         print("SIMULATION: of the virtual toy; says nothing about a real one.")
     reached = found_of["gap"] <= found_of["standard_error"] and max(shares) <= args.share + 1e-9
     figures = {
-        "reached": reached, "names": said, "final": final.tolist(), "joint": joint, "chosen": chosen, **found_of,
+        "reached": reached, "names": labels, "final": final.tolist(), "joint": joint, "chosen": chosen, **found_of,
         "shares": shares, "seconds_shares": seconds, "gap_by_chance": chance, "apart": apart, "replays": replays,
         "search": ready.spec.to_dict(), "grid": ready.grid.to_dict(), "machine": swept.summary["machine"],
         "dataset": dataset.head.name, "dataset_hash": dataset.hash, "simulated": dataset.head.simulated,
@@ -236,7 +237,7 @@ def prove(args: argparse.Namespace) -> int:
     f = found_of
     print(
         f"VERDICT {'reached' if reached else 'NOT reached'}: the search with all {args.seeds} seeds found "
-        f"{said[joint]} (rank {f['rank']} of {len(names)}), {f['gap']:.4f} below the grid's best {said[f['best']]} "
+        f"{labels[joint]} (rank {f['rank']} of {len(names)}), {f['gap']:.4f} below the grid's best {labels[f['best']]} "
         f"{f['best_mean']:.4f}, one standard error {f['standard_error']:.4f} (of the best alone "
         f"{f['standard_error_of_best']:.4f}), for {shares[0]:.1%} of the grid's multiply-accumulates and "
         f"{seconds[0]:.1%} of its seconds of training; networks drawn at random for that cost: {chance:.4f} below. "
@@ -256,7 +257,7 @@ def _replayed(
     eta: float,
     folds: tuple[int, ...],
 ) -> dict[str, Any] | None:
-    """Another way to search, or None where the grid was not scored for it or the share does not suffice."""
+    """Replay other settings of the search; None where the grid was not scored for them or the share is too small."""
     spec = replace(SearchSpec(), rungs=rungs, eta=eta, folds=folds, share=args.share)
     if any(rung not in scored.by_epochs for rung in rungs) or any(f > costs.epoch.shape[1] for f in folds):
         return None
@@ -267,8 +268,8 @@ def _replayed(
         return None
     means = final.mean(axis=1)
     single = float(np.mean([means.max() - means[network] for network, _ in found]))
-    said = {"rungs": list(rungs), "eta": eta, "folds": list(folds) or "all"}
-    return {**said, "gap": float(means.max() - means[whole]), "single": single, "share": share}
+    settings = {"rungs": list(rungs), "eta": eta, "folds": list(folds) or "all"}
+    return {**settings, "gap": float(means.max() - means[whole]), "single": single, "share": share}
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What a live decision costs: a network that keeps its state against one that recomputes its window.
+"""Measure the cost of a live decision: a network that keeps its state against one that recomputes its window.
 
 Both run in the NumPy reference, in turn, on the same samples; the ratio of a round is taken within it, so that a
 machine whose speed drifts does not matter much. Counts of multiply-accumulates stand beside the times.

@@ -1,9 +1,9 @@
-"""What the live page costs: updates a second, the server's processor time, bytes to page, and memory over a long run.
+"""Measure the live page: updates a second, processor time of the server, bytes to page, memory over a long run.
 
     python bench/studio.py --model BUNDLE [--seconds 30] [--minutes 10 --speed 6] [--soak-hours 1] [--json]
 
 A virtual toy in a process of its own (13 channels, 100 Hz) sends over TCP; the studio reads it in another; Chromium,
-headless, shows the page. All three and this program share the machine, whose load is told with the figures.
+headless, shows the page. All three and this program share the machine, whose load is reported with the results.
 
 1. Real time, for `--seconds`: messages and drawings a second; processor time of the studio's process (all its threads:
    reading, deciding, sending); from the arrival of the bytes in the studio to the message in the page, and to the end
@@ -48,7 +48,7 @@ def resident_bytes(pid: int) -> int:
 
 
 def heap_bytes(page: Any) -> int:
-    """What lives in a page's heap, after a collection."""
+    """Return the bytes in a page's heap after a garbage collection."""
     session = page.context.new_cdp_session(page)
     session.send("HeapProfiler.collectGarbage")
     used = int(session.send("Runtime.getHeapUsage")["usedSize"])
@@ -57,7 +57,7 @@ def heap_bytes(page: Any) -> int:
 
 
 def growth(points: list[tuple[float, float]]) -> dict[str, float]:
-    """Of (seconds, bytes): the first and last third's mean, and the slope of the last two thirds in kB a minute."""
+    """Return, from (seconds, bytes), the means of the outer thirds and the slope of the last two in kB a minute."""
     late = np.array(points[len(points) // 3 :])
     third = max(1, len(points) // 3)
     slope = float(np.polyfit(late[:, 0], late[:, 1], 1)[0]) if len(late) > 2 else 0.0
@@ -69,7 +69,7 @@ def growth(points: list[tuple[float, float]]) -> dict[str, float]:
 
 
 def quantiles(values: list[float]) -> dict[str, float]:
-    """p50, p95 and p99."""
+    """Return the 50th, 95th and 99th percentile."""
     return {f"p{q}": round(float(np.percentile(values, q)), 2) for q in (50, 95, 99)} if values else {}
 
 
@@ -78,7 +78,7 @@ class Program:
 
     def __init__(self, *options: str, cwd: Path) -> None:
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "plushsense.apps.cli.main", *options, "--json"],
+            [sys.executable, "-m", "plushsense.cli.main", *options, "--json"],
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             text=True,
@@ -104,18 +104,18 @@ def begin(page: Any) -> None:
 
 
 def at_real_time(page: Any, pid: int, seconds: float) -> dict[str, Any]:
-    """Updates, processor time and delays over so many seconds."""
+    """Measure updates, processor time and delays over so many seconds."""
     page.evaluate("() => { window.plushsenseLive.delays.length = 0; window.plushsenseLive.shown.length = 0; }")
     before, used, began = page.evaluate(_LOOK), processor_s(pid), time.perf_counter()
     delays: list[float] = []
-    shown: list[float] = []
+    drawn: list[float] = []
     while time.perf_counter() - began < seconds:
         time.sleep(min(5.0, seconds))
         seen = page.evaluate(
             "() => { const s = window.plushsenseLive; return [s.delays.splice(0), s.shown.splice(0)]; }"
         )
         delays += seen[0]
-        shown += seen[1]
+        drawn += seen[1]
     passed = time.perf_counter() - began
     after, used = page.evaluate(_LOOK), processor_s(pid) - used
     return {
@@ -126,7 +126,7 @@ def at_real_time(page: Any, pid: int, seconds: float) -> dict[str, Any]:
         "server_core_percent": round(100.0 * used / passed, 2),
         "draw_ms": round((after["drawMs"] - before["drawMs"]) / max(1, after["drawn"] - before["drawn"]), 2),
         "bytes_to_page_ms": quantiles(delays),
-        "bytes_to_drawn_ms": quantiles(shown),
+        "bytes_to_drawn_ms": quantiles(drawn),
         "load_average": round(os.getloadavg()[0], 2),
     }
 
@@ -156,7 +156,7 @@ def memory(page: Any, pid: int, seconds: float, every_s: float = 5.0) -> dict[st
 
 
 def measure(model: Path, speed: float, seconds: float, watched: str, tabs: int = 1) -> dict[str, Any]:
-    """One toy, one studio and one browser: ``watched`` is "real" or "memory"."""
+    """Measure one toy, one studio and one browser: ``watched`` is "real" or "memory"."""
     from playwright.sync_api import sync_playwright
 
     found = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -203,8 +203,8 @@ def main() -> None:
     if args.json:
         print(json.dumps(result))
         return
-    for part, told in result.items():
-        print(f"{part}: {json.dumps(told)}")
+    for part, values in result.items():
+        print(f"{part}: {json.dumps(values)}")
 
 
 if __name__ == "__main__":

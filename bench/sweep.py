@@ -1,4 +1,4 @@
-"""What the paper's grid costs with our training and with a plain PyTorch loop, side by side; and that both learn alike.
+"""Measure the cost of the paper's grid with our training and with a plain PyTorch loop, and that both learn alike.
 
     python bench/sweep.py steps [--cores 1] [--filters 0,1,2,3] [--batches 64,256,3936] [--repeats 5]
     python bench/sweep.py losses DATASET        first 50 steps of all 52 networks, from the same weights and batches
@@ -70,7 +70,7 @@ class Plain(nn.Module):
         return self.dense(self.blocks(x).mean(2))
 
     def take(self, net: Net) -> None:
-        """The weights of one of ours."""
+        """Copy the weights of one of our networks."""
         weights = {name: torch.from_numpy(values) for name, values in net.export_weights().items()}
         with torch.no_grad():
             for i, conv in enumerate(m for m in self.blocks if isinstance(m, nn.Conv1d)):
@@ -81,7 +81,7 @@ class Plain(nn.Module):
 
 
 class Loops:
-    """One training step each way, from the same weights, on the same batch."""
+    """Two training loops that step from the same weights on the same batch."""
 
     def __init__(self, arch: Arch, x: Tensor, y: Tensor, batch: int, threads: int, seed: int = 0) -> None:
         torch.manual_seed(seed)
@@ -94,7 +94,7 @@ class Loops:
         self.fast_adam = torch.optim.Adam(self.fast.parameters, lr=RATE, fused=True)
 
     def take_plain(self, model: Plain) -> None:
-        """The plain loop's present weights, into ours."""
+        """Copy the plain loop's weights into ours."""
         tensors = iter(self.fast.parameters)
         with torch.no_grad():
             convs = [m for m in model.blocks if isinstance(m, nn.Conv1d)]
@@ -137,24 +137,24 @@ def named(arch: Arch) -> str:
 
 
 def noise() -> tuple[Tensor, Tensor]:
-    """Windows as large as the paper's training set; what is in them does not change the time."""
+    """Return random windows as many as the paper's training set; their content does not change the time."""
     random = torch.Generator().manual_seed(1)
     x = torch.randn(WINDOWS, CHANNELS, SAMPLES, generator=random)
     return x, torch.randint(0, CLASSES, (WINDOWS,), generator=random)
 
 
 def training_apart(pipe: Connection) -> None:
-    """A process that takes steps of ours when told: one of several trainings side by side, as a sweep runs them."""
+    """Run training steps on request, in one of several processes as in a sweep."""
     x, y = noise()
     random = torch.Generator().manual_seed(2)
     loops: Loops | None = None
-    while (told := pipe.recv()) is not None:
-        if isinstance(told, tuple):
-            loops = Loops(*told[:1], x, y, told[1], 1)
-            batch = told[1]
+    while (order := pipe.recv()) is not None:
+        if isinstance(order, tuple):
+            loops = Loops(*order[:1], x, y, order[1], 1)
+            batch = order[1]
         else:
             assert loops is not None
-            for _ in range(told):
+            for _ in range(order):
                 loops.ours(torch.randperm(WINDOWS, generator=random)[:batch])
         pipe.send("done")
 
@@ -170,9 +170,9 @@ class Beside:
             context.Process(target=training_apart, args=(there,), daemon=True).start()
             self.pipes.append(here)
 
-    def all(self, told: Any) -> None:
+    def all(self, order: Any) -> None:
         for pipe in self.pipes:
-            pipe.send(told)
+            pipe.send(order)
         for pipe in self.pipes:
             pipe.recv()
 
@@ -235,7 +235,7 @@ def steps(args: argparse.Namespace) -> None:
 
 
 def data(path: str) -> tuple[Tensor, Tensor, Any]:
-    """The looped windows of a data set, scaled; classes; and the windows."""
+    """Return the looped windows of a data set, scaled; their classes; and the windows."""
     from plushsense.windows.features import Scaler
 
     windows = ps.cut_windows(ps.open_dataset(Path(path)), ps.WindowSpec(context="loop"))

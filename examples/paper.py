@@ -22,7 +22,7 @@ from typing import Any
 
 import plushsense as ps
 from plushsense.core.errors import PlushSenseError
-from plushsense.reports.sweep_paper import CHOSEN, TABLE4
+from plushsense.trials.paper import CHOSEN, TABLE4
 
 UNTESTED = "Untested on the original archive: nobody of this project had it. Whoever runs this is the first."
 LEAKY = "leaky: windows of one recording stand on both sides"

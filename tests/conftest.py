@@ -14,6 +14,10 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
+from support.requirements import missing
+
+pytest_plugins = ["support.small_dataset", "support.small_windows", "support.study"]
+
 # Many small arrays: threads only get in each other's way when tests run in parallel.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("MPLBACKEND", "Agg")
@@ -23,14 +27,19 @@ REPO = Path(__file__).resolve().parents[1]
 settings.register_profile("ci", derandomize=True, print_blob=True)
 if os.environ.get("PLUSHSENSE_REQUIRE"):
     settings.load_profile("ci")
-REQUIRED = {word.strip() for word in os.environ.get("PLUSHSENSE_REQUIRE", "").split(",") if word.strip()}
 
 
-def missing(what: str, reason: str) -> None:
-    """Skip for something this machine lacks, or fail where PLUSHSENSE_REQUIRE says that it must be here."""
-    if what in REQUIRED:
-        pytest.fail(f"{what} is required here (PLUSHSENSE_REQUIRE): {reason}")
-    pytest.skip(reason)
+# Folders and fixtures of tests that take seconds; `make test-quick` leaves them out.
+SLOW_FOLDERS = {"bench", "cli", "deploy", "experiments", "studio", "workflow"}
+SLOW_FIXTURES = {"real_data", "c_compiler", "target_here", "two_nodes", "lsl_possible", "publish_tools", "pty_possible"}
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests that `make test-quick` leaves out."""
+    for item in items:
+        folder = item.path.relative_to(REPO / "tests").parts[0]
+        if folder in SLOW_FOLDERS or SLOW_FIXTURES & set(getattr(item, "fixturenames", ())):
+            item.add_marker(pytest.mark.slow)
 
 
 @pytest.fixture(scope="session")
@@ -169,7 +178,7 @@ def two_nodes(cluster_possible: None) -> Iterator[Any]:
         # A short path: it holds sockets, whose names may have 107 bytes. Nothing is written to /tmp/ray.
         patch = pytest.MonkeyPatch()
         patch.setenv("RAY_TMPDIR", folder)
-        jobs = str(REPO / "tests" / "runs")
+        jobs = str(REPO / "tests" / "jobs")
         patch.setenv("PYTHONPATH", os.pathsep.join(filter(None, [jobs, os.environ.get("PYTHONPATH")])))
         head = {"num_cpus": 1, "object_store_memory": _STORE, "include_dashboard": False, "temp_dir": f"{folder}/ray"}
         Path(folder, "ray").mkdir()

@@ -1,4 +1,4 @@
-"""What all opponents are given: one network with its normalisation folded, and the windows they are checked on."""
+"""The test case of all opponents: one network with its normalisation folded, and the windows to check it on."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import ArchError
 from plushsense.core.gestures import GestureSet, load_gestures
-from plushsense.core.signal import Layout, load_layout
+from plushsense.core.layouts import Layout, load_layout
 from plushsense.deploy.quantize import calibrate, folded, quantize, refuse_undeployable
-from plushsense.models import fixed
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
-from plushsense.models.image import IntegerModel
 from plushsense.models.reference import Network, random_weights
-from plushsense.windows.features import Scaler, inputs
+from plushsense.runtime import fixed
+from plushsense.runtime.image import IntegerModel
+from plushsense.windows.features import Scaler, network_inputs
 
 Floats = NDArray[np.float64]
 CHECKED, CALIBRATED, APART = 200, 200, 8  # windows to check on, windows to calibrate with, decisions between them
@@ -26,7 +26,7 @@ FORMS = ("cheapest", "window", "span")
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One network, and the numbers that go through it.
+    """A network, and the windows to run through it.
 
     ``frames`` (n, 1 + C) int32 are what the toy measures: ms and raw values. Ours reads them as a stream. The others
     read ``windows`` (N, F, T) float32, which end where a decision of the stream falls; ``ours`` (N,) says which one.
@@ -55,7 +55,7 @@ class Case:
         return macs_of(self.arch, self.form)
 
     def save(self, folder: Path) -> None:
-        """Everything an opponent needs, without PlushSense."""
+        """Save everything an opponent needs, without PlushSense."""
         facts = {f"dilation{i}": np.int64(layer.dilation) for i, layer in enumerate(self.arch.layers)}
         np.savez(
             folder / "case.npz",
@@ -88,7 +88,7 @@ def make_case(
     bundle: str | None = None,
     seed: int = 1,
 ) -> Case:
-    """A network with random weights, or that of a bundle, and made-up frames for it."""
+    """Return a network with random weights, or that of a bundle, and random frames for it."""
     laid, named = load_layout(layout), load_gestures(gestures)
     if bundle is None:
         arch = Arch.parse(symbol, filters, channels=laid.n_inputs, classes=len(named), window=window)
@@ -118,7 +118,7 @@ def _filled(
     first = -(-max(length - arch.span, 0) // arch.step)  # the first decision that has a whole window behind it
     decisions = first + APART * (CALIBRATED + CHECKED)
     frames = made_up_frames(layout, scaler, arch.span + arch.step * decisions, seed)
-    x = inputs(frames[:, 1:].astype(np.int64), layout)
+    x = network_inputs(frames[:, 1:].astype(np.int64), layout)
     at = first + APART * np.arange(CALIBRATED + CHECKED)
     ends = arch.span + arch.step * at
     spans = np.stack([x[end - arch.span : end].T for end in ends])
@@ -138,7 +138,7 @@ def _filled(
 
 
 def made_up_frames(layout: Layout, scaler: Scaler | None, n: int, seed: int) -> NDArray[np.int32]:
-    """Frames (n, 1 + C) every 10 ms: levels and liveliness of all channels change every few seconds."""
+    """Return frames (n, 1 + C) every 10 ms: level and variance of all channels change every few seconds."""
     rng = np.random.default_rng(seed)
     channels = len(layout.channels)
     level, size = np.empty((n, channels)), np.empty((n, channels))
@@ -162,7 +162,7 @@ def made_up_frames(layout: Layout, scaler: Scaler | None, n: int, seed: int) -> 
 
 
 def fold(arch: Arch, weights: dict[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float32]]:
-    """The network without normalisation: ``w0 (F, C, K)``, ``b0`` … ``dense_w``, ``dense_b``."""
+    """Return the network without normalisation: ``w0 (F, C, K)``, ``b0`` … ``dense_w``, ``dense_b``."""
     *layers, (dense_w, dense_b) = folded(arch, weights)
     found = {"dense_w": dense_w, "dense_b": dense_b}
     for i, (w, b) in enumerate(layers):
@@ -171,7 +171,7 @@ def fold(arch: Arch, weights: dict[str, NDArray[np.float32]]) -> dict[str, NDArr
 
 
 def forward(arch: Arch, plain: dict[str, NDArray[np.float32]], x: NDArray[np.float32], *, padded: bool) -> Floats:
-    """The float answer (N, K) to windows (N, C, T); ``padded`` puts zeros before each layer's first sample."""
+    """Return the float logits (N, K) of windows (N, C, T); ``padded`` puts zeros before each layer's first sample."""
     z = x.astype(np.float64)
     for i, layer in enumerate(arch.layers):
         if padded:

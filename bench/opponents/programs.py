@@ -17,12 +17,12 @@ STRICT = ("-std=gnu99", "-Wall", "-Wextra", "-Werror")
 
 
 class CannotBuild(Exception):
-    """What is missing, or what the compiler said."""
+    """A program that cannot be built: what is missing, or the compiler's message."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One row of the table.
+    """A row of the table.
 
     ``reads`` says what a decision starts from: ``frames``, ``stream`` (network only) or ``window``. Sizes in bytes;
     None where they are not known.
@@ -69,18 +69,18 @@ class Workshop:
             self.marks = ["-DWITHOUT_MARKS"]
 
     def version(self) -> str:
-        """The compiler's first line."""
+        """Return the first line of the compiler's version."""
         return _call([self.cc, "--version"], self.folder).splitlines()[0]
 
     def program(self, name: str, objects: list[Path]) -> list[str]:
-        """Objects, linked with the loop."""
+        """Link objects with the loop."""
         out = self.folder / name
         parts = [str(HERE / "loop.c"), *self.marks, *map(str, objects), "-lm", "-o", str(out)]
         _call([self.cc, "-O2", *STRICT, *parts], self.folder)
         return [str(out), str(self.folder)]
 
     def compiled(self, source: Path, name: str, *flags: str) -> Path:
-        """One object."""
+        """Compile one object."""
         out = self.folder / f"{name}.o"
         _call([self.cc, *flags, f"-I{self.folder}", "-c", str(source), "-o", str(out)], self.folder)
         return out
@@ -109,7 +109,7 @@ def ours(case: Case, shop: Workshop) -> list[Entry]:
 
 
 def _asking(shop: Workshop, sources: Path) -> list[str]:
-    """A program that prints how much memory the model takes, struct and all."""
+    """Return a program that prints how much memory the model takes, its struct included."""
     out = shop.folder / "memory"
     if not out.exists():
         source = shop.folder / "memory.c"
@@ -150,7 +150,7 @@ def _header(case: Case) -> str:
 
 
 def plain_window(case: Case, shop: Workshop) -> list[Entry]:
-    """The bench's own float C: what the compiler makes of simple loops over the whole window."""
+    """Build the bench's own float C: simple loops over the whole window."""
     (shop.folder / "network.h").write_text(_header(case))
     entries = []
     for level in ("-O2", "-O3"):
@@ -164,7 +164,7 @@ def plain_window(case: Case, shop: Workshop) -> list[Entry]:
 
 
 def onnx2c(case: Case, shop: Workshop, tool: str, model: Path) -> list[Entry]:
-    """What onnx2c makes of ``model``, which the Python side wrote."""
+    """Build what onnx2c generates from ``model``."""
     found = shutil.which(tool)
     if found is None:
         raise CannotBuild("no program onnx2c: build github.com/kraiskil/onnx2c and give --onnx2c PATH")

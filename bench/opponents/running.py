@@ -30,7 +30,7 @@ class Running:
         )
 
     def ask(self, line: str) -> str:
-        """What the program answers."""
+        """Send a request to the program and return its reply."""
         assert self._process.stdin is not None and self._process.stdout is not None
         try:
             self._process.stdin.write(line + "\n")
@@ -46,11 +46,11 @@ class Running:
         return answer.strip()
 
     def run(self, decisions: int) -> float:
-        """Seconds a decision."""
+        """Return the seconds a decision takes."""
         return float(self.ask(f"run {decisions}")) / decisions
 
     def check(self, folder: Path, classes: int) -> NDArray[np.float64]:
-        """The logits (N, K) of all its decisions."""
+        """Return the logits (N, K) of all decisions."""
         path = folder / "logits.bin"
         self.ask(f"check {path}")
         return np.fromfile(path, dtype=np.float64).reshape(-1, classes)
@@ -76,7 +76,7 @@ class Running:
 
 
 def instructions(command: list[str], folder: Path, decisions: int) -> float:
-    """Instructions a decision: of 2N decisions less those of N, so that everything around them cancels.
+    """Return the instructions of a decision: those of 2N decisions less those of N, so that overhead cancels.
 
     Raises:
         Died: when the program does, or callgrind cannot be had.

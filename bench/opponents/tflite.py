@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 
 def float_model(case: Mapping[str, NDArray[Any]]) -> bytes:
-    """Time before channels: ``window`` (1, 1, T, C) → ``logits`` (1, K), signature ``serving_default``."""
+    """Build the float model with time before channels: ``window`` (1, 1, T, C) → ``logits`` (1, K)."""
     import flatbuffers
     from ai_edge_litert import schema_py_generated as schema
 
@@ -91,7 +91,7 @@ def float_model(case: Mapping[str, NDArray[Any]]) -> bytes:
 
 
 def quantized(model: bytes, case: Mapping[str, NDArray[Any]]) -> bytes:
-    """int8 weights a channel and int8 activations, by ai-edge-quantizer.
+    """Quantize with ai-edge-quantizer: int8 weights by channel and int8 activations.
 
     Its calibration takes a moving mean of each window's extremes, which cuts off what is rare; the extremes of all
     windows, which it offers too, come closer to the floats here.

@@ -1,4 +1,6 @@
-"""One opponent of Python's world, in the interpreter that has it. Needs NumPy and the opponent, not PlushSense.
+"""One Python opponent, in the interpreter that has it.
+
+Needs NumPy and the opponent, not PlushSense.
 
     python worker.py make PEER FOLDER     writes the opponent's model from FOLDER/case.npz; prints facts as JSON
     python worker.py run PEER FOLDER      decides when told to: the words of loop.c
@@ -32,7 +34,7 @@ Answer = Callable[[NDArray[np.float32]], NDArray[np.float64]]
 
 
 def int8_of(details: Mapping[str, Any], x: NDArray[Any]) -> NDArray[Any]:
-    """Floats as the codes of a quantized tensor, or as they are."""
+    """Return floats as the codes of a quantized tensor, or unchanged."""
     if details["dtype"] == np.float32:
         return x.astype(np.float32)
     scale, zero = _scale(details)
@@ -40,7 +42,7 @@ def int8_of(details: Mapping[str, Any], x: NDArray[Any]) -> NDArray[Any]:
 
 
 def floats_of(details: Mapping[str, Any], x: NDArray[Any]) -> NDArray[np.float64]:
-    """The way back."""
+    """Return the codes of a quantized tensor as floats."""
     if details["dtype"] == np.float32:
         return x.astype(np.float64)
     scale, zero = _scale(details)
@@ -56,7 +58,7 @@ def _scale(details: Mapping[str, Any]) -> tuple[float, int]:
 
 
 def onnx_float(case: Case, path: Path) -> None:
-    """``window`` (1, C, T) → ``logits`` (1, K), with the padding in the convolutions."""
+    """Build ``window`` (1, C, T) → ``logits`` (1, K), with the padding in the convolutions."""
     import onnx
     from onnx import TensorProto, helper, numpy_helper
 
@@ -288,7 +290,7 @@ PACKAGES = (
 
 
 def make(peer: str, folder: Path) -> Facts:
-    """The model file, and what is known of it."""
+    """Build the model file and describe it."""
     with np.load(folder / "case.npz") as case:
         facts = PEERS[peer][0](dict(case), folder)
     facts["model_bytes"] = (folder / facts["model"]).stat().st_size
@@ -303,7 +305,7 @@ def make(peer: str, folder: Path) -> Facts:
 
 
 def serve(peer: str, folder: Path, say: Callable[[str], None]) -> None:
-    """Answers lines until there are no more."""
+    """Answer requests until there are no more."""
     decide, answer = PEERS[peer][1](folder, json.loads((folder / f"{peer}.json").read_text()))
     marks = ctypes.CDLL(str(folder / "marks.so")) if (folder / "marks.so").exists() else None
     with np.load(folder / "case.npz") as case:

@@ -16,56 +16,55 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from plushsense.apps.api import evaluate, load, simulate, train
-    from plushsense.apps.baselining import baselines
-    from plushsense.apps.checking import check_dataset
-    from plushsense.apps.estimator import PlushClassifier
-    from plushsense.apps.exporting import export
-    from plushsense.apps.reporting import write_report
-    from plushsense.apps.retraining import forget
-    from plushsense.apps.searching import search
-    from plushsense.apps.sweeping import sweep
     from plushsense.core.gestures import GestureSet, load_gestures
-    from plushsense.core.signal import Layout, load_layout
+    from plushsense.core.layouts import Layout, load_layout
     from plushsense.dataset.backup import backup, check_backup, restore
-    from plushsense.dataset.importers import import_recordings
+    from plushsense.dataset.importing.importers import import_recordings
     from plushsense.dataset.index import open_dataset
-    from plushsense.dataset.pseudonymise import pseudonymise
+    from plushsense.dataset.privacy.pseudonymise import pseudonymise
     from plushsense.devices.opening import open_device
-    from plushsense.live.stream import StreamClassifier
+    from plushsense.experiments.baselines.run import baselines
+    from plushsense.experiments.search.run import search
+    from plushsense.experiments.sweep.run import sweep
     from plushsense.models.arch import Arch
     from plushsense.models.bundle import Bundle
+    from plushsense.runtime.classifier import StreamClassifier
     from plushsense.windows.cut import WindowSpec, cut_windows
+    from plushsense.workflow.api import evaluate, load, simulate, train
+    from plushsense.workflow.datasets import check_dataset, forget
+    from plushsense.workflow.estimator import PlushClassifier
+    from plushsense.workflow.export import export
+    from plushsense.workflow.reporting import write_report
 
-__version__ = "0.1.0"
+from plushsense.core.version import __version__ as __version__
 
 _WHERE = {
-    "import_recordings": "plushsense.dataset.importers",
+    "import_recordings": "plushsense.dataset.importing.importers",
     "open_dataset": "plushsense.dataset.index",
     "WindowSpec": "plushsense.windows.cut",
     "cut_windows": "plushsense.windows.cut",
     "Arch": "plushsense.models.arch",
     "Bundle": "plushsense.models.bundle",
-    "train": "plushsense.apps.api",
-    "evaluate": "plushsense.apps.api",
-    "load": "plushsense.apps.api",
-    "simulate": "plushsense.apps.api",
-    "export": "plushsense.apps.exporting",
-    "write_report": "plushsense.apps.reporting",
-    "baselines": "plushsense.apps.baselining",
-    "forget": "plushsense.apps.retraining",
-    "search": "plushsense.apps.searching",
-    "sweep": "plushsense.apps.sweeping",
+    "train": "plushsense.workflow.api",
+    "evaluate": "plushsense.workflow.api",
+    "load": "plushsense.workflow.api",
+    "simulate": "plushsense.workflow.api",
+    "export": "plushsense.workflow.export",
+    "write_report": "plushsense.workflow.reporting",
+    "baselines": "plushsense.experiments.baselines.run",
+    "forget": "plushsense.workflow.datasets",
+    "search": "plushsense.experiments.search.run",
+    "sweep": "plushsense.experiments.sweep.run",
     "backup": "plushsense.dataset.backup",
     "check_backup": "plushsense.dataset.backup",
     "restore": "plushsense.dataset.backup",
-    "pseudonymise": "plushsense.dataset.pseudonymise",
-    "check_dataset": "plushsense.apps.checking",
-    "PlushClassifier": "plushsense.apps.estimator",
+    "pseudonymise": "plushsense.dataset.privacy.pseudonymise",
+    "check_dataset": "plushsense.workflow.datasets",
+    "PlushClassifier": "plushsense.workflow.estimator",
     "open_device": "plushsense.devices.opening",
-    "StreamClassifier": "plushsense.live.stream",
-    "Layout": "plushsense.core.signal",
-    "load_layout": "plushsense.core.signal",
+    "StreamClassifier": "plushsense.runtime.classifier",
+    "Layout": "plushsense.core.layouts",
+    "load_layout": "plushsense.core.layouts",
     "GestureSet": "plushsense.core.gestures",
     "load_gestures": "plushsense.core.gestures",
 }

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import importlib.util
-import sys
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "bench"))
 
 import live as bench
-from plushsense.core.signal import load_layout
-from plushsense.live.stream import StreamClassifier
+from plushsense.core.layouts import load_layout
+from plushsense.runtime.classifier import StreamClassifier
 
 
 def test_its_parts_run_and_the_networks_agree() -> None:

@@ -14,17 +14,15 @@ import numpy as np
 import pytest
 
 REPO = Path(__file__).parents[2]
-sys.path.insert(0, str(REPO / "bench"))
-sys.path.insert(0, str(REPO / "tests"))
 
-import peers  # noqa: E402
-from opponents.case import fold, forward, macs_of, make_case  # noqa: E402
-from opponents.programs import Workshop, ours, plain_window  # noqa: E402
-from opponents.running import Died, Running  # noqa: E402
+import peers
+from opponents.case import fold, forward, macs_of, make_case
+from opponents.programs import Workshop, ours, plain_window
+from opponents.running import Died, Running
 
-from conftest import missing  # noqa: E402
-from plushsense.models.arch import Arch  # noqa: E402
-from plushsense.models.reference import Network, random_weights  # noqa: E402
+from plushsense.models.arch import Arch
+from plushsense.models.reference import Network, random_weights
+from support.requirements import missing
 
 SMALL = ("--arch", "5_4d2", "--filters", "4,6", "--layout", "accel-3", "--window", "40")
 

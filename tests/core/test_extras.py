@@ -2,8 +2,7 @@ import json
 
 import pytest
 
-from plushsense.core.errors import MissingExtraError
-from plushsense.core.extras import need
+from plushsense.core.errors import MissingExtraError, need
 
 
 def test_a_present_module_is_returned() -> None:

@@ -49,7 +49,7 @@ def test_spellings_of_one_label_are_one_gesture() -> None:
 @pytest.mark.parametrize(
     ("entry", "said"),
     [
-        ({"label": 5}, "label is 5; it must be a text"),
+        ({"label": 5}, "gestures.0..label is 5: accepted is text"),
         ({"label": "a", "nobody": "no"}, "nobody is 'no'"),
         ("a", "table"),
     ],

@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from plushsense.core.errors import FileFormatError
-from plushsense.core.recfile import (
+from plushsense.core.layouts import Layout, load_layout
+from plushsense.core.recorder_csv import (
     Frames,
     format_rows,
     parse_name,
@@ -15,7 +16,6 @@ from plushsense.core.recfile import (
     recording_filename,
     write_recording,
 )
-from plushsense.core.signal import Layout, load_layout
 
 ACCEL = load_layout("accel-3")
 PLUSH = load_layout("plush-15")

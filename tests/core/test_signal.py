@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from plushsense.core.errors import LayoutError
-from plushsense.core.signal import Layout, layout_names, load_layout
+from plushsense.core.layouts import Layout, layout_names, load_layout
 
 OWN = """
 name = "pad"
@@ -61,10 +61,10 @@ def test_a_users_own_layout(tmp_path: Path) -> None:
         ('derived = [{ name = "m", kind = "norm", of = ["a"] }]', "kind 'norm'"),
         ('derived = [{ name = "m", kind = "magnitude", of = ["a"] }]', "'a' feeds 'm'.*valid_min and valid_max"),
         ('csv = { columns = ["a", "b", "device_ms"], header = ["A", "B"] }', "csv.header has 2 texts for 3 columns"),
-        ("inputs = [1]", "inputs is .1., not a list of texts"),
-        ('inputs = "ab"', "inputs is 'ab', not a list of texts"),
-        ("csv = { separator = 5 }", "separator is 5, not a text"),
-        ('derived = ["m"]', "derived is .*not a list of tables"),
+        ("inputs = [1]", "inputs.0. is 1: accepted is text"),
+        ('inputs = "ab"', "inputs is 'ab': accepted is a list of texts"),
+        ("csv = { separator = 5 }", "csv.separator is 5: accepted is text"),
+        ('derived = ["m"]', "derived.0. is 'm': accepted is a table"),
     ],
 )
 def test_a_wrong_layout_is_refused_in_one_sentence(tmp_path: Path, change: str, said: str) -> None:

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from plushsense.core.recfile import Frames, format_rows, recording_filename, write_recording
-from plushsense.core.signal import Layout, load_layout
-from plushsense.recording.sessionfile import SESSION_LOG, SIDECAR, Event, SessionHead
+from plushsense.core.layouts import Layout, load_layout
+from plushsense.core.recorder_csv import Frames, format_rows, recording_filename, write_recording
+from plushsense.recording.session_files import SESSION_LOG, SIDECAR, SessionEvent, SessionHead
+from support.requirements import missing
 
 START_MS = 1_760_000_000_000
 SessionWriter = Callable[..., Path]
@@ -55,9 +56,9 @@ def write_session(
         path = folder / recording_filename(gesture, begin + (start + rows) * 10, rows)
         write_recording(path, part, layout)
         path.with_suffix(SIDECAR).write_text(json.dumps({"gesture": gesture, "lost": 0}), encoding="utf-8")
-        events.append(Event("take", begin + number, {"file": path.name, "gesture": gesture, "repetition": 1}))
+        events.append(SessionEvent("take", begin + number, {"file": path.name, "gesture": gesture, "repetition": 1}))
         if number in redo:
-            events.append(Event("redo", begin + number, {"file": path.name, "why": "sneezed"}))
+            events.append(SessionEvent("redo", begin + number, {"file": path.name, "why": "sneezed"}))
     (folder / SESSION_LOG).write_text("".join(e.to_line() for e in events), encoding="utf-8")
     return folder
 
@@ -128,9 +129,7 @@ XdfWriter = Callable[..., Path]
 def require(request: pytest.FixtureRequest, module: str, word: str) -> None:
     """Skip, or fail where PLUSHSENSE_REQUIRE names ``word``, when an optional package is not installed."""
     if importlib.util.find_spec(module) is None:
-        shared = request.config.pluginmanager.get_plugin(str(Path(__file__).parents[1] / "conftest.py"))
-        assert shared is not None
-        shared.missing(word, f"the package {module} is not installed")
+        missing(word, f"the package {module} is not installed")
 
 
 @pytest.fixture

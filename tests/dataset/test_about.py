@@ -5,7 +5,7 @@ import pytest
 
 from plushsense.core.errors import DatasetError
 from plushsense.core.gestures import GestureSet
-from plushsense.core.signal import load_layout
+from plushsense.core.layouts import load_layout
 from plushsense.dataset.about import About, Contact, Creator, Funding
 from plushsense.dataset.store import HEAD, DatasetHead
 
@@ -47,18 +47,18 @@ def test_an_older_head_opens(tmp_path: Path) -> None:
     ("line", "said"),
     [
         ('titel = "x"', "Unknown key 'titel'.*Did you mean 'title'"),
-        ("title = 3", "title is 3; it must be a text"),
-        ('keywords = "touch"', "keywords is 'touch'; it must be a list"),
-        ('creators = ["Marie"]', "creators is 'Marie'; it must be a table"),
-        ('creators = [{ orcid = "x" }]', "creators lacks 'name'"),
+        ("title = 3", "title is 3: accepted is text"),
+        ('keywords = "touch"', "keywords is 'touch': accepted is a list of texts"),
+        ('creators = ["Marie"]', "creators.0. is 'Marie': accepted is a table"),
+        ('creators = [{ orcid = "x" }]', "creators.0..name is missing"),
         ('creators = [{ name = " " }]', "a creator has no name"),
         ('creators = [{ name = "M", orcid = "0000-0002-1825-0098" }]', "is no ORCID iD"),
         ('creators = [{ name = "M", orchid = "0000-0002-1825-0097" }]', "Did you mean 'orcid'"),
         ('contact = { name = "M", email = "at home" }', "is no e-mail address"),
-        ('contact = "M <m@example.org>"', "must be a table"),
+        ('contact = "M <m@example.org>"', "accepted is a table"),
         ('doi = "https://doi.org/10.5281/1"', "a bare DOI is accepted"),
         ('homepage = "example.org"', "begins with https://"),
-        ('funding = [{ award = "1" }]', "funding lacks 'funder'"),
+        ('funding = [{ award = "1" }]', "funding.0..funder is missing"),
         ('language = "English please"', "a code like en is accepted"),
     ],
 )

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from plushsense.core.errors import DatasetError
-from plushsense.core.recfile import Frames, recording_filename, write_recording
-from plushsense.core.signal import load_layout
+from plushsense.core.layouts import load_layout
+from plushsense.core.recorder_csv import Frames, recording_filename, write_recording
 from plushsense.dataset.backup import MANIFEST, backup, check_backup, restore
-from plushsense.dataset.importers import import_recordings
+from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks
 

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from plushsense.dataset.contents import contents, folders_of_people, same_code
+from plushsense.dataset.files import list_files, match_code, person_folders
 
 
 def test_every_file_has_a_kind_and_its_person(tmp_path: Path) -> None:
@@ -28,17 +28,17 @@ def test_every_file_has_a_kind_and_its_person(tmp_path: Path) -> None:
     for name in kinds:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("")
-    assert {str(c.path): (c.kind, c.person) for c in contents(tmp_path)} == kinds
-    assert folders_of_people(tmp_path) == ["P1", "P2"]
+    assert {str(c.path): (c.kind, c.person) for c in list_files(tmp_path)} == kinds
+    assert person_folders(tmp_path) == ["P1", "P2"]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs links")
 def test_links_are_named_and_not_followed(tmp_path: Path) -> None:
     (tmp_path / "loop").symlink_to(tmp_path, target_is_directory=True)
     (tmp_path / "nowhere.csv").symlink_to(tmp_path / "gone")
-    assert [(str(c.path), c.kind) for c in contents(tmp_path)] == [("loop", "link"), ("nowhere.csv", "link")]
+    assert [(str(c.path), c.kind) for c in list_files(tmp_path)] == [("loop", "link"), ("nowhere.csv", "link")]
 
 
 def test_one_code_in_two_spellings() -> None:
-    assert same_code("p 01", ["P02", "P_01"]) == "P_01"
-    assert same_code("P01", ["P011"]) == ""
+    assert match_code("p 01", ["P02", "P_01"]) == "P_01"
+    assert match_code("P01", ["P011"]) == ""

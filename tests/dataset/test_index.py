@@ -11,10 +11,10 @@ import pytest
 
 from plushsense.core.errors import DatasetError
 from plushsense.core.gestures import GestureSet
-from plushsense.core.recfile import Frames, format_rows, write_recording
-from plushsense.core.signal import CsvFormat, load_layout
+from plushsense.core.layouts import CsvFormat, load_layout
+from plushsense.core.recorder_csv import Frames, format_rows, write_recording
 from plushsense.dataset import index
-from plushsense.dataset.importers import import_recordings
+from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks
 from plushsense.dataset.store import Dataset, DatasetHead
@@ -42,7 +42,7 @@ def refuse(*args: object) -> None:
 
 
 def test_nothing_is_read_again_when_nothing_changed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(index, "build", refuse)
+    monkeypatch.setattr(index, "build_index", refuse)
     assert len(open_dataset(folder).recordings) == 2
 
 
@@ -78,14 +78,14 @@ def test_a_mark_reads_no_raw_file_again_and_comes_to_the_same(folder: Path, monk
     whole = open_dataset(folder)
     append_marks(folder, [Mark(first, "trim", "x", start=5, stop=50), Mark(second, "exclude", "x")])
     with monkeypatch.context() as patched:
-        patched.setattr(index, "build", refuse)
+        patched.setattr(index, "build_index", refuse)
         marked = open_dataset(folder)
     assert [(r.start, r.stop, r.excluded) for r in marked.recordings] == [(5, 50, False), (0, 60, True)]
-    again = index.rebuild(folder).dataset
+    again = index.rebuild_index(folder).dataset
     assert [replace(r, rate_hz=0.0) for r in again.recordings] == [replace(r, rate_hz=0.0) for r in marked.recordings]
     assert again.hash == marked.hash
     with monkeypatch.context() as patched:
-        patched.setattr(index, "build", refuse)
+        patched.setattr(index, "build_index", refuse)
         (folder / "marks.jsonl").unlink()
         assert open_dataset(folder).recordings == whole.recordings, "without the marks, as it was"
 
@@ -95,7 +95,7 @@ def test_a_raw_file_that_became_unreadable_is_named(folder: Path) -> None:
     for _ in range(2):
         with pytest.raises(DatasetError, match="Shake_1_60.csv' can no longer be read.*bring it back"):
             open_dataset(folder)
-        assert list(index.rebuild(folder).unreadable) == ["recordings/ana/Shake_1_60.csv"]
+        assert list(index.rebuild_index(folder).unreadable) == ["recordings/ana/Shake_1_60.csv"]
 
 
 def test_a_disk_that_cannot_be_written_still_opens(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

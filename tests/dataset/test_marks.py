@@ -5,25 +5,25 @@ import pytest
 from plushsense.core.errors import DatasetError
 from plushsense.dataset.marks import (
     MARKS,
-    FollowedMarks,
     Mark,
-    Standing,
-    after,
+    MarksFollower,
+    MarkState,
     append_marks,
+    apply_mark,
+    inverse_mark,
     read_marks,
-    taking_back,
 )
 
 
 def test_marks_are_appended_and_undone(tmp_path: Path) -> None:
     append_marks(tmp_path, [Mark("a", "trim", "x", start=5, stop=50), Mark("a", "exclude", "x", "noise")])
     first = (tmp_path / MARKS).read_text()
-    assert read_marks(tmp_path) == {"a": Standing(True, 5, 50)}
+    assert read_marks(tmp_path) == {"a": MarkState(True, 5, 50)}
     append_marks(tmp_path, [Mark("a", "include", "y")])
     assert (tmp_path / MARKS).read_text().startswith(first), "append-only"
-    assert read_marks(tmp_path) == {"a": Standing(False, 5, 50)}
+    assert read_marks(tmp_path) == {"a": MarkState(False, 5, 50)}
     append_marks(tmp_path, [Mark("a", "untrim", "y")])
-    assert read_marks(tmp_path) == {"a": Standing()}
+    assert read_marks(tmp_path) == {"a": MarkState()}
 
 
 def test_a_torn_line_swallows_nothing_and_locks_nothing(tmp_path: Path) -> None:
@@ -41,7 +41,7 @@ def test_a_torn_line_swallows_nothing_and_locks_nothing(tmp_path: Path) -> None:
 
 def test_only_a_newline_ends_a_mark(tmp_path: Path) -> None:
     append_marks(tmp_path, [Mark("a", "exclude", "x", "noise\u2028and more\x85\x0b")])
-    assert read_marks(tmp_path) == {"a": Standing(True)}
+    assert read_marks(tmp_path) == {"a": MarkState(True)}
 
 
 @pytest.mark.parametrize(
@@ -81,56 +81,56 @@ def test_a_finding_is_accepted_and_taken_back(tmp_path: Path) -> None:
     )
     assert read_marks(tmp_path)["a"].accepted == {"gaps", "rate"}
     append_marks(tmp_path, [Mark("a", "trim", "x", start=3), Mark("a", "unaccept", "y", check="gaps")])
-    assert read_marks(tmp_path)["a"] == Standing(False, 3, -1, frozenset({"rate"}))
+    assert read_marks(tmp_path)["a"] == MarkState(False, 3, -1, frozenset({"rate"}))
     for wrong in (Mark("a", "accept", "x"), Mark("a", "trim", "x", check="gaps")):
         with pytest.raises(DatasetError, match="name a check"):
             append_marks(tmp_path, [wrong])
 
 
 def test_followed_marks_are_those_read_whole(tmp_path: Path) -> None:
-    followed = FollowedMarks(tmp_path)
-    assert followed.standing() == {}
+    followed = MarksFollower(tmp_path)
+    assert followed.states() == {}
     assert not followed.changed
     for number in range(20):
         append_marks(tmp_path, [Mark(f"r{number % 7}", "trim", "x", start=number), Mark("r3", "exclude", "x")])
         assert followed.changed
-        assert followed.standing() == read_marks(tmp_path)
-        assert followed.standing() is followed.standing(), "nothing changed"
+        assert followed.states() == read_marks(tmp_path)
+        assert followed.states() is followed.states(), "nothing changed"
     with (tmp_path / MARKS).open("a") as file:
         file.write('{"recording": "r9", "action": "exclude", "who": "x"')
-    assert "r9" not in followed.standing()
+    assert "r9" not in followed.states()
     with (tmp_path / MARKS).open("a") as file:
         file.write("}")
-    assert followed.standing()["r9"].excluded, "a mark without a line's end"
+    assert followed.states()["r9"].excluded, "a mark without a line's end"
     append_marks(tmp_path, [Mark("r9", "include", "x")])
-    assert followed.standing() == read_marks(tmp_path)
+    assert followed.states() == read_marks(tmp_path)
 
 
 def test_a_marks_file_that_was_replaced_is_read_anew(tmp_path: Path) -> None:
-    followed = FollowedMarks(tmp_path)
+    followed = MarksFollower(tmp_path)
     append_marks(tmp_path, [Mark("a", "exclude", "x"), Mark("b", "exclude", "x")])
-    assert set(followed.standing()) == {"a", "b"}
+    assert set(followed.states()) == {"a", "b"}
     other = (tmp_path / MARKS).read_text().replace('"a"', '"c"')
     (tmp_path / "other").write_text(other + other)
     (tmp_path / "other").replace(tmp_path / MARKS)
-    assert set(followed.standing()) == {"b", "c"}
+    assert set(followed.states()) == {"b", "c"}
     (tmp_path / MARKS).unlink()
-    assert followed.standing() == {}
+    assert followed.states() == {}
 
 
 def test_followed_marks_name_the_line_that_is_none(tmp_path: Path) -> None:
     append_marks(tmp_path, [Mark("a", "exclude", "x")])
-    followed = FollowedMarks(tmp_path)
-    followed.standing()
+    followed = MarksFollower(tmp_path)
+    followed.states()
     with (tmp_path / MARKS).open("a") as file:
         file.write("[1]\n")
     for _ in range(2):
         with pytest.raises(DatasetError, match="line 2 is no mark"):
-            followed.standing()
+            followed.states()
 
 
 @pytest.mark.parametrize(
-    "before", [Standing(), Standing(start=3, stop=9, how="hand"), Standing(True, accepted=frozenset({"gaps"}))]
+    "before", [MarkState(), MarkState(start=3, stop=9, how="hand"), MarkState(True, accepted=frozenset({"gaps"}))]
 )
 @pytest.mark.parametrize(
     "mark",
@@ -143,5 +143,5 @@ def test_followed_marks_name_the_line_that_is_none(tmp_path: Path) -> None:
         Mark("a", "unaccept", "x", check="gaps"),
     ],
 )
-def test_a_mark_taken_back_leaves_what_was_before(before: Standing, mark: Mark) -> None:
-    assert after(after(before, mark), taking_back(mark, before, "y")) == before
+def test_a_mark_taken_back_leaves_what_was_before(before: MarkState, mark: Mark) -> None:
+    assert apply_mark(apply_mark(before, mark), inverse_mark(mark, before, "y")) == before

@@ -9,15 +9,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from plushsense.core.recfile import Frames
-from plushsense.core.signal import Layout, load_layout
-from plushsense.dataset.importers import import_recordings
+from plushsense.core.layouts import Layout, load_layout
+from plushsense.core.recorder_csv import Frames
+from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.onset import suggest
-from plushsense.dataset.trim import trims
-from plushsense.devices.virtual.people import draw_person
-from plushsense.devices.virtual.session import Session
+from plushsense.dataset.trimming import suggest_trims
+from plushsense.devices.virtual.session import VirtualSession
 from plushsense.devices.virtual.stream import channel_columns
-from plushsense.devices.virtual.world import WORLD
+from plushsense.devices.virtual.world import WORLD, draw_person
 
 ACCEL, PLUSH, PHONE = load_layout("accel-3"), load_layout("plush-15"), load_layout("phone-6")
 MARKS = Path(__file__).with_name("onsets.csv")
@@ -124,7 +123,7 @@ def test_a_clock_that_stands_still_is_no_crash() -> None:
 
 def test_a_hand_that_lies_still_is_no_rest() -> None:
     """On the toy's electrodes a hold is the gesture: its end is where the hand leaves, not where it stops moving."""
-    session = Session(draw_person(2, 1, WORLD), 1, 0, WORLD)
+    session = VirtualSession(draw_person(2, 1, WORLD), 1, 0, WORLD)
     session.idle(2.0)
     ends = []
     for label in ("Hold strong", "Back stroke 1"):
@@ -147,7 +146,7 @@ def test_suggestions_lie_near_the_marks_made_by_eye(real_data: Path, tmp_path: P
     with MARKS.open(encoding="utf-8", newline="") as file:
         marked = {row["recording"]: row for row in csv.DictReader(file)}
     dataset = import_recordings(real_data / "makeability-gestures", tmp_path / "DS", layout="accel-3").dataset
-    found = trims(dataset, [r for r in dataset.recordings if r.id in marked])
+    found = suggest_trims(dataset, [r for r in dataset.recordings if r.id in marked])
     assert len(found) == len(marked) >= 60
 
     def errors(edge: str, sure: float) -> NDArray[np.float64]:

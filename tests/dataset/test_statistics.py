@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 
 from plushsense.core.errors import DatasetError
-from plushsense.core.recfile import Frames, recording_filename, write_recording
-from plushsense.core.signal import load_layout
-from plushsense.dataset.importers import import_recordings
+from plushsense.core.layouts import load_layout
+from plushsense.core.recorder_csv import Frames, recording_filename, write_recording
+from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks
 from plushsense.dataset.people import PersonInfo, write_people
-from plushsense.dataset.statistics import Spread, channel_table, duration_table
+from plushsense.dataset.statistics import SummaryStatistics, channel_table, duration_table
 from plushsense.dataset.store import Dataset
 
 ACCEL = load_layout("accel-3")
@@ -35,8 +35,8 @@ def dataset(tmp_path: Path) -> Dataset:
 
 
 def test_spread_is_the_sample_s() -> None:
-    assert Spread.of([1.0, 2.0, 6.0]) == Spread(3.0, 2.0, 7.0, 1.0, 6.0)
-    assert Spread.of([4.0]).variance is None
+    assert SummaryStatistics.of([1.0, 2.0, 6.0]) == SummaryStatistics(3.0, 2.0, 7.0, 1.0, 6.0)
+    assert SummaryStatistics.of([4.0]).variance is None
 
 
 def test_durations_by_gesture_before_and_after_trimming(dataset: Dataset) -> None:

@@ -11,13 +11,22 @@ import pytest
 
 from plushsense.core.errors import DatasetError
 from plushsense.core.gestures import Gesture, GestureSet
-from plushsense.core.recfile import Frames, recording_filename, write_recording
-from plushsense.core.signal import load_layout
-from plushsense.dataset.importers import import_recordings
+from plushsense.core.layouts import load_layout
+from plushsense.core.recorder_csv import Frames, recording_filename, write_recording
+from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import MARKS, Mark, append_marks
 from plushsense.dataset.store import Dataset
-from plushsense.dataset.trim import Trim, accept, choose, kept_rows, set_rows, set_trim, trims, undo
+from plushsense.dataset.trimming import (
+    Trim,
+    accept_suggestions,
+    find_recordings,
+    kept_rows,
+    set_rows,
+    set_trim,
+    suggest_trims,
+    undo_trims,
+)
 
 ACCEL = load_layout("accel-3")
 BEGIN_S, END_S = 0.5, 1.8
@@ -47,7 +56,7 @@ def dataset(tmp_path: Path) -> Dataset:
 
 
 def _states(dataset: Dataset) -> list[str]:
-    return [t.state for t in trims(open_dataset(dataset.path))]
+    return [t.state for t in suggest_trims(open_dataset(dataset.path))]
 
 
 def _raw(dataset: Dataset) -> str:
@@ -67,7 +76,7 @@ def _waves(found: list[Trim]) -> list[Trim]:
 def test_accepting_trims_the_start_and_changes_no_file(dataset: Dataset) -> None:
     raw, before = _raw(dataset), dataset.hash
     assert _states(dataset) == ["none", "suggested", "suggested"] * 2
-    done = accept(dataset, trims(dataset), "K", "as suggested", above=0.5)
+    done = accept_suggestions(dataset, suggest_trims(dataset), "K", "as suggested", above=0.5)
     assert (len(done.marked), len(done.not_visible), done.kept_by_hand) == (4, 2, ())
     opened = open_dataset(dataset.path)
     assert _states(dataset) == ["none", "accepted", "accepted"] * 2
@@ -77,30 +86,30 @@ def test_accepting_trims_the_start_and_changes_no_file(dataset: Dataset) -> None
         assert len(opened.read(info)) == 250 - info.start
     assert opened.hash != before
     assert _raw(dataset) == raw
-    again = accept(opened, trims(opened), "K", above=0.5)
+    again = accept_suggestions(opened, suggest_trims(opened), "K", above=0.5)
     assert (again.marked, len(again.already)) == ((), 4)
     assert _lines(dataset) == 4, "running twice adds nothing"
 
 
 def test_the_end_goes_too_when_asked(dataset: Dataset) -> None:
-    accept(dataset, trims(dataset), "K", offset=True)
+    accept_suggestions(dataset, suggest_trims(dataset), "K", offset=True)
     info = next(r for r in open_dataset(dataset.path).recordings if r.gesture == "Wave")
     assert info.stop == pytest.approx(100 * END_S, abs=12)
 
 
 def test_a_confidence_nobody_reaches_marks_nothing(dataset: Dataset) -> None:
-    found = [replace(t, suggestion=replace(t.suggestion, onset_confidence=0.7)) for t in trims(dataset)]
-    done = accept(dataset, found, "K", above=0.71, offset=True)
+    found = [replace(t, suggestion=replace(t.suggestion, onset_confidence=0.7)) for t in suggest_trims(dataset)]
+    done = accept_suggestions(dataset, found, "K", above=0.71, offset=True)
     assert (done.marked, len(done.not_visible)) == ((), 6)
     assert _lines(dataset) == 0
 
 
 def test_what_a_person_set_stays(dataset: Dataset) -> None:
-    mine, old, whole, plain = _waves(trims(dataset))
+    mine, old, whole, plain = _waves(suggest_trims(dataset))
     assert set_trim(dataset, mine, 0.8, 1.5, "K", "I saw it")
     assert set_trim(dataset, whole, None, None, "K", "nothing to trim")
     append_marks(dataset.path, [Mark(old.recording.id, "trim", "from an old version", start=7)])
-    done = accept(dataset, trims(open_dataset(dataset.path)), "bulk")
+    done = accept_suggestions(dataset, suggest_trims(open_dataset(dataset.path)), "bulk")
     assert done.marked == (plain.recording.id,)
     assert set(done.kept_by_hand) == {mine.recording.id, old.recording.id, whole.recording.id}
     by_id = {r.id: r for r in open_dataset(dataset.path).recordings}
@@ -110,13 +119,13 @@ def test_what_a_person_set_stays(dataset: Dataset) -> None:
 
 
 def test_setting_what_stands_adds_nothing_and_undo_brings_the_suggestion_back(dataset: Dataset) -> None:
-    first = _waves(trims(dataset))[0]
+    first = _waves(suggest_trims(dataset))[0]
     assert set_trim(dataset, first, 0.8, None, "K")
-    standing = next(t for t in trims(dataset) if t.recording.id == first.recording.id)
+    standing = next(t for t in suggest_trims(dataset) if t.recording.id == first.recording.id)
     assert not set_trim(dataset, standing, 0.8, None, "K")
     assert _lines(dataset) == 1
-    assert undo(dataset, choose(dataset, "P1/*"), "K") == (first.recording.id,)
-    assert undo(dataset, choose(dataset, "P1/*"), "K") == ()
+    assert undo_trims(dataset, find_recordings(dataset, "P1/*"), "K") == (first.recording.id,)
+    assert undo_trims(dataset, find_recordings(dataset, "P1/*"), "K") == ()
     assert _lines(dataset) == 2
     assert _states(dataset) == ["none", "suggested", "suggested"] * 2
     assert open_dataset(dataset.path).hash == dataset.hash
@@ -128,14 +137,14 @@ def test_setting_what_stands_adds_nothing_and_undo_brings_the_suggestion_back(da
 )
 def test_times_that_cannot_be_are_refused(dataset: Dataset, start: float, stop: float | None, said: str) -> None:
     with pytest.raises(DatasetError, match=said):
-        kept_rows(_waves(trims(dataset))[0], start, stop)
+        kept_rows(_waves(suggest_trims(dataset))[0], start, stop)
 
 
 def test_rows_are_set_as_they_are_given(dataset: Dataset) -> None:
-    wave = _waves(trims(dataset))[0]
+    wave = _waves(suggest_trims(dataset))[0]
     assert set_rows(dataset, wave, 0, wave.recording.rows, "x"), "keeping all of it is a decision, too"
-    wave = _waves(trims(dataset))[0]
-    assert wave.state == "adjusted" and wave.shown() == (0, wave.recording.rows)
+    wave = _waves(suggest_trims(dataset))[0]
+    assert wave.state == "adjusted" and wave.current_rows() == (0, wave.recording.rows)
     assert not set_rows(dataset, wave, 0, wave.recording.rows, "x")
     for start, stop in ((-1, 5), (5, 5), (0, wave.recording.rows + 1)):
         with pytest.raises(DatasetError, match="cannot be kept"):
@@ -143,27 +152,27 @@ def test_rows_are_set_as_they_are_given(dataset: Dataset) -> None:
 
 
 def test_seconds_are_of_the_device_clock(dataset: Dataset) -> None:
-    first = _waves(trims(dataset))[0]
+    first = _waves(suggest_trims(dataset))[0]
     assert kept_rows(first, 0.35, 2.1) == (35, 210)
     assert kept_rows(first, None, 2.5) == (0, 250)
     assert first.to_dict()["stop_s"] == 2.5
 
 
 def test_names_and_patterns(dataset: Dataset) -> None:
-    assert len(choose(dataset, "P2/Wave*")) == 2
-    (one,) = choose(dataset, dataset.recordings[0].id)
+    assert len(find_recordings(dataset, "P2/Wave*")) == 2
+    (one,) = find_recordings(dataset, dataset.recordings[0].id)
     assert one == dataset.recordings[0]
     with pytest.raises(DatasetError, match="no recording 'P3/.'"):
-        choose(dataset, "P3/*")
+        find_recordings(dataset, "P3/*")
 
 
 def test_rest_that_nobody_makes_is_all_gesture(dataset: Dataset) -> None:
     named = GestureSet("g", (Gesture("Rest"), Gesture("Wave", nobody=True)))
     dataset = Dataset(dataset.path, replace(dataset.head, gestures=named), dataset.recordings, dataset.streams)
-    assert {t.state for t in trims(dataset)} == {"none"}
+    assert {t.state for t in suggest_trims(dataset)} == {"none"}
 
 
 def test_recordings_cut_from_labels_are_refused(dataset: Dataset) -> None:
     phone = Dataset(dataset.path, replace(dataset.head, layout=load_layout("phone-6")), [], [])
     with pytest.raises(DatasetError, match=r"label on the rows.*phone-6"):
-        trims(phone)
+        suggest_trims(phone)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,16 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
-from c_toy import C_FOLDER, TOY_C, compiled
-from conftest import missing
-from exports import LAYOUTS, bundle_of, exported
-from plushsense.dataset.importers import import_recordings
-from plushsense.deploy.calibration import integer_model
+from plushsense.dataset.importing.importers import import_recordings
 from plushsense.deploy.emit import emit
 from plushsense.deploy.package import package
-from plushsense.models.image import IntegerModel
+from plushsense.deploy.quantize import integer_model
+from plushsense.runtime.image import IntegerModel
+from support.c_toy import C_FOLDER, TOY_C, compiled
+from support.exports import LAYOUTS, bundle_of, exported
+from support.requirements import missing
 
 Packages = dict[str, tuple[Path, IntegerModel]]
 

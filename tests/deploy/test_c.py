@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import math
 import struct
-import sys
 import zlib
 from dataclasses import replace
 from pathlib import Path
@@ -16,17 +15,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 TESTS = Path(__file__).parents[1]
-sys.path.insert(0, str(TESTS))
 
-from c_toy import answers, seat  # noqa: E402
-from integers import INT32, any_frames, edged_model, models, plain_model, ruled_model  # noqa: E402
-from plushsense.deploy.golden import EVENT, answers_of, column  # noqa: E402
-from plushsense.models.events import NO_GESTURE, EventPlan  # noqa: E402
-from plushsense.models.fixed import exponentials  # noqa: E402
-from plushsense.models.gate import DOUBT, JERK, GatePlan, Rule, Signal, Term  # noqa: E402
-from plushsense.models.health import HealthPlan  # noqa: E402
-from plushsense.models.image import IntegerModel, memory_bytes  # noqa: E402
-from plushsense.models.rules import Rules  # noqa: E402
+from plushsense.deploy.golden import EVENT, answers_of, column
+from plushsense.runtime.decisions import Rules
+from plushsense.runtime.events import NO_GESTURE, EventSettings
+from plushsense.runtime.fixed import exponentials
+from plushsense.runtime.gate import DOUBT, JERK, GateSettings, Rule, Signal, Term
+from plushsense.runtime.health import HealthSettings
+from plushsense.runtime.image import IntegerModel, memory_bytes
+from support.c_toy import answers, seat
+from support.integers import INT32, any_frames, edged_model, models, plain_model, ruled_model
 
 OK, TOO_SMALL = 0, 4
 
@@ -38,12 +36,12 @@ OK, TOO_SMALL = 0, 4
 @given(models(), st.integers(0, 1 << 30))
 def test_any_network_any_stream(c_library: Any, plain_c_library: Any, model: IntegerModel, seed: int) -> None:
     frames = any_frames(model, seed)
-    wanted = answers_of(model, frames)
+    expected = answers_of(model, frames)
     for library in (c_library, plain_c_library):
         toy = seat(library, model)
         assert toy.status == OK
-        assert np.array_equal(toy.push(frames), wanted)
-        assert library.seat_answers(toy.toy) == len(answers(wanted))
+        assert np.array_equal(toy.push(frames), expected)
+        assert library.seat_answers(toy.toy) == len(answers(expected))
 
 
 def test_most_random_streams_are_answered(c_library: Any) -> None:
@@ -62,12 +60,12 @@ def test_most_random_streams_are_answered(c_library: Any) -> None:
 
 def test_sensors_in_doubt(c_library: Any) -> None:
     """Runs of suspect samples, too short and long enough for the gate to begin anew."""
-    told, longest = 0, 0
+    events, longest = 0, 0
     blow = Rule((Term(0, 24, times=1),), 3, NO_GESTURE, within=2, deaf=3)
-    gate = GatePlan((Signal(JERK, (1,), lag=3, shift=4, baseline=4, noise=4),), (blow,))
+    gate = GateSettings((Signal(JERK, (1,), lag=3, shift=4, baseline=4, noise=4),), (blow,))
     for seed in range(8):
         model, rng = ruled_model(seed), np.random.default_rng(seed)
-        rules = Rules(EventPlan(hold=0, rest=0), gate, HealthPlan(fault_ms=2000 * (seed % 2)))
+        rules = Rules(EventSettings(hold=0, rest=0), gate, HealthSettings(fault_ms=2000 * (seed % 2)))
         model = replace(model, rules=rules)
         frames, at = any_frames(model, seed, 700), 30
         while at < len(frames):
@@ -76,19 +74,19 @@ def test_sensors_in_doubt(c_library: Any) -> None:
             at, longest = at + run + int(rng.integers(3, 60)), max(longest, run)
         rows = seat(c_library, model).push(frames)
         assert np.array_equal(rows, answers_of(model, frames))
-        told += int((column(rows, "source", EVENT) == 1).sum())
-    assert longest > 2 * DOUBT and told > 500, "events of the gate"
+        events += int((column(rows, "source", EVENT) == 1).sum())
+    assert longest > 2 * DOUBT and events > 500, "events of the gate"
 
 
 def test_every_edge(c_library: Any, plain_c_library: Any) -> None:
     model = edged_model()
     for seed in range(4):
         frames = any_frames(model, seed, 700)
-        wanted = answers_of(model, frames)
+        expected = answers_of(model, frames)
         for library in (c_library, plain_c_library):
-            assert np.array_equal(seat(library, model).push(frames), wanted)
-        wanted = answers(wanted)
-        logits, best = wanted[wanted[:, 3] == 1][:, 9:18], wanted[wanted[:, 3] == 1][:, 4]
+            assert np.array_equal(seat(library, model).push(frames), expected)
+        expected = answers(expected)
+        logits, best = expected[expected[:, 3] == 1][:, 9:18], expected[expected[:, 3] == 1][:, 4]
         # Held within their limits; a tie goes to the first.
         assert (logits.min(), logits.max()) == (-16384, 16384)
         assert np.array_equal(logits[:, 0], logits[:, 1])
@@ -121,12 +119,12 @@ def test_a_restart_is_a_fresh_toy(c_library: Any) -> None:
     used, fresh = seat(c_library, model), seat(c_library, model)
     used.push(before)
     c_library.seat_restart(used.toy)
-    got, wanted = answers(used.push(after)), answers(fresh.push(after))
+    got, expected = answers(used.push(after)), answers(fresh.push(after))
     # The counts of restarts and invalid values, and the frames' numbers, go on.
     for count in (0, 7, 8):
-        got[:, count] -= got[0, count] - wanted[0, count]
-    assert np.array_equal(got, wanted)
-    assert (wanted[:, 3] == 1).any()
+        got[:, count] -= got[0, count] - expected[0, count]
+    assert np.array_equal(got, expected)
+    assert (expected[:, 3] == 1).any()
 
 
 def test_a_gap_is_a_fresh_toy(c_library: Any) -> None:
@@ -184,16 +182,16 @@ def test_counts_wrap_and_nothing_else_changes(c_library: Any) -> None:
     young, old = seat(c_library, model), seat(c_library, model)
     by = 2**32 - 40
     c_library.seat_age(old.toy, ctypes.c_uint32(by))
-    wanted, got = answers(young.push(frames)), answers(old.push(frames))
+    expected, got = answers(young.push(frames)), answers(old.push(frames))
     assert c_library.seat_answers(old.toy) == (c_library.seat_answers(young.toy) + by) % 2**32
     assert c_library.seat_answers(old.toy) < c_library.seat_answers(young.toy)
     for count in (7, 8):
-        assert np.array_equal(got[:, count].view(np.uint32), (wanted[:, count].astype(np.int64) + by) % 2**32)
+        assert np.array_equal(got[:, count].view(np.uint32), (expected[:, count].astype(np.int64) + by) % 2**32)
     # A restart sets the samples to 0, whatever they were.
-    since = wanted[:, 2].astype(np.int64) + np.where(wanted[:, 7] == 0, by, 0)
+    since = expected[:, 2].astype(np.int64) + np.where(expected[:, 7] == 0, by, 0)
     assert np.array_equal(got[:, 2].view(np.uint32), since % 2**32)
-    same = [0, 1, 3, 4, 5, 6, *range(9, wanted.shape[1])]
-    assert np.array_equal(got[:, same], wanted[:, same])
+    same = [0, 1, 3, 4, 5, 6, *range(9, expected.shape[1])]
+    assert np.array_equal(got[:, same], expected[:, same])
     assert (got[:, 2].view(np.uint32) < 1000).any()
 
 

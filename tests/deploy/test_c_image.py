@@ -6,7 +6,6 @@ import ctypes
 import re
 import struct
 import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,24 +15,25 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 TESTS = Path(__file__).parents[1]
-sys.path.insert(0, str(TESTS))
 
-from c_toy import Seat, seat  # noqa: E402
-from integers import any_frames, models, plain_model, ruled_model  # noqa: E402
-from plushsense.deploy.golden import answers_of  # noqa: E402
-from plushsense.models.gate import JERK, LEVEL, MOST_SIZE, GatePlan, Rule, Signal, Term  # noqa: E402
-from plushsense.models.image import IntegerModel, head  # noqa: E402
 
-OK, NOT_A_MODEL, OTHER_VERSION, DAMAGED, TOO_SMALL = range(5)
+from plushsense.deploy.golden import EVENT, FAULT, HEALTH, answers_of, answers_over_swaps, column
+from plushsense.runtime.events import ENDED
+from plushsense.runtime.gate import JERK, LEVEL, MOST_SIZE, GateSettings, Rule, Signal, Term
+from plushsense.runtime.image import IntegerModel, image_head
+from support.c_toy import Seat, seat
+from support.integers import any_frames, models, plain_model, ruled_model
+
+OK, NOT_A_MODEL, OTHER_VERSION, DAMAGED, TOO_SMALL, OTHER_LAYOUT = range(6)
 
 
 def test_what_plush_begin_says(c_library: Any) -> None:
     image = plain_model().to_bytes()
 
     def status(bytes_: bytes) -> int:
-        said = Seat(c_library, bytes_, 4, 3).status
-        assert (c_library.plush_memory_bytes(bytes_, len(bytes_)) == 0) == (said != OK)
-        return int(said)
+        output = Seat(c_library, bytes_, 4, 3).status
+        assert (c_library.plush_memory_bytes(bytes_, len(bytes_)) == 0) == (output != OK)
+        return int(output)
 
     assert status(image) == OK
     assert status(image + b"what stands behind it in flash") == OK
@@ -50,7 +50,7 @@ def test_what_plush_begin_says(c_library: Any) -> None:
 
 def sealed(body: bytes) -> bytes:
     """With a good checksum, as somebody who writes an image by hand would have it."""
-    return head(body) + body
+    return image_head(body) + body
 
 
 def test_a_good_checksum_makes_no_model(c_library: Any) -> None:
@@ -113,7 +113,7 @@ def test_a_good_checksum_makes_no_rules(c_library: Any) -> None:
     one = Signal(JERK, (0, 1), 16, 24, 15, 15, 1 << 20)
     two = Signal(LEVEL, (1,), 1, 0, 1, 1, 1)
     rule = Rule((Term(1, MOST_SIZE, -1, 255), Term(0, 1, 1, 1)), 3, 2, 255, 65535)
-    model = replace(model, rules=replace(model.rules, gate=GatePlan((one, two), (rule,))))
+    model = replace(model, rules=replace(model.rules, gate=GateSettings((one, two), (rule,))))
     body = model.to_bytes()[16:]
     term = len(body) - 16
     rule_at, level, jerk = term - 6, term - 6 - 11, term - 6 - 11 - 12
@@ -167,6 +167,102 @@ def test_a_good_checksum_makes_no_rules(c_library: Any) -> None:
         assert Seat(c_library, sealed(body[:at] + change + body[at + len(change) :]), 4, 3).status == OK, what
 
 
+def open_at(rows: np.ndarray) -> list[int]:
+    """The frames before which an event is going on."""
+    found: list[int] = []
+    since = -1
+    for row in rows[rows[:, 0] == EVENT].tolist():
+        if since >= 0:
+            found += range(since + 1, row[1] + 1)
+        since = -1 if row[4] == ENDED else row[1]
+    return found
+
+
+def test_a_swap_in_the_middle_of_an_event(c_library: Any) -> None:
+    """Its end is told once, by the callback that was set before; counts go on, and the new model warms up."""
+    rng = np.random.default_rng(1)
+    ended = 0
+    for seed in range(24):
+        old = ruled_model(seed)
+        other = ruled_model(seed + 100, classes=int(rng.integers(2, 7)), step=int(rng.integers(1, 6)), pool=60)
+        frames = any_frames(old, seed, 900)
+        moments = open_at(answers_of(old, frames[:600]))
+        at = int(rng.choice(moments)) if moments and seed % 4 else int(rng.integers(1, 600))
+        parts = [(old, frames[:at]), (other, frames[at:750]), (old, frames[750:])]
+        expected = answers_over_swaps(parts)
+        ended += len(expected[0]) > len(answers_of(old, frames[:at]))
+        toy = seat(c_library, old)
+        for n, (model, piece) in enumerate(parts):
+            rows = toy.push(piece)
+            if n < 2:
+                following = parts[n + 1][0]
+                status, more = toy.swap(following.to_bytes(), following.network.arch.classes)
+                assert status == OK and len(more) <= 1
+                assert [(r[0], r[4]) for r in more.tolist()] in ([], [(EVENT, ENDED)])
+                assert c_library.seat_title(toy.toy).decode() == following.network.arch.title
+                rows = np.concatenate([rows, more])
+            assert np.array_equal(rows, expected[n]), (seed, at, n, model.network.arch.title)
+    assert ended >= 12
+
+
+def test_a_swap_to_what_is_no_model_for_this_toy_changes_nothing(c_library: Any) -> None:
+    """Not a byte of the toy and its memory: the event goes on, and every answer is that of a toy left alone."""
+    rng = np.random.default_rng(2)
+    opened = 0
+    for seed in (5, 8, 14):
+        model = ruled_model(seed)
+        good = ruled_model(seed + 100, classes=5).to_bytes()
+        body = good[16:]
+        other_layout = sealed(body[:26] + bytes([body[26] ^ 1]) + body[27:])
+        refused = {
+            NOT_A_MODEL: [b"", good[:15], b"PLSX" + good[4:]],
+            OTHER_VERSION: [good[:4] + b"\1" + good[5:], good[:4] + b"\3" + good[5:]],
+            DAMAGED: [good[: int(rng.integers(16, len(good)))] for _ in range(20)],
+            OTHER_LAYOUT: [other_layout],
+        }
+        for _ in range(60):
+            flipped = bytearray(good)
+            flipped[int(rng.integers(16, len(good)))] ^= 1 << int(rng.integers(8))
+            refused[DAMAGED].append(bytes(flipped))
+        refused[DAMAGED].append(sealed(body[: len(body) - 9]))  # cut off, with a good checksum
+        frames = any_frames(model, seed, 900)
+        toy, got, at = seat(c_library, model), [], 0
+        offers = [(status, image) for status, images in refused.items() for image in images]
+        for n in rng.permutation(len(offers)).tolist():
+            until = min(at + 8, len(frames))
+            got.append(toy.push(frames[at:until]))
+            at = until
+            assert toy.swap(offers[n][1], 0)[0] == offers[n][0]
+            assert toy.swap(good, 0, too_few=1)[0] == TOO_SMALL
+        got.append(toy.push(frames[at:]))
+        assert np.array_equal(np.concatenate(got), answers_of(model, frames))
+        opened += len(open_at(np.concatenate(got)))
+    assert opened > 100
+
+
+def test_nothing_is_swapped_where_nothing_runs(c_library: Any) -> None:
+    image = plain_model().to_bytes()
+    toy = Seat(c_library, b"no model at all.....", 4, 3)
+    assert toy.swap(image, 3)[0] == OTHER_LAYOUT
+    assert len(toy.push(any_frames(plain_model(), 1, 50))) == 0
+
+
+def test_a_swap_ends_a_fault_as_a_beginning_does(c_library: Any) -> None:
+    """The sensors are judged anew, by the limits of the new model."""
+    model = ruled_model(4)
+    frames = any_frames(model, 1, 400)
+    frames[:, 0] = 10 * np.arange(400)
+    frames[200:300, 1:] = frames[200, 1:]  # frozen
+    parts = [(model, frames[:230]), (ruled_model(9), frames[230:])]
+    expected = answers_over_swaps(parts)
+    assert column(expected[0], "state", HEALTH)[-1] == FAULT
+    toy = seat(c_library, model)
+    first = toy.push(parts[0][1])
+    status, more = toy.swap(parts[1][0].to_bytes(), 3)
+    assert status == OK and np.array_equal(np.concatenate([first, more]), expected[0])
+    assert np.array_equal(toy.push(parts[1][1]), expected[1])
+
+
 def test_a_toy_that_never_began_is_quiet(c_library: Any) -> None:
     frames = any_frames(plain_model(), 1, 50)
     for toy in (seat(c_library, plain_model(), too_few=1), Seat(c_library, b"no model at all.....", 4, 3)):
@@ -189,8 +285,8 @@ def cases(*all_cases: tuple[bytes, np.ndarray]) -> bytes:
     )
 
 
-def run(program: Path, file: Path) -> bytes:
-    done = subprocess.run([program, file], capture_output=True, timeout=300)
+def run(program: Path, file: Path, *swaps: str) -> bytes:
+    done = subprocess.run([program, file, *swaps], capture_output=True, timeout=300)
     assert done.returncode == 0, done.stderr.decode()[-3000:]
     return done.stdout
 
@@ -203,13 +299,15 @@ def test_sanitizers_find_nothing_in_good_models(sanitized: list[Path], tmp_path:
     @given(models(longest=200), st.integers(0, 1 << 30))
     def collect(model: IntegerModel, seed: int) -> None:
         frames = any_frames(model, seed, 450)
-        wanted = answers_of(model, frames)
-        found.append((model.to_bytes(), frames, struct.pack("<iI", 0, len(wanted)) + wanted.astype("<i4").tobytes()))
+        expected = answers_of(model, frames)
+        found.append(
+            (model.to_bytes(), frames, struct.pack("<iI", 0, len(expected)) + expected.astype("<i4").tobytes())
+        )
 
     collect()
     (tmp_path / "cases").write_bytes(cases(*((image, frames) for image, frames, _ in found)))
     for program in sanitized:
-        assert run(program, tmp_path / "cases") == b"".join(wanted for *_, wanted in found)
+        assert run(program, tmp_path / "cases") == b"".join(expected for *_, expected in found)
 
 
 def test_sanitizers_find_nothing_in_any_bytes(sanitized: list[Path], tmp_path: Path) -> None:
@@ -252,9 +350,9 @@ def test_sanitizers_find_nothing_in_any_bytes(sanitized: list[Path], tmp_path: P
             image = bytes(rng.integers(0, 256, int(rng.integers(0, 60)), dtype=np.uint8))
         images.append((image, wide))
     (tmp_path / "cases").write_bytes(cases(*images))
-    said = {run(program, tmp_path / "cases") for program in sanitized}
-    assert len(said) == 1
-    out, at, statuses = said.pop(), 0, []
+    output = {run(program, tmp_path / "cases") for program in sanitized}
+    assert len(output) == 1
+    out, at, statuses = output.pop(), 0, []
     for image, _ in images:
         status, made = struct.unpack_from("<iI", out, at)
         statuses.append(status)
@@ -263,3 +361,32 @@ def test_sanitizers_find_nothing_in_any_bytes(sanitized: list[Path], tmp_path: P
     assert at == len(out)
     assert statuses.count(OK) > 200
     assert statuses.count(DAMAGED) > 1000
+
+
+def test_sanitizers_find_nothing_in_swaps(sanitized: list[Path], tmp_path: Path) -> None:
+    """One toy, offered good models of many sizes and damaged ones between its frames: all or nothing of each."""
+    rng = np.random.default_rng(6)
+    offered, good = [], []
+    for n in range(400):
+        shape = {"classes": int(rng.integers(2, 9)), "step": int(rng.integers(1, 6)), "pool": 60}
+        body = bytearray(ruled_model(int(rng.integers(40)), **shape).to_bytes()[16:])
+        fine = n == 0 or rng.random() < 0.3
+        if not fine:
+            body[int(rng.integers(len(body)))] ^= 1 << int(rng.integers(8))
+        image = sealed(bytes(body))
+        if not fine and rng.random() < 0.3:
+            image = image[: int(rng.integers(len(image)))]
+        offered.append((image, any_frames(ruled_model(), n, int(rng.integers(1, 120)))))
+        good.append(fine)
+    (tmp_path / "cases").write_bytes(cases(*offered))
+    output = {run(program, tmp_path / "cases", "swap") for program in sanitized}
+    assert len(output) == 1
+    out, at, statuses, classes = output.pop(), 0, [], 0
+    for image, _ in offered:
+        status, made = struct.unpack_from("<iI", out, at)
+        statuses.append(status)
+        classes = image[16 + 3] if status == OK else classes
+        at += 8 + 4 * made * (12 + 2 * classes)
+    assert at == len(out)
+    assert all(status == OK for status, fine in zip(statuses, good, strict=True) if fine)
+    assert sum(status != OK for status in statuses) > 100

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import re
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 TESTS = Path(__file__).parents[1]
-sys.path.insert(0, str(TESTS))
 
-from c_toy import C_FOLDER  # noqa: E402
-from plushsense.deploy.emit import TOY_BYTES  # noqa: E402
+from plushsense.deploy.emit import TOY_BYTES
+from support.c_toy import C_FOLDER
 
 STRICT = ["-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wsign-conversion", "-Wshadow", "-Werror"]
 

@@ -9,13 +9,12 @@ import pytest
 
 from plushsense.core.errors import ArchError, BundleError
 from plushsense.core.gestures import Gesture, GestureSet
-from plushsense.core.signal import load_layout
-from plushsense.deploy.calibration import calibrated, calibration, integer_model, integer_network
-from plushsense.deploy.quantize import Ranges, quantize
-from plushsense.live.decide import DecideSpec
+from plushsense.core.layouts import load_layout
+from plushsense.deploy.quantize import Ranges, calibrated, calibration, integer_model, integer_network, quantize
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.models.reference import random_weights
+from plushsense.runtime.decisions import DecideSpec
 from plushsense.windows.features import Scaler
 
 GESTURES = GestureSet("three", (Gesture("tap", "positive"), Gesture("hold", "neutral"), Gesture("hit", "negative")))
@@ -42,10 +41,10 @@ def test_the_same_bundle_gives_the_same_image_also_once_it_was_saved() -> None:
 def test_the_whole_numbers_answer_as_the_floats_do() -> None:
     bundle = calibrated(make(), windows())
     x = windows(seed=1, n=200)
-    wanted = bundle.network().forward(bundle.scaler.apply(x))
+    expected = bundle.network().forward(bundle.scaler.apply(x))
     found = integer_network(bundle).forward(x) / 256
-    assert (wanted.argmax(axis=1) == found.argmax(axis=1)).mean() > 0.95
-    assert np.abs(wanted - found).max() < 0.15 * np.abs(wanted).max()
+    assert (expected.argmax(axis=1) == found.argmax(axis=1)).mean() > 0.95
+    assert np.abs(expected - found).max() < 0.15 * np.abs(expected).max()
 
 
 def test_the_biases_undo_what_rounding_the_weights_does_to_the_mean() -> None:
@@ -54,15 +53,15 @@ def test_the_biases_undo_what_rounding_the_weights_does_to_the_mean() -> None:
     # Read as if every mean lay where 8 bits begin, nothing is undone.
     idle = replace(ranges, means=(ranges.low, *(np.zeros_like(m) for m in ranges.means[1:])))
     x = windows(seed=1, n=200)
-    wanted = bundle.network().forward(bundle.scaler.apply(x))
+    expected = bundle.network().forward(bundle.scaler.apply(x))
     far = [
-        np.abs((quantize(bundle.arch, bundle.weights, bundle.scaler, r).forward(x) / 256 - wanted).mean(axis=0)).max()
+        np.abs((quantize(bundle.arch, bundle.weights, bundle.scaler, r).forward(x) / 256 - expected).mean(axis=0)).max()
         for r in (ranges, idle)
     ]
     assert far[0] < far[1], far
 
 
-def test_the_smoothing_is_the_bundles_unless_told_otherwise() -> None:
+def test_the_smoothing_is_the_bundles_by_default() -> None:
     bundle = calibrated(replace(make(), decision={"smoothing_s": 0.0}), windows())
     assert integer_model(bundle).smoothing == 1 << 15
     step_s = bundle.arch.step / bundle.layout.rate_hz

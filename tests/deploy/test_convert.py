@@ -14,16 +14,18 @@ import pytest
 
 from plushsense.core.errors import ArchError, BadInput, BundleError, ConfigError, MissingExtraError
 from plushsense.core.gestures import load_gestures
-from plushsense.core.recfile import read_stream
-from plushsense.core.signal import load_layout
-from plushsense.deploy.calibration import calibrated, integer_network
-from plushsense.deploy.convert import as_onnx, as_tflite, convert
-from plushsense.deploy.convert.facts import Job, compare, made_up_windows
+from plushsense.core.layouts import load_layout
+from plushsense.core.recorder_csv import read_stream
+from plushsense.deploy.convert import convert
+from plushsense.deploy.convert import onnx as as_onnx
+from plushsense.deploy.convert import tflite as as_tflite
+from plushsense.deploy.convert.facts import ConversionJob, compare, made_up_windows
+from plushsense.deploy.quantize import calibrated, integer_network
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
-from plushsense.models.integer import deployable
 from plushsense.models.reference import random_weights
-from plushsense.windows.features import Scaler, inputs
+from plushsense.runtime.integer import deployable
+from plushsense.windows.features import Scaler, network_inputs
 
 # symbol, filters, layout, settings: every padding and normalisation, one layer to four, one reflection and several.
 NETS: list[tuple[str, tuple[int, ...], str, dict[str, Any]]] = [
@@ -109,7 +111,7 @@ def test_int8_comes_close_to_the_integers(name: str, net: Any, tmp_path: Path, r
 def test_real_windows(real_data: Path, onnx_here: None, litert_here: None) -> None:
     bundle = made(("14d1_19d2_19d4", (8, 12, 16), "accel-3", {}))
     stream = real_data / "makeability-gestures" / "P07" / "fulldatastream.csv"
-    values = inputs(read_stream(stream, bundle.layout).frames.values, bundle.layout)
+    values = network_inputs(read_stream(stream, bundle.layout).frames.values, bundle.layout)
     raw = np.stack([values[at : at + bundle.arch.span].T for at in range(0, len(values) - bundle.arch.span, 400)])
     assert len(raw) > 10
     fitted = Bundle(bundle.arch, bundle.weights, bundle.layout, Scaler.fit(raw), bundle.gestures)
@@ -122,11 +124,11 @@ def test_onnx_says_what_it_is(tmp_path: Path, onnx_here: None) -> None:
 
     bundle = made(NETS[0])
     model = onnx.load(convert(bundle, tmp_path / "m.onnx", "onnx").path)
-    said = {entry.key: entry.value for entry in model.metadata_props}
-    assert json.loads(said["channels"]) == list(bundle.layout.inputs)
-    assert json.loads(said["gestures"]) == list(bundle.gestures.labels)
-    assert said["layout"] == "plush-15" and said["title"] == bundle.arch.title
-    assert json.loads(said["span"]) == bundle.arch.span and json.loads(said["simulated"]) is True
+    metadata = {entry.key: entry.value for entry in model.metadata_props}
+    assert json.loads(metadata["channels"]) == list(bundle.layout.inputs)
+    assert json.loads(metadata["gestures"]) == list(bundle.gestures.labels)
+    assert metadata["layout"] == "plush-15" and metadata["title"] == bundle.arch.title
+    assert json.loads(metadata["span"]) == bundle.arch.span and json.loads(metadata["simulated"]) is True
     shape = model.graph.input[0].type.tensor_type.shape.dim
     assert model.graph.input[0].name == "raw"
     assert [d.dim_param or d.dim_value for d in shape] == ["N", 11, bundle.arch.span]
@@ -155,7 +157,7 @@ def test_a_file_that_answers_otherwise_is_refused(tmp_path: Path, onnx_here: Non
     changed["conv0.weight"] = changed["conv0.weight"].copy()
     changed["conv0.weight"][0, 0, 0] += 0.05
     other = Bundle(bundle.arch, changed, bundle.layout, bundle.scaler, bundle.gestures)
-    job = Job.of(bundle, None)
+    job = ConversionJob.of(bundle, None)
     with pytest.raises(BundleError, match="answers otherwise"):
         compare(as_onnx.answers(as_onnx.float_model(other), job.windows), job, "ONNX")
 

@@ -4,24 +4,20 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
-from exports import bundle_of
 from plushsense.core.errors import BadInput
 from plushsense.core.gestures import GestureSet
-from plushsense.deploy.calibration import integer_model
 from plushsense.deploy.emit import TOY_BYTES, c_names, comment, emit, read_facts, without_people
-from plushsense.deploy.golden import answers_of, column, read_golden
-from plushsense.deploy.made_frames import golden_frames
+from plushsense.deploy.golden import answers_of, column, golden_frames, read_golden
+from plushsense.deploy.quantize import integer_model
 from plushsense.models.bundle import Bundle
-from plushsense.models.image import IntegerModel, memory_bytes
+from plushsense.runtime.image import IntegerModel, memory_bytes
+from support.exports import bundle_of
 
 PEOPLE = {"subjects": ["Anna", "P02"], "validation_subjects": ["Bo"], "scores": {"said": "people: Bo, P02", "f1": 0.5}}
 
@@ -59,7 +55,7 @@ def test_the_folder(tmp_path: Path) -> None:
     assert set(column(answers, "state")) == {0, 1}
     assert answers[-1, 10] >= 4  # restarts: two gaps or resets, a wrap, …
     assert answers[-1, 11] > 25  # invalid values
-    with pytest.raises(BadInput, match="overwrites nothing"):
+    with pytest.raises(BadInput, match="already holds something"):
         emit(model, bundle, tmp_path / "out")
     assert not list(tmp_path.glob(".out*"))
 
@@ -88,8 +84,8 @@ def test_nobody_is_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("label", ["*\\", "*/*", "/*/", "\u202eRTL", "a\rb\n", "\u2066x"])
 def test_no_label_ends_a_comment_or_turns_it_round(label: str) -> None:
-    said = comment(label)
-    assert "*/" not in said and "/*" not in said and "\\" not in said and said.isprintable()
+    text = comment(label)
+    assert "*/" not in text and "/*" not in text and "\\" not in text and text.isprintable()
 
 
 @pytest.mark.parametrize("layout", ["plush-15", "phone-6"])
@@ -145,7 +141,7 @@ def test_labels_cannot_break_out_of_comments(tmp_path: Path) -> None:
     assert "a */" not in (tmp_path / "out" / "plush_model.c").read_text()
 
 
-def test_no_export_is_said(tmp_path: Path) -> None:
+def test_no_export_is_refused(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="is no export"):
         read_facts(tmp_path)
     (tmp_path / "export.json").write_text("{}")

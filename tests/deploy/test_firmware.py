@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import re
 import shutil
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,21 +12,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
-from exports import LAYOUTS, bundle_of
 from plushsense.core.errors import LayoutError
 from plushsense.core.gestures import Gesture, GestureSet
-from plushsense.core.signal import Channel, load_layout
-from plushsense.deploy.calibration import integer_model
+from plushsense.core.layouts import Channel, load_layout
 from plushsense.deploy.emit import emit
 from plushsense.deploy.firmware import TEMPLATES, firmware
 from plushsense.deploy.golden import answers_of, column, read_golden
 from plushsense.deploy.package import ARDUINO, SKETCH, changed_copies, copies, package
+from plushsense.deploy.quantize import integer_model
 from plushsense.devices.wire import LineParser, format_line
-from plushsense.models.image import IntegerModel
+from plushsense.runtime.image import IntegerModel
 from plushsense.windows.features import Scaler
-from virtual_boards import BUILDS, SECONDS, WARNINGS, arduino, frames_of, idf, play, run, told
+from support.exports import LAYOUTS, bundle_of
+from support.virtual_boards import BUILDS, SECONDS, WARNINGS, arduino, frames_of, idf, play, run, told
 
 Packages = dict[str, tuple[Path, IntegerModel]]
 
@@ -258,7 +255,7 @@ def test_names_of_any_kind_become_legal(tmp_path: Path) -> None:
 
 def test_channels_that_no_pad_measures_are_marked() -> None:
     plain = load_layout("accel-3")
-    for kinds, said in (
+    for kinds, note in (
         ([("capacitive", "count")] * 12, "NO PAD IS LEFT"),
         ([("heat", "K"), ("acceleration", "count")], "see read_other()"),
     ):
@@ -270,7 +267,7 @@ def test_channels_that_no_pad_measures_are_marked() -> None:
         facts = {"title": "t", "classes": 2, "span": 10}
         files = firmware(layout, Scaler(np.zeros(len(names)), np.ones(len(names))), facts)
         assert set(files) == set(TEMPLATES)
-        assert said in files["PlushToy.ino"] and said in files["main.c"]
+        assert note in files["PlushToy.ino"] and note in files["main.c"]
 
 
 def test_a_step_that_no_line_carries_is_refused() -> None:

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from plushsense.deploy.emit import read_facts
 from plushsense.deploy.package import ARDUINO, IDF, IDF_EXAMPLE, changed_copies
-from plushsense.models.image import IntegerModel
+from plushsense.runtime.image import IntegerModel
 
 REPO = Path(__file__).resolve().parents[2]
 Packages = dict[str, tuple[Path, IntegerModel]]

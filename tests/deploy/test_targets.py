@@ -34,17 +34,17 @@ __attribute__((noinline)) static void deep(void) {
 }
 static volatile uint32_t thousand = 1000;
 int main(void) {
-    uint32_t told[4], then, i;
+    uint32_t values[4], then, i;
     for (i = 0; i < 3; i++) {
         uint32_t n = i * thousand;
         then = target_instructions();
         turn(n);
-        told[i] = target_instructions() - then;
+        values[i] = target_instructions() - then;
     }
     target_stack_paint();
     deep();
-    told[3] = target_stack_used();
-    target_write(told, sizeof told);
+    values[3] = target_stack_used();
+    target_write(values, sizeof values);
     return 0;
 }
 """
@@ -60,19 +60,19 @@ int main(void) {
         uint32_t a = p[0], b = p[1];
         int32_t sa, sb;
         uint64_t product = (uint64_t)a * b, square;
-        uint32_t told[8];
+        uint32_t values[8];
         memcpy(&sa, p, 4);
         memcpy(&sb, p + 1, 4);
         square = product * product;
-        told[0] = a / b;
-        told[1] = a % b;
-        told[2] = (uint32_t)(sa / sb);
-        told[3] = (uint32_t)(sa % sb);
-        told[4] = (uint32_t)product;
-        told[5] = (uint32_t)(product >> 32);
-        told[6] = (uint32_t)square;
-        told[7] = (uint32_t)(square >> 32);
-        target_write(told, sizeof told);
+        values[0] = a / b;
+        values[1] = a % b;
+        values[2] = (uint32_t)(sa / sb);
+        values[3] = (uint32_t)(sa % sb);
+        values[4] = (uint32_t)product;
+        values[5] = (uint32_t)(product >> 32);
+        values[6] = (uint32_t)square;
+        values[7] = (uint32_t)(square >> 32);
+        target_write(values, sizeof values);
     }
     memset(moved, 7, sizeof moved);
     memcpy(moved + 1, "abcdefg", 7);
@@ -116,9 +116,9 @@ def test_bytes_go_in_and_come_out_as_they_are(target: str, tmp_path: Path, targe
 @pytest.mark.parametrize("target", EMULATED)
 def test_instructions_and_stack(target: str, tmp_path: Path, target_here: Here) -> None:
     program = build(target_here(target), [written(tmp_path, COUNT)], tmp_path)
-    said = program.run()
-    none, some, twice, stack = np.frombuffer(said, "<u4").tolist()
-    assert program.run() == said
+    output = program.run()
+    none, some, twice, stack = np.frombuffer(output, "<u4").tolist()
+    assert program.run() == output
     each = (twice - some) / 1000
     # The clock's ticks are no whole instructions: a count may be one off.
     assert 2 <= round(each) <= 4 and abs(each - round(each)) <= 0.002
@@ -136,11 +136,11 @@ def test_division_products_and_memory_functions(target: str, tmp_path: Path, tar
     file = tmp_path / "pairs"
     file.write_bytes(np.array(numbers, "<u4").tobytes())
     source = written(tmp_path, ARITHMETIC)
-    said = build(target_here(target), [source], tmp_path, blobs={"PAIRS": file}, flags=["-fno-builtin"]).run()
-    told = np.frombuffer(said[:-17], "<u4").reshape(-1, 8).tolist()
-    assert said[-17:] == b"\x07aaabcdefg\x07\x07\x07\x07\x07\x07\x01".replace(b"\x07aaabc", b"\x07ababc")
+    output = build(target_here(target), [source], tmp_path, blobs={"PAIRS": file}, flags=["-fno-builtin"]).run()
+    values = np.frombuffer(output[:-17], "<u4").reshape(-1, 8).tolist()
+    assert output[-17:] == b"\x07aaabcdefg\x07\x07\x07\x07\x07\x07\x01".replace(b"\x07aaabc", b"\x07ababc")
     mask = 0xFFFFFFFF
-    for (a, b), row in zip(numbers, told, strict=True):
+    for (a, b), row in zip(numbers, values, strict=True):
         sa, sb = (v - (1 << 32) if v >> 31 else v for v in (a, b))
         quotient = abs(sa) // abs(sb) * (1 if (sa < 0) == (sb < 0) else -1)
         square = (a * b) ** 2
@@ -168,7 +168,7 @@ def test_what_a_compiler_refuses(target: str, tmp_path: Path, target_here: Here)
     target_here(target)
     with pytest.raises(BuildError, match="refused main.c: .*error: expected expression") as refusal:
         build(target, [written(tmp_path, "int main(void) { return f(; }")], tmp_path)
-    assert "main.c:1" in refusal.value.said
+    assert "main.c:1" in refusal.value.output
     with pytest.raises(BuildError, match="refused the program: .*undefined reference to .f'"):
         build(target, [written(tmp_path, "int f(void); int main(void) { return f(); }")], tmp_path)
     with pytest.raises(BuildError, match="unused"):

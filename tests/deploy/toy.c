@@ -10,7 +10,7 @@
 typedef struct {
     plush_toy toy;
     uint8_t *model;
-    uint32_t *memory;
+    uint32_t *memory, memory_bytes;
     int32_t *rows;
     uint32_t frame, made, most;
 } seat;
@@ -95,6 +95,7 @@ void *seat_new(const uint8_t *model, uint32_t bytes, int *status, uint32_t too_f
         memset(&s->toy, 0, sizeof s->toy);
         return s;
     }
+    s->memory_bytes = needed;
     s->memory = (uint32_t *)malloc(needed + off + 4);
     memset(s->memory, 0xc3, needed + off + 4);
     s->memory = (uint32_t *)realloc(s->memory, needed + off ? needed + off : 1);
@@ -122,9 +123,11 @@ uint32_t seat_push(void *p, const int32_t *frames, uint32_t n, uint32_t channels
     s->rows = rows;
     s->made = 0;
     s->most = most;
-    s->toy.on_answer = note;
-    s->toy.on_event = note_event;
-    s->toy.user = s;
+    if (s->toy.user == NULL) { /* a swap keeps them */
+        s->toy.on_answer = note;
+        s->toy.on_event = note_event;
+        s->toy.user = s;
+    }
     for (i = 0; i < n; i++, s->frame++, frames += 1 + channels) {
         uint32_t fault = s->toy.answer.state == PLUSH_FAULT, suspect = s->toy.suspect;
 
@@ -171,8 +174,53 @@ int seat_begin_again(void *p, const uint8_t *model, uint32_t bytes)
     s->model = (uint8_t *)realloc(s->model, bytes);
     memcpy(s->model, model, bytes);
     s->memory = (uint32_t *)realloc(s->memory, needed);
+    s->memory_bytes = needed;
     s->frame = 0;
     return (int)plush_begin(&s->toy, s->model, bytes, s->memory, needed);
+}
+
+/* Offers another model in the middle of a stream, in an allocation of just its bytes; its memory is that of the old one
+ * where that is enough. What happens to an event is written to `rows`; returns how many there were, or UINT32_MAX when
+ * a refusal changed a byte of the toy or its memory. */
+uint32_t seat_swap(void *p, const uint8_t *model, uint32_t bytes, uint32_t too_few, int *status, int32_t *rows,
+                   uint32_t most)
+{
+    seat *s = (seat *)p;
+    uint8_t *copy = (uint8_t *)malloc(bytes ? bytes : 1), *before = (uint8_t *)malloc(s->memory_bytes + 1);
+    plush_toy toy = s->toy;
+    uint32_t *memory = s->memory, needed;
+    int same;
+
+    memcpy(copy, model, bytes);
+    memcpy(before, s->memory, s->memory_bytes);
+    needed = plush_memory_bytes(copy, bytes);
+    if (needed > (1u << 26))
+        needed = 0; /* a giant: refused */
+    if (needed > s->memory_bytes) {
+        memory = (uint32_t *)malloc(needed);
+        memset(memory, 0xc3, needed);
+    }
+    s->rows = rows;
+    s->made = 0;
+    s->most = most;
+    *status = (int)plush_swap(&s->toy, copy, bytes, memory, needed - (needed > 0 ? too_few : 0));
+    if (*status == PLUSH_OK) {
+        free(s->model);
+        s->model = copy;
+        if (memory != s->memory) {
+            free(s->memory);
+            s->memory = memory;
+            s->memory_bytes = needed;
+        }
+        free(before);
+        return s->made;
+    }
+    same = memcmp(&toy, &s->toy, sizeof toy) == 0 && memcmp(before, s->memory, s->memory_bytes) == 0;
+    if (memory != s->memory)
+        free(memory);
+    free(copy);
+    free(before);
+    return same && s->made == 0 ? 0 : UINT32_MAX;
 }
 
 const char *seat_name(void *p, uint8_t gesture)
@@ -198,6 +246,8 @@ uint32_t try_part_of(uint32_t distance, uint32_t into, uint32_t by, uint32_t add
 }
 
 #ifdef ALONE
+static seat *s; /* reachable at the end, for the sanitizer of leaks */
+
 static uint32_t word(FILE *f)
 {
     uint8_t b[4];
@@ -208,7 +258,8 @@ static uint32_t word(FILE *f)
 }
 
 /* Cases, one after the other: bytes of the model, the model, frames, columns, the frames. Writes of each: status,
- * answers, and the answers' rows. */
+ * answers, and the answers' rows. With a second argument the first toy whose model is good goes on with all further
+ * cases, and is offered their models. */
 int main(int argc, char **argv)
 {
     FILE *f = argc > 1 ? fopen(argv[1], "rb") : NULL;
@@ -218,9 +269,8 @@ int main(int argc, char **argv)
     for (;;) {
         uint32_t bytes = word(f), n, columns, told = 0, fit, width;
         uint8_t *model = (uint8_t *)malloc(bytes ? bytes : 1);
-        int32_t *frames, *rows;
+        int32_t *frames, *rows, ended[HEAD + 2u * 255u];
         int status;
-        seat *s;
 
         if (fread(model, 1, bytes, f) != bytes)
             return 2;
@@ -229,7 +279,10 @@ int main(int argc, char **argv)
         frames = (int32_t *)malloc((size_t)4 * n * columns + 4);
         if (fread(frames, 4, (size_t)n * columns, f) != (size_t)n * columns)
             return 2;
-        s = (seat *)seat_new(model, bytes, &status, 0, 0);
+        if (s == NULL)
+            s = (seat *)seat_new(model, bytes, &status, 0, 0);
+        else if (seat_swap(s, model, bytes, 0, &status, ended, 1) == UINT32_MAX)
+            return 3;
         free(model);
         width = HEAD + 2u * s->toy.classes;
         rows = (int32_t *)malloc((size_t)4 * width * 16384);
@@ -246,7 +299,10 @@ int main(int argc, char **argv)
         fwrite(rows, 4, (size_t)width * s->made, stdout);
         free(frames);
         free(rows);
-        seat_free(s);
+        if (argc < 3 || s->toy.memory == NULL) {
+            seat_free(s);
+            s = NULL;
+        }
     }
 }
 #endif

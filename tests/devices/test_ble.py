@@ -14,9 +14,9 @@ from typing import Any, ClassVar
 import pytest
 
 from plushsense.core.errors import ConfigError, DeviceError, MissingExtraError
-from plushsense.core.signal import load_layout
+from plushsense.core.layouts import load_layout
 from plushsense.devices import ble
-from plushsense.devices.ble import UART_SERVICE, UART_TX, Backends, BleDevice, BleTarget
+from plushsense.devices.ble import UART_SERVICE, UART_TX, BleBackends, BleDevice, BleTarget
 from plushsense.devices.opening import open_device, parse_url
 from plushsense.devices.reconnect import ReconnectingDevice
 from plushsense.devices.virtual.stream import ToySpec, ToyStream
@@ -139,7 +139,7 @@ class Client(bleak.backends.client.BaseBleakClient):
         self.loop.call_soon_threadsafe(self._disconnected_callback)
 
 
-FAKE = Backends(Client, Scanner)
+FAKE = BleBackends(Client, Scanner)
 
 
 def opened(**target: Any) -> BleDevice:
@@ -208,7 +208,7 @@ def test_refusals_name_what_is_there() -> None:
 def test_a_toy_that_does_not_let_itself_be_connected(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ble, "_CONNECT_S", 0.2)
     Air.hang = True
-    with pytest.raises(DeviceError, match="does not let itself be connected within 0.2 s"):
+    with pytest.raises(DeviceError, match="could not be connected within 0.2 s"):
         opened()
 
 
@@ -235,8 +235,8 @@ def not_available(name: str) -> Exception:
             "system service does not answer",
         ),
         (FileNotFoundError(2, "No such file or directory"), "system service does not answer"),
-        (bleak.exc.BleakError("something else."), "Bluetooth says: something else"),
-        (ZeroDivisionError(), "Bluetooth says: ZeroDivisionError"),
+        (bleak.exc.BleakError("something else."), "Bluetooth reports: something else"),
+        (ZeroDivisionError(), "Bluetooth reports: ZeroDivisionError"),
     ],
 )
 def test_bluetooth_that_cannot_be_used_is_one_sentence(fault: str | Exception, words: str) -> None:
@@ -325,7 +325,7 @@ def test_urls_that_are_refused(url: str, error: type[Exception], words: str) -> 
 def test_urls(url: str, target: BleTarget, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[Any] = []
     monkeypatch.setattr(ble, "BleDevice", lambda *given: asked.append(given))
-    ble.open_url(parse_url(url), PLUSH)
+    ble.open_ble(parse_url(url), PLUSH)
     assert asked == [(url, PLUSH, target)]
 
 

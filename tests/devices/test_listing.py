@@ -9,10 +9,10 @@ import uuid
 import pytest
 
 from plushsense.core.errors import ConfigError
-from plushsense.core.signal import load_layout
+from plushsense.core.layouts import load_layout
 from plushsense.devices import listing as room
 from plushsense.devices.listing import list_devices
-from plushsense.devices.lsl_outlet import LslOutlet
+from plushsense.devices.lsl import LslOutlet
 from plushsense.devices.opening import open_device, parse_url
 
 

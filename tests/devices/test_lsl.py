@@ -13,10 +13,9 @@ from typing import Any
 import pytest
 
 from plushsense.core.errors import ConfigError, DeviceError, MissingExtraError
-from plushsense.core.signal import Channel, CsvFormat, Layout, load_layout
+from plushsense.core.layouts import Channel, CsvFormat, Layout, load_layout
 from plushsense.devices.base import Device, Frame
-from plushsense.devices.lsl import LslDevice, load_pylsl, match_columns, name_url
-from plushsense.devices.lsl_outlet import LslOutlet, forward, serve_lsl
+from plushsense.devices.lsl import LslDevice, LslOutlet, forward, load_pylsl, match_columns, name_url, serve_lsl
 from plushsense.devices.opening import open_device
 from plushsense.devices.reconnect import ReconnectingDevice
 from plushsense.devices.virtual.stream import ToySpec

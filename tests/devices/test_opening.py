@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from plushsense.core.errors import ConfigError, DeviceError, LayoutError, PlushSenseError
-from plushsense.core.signal import load_layout
+from plushsense.core.layouts import load_layout
 from plushsense.devices.opening import SCHEMES, open_device, parse_url
 
 
@@ -99,11 +99,13 @@ def test_own_layout_by_path(tmp_path: Path) -> None:
         assert len(next(iter(device)).values) == 3
 
 
-def test_every_scheme_has_its_room() -> None:
+def test_every_scheme_has_a_function_of_its_own() -> None:
     import importlib
 
-    for module in SCHEMES.values():
-        assert callable(importlib.import_module(module).open_url)
+    assert len(set(SCHEMES.values())) == len(SCHEMES)
+    for opener in SCHEMES.values():
+        module, function = opener.split(":")
+        assert callable(getattr(importlib.import_module(module), function))
 
 
 @pytest.mark.parametrize("port", ["/dev/ttyUSB99", "COM77"])

@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 
 from plushsense.core.errors import ConfigError, DeviceError
-from plushsense.core.signal import load_layout
+from plushsense.core.layouts import load_layout
 from plushsense.devices.base import Device, Frame
 from plushsense.devices.opening import open_device
 from plushsense.devices.reconnect import ReconnectingDevice
-from plushsense.devices.toy import serve_tcp
+from plushsense.devices.virtual.server import serve_tcp
 from plushsense.devices.virtual.stream import ToySpec
 
 PLUSH = load_layout("plush-15")

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from plushsense.core.errors import DeviceError
-from plushsense.core.recfile import Frames, format_rows, recording_filename, write_recording
-from plushsense.core.signal import load_layout
+from plushsense.core.layouts import load_layout
+from plushsense.core.recorder_csv import Frames, format_rows, recording_filename, write_recording
 from plushsense.devices.opening import open_device
 
 PLUSH = load_layout("plush-15")

@@ -15,8 +15,8 @@ import pytest
 
 from plushsense.core.errors import ConfigError, DeviceError
 from plushsense.devices.opening import open_device
-from plushsense.devices.toy import ToyCounters, serve_pty, serve_tcp
-from plushsense.devices.virtual.stream import Performed, ToySpec
+from plushsense.devices.virtual.server import ToyCounters, serve_pty, serve_tcp
+from plushsense.devices.virtual.stream import PerformedGesture, ToySpec
 
 needs_pty = pytest.mark.usefixtures("pty_possible")
 
@@ -26,7 +26,7 @@ class Running:
 
     def __init__(self) -> None:
         self.url = ""
-        self.performed: list[Performed] = []
+        self.performed: list[PerformedGesture] = []
         self.counters: ToyCounters | None = None
 
 

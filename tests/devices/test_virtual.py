@@ -10,22 +10,21 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError
 from plushsense.core.gestures import load_gestures
-from plushsense.core.signal import load_layout
+from plushsense.core.layouts import load_layout
 from plushsense.devices.base import Frame
 from plushsense.devices.opening import open_device
 from plushsense.devices.virtual.device import VirtualDevice
 from plushsense.devices.virtual.motions import AT_REST, DURATIONS, MOTIONS, split_label
-from plushsense.devices.virtual.people import draw_person
-from plushsense.devices.virtual.session import GESTURES, Session
+from plushsense.devices.virtual.session import GESTURES, VirtualSession
 from plushsense.devices.virtual.stream import ToySpec, ToyStream
-from plushsense.devices.virtual.world import CHANNELS, WORLD, ZONES
+from plushsense.devices.virtual.world import CHANNELS, WORLD, ZONES, draw_person
 
 PLUSH = load_layout("plush-15")
 
 
 def recording(label: str, person: int, number: int = 0) -> NDArray[np.int64]:
     """One recording as the recorder would cut it, (n, 13)."""
-    episode = Session(draw_person(person), number=number).perform(label)
+    episode = VirtualSession(draw_person(person), number=number).perform(label)
     mark = episode.marks[0]
     return episode.values[mark.record_start : mark.record_stop]
 
@@ -67,7 +66,7 @@ def test_raw_integers_are_plausible() -> None:
     for name in ZONES:
         assert 100 < np.median(zone(values, name)) < 4000
         assert zone(values, name).max() < 12_000
-    rest = Session(draw_person(1)).idle(5.0).values
+    rest = VirtualSession(draw_person(1)).idle(5.0).values
     magnitude = np.sqrt((rest[:, 10:].astype(float) ** 2).sum(axis=1))
     assert abs(np.median(magnitude) - 16384) < 600
 
@@ -109,7 +108,7 @@ def test_look_alikes_overlap_between_people() -> None:
     def evenness(label: str) -> NDArray[np.float64]:
         tails = []
         for person in range(1, 31):
-            episode = Session(draw_person(person)).perform(label)
+            episode = VirtualSession(draw_person(person)).perform(label)
             mark = episode.marks[0]
             tails.append(zone(episode.values, "tail")[mark.start + 20 : mark.stop - 20])
         return np.array([np.percentile(t, 10) / np.percentile(t, 90) for t in tails])
@@ -134,7 +133,7 @@ def test_on_a_steadied_table_and_on_the_lap_feel_the_same() -> None:
 def test_durations_and_reaction_times() -> None:
     rows: dict[str, list[int]] = {g: [] for g in GESTURES}
     for person in range(1, 16):
-        session = Session(draw_person(person))
+        session = VirtualSession(draw_person(person))
         for g in GESTURES:
             mark = session.perform(g).marks[0]
             assert mark.record_start < mark.start < mark.stop < mark.record_stop
@@ -145,16 +144,16 @@ def test_durations_and_reaction_times() -> None:
 
 
 def test_the_room_drifts() -> None:
-    session = Session(draw_person(1))
+    session = VirtualSession(draw_person(1))
     belly = zone(session.idle(600.0).values, "belly").astype(float)
     minutes = belly.reshape(10, -1).mean(axis=1)
     assert np.ptp(minutes) > 4 * WORLD.noise_counts
-    days = [zone(Session(draw_person(p)).idle(2.0).values, "belly").mean() for p in range(1, 30)]
+    days = [zone(VirtualSession(draw_person(p)).idle(2.0).values, "belly").mean() for p in range(1, 30)]
     assert np.std(days) > 40
 
 
 def test_the_clock_jitters_and_joins() -> None:
-    session = Session(draw_person(1))
+    session = VirtualSession(draw_person(1))
     episodes = [session.idle(1.0), session.perform("Tail hit 2", 2), session.handle(), session.perform(AT_REST)]
     clock = np.concatenate([e.device_ms for e in episodes])
     assert set(np.diff(clock)) == {9, 10, 11}
@@ -165,7 +164,7 @@ def test_the_clock_jitters_and_joins() -> None:
 
 def test_episodes_join_without_a_jump() -> None:
     """The toy stands after an episode as it stands before the next: gravity does not jump."""
-    session = Session(draw_person(2))
+    session = VirtualSession(draw_person(2))
     before = session.perform("Hold in hands", 2)
     for nxt in (session.perform("Tail tap 1"), session.perform("Back stroke 2"), session.handle(), session.idle(1)):
         a, b = before.values[-20:, 10:].mean(axis=0), nxt.values[:20, 10:].mean(axis=0)
@@ -175,7 +174,7 @@ def test_episodes_join_without_a_jump() -> None:
 
 def test_glitches_are_garbage() -> None:
     world = dataclasses.replace(WORLD, glitch=0.05)
-    values = Session(draw_person(1), world=world).idle(20.0).values
+    values = VirtualSession(draw_person(1), world=world).idle(20.0).values
     assert 50 < np.sum(np.any(values[:, :10] < -2000, axis=1)) < 170
 
 
@@ -212,7 +211,7 @@ def test_real_time_pace_and_closing() -> None:
 
 def test_unknown_gesture() -> None:
     with pytest.raises(ConfigError, match="Did you mean 'Tail pull'"):
-        Session(draw_person(1)).perform("Tail pul")
+        VirtualSession(draw_person(1)).perform("Tail pul")
     with pytest.raises(ConfigError, match="share"):
         ToySpec(lost=1.5)
 

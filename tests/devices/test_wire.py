@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from plushsense.core.signal import Channel, CsvFormat, Layout, load_layout
-from plushsense.devices.base import Counters, LossMeter
+from plushsense.core.layouts import Channel, CsvFormat, Layout, load_layout
+from plushsense.devices.base import Counters, LossCounter
 from plushsense.devices.wire import LineParser, ParsedLine, format_line
 
 PLUSH = load_layout("plush-15")
@@ -138,18 +138,18 @@ def test_lost_frames_come_from_the_device_clock() -> None:
         t += 10 + (i % 3 - 1)
         if i not in (50, 51, 52, 200):
             clock.append(t)
-    meter = LossMeter()
+    meter = LossCounter()
     assert sum(meter.push(c) for c in clock) == 4
 
 
 def test_a_restarted_or_paused_clock_is_no_loss() -> None:
-    meter = LossMeter()
+    meter = LossCounter()
     clock = [*range(0, 1000, 10), *range(5, 500, 10), *range(90_000, 91_000, 10)]
     assert sum(meter.push(c) for c in clock) == 0
 
 
 def test_loss_follows_the_real_period() -> None:
-    meter = LossMeter()
+    meter = LossCounter()
     assert sum(meter.push(c) for c in range(0, 3000, 31)) == 0
 
 

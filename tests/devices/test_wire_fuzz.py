@@ -9,7 +9,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from plushsense.core.signal import Layout, load_layout
+from plushsense.core.layouts import Layout, load_layout
 from plushsense.devices.wire import LineParser, ParsedLine, format_line
 
 LAYOUTS = {name: load_layout(name) for name in ("plush-15", "plush-14", "accel-3", "phone-6")}

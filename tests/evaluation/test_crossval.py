@@ -15,12 +15,11 @@ import pytest
 
 from plushsense.core.errors import ConfigError, TrainingError
 from plushsense.evaluation.crossval import FoldProgress, evaluate
-from plushsense.runs.journal import Journal
+from plushsense.jobs.journal import Journal
 
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE))
+HERE = Path(__file__).parents[1]
 
-from fakes import AFFECTS, LABELS, Memory, Oracle, misshapen, refuses, study  # noqa: E402
+from support.fakes import AFFECTS, LABELS, Memory, Oracle, misshapen, refuses, study
 
 KEYS = {
     "split", "context", "train_context", "leaky", "seeds", "accuracy", "macro_f1", "macro_recall",
@@ -147,9 +146,9 @@ def test_what_goes_wrong_is_said() -> None:
 SCRIPT = """
 import sys
 sys.path.insert(0, {here!r})
-from fakes import Oracle, study
+from support.fakes import Oracle, study
 from plushsense.evaluation.crossval import evaluate
-from plushsense.runs.journal import Journal
+from plushsense.jobs.journal import Journal
 
 if __name__ == "__main__":
     windows = study()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +10,8 @@ import pytest
 
 from plushsense.core.errors import ConfigError
 from plushsense.evaluation.crossval import FoldOutput, evaluate
-from plushsense.runs.journal import Journal
-
-sys.path.insert(0, str(Path(__file__).parent))
-
-from fakes import Deploying, Oracle, study
+from plushsense.jobs.journal import Journal
+from support.fakes import Deploying, Oracle, study
 
 
 def test_what_deploying_costs_each_person(tmp_path: Path) -> None:

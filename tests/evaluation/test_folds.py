@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,10 +11,7 @@ from plushsense.core.errors import BadInput, ConfigError
 from plushsense.evaluation.folds import fold_windows
 from plushsense.scoring.splits import parse_split
 from plushsense.windows.cut import WindowSet
-
-sys.path.insert(0, str(Path(__file__).parent))
-
-from fakes import study
+from support.fakes import study
 
 
 def touched(windows: WindowSet, index: np.ndarray, tested: WindowSet, test: np.ndarray) -> int:

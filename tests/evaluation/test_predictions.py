@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from plushsense.core.errors import BadInput
-from plushsense.evaluation.predictions import Predictions, read_predictions, write_predictions
+from plushsense.evaluation.scores import Predictions, read_predictions, write_predictions
 
 
 def test_they_come_back(tmp_path: Path) -> None:

@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 
 from plushsense.core.errors import BadInput
-from plushsense.core.recfile import Frames, recording_filename, write_recording
-from plushsense.core.signal import load_layout
-from plushsense.dataset.importers import import_recordings
+from plushsense.core.layouts import load_layout
+from plushsense.core.recorder_csv import Frames, recording_filename, write_recording
+from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks
 from plushsense.dataset.store import Dataset
-from plushsense.evaluation.reidentification import SEES, features, reidentify
-from plushsense.evaluation.reidentification_words import report, short
+from plushsense.evaluation.reidentification import SEES, features, reidentify, report, verdict
 
 pytestmark = pytest.mark.usefixtures("publish_tools")
 
@@ -64,7 +63,7 @@ def test_people_of_their_own_style_are_found_and_the_words_say_so(tmp_path: Path
     assert everything.top1["mean"] > 0.9
     assert (everything.people, everything.recordings, everything.chance) == (4, 96, 0.25)
     assert found.find("recordings", "movement").top1["mean"] > 0.9  # type: ignore[union-attr]
-    said = short(found)
+    said = verdict(found)
     assert "one more recording of a session and of gestures that it knows" in said
     assert "the right one of 4 people" in said
     assert "Of a gesture that it never saw, it is" in said
@@ -83,15 +82,15 @@ def test_people_who_do_the_same_are_not_found(tmp_path: Path) -> None:
     assert everything.top1["mean"] < 0.5
     assert everything.top5["mean"] == everything.chance5 == 1.0
     if everything.top1["ci95"][0] <= everything.chance:
-        assert "no better than guessing, which is no proof of anonymity" in short(found)
+        assert "no better than guessing, which is no proof of anonymity" in verdict(found)
 
 
 def test_the_clock_alone_may_tell_and_movement_does_not_see_it(tmp_path: Path) -> None:
     found = reidentify(people(tmp_path, style=0.0, hold=0.0, rates_ms=(10, 11, 12, 13)), trees=30)
     assert found.find("recordings", "clock").top1["mean"] == 1.0  # type: ignore[union-attr]
     assert found.find("recordings", "movement").top1["mean"] < 0.6  # type: ignore[union-attr]
-    assert "The sampling clock alone, nothing of the touch, tells 100 of 100" in short(found)
-    assert "4 of them almost surely (P1, P2, P3, P4)" in short(found)
+    assert "The sampling clock alone, nothing of the touch, tells 100 of 100" in verdict(found)
+    assert "4 of them almost surely (P1, P2, P3, P4)" in verdict(found)
 
 
 def test_people_of_one_clock_are_not_named_by_the_order_of_their_codes(tmp_path: Path) -> None:
@@ -114,8 +113,8 @@ def test_across_sessions_the_way_of_holding_does_not_help(tmp_path: Path) -> Non
     assert across is not None
     assert within.top1["mean"] > 0.95
     assert across.top1["mean"] < 0.6
-    assert "In a session that the program never saw it is right in" in short(found)
-    assert "tried on those who came more than once: 4 of 4 people" in short(found)
+    assert "In a session that the program never saw it is right in" in verdict(found)
+    assert "tried on those who came more than once: 4 of 4 people" in verdict(found)
     other = found.under({"P1": "PX"})
     assert set(other.trials[0].by_person) == set(other.trials[0].precision) == {"PX", "P2", "P3", "P4"}
     assert "PX" in report(other, "x")
@@ -163,4 +162,4 @@ def test_a_gesture_of_one_person_is_told(tmp_path: Path) -> None:
         target.write_bytes(some.read_bytes().replace(b", 1", b", 2", 1 + number))
     found = reidentify(open_dataset(dataset.path), trees=10)
     assert found.of_one_person == ("Salute",)
-    assert "that label alone names a person" in short(found)
+    assert "that label alone names a person" in verdict(found)

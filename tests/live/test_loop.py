@@ -9,17 +9,17 @@ import time
 import pytest
 
 from plushsense.core.errors import ConfigError
-from plushsense.core.recfile import write_recording
+from plushsense.core.recorder_csv import write_recording
 from plushsense.devices.base import Device, Frame
 from plushsense.devices.opening import open_device
-from plushsense.live.loop import run
-from plushsense.live.stream import StreamClassifier
+from plushsense.live.loop import run_live
+from plushsense.runtime.classifier import StreamClassifier
 
 
 @pytest.fixture()
 def recording(tmp_path, frames):
     """A recording of 400 rows with gaps, a clock reset and garbage, as a URL."""
-    from plushsense.core.signal import load_layout
+    from plushsense.core.layouts import load_layout
 
     path = tmp_path / "tap_1700000000000_400.csv"
     write_recording(path, frames(), load_layout("accel-3"))
@@ -33,7 +33,7 @@ def test_a_replay_gives_what_pushing_its_frames_gives(bundle, recording):
     assert classifier.in_event, "at the end of the file"
     wanted.append(classifier.silence())
     with open_device(recording) as device:
-        live = run(device, classifier)
+        live = run_live(device, classifier)
         assert live.latency_s is None
         assert list(live) == wanted
         assert live.latency_s in live.latencies_s
@@ -57,20 +57,20 @@ def test_it_stops_by_device_time_and_begins_anew(bundle, recording):
     classifier = StreamClassifier(bundle())
     for _ in range(2):
         with open_device(recording) as device:
-            times = [d.t_s for d in run(device, classifier, seconds=1.5)]
+            times = [d.t_s for d in run_live(device, classifier, seconds=1.5)]
         assert 1.4 < times[-1] < 1.5
 
 
 @pytest.mark.parametrize("seconds", [0, -1, float("nan")])
 def test_a_duration_is_positive(bundle, recording, seconds):
     with open_device(recording) as device, pytest.raises(ConfigError, match="seconds"):
-        run(device, StreamClassifier(bundle()), seconds=seconds)
+        run_live(device, StreamClassifier(bundle()), seconds=seconds)
 
 
 def test_another_layout_is_refused_before_anything_is_read(bundle, recording):
     with open_device(recording) as device:
         with pytest.raises(ConfigError, match=r"'accel-3'.*'plush-15'"):
-            run(device, StreamClassifier(bundle(layout="plush-15")))
+            run_live(device, StreamClassifier(bundle(layout="plush-15")))
         assert device.counters.frames == 0
 
 
@@ -95,7 +95,7 @@ def test_lost_and_garbled_lines_are_counted_and_survived(bundle):
         thread.start()
         classifier = StreamClassifier(bundle())
         with open_device(f"tcp://127.0.0.1:{server.getsockname()[1]}?layout=accel-3") as device:
-            live = run(device, classifier)
+            live = run_live(device, classifier)
             found = list(live)
         thread.join()
     summary = live.summary()
@@ -119,7 +119,7 @@ class Silent(Device):
 
 def test_a_silent_toy_ends_a_run_of_given_length(bundle):
     model = bundle()
-    live = run(Silent("silent://", model.layout), StreamClassifier(model), seconds=0.1)
+    live = run_live(Silent("silent://", model.layout), StreamClassifier(model), seconds=0.1)
     began = time.perf_counter()
     assert not list(live)
     assert time.perf_counter() - began < 2
@@ -131,4 +131,4 @@ def test_closing_the_device_ends_the_run(bundle):
     model = bundle()
     device = Silent("silent://", model.layout)
     threading.Timer(0.05, device.close).start()
-    assert not list(run(device, StreamClassifier(model)))
+    assert not list(run_live(device, StreamClassifier(model)))

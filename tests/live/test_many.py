@@ -9,9 +9,8 @@ import pytest
 
 from plushsense.core.errors import ConfigError
 from plushsense.devices.opening import open_device
-from plushsense.live.loop import run
-from plushsense.live.many import run_many
-from plushsense.live.stream import StreamClassifier
+from plushsense.live.loop import run_live, run_many
+from plushsense.runtime.classifier import StreamClassifier
 
 
 def url(n: int, more: str = "speed=0") -> str:
@@ -24,7 +23,7 @@ def test_each_toy_gets_what_it_gets_alone(bundle):
     found = list(live)
     for n, device in enumerate(devices):
         with open_device(url(n + 1)) as again:
-            alone = list(run(again, StreamClassifier(bundle())))
+            alone = list(run_live(again, StreamClassifier(bundle())))
         assert [d for number, d in found if number == n] == alone
         assert device.counters == again.counters
     assert [number for number, _ in found][:1] == [0] and len({number for number, _ in found[:400]}) > 1, "in turn"
@@ -62,8 +61,8 @@ def test_two_toys_do_not_share_a_classifier(bundle):
 def test_a_device_can_be_asked_without_waiting_and_tells_when_its_bytes_came(scheme, tmp_path, frames):
     import socket
 
-    from plushsense.core.recfile import write_recording
-    from plushsense.core.signal import load_layout
+    from plushsense.core.layouts import load_layout
+    from plushsense.core.recorder_csv import write_recording
 
     path = tmp_path / "tap_1700000000000_400.csv"
     write_recording(path, frames(), load_layout("accel-3"))

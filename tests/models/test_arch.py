@@ -22,9 +22,10 @@ from plushsense.models.arch import (
     TABLE3_MISPRINT,
     Arch,
     ConvLayer,
+    parse_filters,
+    parse_symbol,
     reflected,
 )
-from plushsense.models.symbol import parse_filters, parse_symbol
 
 CELLS = [
     (symbol, filters, TABLE3[symbol][column])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from safetensors.numpy import save
 
 from plushsense.core.errors import BundleError
 from plushsense.core.gestures import load_gestures
-from plushsense.core.signal import load_layout
+from plushsense.core.layouts import load_layout
 from plushsense.models import bundle as room
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
@@ -158,7 +159,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.
         def fails(*_: object, failure: BaseException = failure) -> None:
             raise failure
 
-        monkeypatch.setattr(Path, "replace", fails)
+        monkeypatch.setattr(os, "replace", fails)
         with pytest.raises(seen):
             make(provenance={"other": 1}).save(path)
         assert path.read_bytes() == before

@@ -11,7 +11,7 @@ from plushsense.models.reference import Network, random_weights
 
 torch = pytest.importorskip("torch")
 
-from plushsense.models.net import Net  # noqa: E402
+from plushsense.models.net import Net
 
 
 @pytest.fixture(autouse=True)

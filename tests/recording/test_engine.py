@@ -19,18 +19,19 @@ import numpy as np
 import pytest
 
 from plushsense.core.errors import DatasetError, DeviceError
-from plushsense.core.recfile import STREAM_NAME, read_recording, read_stream
-from plushsense.core.signal import load_layout
+from plushsense.core.layouts import load_layout
+from plushsense.core.recorder_csv import STREAM_NAME, read_recording, read_stream
 from plushsense.devices.base import Device, Frame, now_ms
 from plushsense.devices.opening import open_device
 from plushsense.devices.reconnect import ReconnectingDevice
-from plushsense.recording import machine
-from plushsense.recording.engine import Auto, Recorder
-from plushsense.recording.protocol import load_protocol
+from plushsense.recording import states as machine
+from plushsense.recording.plan import load_protocol
+from plushsense.recording.recorder import Recorder
 from plushsense.recording.session import OpenSession
-from plushsense.recording.sessionfile import SessionHead, read_events, set_aside
-from plushsense.recording.status import Status
-from plushsense.recording.toy import prompt_virtual
+from plushsense.recording.session_files import SessionHead, discarded_recordings, read_events
+from plushsense.recording.setup import prompt_virtual
+from plushsense.recording.states import AutoRecording
+from plushsense.recording.status import RecorderStatus
 from plushsense.recording.writer import StreamFile
 
 LAYOUT = load_layout("plush-15")
@@ -46,7 +47,7 @@ def head(**changes: Any) -> SessionHead:
 
 @contextmanager
 def recorder(
-    folder: Path, device: Device | None = None, auto: Auto | None = None, **changes: Any
+    folder: Path, device: Device | None = None, auto: AutoRecording | None = None, **changes: Any
 ) -> Iterator[Recorder]:
     with (
         device or open_device(URL) as toy,
@@ -63,7 +64,7 @@ def until(true: Callable[[], bool]) -> None:
         time.sleep(0.002)
 
 
-def take(r: Recorder, seconds: float = 1.0) -> Status:
+def take(r: Recorder, seconds: float = 1.0) -> RecorderStatus:
     """Make the recording that is asked for; returns what the screen shows then."""
     r.space()
     assert r.status().state == "countdown"
@@ -82,10 +83,10 @@ def test_one_recording(tmp_path: Path) -> None:
     seen: list[str] = []
     with recorder(tmp_path) as r:
         assert (r.status().state, r.status().step.gesture, r.status().done) == ("idle", "Back stroke 1", 0)
-        r.listen(lambda what, _: seen.append(what))
+        r.subscribe(lambda what, _: seen.append(what))
         status = take(r)
         assert (status.done, status.step.gesture, status.steps) == (1, "Head stroke 1", 4)
-        assert status.following is not None and status.following.gesture == "Hold strong"
+        assert status.next_step is not None and status.next_step.gesture == "Hold strong"
         assert status.rate_hz == pytest.approx(100, abs=3)
         assert 0.2 < status.jitter_ms < 1.0
         assert (status.signal, status.lost, status.malformed, status.garbage) == ("good", 0, 0, 0)
@@ -103,8 +104,8 @@ def test_one_recording(tmp_path: Path) -> None:
     assert lines == stream[beside["stream_row"] : beside["stream_row"] + len(lines)]
     start = next(e for e in read_events(tmp_path) if e.what == "start")
     countdown = next(e for e in read_events(tmp_path) if e.what == "countdown")
-    assert start.more["device_ms"] - countdown.more["device_ms"] == pytest.approx(3000, abs=12)
-    assert beside["device_ms"][0] == start.more["device_ms"]
+    assert start.details["device_ms"] - countdown.details["device_ms"] == pytest.approx(3000, abs=12)
+    assert beside["device_ms"][0] == start.details["device_ms"]
 
 
 def test_space_cancels_a_countdown_and_does_not_stop_too_soon(tmp_path: Path) -> None:
@@ -137,7 +138,7 @@ def test_redo_sets_the_last_one_aside_and_skip_brings_it_back(tmp_path: Path) ->
         r.redo("sneezed")
         again = take(r).file
         assert again != first
-    assert set_aside(tmp_path) == {first: "sneezed"}
+    assert discarded_recordings(tmp_path) == {first: "sneezed"}
     assert (tmp_path / first).exists()
     with recorder(tmp_path) as r:
         assert (r.status().step.gesture, r.status().done, r.status().redone) == ("Head stroke 1", 1, 1)
@@ -147,7 +148,7 @@ def test_a_running_one_is_broken_off(tmp_path: Path) -> None:
     with recorder(tmp_path) as r:
         r.space()
         r.wait("recording", timeout_s=20)
-        for refused in (r.skip, r.pause, r.back):
+        for refused in (r.skip, r.back):
             refused()
             assert (r.status().state, "Recording" in r.status().message) == ("recording", True)
         r.redo()
@@ -155,8 +156,37 @@ def test_a_running_one_is_broken_off(tmp_path: Path) -> None:
         r.space()
         r.wait("recording", timeout_s=20)
     assert whats(tmp_path) == ["open", *2 * ["countdown", "start", "abandon"], "close"]
-    assert [e.more["why"] for e in read_events(tmp_path) if e.what == "abandon"] == ["redo", "quit"]
+    assert [e.details["why"] for e in read_events(tmp_path) if e.what == "abandon"] == ["redo", "quit"]
     assert not list(tmp_path.glob("Back*"))
+
+
+def test_a_pause_breaks_a_recording_off_and_asks_for_it_again(tmp_path: Path) -> None:
+    with recorder(tmp_path) as r:
+        first = take(r).file
+        before = r.status().rows
+        r.space()
+        r.wait("recording", timeout_s=20)
+        until(lambda: r.status().elapsed_s >= 1.0)
+        r.pause()
+        status = r.status()
+        assert (status.state, status.done, status.file) == ("paused", 1, first)
+        assert (status.step.gesture, "made again" in status.message) == ("Head stroke 1", True)
+        r.resume()
+        assert (r.status().state, r.status().step.gesture, r.status().done) == ("idle", "Head stroke 1", 1)
+        assert take(r).done == 2
+    events = list(read_events(tmp_path))
+    (abandoned,) = [e.details for e in events if e.what == "abandon"]
+    assert (abandoned["why"], abandoned["gesture"], abandoned["repetition"]) == ("pause", "Head stroke 1", 1)
+    # Nothing is lost: the rows of the abandoned recording are in the stream, where the log says.
+    started = [e.details["row"] for e in events if e.what == "start"][1]
+    rows = read_stream(tmp_path / STREAM_NAME, LAYOUT).frames
+    assert started >= before
+    assert abandoned["rows"] >= 95
+    assert len(rows) >= started + abandoned["rows"]
+    assert [e.details["gesture"] for e in events if e.what == "take"] == ["Back stroke 1", "Head stroke 1"]
+    assert len(list(tmp_path.glob("Head stroke 1_*.csv"))) == 1
+    with recorder(tmp_path) as r:
+        assert (r.status().done, r.status().step.gesture) == (2, "Hold strong")
 
 
 def test_back_makes_one_again_only_when_the_new_one_is_there(tmp_path: Path) -> None:
@@ -166,15 +196,15 @@ def test_back_makes_one_again_only_when_the_new_one_is_there(tmp_path: Path) -> 
         r.back()
         assert r.status().step.gesture == "Head stroke 1"
         r.back()
-        assert (r.status().step.gesture, r.status().already) == ("Back stroke 1", first)
+        assert (r.status().step.gesture, r.status().existing) == ("Back stroke 1", first)
         r.space()
         r.space()
-        assert r.status().already == first
+        assert r.status().existing == first
         status = take(r)
         assert (status.done, status.redone, status.skipped, status.step.gesture) == (1, 1, 1, "Hold strong")
         r.go(1)
         assert take(r).skipped == 0
-    assert set_aside(tmp_path) == {first: "recorded again"}
+    assert discarded_recordings(tmp_path) == {first: "recorded again"}
 
 
 def test_pause_note_and_the_end(tmp_path: Path) -> None:
@@ -188,7 +218,7 @@ def test_pause_note_and_the_end(tmp_path: Path) -> None:
             r.skip()
         assert take(r).state == "finished"
         assert r.wait("finished", timeout_s=0)
-    assert next(e.more["text"] for e in read_events(tmp_path) if e.what == "note") == "the child laughs"
+    assert next(e.details["text"] for e in read_events(tmp_path) if e.what == "note") == "the child laughs"
     assert whats(tmp_path)[-2:] == ["finished", "close"]
     with recorder(tmp_path) as r:
         assert (r.status().state, r.status().done, r.status().skipped) == ("finished", 1, 3)
@@ -210,7 +240,7 @@ def test_a_recording_that_nobody_stops_ends_by_itself(tmp_path: Path) -> None:
 
 def test_it_presses_its_own_space_bar(tmp_path: Path) -> None:
     device = open_device(URL)
-    with device, Recorder.open(tmp_path, device, head(), speed=SPEED, auto=Auto(1.5, 0.5)) as r:
+    with device, Recorder.open(tmp_path, device, head(), speed=SPEED, auto=AutoRecording(1.5, 0.5)) as r:
         assert r.wait("finished", timeout_s=30)
         assert r.status().done == 4
     for path in tmp_path.glob("*_*.json"):
@@ -222,7 +252,7 @@ def test_it_presses_its_own_space_bar(tmp_path: Path) -> None:
 def test_the_virtual_person_does_what_is_asked_for(tmp_path: Path) -> None:
     # Slowly: a machine that stands still for a moment is seen by the person as toy's time, ten times over.
     with open_device(URL.replace(f"speed={SPEED:g}", "speed=10")) as device:
-        r = Recorder.open(tmp_path, device, head(), speed=10, auto=Auto(4.0))
+        r = Recorder.open(tmp_path, device, head(), speed=10, auto=AutoRecording(4.0))
         prompt_virtual(r)
         with r:
             assert r.wait("finished", timeout_s=60)
@@ -266,9 +296,9 @@ def test_unplugged_for_five_seconds_during_a_gesture(tmp_path: Path) -> None:
         # The recording runs from about 4 s on to about 20 s: rest, countdown, and sixteen seconds of gesture.
         from_ms = first[-1].device_ms + 7000
         device = ReconnectingDevice("x", LAYOUT, lambda: Plug(toy, from_ms, 5000))
-        seen: list[Status] = []
-        r = Recorder.open(tmp_path, device, head(), speed=speed, auto=Auto(16.0, 1.0))
-        r.listen(lambda what, status: seen.append(status))
+        seen: list[RecorderStatus] = []
+        r = Recorder.open(tmp_path, device, head(), speed=speed, auto=AutoRecording(16.0, 1.0))
+        r.subscribe(lambda what, status: seen.append(status))
         with device, r:
             until(lambda: r.status().done == 1)
             status = r.status()
@@ -280,7 +310,7 @@ def test_unplugged_for_five_seconds_during_a_gesture(tmp_path: Path) -> None:
     assert 5000 <= gap["missing_ms"] < 11_000
     assert (beside["reconnects"], gap["reason"]) == (1, "'x' went away: was it unplugged?")
     (event,) = [e for e in read_events(tmp_path) if e.what == "gap"]
-    assert (event.more["gesture"], event.more["missing_ms"]) == ("Back stroke 1", gap["missing_ms"])
+    assert (event.details["gesture"], event.details["missing_ms"]) == ("Back stroke 1", gap["missing_ms"])
     frames = read_recording(next(tmp_path.glob("Back*.csv")), LAYOUT).frames
     hole = int(np.argmax(np.diff(frames.device_ms)))
     assert hole + 1 == gap["after_row"]
@@ -316,7 +346,9 @@ def test_a_hole_that_ends_a_recording_is_stated_once(tmp_path: Path) -> None:
     """The first frame after a silence may be the one at which the recording ends."""
     with (
         Pausing(1.0, 1.5) as toy,
-        Recorder.open(tmp_path, toy, head(countdown_s=0.1, gestures=("Hold strong",)), auto=Auto(1.2, 0.3)) as r,
+        Recorder.open(
+            tmp_path, toy, head(countdown_s=0.1, gestures=("Hold strong",)), auto=AutoRecording(1.2, 0.3)
+        ) as r,
     ):
         assert r.wait("finished", timeout_s=20)
     beside = json.loads(next(tmp_path.glob("*_*.json")).read_text())
@@ -343,7 +375,7 @@ class Breaking(Device):
 def test_a_toy_that_goes_for_good_leaves_its_recording(tmp_path: Path) -> None:
     with open_device(URL) as inner:
         device = Breaking(inner, 600)
-        with Recorder.open(tmp_path, device, head(), speed=SPEED, auto=Auto(30.0, 0.5)) as r:
+        with Recorder.open(tmp_path, device, head(), speed=SPEED, auto=AutoRecording(30.0, 0.5)) as r:
             assert r.wait(timeout_s=20)
             assert (r.status().message, r.status().done) == ("'x' went away: was it unplugged or switched off?", 1)
     beside = json.loads(next(tmp_path.glob("*_*.json")).read_text())
@@ -386,7 +418,7 @@ def test_commands_from_many_threads_lose_nothing(tmp_path: Path) -> None:
     stream = (tmp_path / STREAM_NAME).read_text().splitlines()
     clock = read_stream(tmp_path / STREAM_NAME, LAYOUT).frames.device_ms
     assert np.diff(clock).max() <= 12
-    takes = [e.more for e in read_events(tmp_path) if e.what == "take"]
+    takes = [e.details for e in read_events(tmp_path) if e.what == "take"]
     assert takes
     assert {t["file"] for t in takes} == {p.name for p in tmp_path.glob("* *_*.csv")}
     for path in tmp_path.glob("* *_*.csv"):
@@ -395,8 +427,8 @@ def test_commands_from_many_threads_lose_nothing(tmp_path: Path) -> None:
         assert lines == stream[beside["stream_row"] : beside["stream_row"] + len(lines)]
     session = OpenSession(tmp_path)
     session.close()
-    assert session.standing.mended == []
-    assert (len(session.standing.takes), len(session.standing.skipped)) == (at_end.done, at_end.skipped)
+    assert session.progress.repairs == []
+    assert (len(session.progress.takes), len(session.progress.skipped)) == (at_end.done, at_end.skipped)
 
 
 def test_a_remark_after_the_end_is_not_said_to_be_kept(tmp_path: Path) -> None:
@@ -405,13 +437,13 @@ def test_a_remark_after_the_end_is_not_said_to_be_kept(tmp_path: Path) -> None:
         assert r.status().message == "Noted."
     r.note("too late")
     assert "not kept" in r.status().message
-    assert [e.more["text"] for e in read_events(tmp_path) if e.what == "note"] == ["in time"]
+    assert [e.details["text"] for e in read_events(tmp_path) if e.what == "note"] == ["in time"]
 
 
 FULL = """
 import resource, signal, sys
 from pathlib import Path
-from plushsense.apps.cli.main import main
+from plushsense.cli.main import main
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), resource.RLIM_INFINITY))
 sys.exit(main(["record", sys.argv[1], "--device", sys.argv[3], "--subject", "S01", "--auto", "2", "--json"]))
@@ -443,7 +475,7 @@ def check_full(done: subprocess.CompletedProcess[str], out: Path) -> None:
 def resumed(out: Path, before: dict[str, bytes]) -> None:
     with open_device(URL) as device:
         session = OpenSession(out / "S01" / "1")
-        with Recorder(session, device, speed=SPEED, auto=Auto(1.0, 0.2)) as r:
+        with Recorder(session, device, speed=SPEED, auto=AutoRecording(1.0, 0.2)) as r:
             assert r.wait("finished", timeout_s=60)
             assert r.status().done == 51
     for name, data in before.items():
@@ -477,7 +509,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 def test_a_full_disk(small_disk: Path) -> None:
     words = [
-        sys.executable, "-m", "plushsense.apps.cli.main", "record", str(small_disk), "--device", URL,
+        sys.executable, "-m", "plushsense.cli.main", "record", str(small_disk), "--device", URL,
         "--subject", "S01", "--auto", "2", "--json",
     ]  # fmt: skip
     done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=60, stdin=subprocess.DEVNULL)
@@ -496,7 +528,7 @@ def test_a_stream_that_fails_while_a_recording_is_saved_stops_the_session(
 ) -> None:
     """The recording is kept, and the screen must not say that the next may begin."""
     full = threading.Event()
-    keep, write = machine.keep_take, StreamFile.write
+    keep, write = machine.store_take, StreamFile.write
 
     def slowly(*given: Any, **more: Any) -> tuple[str, str]:
         kept = keep(*given, **more)
@@ -509,9 +541,9 @@ def test_a_stream_that_fails_while_a_recording_is_saved_stops_the_session(
             raise OSError(28, "No space left on device")
         write(self, frames)
 
-    monkeypatch.setattr(machine, "keep_take", slowly)
+    monkeypatch.setattr(machine, "store_take", slowly)
     monkeypatch.setattr(StreamFile, "write", refused)
-    with recorder(tmp_path, auto=Auto(1.0, 0.5)) as r:
+    with recorder(tmp_path, auto=AutoRecording(1.0, 0.5)) as r:
         until(lambda: r.status().done == 1)
         assert r.status().state == "stopped"
         assert "cannot be written any more" in r.status().message
@@ -526,3 +558,77 @@ def test_a_stream_that_cannot_be_opened_is_one_sentence(tmp_path: Path) -> None:
             made.start()
     (tmp_path / STREAM_NAME).rmdir()
     OpenSession(tmp_path).close()
+
+
+NO_DESCRIPTOR = """
+import contextlib, errno, json, os, resource, sys, threading
+from pathlib import Path
+from plushsense.core.layouts import load_layout
+from plushsense.devices.opening import open_device
+from plushsense.recording.recorder import Recorder
+from plushsense.recording.states import AutoRecording
+from plushsense.recording.plan import load_protocol
+from plushsense.recording.session_files import SessionHead
+
+head = SessionHead("S01", "1", 5, load_layout("plush-15").to_dict(), load_protocol("quick").to_dict(), simulated=True)
+before = resource.getrlimit(resource.RLIMIT_NOFILE)
+waits, refused, news = threading.Event(), [], []
+
+def listener(what, status):
+    news.append(what)
+    if what == "recording" and not refused:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (3, before[1]))
+        try:
+            open(os.devnull)
+        except OSError as cause:
+            refused.append(cause.errno)
+    elif what == "message" and "Too many files are open" in status.message:
+        waits.set()
+
+with open_device(sys.argv[2]) as toy:
+    folder = Path(sys.argv[1])
+    with Recorder.open(folder, toy, head, speed=float(sys.argv[3]), auto=AutoRecording(1.0, 0.2)) as recorder:
+        recorder.subscribe(listener)
+        waited = waits.wait(60)
+        state = recorder.status().state
+        if sys.argv[4] == "passes":
+            resource.setrlimit(resource.RLIMIT_NOFILE, before)
+            recorder.wait("finished", timeout_s=60)
+    status = recorder.status()
+    resource.setrlimit(resource.RLIMIT_NOFILE, before)
+said = {"waited": waited, "refused": refused == [errno.EMFILE], "saving": state, "done": status.done}
+print(json.dumps(said | {"failed": status.failed, "rows": status.rows, "finished": "finished" in news}))
+"""
+
+
+def without_descriptors(folder: Path, until: str) -> dict[str, Any]:
+    words = [sys.executable, "-c", NO_DESCRIPTOR, str(folder), URL, str(SPEED), until]
+    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=200)
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    said: dict[str, Any] = json.loads(done.stdout)
+    assert (said["waited"], said["refused"], said["saving"]) == (True, True, "saving"), said
+    stream = (folder / STREAM_NAME).read_text().splitlines()
+    assert len(stream) == said["rows"]
+    files = sorted(folder.glob("* *_*.csv"))
+    assert len(files) == said["done"]
+    for path in files:
+        beside = json.loads(path.with_suffix(".json").read_text())
+        lines = path.read_text().splitlines()[1:]
+        assert lines == stream[beside["stream_row"] : beside["stream_row"] + len(lines)]
+    assert not [p for p in folder.iterdir() if p.name.endswith((".part", ".new"))]
+    return said
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no limit on open files")
+def test_a_recording_is_saved_when_a_file_descriptor_is_free_again(tmp_path: Path) -> None:
+    said = without_descriptors(tmp_path, "passes")
+    assert (said["done"], said["failed"], said["finished"]) == (4, "", True)
+    assert whats(tmp_path).count("take") == 4
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no limit on open files")
+def test_a_session_can_be_closed_while_no_file_descriptor_is_free(tmp_path: Path) -> None:
+    said = without_descriptors(tmp_path, "stays")
+    assert said["done"] == 0
+    assert "close other programs, and go on with the same session" in said["failed"]

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from plushsense.core.signal import load_layout
+from plushsense.core.layouts import load_layout
 from plushsense.devices.base import Device, Frame
-from plushsense.recording.intake import Intake
+from plushsense.recording.takes import FrameReceiver
 
 LAYOUT = load_layout("plush-15")
 VALUES = (0,) * LAYOUT.n_channels
@@ -17,12 +17,12 @@ class Silent(Device):
         return []
 
 
-def taken_in(stamps: list[int], speed: float = 1.0) -> Intake:
+def taken_in(stamps: list[int], speed: float = 1.0) -> FrameReceiver:
     """These stamps of the toy's clock, each 10 ms after the one before by the computer's."""
-    intake = Intake(Silent("x", LAYOUT), LAYOUT, speed, 0, 0)
+    intake = FrameReceiver(Silent("x", LAYOUT), LAYOUT, speed, 0, 0)
     for n, stamp in enumerate(stamps):
-        intake.take_in(Frame(1_000_000 + 10 * n, stamp, VALUES))
-        intake.heard()
+        intake.receive(Frame(1_000_000 + 10 * n, stamp, VALUES))
+        intake.end_reading()
     return intake
 
 
@@ -41,10 +41,10 @@ def test_a_spoilt_stamp_lets_no_time_pass(spoilt: int) -> None:
 
 
 def test_a_hole_that_the_computer_waited_through_counts() -> None:
-    intake = Intake(Silent("x", LAYOUT), LAYOUT, 1.0, 0, 0)
-    intake.take_in(Frame(1_000_000, 5000, VALUES))
-    intake.heard()
-    intake.take_in(Frame(1_005_000, 10_000, VALUES))
+    intake = FrameReceiver(Silent("x", LAYOUT), LAYOUT, 1.0, 0, 0)
+    intake.receive(Frame(1_000_000, 5000, VALUES))
+    intake.end_reading()
+    intake.receive(Frame(1_005_000, 10_000, VALUES))
     assert intake.toy_ms == 5000
     (gap,) = intake.gaps
     assert (gap["reason"], gap["missing_ms"]) == ("nothing came", 5000)
@@ -57,8 +57,8 @@ def test_a_toy_faster_than_time_is_believed() -> None:
 
 def test_lines_without_a_frame_are_a_signal() -> None:
     device = Silent("x", LAYOUT)
-    intake = Intake(device, LAYOUT, 1.0, 0, 0)
+    intake = FrameReceiver(device, LAYOUT, 1.0, 0, 0)
     assert intake.quality().signal == "none"
     device.counters.malformed += 3
-    intake.listened()
+    intake.check_malformed()
     assert intake.quality().signal == "unreadable"

@@ -5,7 +5,7 @@ import pytest
 
 from plushsense.core.errors import ConfigError, GestureError
 from plushsense.devices.virtual.session import GESTURES
-from plushsense.recording.protocol import Protocol, load_protocol, protocol_names, wordings
+from plushsense.recording.plan import Protocol, load_protocol, protocol_names, wordings
 
 
 def own(folder: Path, text: str) -> Path:
@@ -85,16 +85,16 @@ def test_a_gesture_set_beside_it_is_found(tmp_path: Path) -> None:
     ("text", "said"),
     [
         ("repetition = 3", "Unknown key 'repetition'.*Did you mean 'repetitions'"),
-        ("repetitions = 0", "whole number, 1 to 1000"),
-        ("repetitions = true", "whole number, 1 to 1000"),
+        ("repetitions = 0", "accepted are 1 to 1000"),
+        ("repetitions = true", "accepted is a whole number"),
         ('order = "rounds"', "Did you mean 'round'"),
         ("countdown_s = -1", "0 to 60 seconds"),
-        ("longest_s = nan", "must be a number"),
+        ("longest_s = nan", "accepted is a number"),
         ("shortest_s = 5\nlongest_s = 4", "must be below"),
         ('gestures = ["Tail kick"]', "Tail kick"),
         ('gestures = ["Tail pull", "tail_pull"]', "every gesture once"),
-        ("gestures = 3", "list of labels"),
-        ('[prompts]\n"Tail pull" = 3', "must be a text"),
+        ("gestures = 3", "accepted is a list of texts"),
+        ('[prompts]\n"Tail pull" = 3', 'prompts."Tail pull" is 3: accepted is text or a table'),
         ('[prompts]\n"Tail kick" = "x"', "Tail kick"),
     ],
 )

@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 
 from plushsense.core.errors import DatasetError
-from plushsense.core.recfile import STREAM_NAME
-from plushsense.core.signal import load_layout
+from plushsense.core.layouts import load_layout
+from plushsense.core.recorder_csv import STREAM_NAME
 from plushsense.devices.base import Frame
-from plushsense.recording.protocol import load_protocol
+from plushsense.recording.plan import load_protocol
 from plushsense.recording.session import (
     LOCK,
     OpenSession,
@@ -26,7 +26,7 @@ from plushsense.recording.session import (
     next_session,
     session_names,
 )
-from plushsense.recording.sessionfile import SESSION_LOG, Event, SessionHead, read_events, set_aside
+from plushsense.recording.session_files import SESSION_LOG, SessionEvent, SessionHead, discarded_recordings, read_events
 from plushsense.recording.writer import StreamFile, save_take, to_frames
 
 ACCEL = load_layout("accel-3")
@@ -42,11 +42,11 @@ def made(folder: Path, key: tuple[str, int], saved_ms: int, log: bool = True) ->
     path = save_take(folder, to_frames(ROWS[5:9], 3), ACCEL, key[0], saved_ms, more)
     if log:
         with (folder / SESSION_LOG).open("a", encoding="utf-8") as file:
-            file.write(Event("take", saved_ms, more | {"file": path.name}).to_line())
+            file.write(SessionEvent("take", saved_ms, more | {"file": path.name}).to_line())
     return path
 
 
-def opened(folder: Path, *events: Event) -> OpenSession:
+def opened(folder: Path, *events: SessionEvent) -> OpenSession:
     """Take the session up, with these events in its log before."""
     with (folder / SESSION_LOG).open("a", encoding="utf-8") as file:
         file.writelines(e.to_line() for e in events)
@@ -68,7 +68,7 @@ def folder(tmp_path: Path) -> Path:
 
 def test_a_new_one(tmp_path: Path) -> None:
     session = OpenSession(tmp_path / "S01" / "1", HEAD)
-    assert (session.standing.resumed, session.standing.takes, session.standing.mended) == (False, {}, [])
+    assert (session.progress.resumed, session.progress.takes, session.progress.repairs) == (False, {}, [])
     assert session.protocol.name == "quick"
     session.close()
     session.close()
@@ -78,27 +78,30 @@ def test_a_new_one(tmp_path: Path) -> None:
 
 def test_it_goes_on_where_it_stood(folder: Path) -> None:
     first, second = made(folder, ("Back stroke 1", 1), 50), made(folder, ("Head stroke 1", 1), 60)
-    skip = Event("skip", 70, {"gesture": "Hold strong", "repetition": 1})
-    standing = opened(folder, skip, Event("redo", 80, {"file": second.name})).standing
-    assert standing.takes == {("Back stroke 1", 1): first.name}
-    assert standing.skipped == {("Hold strong", 1)}
-    assert standing.aside == {("Head stroke 1", 1): [second.name]}
-    assert (standing.rows, standing.host_ms, standing.resumed, standing.mended) == (20, 1019, True, [])
-    assert opened(folder, Event("keep", 90, {"file": second.name})).standing.takes[("Head stroke 1", 1)] == second.name
+    skip = SessionEvent("skip", 70, {"gesture": "Hold strong", "repetition": 1})
+    progress = opened(folder, skip, SessionEvent("redo", 80, {"file": second.name})).progress
+    assert progress.takes == {("Back stroke 1", 1): first.name}
+    assert progress.skipped == {("Hold strong", 1)}
+    assert progress.discarded == {("Head stroke 1", 1): [second.name]}
+    assert (progress.rows, progress.host_ms, progress.resumed, progress.repairs) == (20, 1019, True, [])
+    assert (
+        opened(folder, SessionEvent("keep", 90, {"file": second.name})).progress.takes[("Head stroke 1", 1)]
+        == second.name
+    )
 
 
 def test_a_torn_stream_is_cut_to_whole_lines_and_the_log_keeps_the_rest(folder: Path) -> None:
     path = folder / STREAM_NAME
     whole = path.read_bytes()
     path.write_bytes(whole + b"1020, 20")
-    standing = OpenSession(folder)
-    standing.close()
+    progress = OpenSession(folder)
+    progress.close()
     assert path.read_bytes() == whole
     (event,) = [e for e in read_events(folder) if e.what == "mended"]
-    assert (event.more["bytes"], event.more["text"]) == (8, "1020, 20")
-    assert len(standing.standing.mended) == 1
+    assert (event.details["bytes"], event.details["text"]) == (8, "1020, 20")
+    assert len(progress.progress.repairs) == 1
     path.write_bytes(b"10")
-    assert opened(folder).standing.rows == 0
+    assert opened(folder).progress.rows == 0
 
 
 def test_a_torn_line_of_the_log_is_passed_over(folder: Path) -> None:
@@ -106,9 +109,9 @@ def test_a_torn_line_of_the_log_is_passed_over(folder: Path) -> None:
     with (folder / SESSION_LOG).open("ab") as file:
         file.write(b'{"what": "take", "at_ms": 4, "fil')
     session = OpenSession(folder)
-    session.log.write([Event("note", 1, {"text": "after"})])
+    session.log.write([SessionEvent("note", 1, {"text": "after"})])
     session.close()
-    assert session.standing.takes == {("Back stroke 1", 1): path.name}
+    assert session.progress.takes == {("Back stroke 1", 1): path.name}
     assert [e.what for e in read_events(folder)] == ["take", "note"]
 
 
@@ -116,18 +119,18 @@ def test_a_recording_that_the_log_does_not_know_is_taken_in(folder: Path) -> Non
     """Killed between the recording and its line in the log; it was made again, so the earlier one is set aside."""
     earlier = made(folder, ("Back stroke 1", 1), 50)
     later = made(folder, ("Back stroke 1", 1), 60, log=False)
-    assert opened(folder).standing.takes == {("Back stroke 1", 1): later.name}
-    assert set_aside(folder) == {earlier.name: "recorded again"}
-    assert opened(folder).standing.takes == {("Back stroke 1", 1): later.name}
+    assert opened(folder).progress.takes == {("Back stroke 1", 1): later.name}
+    assert discarded_recordings(folder) == {earlier.name: "recorded again"}
+    assert opened(folder).progress.takes == {("Back stroke 1", 1): later.name}
 
 
 def test_what_was_begun_is_to_be_made_again(folder: Path) -> None:
-    start = Event("start", 50, {"gesture": "Hold strong", "repetition": 1, "row": 3})
-    standing = opened(folder, start).standing
-    assert standing.takes == {}
-    assert "is to be made again" in standing.mended[0]
+    start = SessionEvent("start", 50, {"gesture": "Hold strong", "repetition": 1, "row": 3})
+    progress = opened(folder, start).progress
+    assert progress.takes == {}
+    assert "is to be made again" in progress.repairs[0]
     assert [e.what for e in read_events(folder)] == ["start", "unfinished"]
-    assert opened(folder).standing.mended == []
+    assert opened(folder).progress.repairs == []
 
 
 def test_what_is_half_goes_and_what_is_damaged_is_set_aside(folder: Path) -> None:
@@ -137,9 +140,9 @@ def test_what_is_half_goes_and_what_is_damaged_is_set_aside(folder: Path) -> Non
     cut.write_bytes(cut.read_bytes()[:-20])
     gone = made(folder, ("Tail tap 1", 1), 70)
     gone.unlink()
-    standing = opened(folder).standing
-    assert standing.takes == {}
-    assert len(standing.mended) == 2
+    progress = opened(folder).progress
+    assert progress.takes == {}
+    assert len(progress.repairs) == 2
     assert sorted(p.name for p in folder.iterdir()) == [
         cut.name + ".torn", cut.with_suffix(".json").name, gone.with_suffix(".json").name, STREAM_NAME,
         "session.json", "session.jsonl",
@@ -150,32 +153,32 @@ def test_a_recording_that_was_away_and_is_back_does_not_replace_the_newer(folder
     first = made(folder, ("Back stroke 1", 1), 50)
     rows = first.read_bytes()
     first.unlink()
-    assert opened(folder).standing.takes == {}
+    assert opened(folder).progress.takes == {}
     assert first.with_suffix(".json").exists()
     second = made(folder, ("Back stroke 1", 1), 60)
     first.write_bytes(rows)
     for _ in range(2):
-        standing = opened(folder).standing
-        assert standing.takes == {("Back stroke 1", 1): second.name}
-        assert standing.aside == {("Back stroke 1", 1): [first.name]}
-    assert set_aside(folder) == {first.name: "made again"}
+        progress = opened(folder).progress
+        assert progress.takes == {("Back stroke 1", 1): second.name}
+        assert progress.discarded == {("Back stroke 1", 1): [first.name]}
+    assert discarded_recordings(folder) == {first.name: "made again"}
 
 
 def test_a_log_that_lost_lines_is_survived(folder: Path) -> None:
     """Whatever is left of a log, in whatever order: a session opens, and no recording on disk is forgotten."""
     a, b = made(folder, ("Back stroke 1", 1), 50), made(folder, ("Back stroke 1", 1), 60)
     words = [
-        Event(what, 70, {"file": file, "gesture": "Back stroke 1", "repetition": 1}).to_line()
+        SessionEvent(what, 70, {"file": file, "gesture": "Back stroke 1", "repetition": 1}).to_line()
         for what in ("take", "redo", "keep", "start", "skip", "abandon", "go")
         for file in (a.name, b.name, "x", "")
     ] + ["{}\n", "[]\n", "\x00\x00", '{"what": "keep", "at_ms": "x"}\n']
     rng = random.Random(5)
     for _ in range(60):
         (folder / SESSION_LOG).write_text("".join(rng.choices(words, k=rng.randrange(12))))
-        standing = opened(folder).standing
-        known = set(standing.takes.values()) | {f for files in standing.aside.values() for f in files}
+        progress = opened(folder).progress
+        known = set(progress.takes.values()) | {f for files in progress.discarded.values() for f in files}
         assert {a.name, b.name} <= known
-        assert set(standing.takes.values()) <= {a.name, b.name}
+        assert set(progress.takes.values()) <= {a.name, b.name}
         assert a.exists() and b.exists()
 
 
@@ -239,9 +242,9 @@ def test_which_session_comes_next(tmp_path: Path) -> None:
         OpenSession(other / name, replace(HEAD, subject="S02", session=name, started_ms=started)).close()
     assert session_names(other) == ["9", "10"], "the computer's clock was set back between them"
     assert (next_session(person), new_session(person)) == ("1", "2")
-    opened(person / "1", Event("finished", 9))
+    opened(person / "1", SessionEvent("finished", 9))
     assert next_session(person) == "2"
-    opened(person / "1", Event("redo", 10, {"file": "x"}))
+    opened(person / "1", SessionEvent("redo", 10, {"file": "x"}))
     assert not is_finished(person / "1")
 
 

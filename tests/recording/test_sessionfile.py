@@ -4,7 +4,14 @@ from pathlib import Path
 import pytest
 
 from plushsense.core.errors import DatasetError
-from plushsense.recording.sessionfile import SESSION_HEAD, SESSION_LOG, Event, SessionHead, read_events, set_aside
+from plushsense.recording.session_files import (
+    SESSION_HEAD,
+    SESSION_LOG,
+    SessionEvent,
+    SessionHead,
+    discarded_recordings,
+    read_events,
+)
 
 HEAD = SessionHead("P1", "session-1", 5, {"name": "l"}, {"name": "p"}, "child", consent="C-3", simulated=True)
 
@@ -21,7 +28,7 @@ def test_the_head_comes_back(tmp_path: Path) -> None:
     [
         ({"format": 9}, "format 1"),
         ({"subject": None}, "subject is None"),
-        ({"simulated": 1}, "kind bool"),
+        ({"simulated": 1}, "simulated is 1: accepted is true or false"),
         ({"colour": "red"}, "Unknown key 'colour'"),
     ],
 )
@@ -36,11 +43,11 @@ def test_a_damaged_head_is_refused(tmp_path: Path, change: dict[str, object], sa
 def test_the_log_says_what_was_recorded_again(tmp_path: Path) -> None:
     assert list(read_events(tmp_path)) == []
     events = [
-        Event("take", 1, {"file": "a.csv"}),
-        Event("redo", 2, {"file": "a.csv"}),
-        Event("redo", 3, {"file": "b.csv", "why": "sneezed"}),
+        SessionEvent("take", 1, {"file": "a.csv"}),
+        SessionEvent("redo", 2, {"file": "a.csv"}),
+        SessionEvent("redo", 3, {"file": "b.csv", "why": "sneezed"}),
     ]
     torn = b'{"what": "redo", "at_ms": 4, "file": "c.c'
     (tmp_path / SESSION_LOG).write_bytes("".join(e.to_line() for e in events).encode() + b"[]\n" + torn)
     assert list(read_events(tmp_path)) == events
-    assert set_aside(tmp_path) == {"a.csv": "recorded again", "b.csv": "sneezed"}
+    assert discarded_recordings(tmp_path) == {"a.csv": "recorded again", "b.csv": "sneezed"}

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from plushsense.core.errors import ConfigError, DatasetError
-from plushsense.core.recfile import parse_name, read_recording, read_stream
-from plushsense.core.signal import load_layout
+from plushsense.core.layouts import load_layout
+from plushsense.core.recorder_csv import parse_name, read_recording, read_stream
 from plushsense.devices.virtual.session import GESTURES
 from plushsense.devices.virtual.stream import ToySpec
 from plushsense.recording.simulate import simulate
@@ -133,7 +133,7 @@ def test_a_users_folder_beside_is_left_alone(tmp_path: Path) -> None:
     assert (mine / "thesis.txt").is_file()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "out.simulating"]
     (tmp_path / "afile").write_text("x", encoding="utf-8")
-    with pytest.raises(DatasetError, match="cannot be made"):
+    with pytest.raises(DatasetError, match="cannot be created"):
         simulate(tmp_path / "afile" / "x", people=1, repetitions=1, at_rest=0, gestures=["Tail hit 1"])
 
 

@@ -14,14 +14,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from plushsense.apps.checking import check_dataset
-from plushsense.core.recfile import STREAM_NAME, parse_name, read_stream
-from plushsense.dataset.importers import import_recordings
+from plushsense.core.recorder_csv import STREAM_NAME, parse_name, read_stream
+from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.people import PersonInfo, read_people
 from plushsense.devices.virtual.session import GESTURES
-from plushsense.recording.sessionfile import SESSION_LOG, read_events
-from pty_toys import LAYOUT, Toy, check_whole, pty_toy, recordings
+from plushsense.recording.session_files import SESSION_LOG, read_events
+from plushsense.workflow.datasets import check_dataset
+from support.pty_toys import LAYOUT, Toy, check_whole, pty_toy, recordings
 
 SPEED = 60.0
 KILL_SPEED = 8.0
@@ -33,7 +32,7 @@ def recording(out: Path, toy: Toy, speed: float, *words: str) -> subprocess.Pope
     """``plushsense record`` as a program of its own, pressing its own space bar."""
     process = subprocess.Popen(
         [
-            sys.executable, "-m", "plushsense.apps.cli.main", "record", str(out), "--device", toy.url,
+            sys.executable, "-m", "plushsense.cli.main", "record", str(out), "--device", toy.url,
             "--subject", "S01", "--speed", str(speed), "--auto", "4", "--json", *words,
         ],
         stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
@@ -136,7 +135,7 @@ def test_killed_three_times(tmp_path: Path) -> None:
     assert not [p.name for p in folder.iterdir() if p.suffix in (".part", ".new", ".torn", ".lock")]
     # What is missing lies between two runs, nowhere else.
     stream = read_stream(folder / STREAM_NAME, LAYOUT).frames
-    opened = {e.more["row"] for e in read_events(folder) if e.what == "open"}
+    opened = {e.details["row"] for e in read_events(folder) if e.what == "open"}
     gaps = set((np.flatnonzero(np.abs(np.diff(stream.device_ms)) > 15) + 1).tolist())
     assert gaps <= opened
 

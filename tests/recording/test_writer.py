@@ -1,15 +1,17 @@
+import errno
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from plushsense.core.recfile import read_recording, read_stream
-from plushsense.core.signal import Layout, load_layout
+from plushsense.core.layouts import Layout, load_layout
+from plushsense.core.recorder_csv import read_recording, read_stream
 from plushsense.devices.base import Frame
 from plushsense.devices.wire import LineParser
-from plushsense.recording.sessionfile import Event, read_events
+from plushsense.recording.session_files import SessionEvent, read_events
 from plushsense.recording.writer import AppendedFile, LogFile, StreamFile, save_take, to_frames
 
 ACCEL = load_layout("accel-3")
@@ -90,6 +92,20 @@ def test_a_refused_recording_leaves_nothing_half(tmp_path: Path, monkeypatch: py
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.skipif(os.name != "posix", reason="Windows needs no descriptor for a folder")
+def test_nothing_is_opened_once_a_recording_has_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What fails can be done again: a recording that lies there already would be there twice."""
+    real = os.open
+
+    def exhausted(path: Any, *given: Any, **more: Any) -> int:
+        if list(tmp_path.glob("*.csv")):
+            raise OSError(errno.EMFILE, "Too many open files")
+        return real(path, *given, **more)
+
+    monkeypatch.setattr(os, "open", exhausted)
+    save_take(tmp_path, to_frames(frames(4), 3), ACCEL, "Wave", 9, {})
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full on this system")
 def test_a_full_disk_is_an_oserror() -> None:
     file = AppendedFile(Path("/dev/full"))
@@ -101,7 +117,7 @@ def test_a_full_disk_is_an_oserror() -> None:
 def test_events_are_appended(tmp_path: Path) -> None:
     for n in range(2):
         log = LogFile(tmp_path)
-        log.write([Event("note", n, {"text": "ä"}), Event("pause", n)])
+        log.write([SessionEvent("note", n, {"text": "ä"}), SessionEvent("pause", n)])
         log.write([])
         log.close()
     assert [(e.what, e.at_ms) for e in read_events(tmp_path)] == [("note", 0), ("pause", 0), ("note", 1), ("pause", 1)]

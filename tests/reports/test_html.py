@@ -8,7 +8,7 @@ from html.parser import HTMLParser
 import pytest
 
 from plushsense.core.errors import ConfigError
-from plushsense.reports.html import render, write_report
+from plushsense.reports.evaluation import render, write_evaluation_report
 
 VOID = {"meta", "img", "br"}
 
@@ -47,7 +47,7 @@ def read(study, **changes) -> Reader:
 
 
 def test_it_asks_for_nothing_outside_itself(tmp_path, study):
-    page = write_report(tmp_path / "deep" / "report.html", **study).read_text(encoding="utf-8")
+    page = write_evaluation_report(tmp_path / "deep" / "report.html", **study).read_text(encoding="utf-8")
     reader = Reader()
     reader.feed(page)
     assert all(a.startswith(("#E", "data:image/svg+xml;base64,")) for a in reader.addresses)
@@ -132,14 +132,14 @@ def test_one_affect_makes_no_matrix(study):
 def test_a_place_that_cannot_be_written_is_one_sentence(tmp_path, study):
     (tmp_path / "file").write_text("x")
     with pytest.raises(ConfigError, match=r"cannot be written"):
-        write_report(tmp_path / "file" / "report.html", **study)
+        write_evaluation_report(tmp_path / "file" / "report.html", **study)
 
 
 def test_an_older_report_is_replaced_whole(tmp_path, study):
     target = tmp_path / "report.html"
-    write_report(target, **study)
+    write_evaluation_report(target, **study)
     target.write_text(target.read_text(encoding="utf-8") + "old" * 1_000_000, encoding="utf-8")
-    write_report(target, **{**study, "evaluations": []})
+    write_evaluation_report(target, **{**study, "evaluations": []})
     assert target.read_text(encoding="utf-8").rstrip().endswith("</html>")
 
 
@@ -151,7 +151,7 @@ def test_nothing_else_is_ever_replaced(name, tmp_path, study):
     else:
         target.write_text("<!DOCTYPE html><title>my thesis</title>")
     with pytest.raises(ConfigError, match="name"):
-        write_report(target, **study)
+        write_evaluation_report(target, **study)
     assert target.is_dir() or "my thesis" in target.read_text()
     assert len(list(tmp_path.iterdir())) == 1
 

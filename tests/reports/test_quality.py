@@ -9,19 +9,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plushsense.core.recfile import Frames, format_rows, recording_filename, write_recording
-from plushsense.core.signal import load_layout
-from plushsense.dataset.importers import import_recordings
-from plushsense.dataset.quality.checking import Checked, check
-from plushsense.dataset.trim import trims
+from plushsense.core.layouts import load_layout
+from plushsense.core.recorder_csv import Frames, format_rows, recording_filename, write_recording
+from plushsense.dataset.importing.importers import import_recordings
+from plushsense.dataset.quality.checking import CheckReport, check
+from plushsense.dataset.trimming import suggest_trims
 from plushsense.reports import figures, quality, quality_figures
-from plushsense.reports.trims import trim_page
+from plushsense.reports.quality_figures import trim_page
 
 ACCEL = load_layout("accel-3")
 
 
 @pytest.fixture(scope="module")
-def result(tmp_path_factory: pytest.TempPathFactory) -> Checked:
+def result(tmp_path_factory: pytest.TempPathFactory) -> CheckReport:
     """Six people; one recording never stopped, one with a gap, one stuck; a label that would break a page."""
     folder = tmp_path_factory.mktemp("page")
     rng = np.random.default_rng(0)
@@ -53,7 +53,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Checked:
 
 
 @pytest.fixture(scope="module")
-def page(result: Checked) -> str:
+def page(result: CheckReport) -> str:
     return quality.render(result)
 
 
@@ -64,7 +64,7 @@ def test_the_page_asks_for_nothing_outside_itself(page: str) -> None:
     assert '<meta name="generator" content="PlushSense">' in page
 
 
-def test_each_finding_is_there_and_what_needs_a_decision_first(result: Checked, page: str) -> None:
+def test_each_finding_is_there_and_what_needs_a_decision_first(result: CheckReport, page: str) -> None:
     assert {"never-stopped", "gaps", "stuck"} <= {f.check for f in result.findings}
     for name in {f.check for f in result.findings}:
         assert f'<h2 id="{name}">' in page
@@ -72,7 +72,7 @@ def test_each_finding_is_there_and_what_needs_a_decision_first(result: Checked, 
         r'#gaps">gaps</a></td><td class="n">(\d*)</td><td class="n">(\d*)</td><td class="n">(\d*)</td>', page
     )
     assert shares is not None
-    assert sum(int(n or 0) for n in shares.groups()) == len(result.of("gaps"))
+    assert sum(int(n or 0) for n in shares.groups()) == len(result.findings_of("gaps"))
     decide = page[page.index("<h2>To decide</h2>") : page.index("<h2>Gesture by gesture</h2>")]
     for f in result.undecided:
         assert f.recording.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;") in decide
@@ -80,8 +80,8 @@ def test_each_finding_is_there_and_what_needs_a_decision_first(result: Checked, 
     assert overlays.count("<img") == 2, "a picture a gesture"
 
 
-def test_the_odd_recordings_are_named_in_the_overlay(result: Checked) -> None:
-    (gesture,) = [f.gesture for f in result.of("never-stopped")]
+def test_the_odd_recordings_are_named_in_the_overlay(result: CheckReport) -> None:
+    (gesture,) = [f.gesture for f in result.findings_of("never-stopped")]
     figure = quality.gesture_figure(result, gesture)
     legend = figure.axes[0].get_legend()
     assert legend is not None
@@ -92,15 +92,15 @@ def test_the_odd_recordings_are_named_in_the_overlay(result: Checked) -> None:
     assert high < 10, "the one of 30 s does not squeeze the others"
 
 
-def test_accepted_findings_are_not_named(result: Checked) -> None:
+def test_accepted_findings_are_not_named(result: CheckReport) -> None:
     accepted = replace(result, findings=tuple(replace(f, accepted=True) for f in result.findings))
-    (gesture,) = {f.gesture for f in result.of("never-stopped")}
+    (gesture,) = {f.gesture for f in result.findings_of("never-stopped")}
     assert quality.gesture_figure(accepted, gesture).axes[0].get_legend() is None
     page = quality.render(accepted)
     assert page.count('<tr class="accepted">') == len(result.findings)
 
 
-def test_pictures_are_bounded_and_the_page_says_so(result: Checked, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pictures_are_bounded_and_the_page_says_so(result: CheckReport, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(quality, "PICTURE_BYTES", 150_000)
     page = quality.render(result)
     assert len(page) < 300_000
@@ -110,15 +110,15 @@ def test_pictures_are_bounded_and_the_page_says_so(result: Checked, monkeypatch:
     assert "This picture was left out" in page
 
 
-def test_a_check_is_drawn_so_often_at_most(result: Checked, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_check_is_drawn_so_often_at_most(result: CheckReport, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(quality, "PLOTS", 1)
     (gaps,) = [s for s in re.split("<h2 ", quality.render(result)) if s.startswith('id="gaps"')]
     assert gaps.count("<img") == 2, "the clock and the signal of one recording"
     assert "6 more findings of this check are not drawn" in gaps
 
 
-def test_the_place_is_marked_in_rows_of_the_file(result: Checked) -> None:
-    (stuck,) = [f for f in result.of("stuck") if f.recording]
+def test_the_place_is_marked_in_rows_of_the_file(result: CheckReport) -> None:
+    (stuck,) = [f for f in result.findings_of("stuck") if f.recording]
     info = next(r for r in result.dataset.recordings if r.id == stuck.recording)
     frames = result.dataset.read(info)
     figure = quality_figures.signals(frames, ACCEL, stuck.rows, stuck.channels)
@@ -128,7 +128,7 @@ def test_the_place_is_marked_in_rows_of_the_file(result: Checked) -> None:
     assert (span.get_x(), span.get_x() + span.get_width()) == (31, 190)
 
 
-def test_the_same_data_give_the_same_bytes(result: Checked) -> None:
+def test_the_same_data_give_the_same_bytes(result: CheckReport) -> None:
     gesture = result.dataset.gestures.labels[0]
     assert figures.png(quality.gesture_figure(result, gesture)) == figures.png(quality.gesture_figure(result, gesture))
 
@@ -140,4 +140,4 @@ def test_a_recording_of_one_row_is_drawn_without_a_word(tmp_path: Path) -> None:
     write_recording(tmp_path / "src" / "bo" / "Tap_1000000000000_1.csv", one, ACCEL)
     dataset = import_recordings(tmp_path / "src", tmp_path / "DS", layout="accel-3").dataset
     assert "<h3>Tap</h3>" in quality.render(check(dataset))
-    assert figures.png(trim_page(dataset, trims(dataset))).startswith(b"\x89PNG")
+    assert figures.png(trim_page(dataset, suggest_trims(dataset))).startswith(b"\x89PNG")

@@ -2,12 +2,12 @@ from pathlib import Path
 
 import numpy as np
 
-from plushsense.dataset.importers import import_recordings
+from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.store import Dataset
-from plushsense.dataset.trim import accept, renewed, trims
+from plushsense.dataset.trimming import accept_suggestions, refresh_trims, suggest_trims
 from plushsense.recording.simulate import simulate
-from plushsense.reports.trims import PER_PAGE, save_trims, trim_page
+from plushsense.reports.quality_figures import PER_PAGE, save_trims, trim_page
 
 
 def _dataset(folder: Path) -> Dataset:
@@ -17,10 +17,10 @@ def _dataset(folder: Path) -> Dataset:
 
 def test_dotted_where_suggested_and_solid_where_marked(tmp_path: Path) -> None:
     dataset = _dataset(tmp_path)
-    found = trims(dataset)
+    found = suggest_trims(dataset)
     seen = next(t for t in found if t.suggestion.onset_visible)
-    accept(dataset, [seen], "K")
-    (marked,) = renewed(dataset, [seen])
+    accept_suggestions(dataset, [seen], "K")
+    (marked,) = refresh_trims(dataset, [seen])
     for trim, expected in ((seen, {":"}), (marked, {":", "-"})):
         axes = trim_page(dataset, [trim], offset=False).axes[0]
         upright = [line for line in axes.lines if len(line.get_xdata()) == 2]
@@ -37,7 +37,7 @@ def test_garbage_is_a_hole_and_squeezes_nothing(tmp_path: Path) -> None:
     cells = lines[20].split("; ")
     path.write_text("\n".join([*lines[:20], "; ".join(["-30000", *cells[1:]]), *lines[21:], ""]))
     dataset = open_dataset(dataset.path)
-    axes = trim_page(dataset, trims(dataset)[:1]).axes[0]
+    axes = trim_page(dataset, suggest_trims(dataset)[:1]).axes[0]
     drawn = np.asarray(axes.lines[0].get_ydata())
     assert np.flatnonzero(np.isnan(drawn)).tolist() == [19]
     lane = [np.asarray(line.get_ydata()) for line in axes.lines if line.get_label() in dataset.layout.names[:5]]
@@ -46,7 +46,7 @@ def test_garbage_is_a_hole_and_squeezes_nothing(tmp_path: Path) -> None:
 
 def test_pages(tmp_path: Path) -> None:
     dataset = _dataset(tmp_path)
-    found = trims(dataset) * 4
+    found = suggest_trims(dataset) * 4
     assert len(found) > PER_PAGE
     assert [p.name for p in save_trims(dataset, found, tmp_path / "pages")] == ["trim-001.png", "trim-002.png"]
     (one,) = save_trims(dataset, found, tmp_path / "deep" / "one.png")

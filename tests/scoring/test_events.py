@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from plushsense.scoring.events import (
     UNNAMED,
-    Costs,
+    ErrorCosts,
     Interval,
     Tally,
     at_recall,
@@ -115,8 +115,8 @@ def test_an_affect_error_costs_more_than_a_confusion_in_the_family(event: Interv
 def test_saying_it_again_costs_a_little() -> None:
     said = [at(0, 0.5), at(1, 1.5), at(1.6, 1.8)]
     assert cost([at(0, 2)], said, ["positive"] * 3, FAMILIES, AFFECTS) == 1.0
-    assert cost([at(0, 2)], said, ["positive"] * 3, FAMILIES, AFFECTS, Costs(again=0.0)) == 0.0
-    assert cost([at(0, 2)], [], [], FAMILIES, AFFECTS) == Costs().missed
+    assert cost([at(0, 2)], said, ["positive"] * 3, FAMILIES, AFFECTS, ErrorCosts(again=0.0)) == 0.0
+    assert cost([at(0, 2)], [], [], FAMILIES, AFFECTS) == ErrorCosts().missed
 
 
 def test_uncovered_time() -> None:

@@ -6,17 +6,14 @@ import contextlib
 import importlib.util
 import os
 import shutil
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
-from browsing import CHROMIUM, DESK, Look, Studio, is_own
-from conftest import missing
+from support.browsing import CHROMIUM, DESK, Look, Studio, is_own
+from support.requirements import missing
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -27,8 +24,8 @@ def studio(tmp_path: Path) -> Iterator[Callable[..., Studio]]:
     """``studio("--device", URL, home=...)`` starts one; all are stopped at the end, and none may have failed inside."""
     begun: list[Studio] = []
 
-    def start(*options: str, home: Path | None = None) -> Studio:
-        begun.append(Studio(home or tmp_path / "home", options).start())
+    def start(*options: str, home: Path | None = None, open_files: int = 0) -> Studio:
+        begun.append(Studio(home or tmp_path / "home", options, open_files=open_files).start())
         return begun[-1]
 
     yield start

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,31 +9,27 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
-from bundles import odd_bundle
-from test_listening import until
-
-from plushsense.apps.studio.clip import PROTOCOL
-from plushsense.apps.studio.clips import LONGEST_S, Clips
-from plushsense.apps.studio.felt import Choice
-from plushsense.apps.studio.house import House
-from plushsense.apps.studio.listening import Listening
 from plushsense.core.errors import ConfigError, DatasetError
-from plushsense.core.recfile import read_recording
+from plushsense.core.recorder_csv import read_recording
+from plushsense.dataset.importing.build import ImportSummary
 from plushsense.dataset.index import open_dataset
-from plushsense.dataset.making import ImportSummary
 from plushsense.recording import writer
 from plushsense.recording.session import next_session
-from plushsense.recording.sessionfile import SESSION_LOG, read_events
+from plushsense.recording.session_files import SESSION_LOG, read_events
+from plushsense.studio.app.workspace import Workspace
+from plushsense.studio.pages.live.clips import LONGEST_S, PROTOCOL, Clips
+from plushsense.studio.pages.live.reader import LiveChoice, LiveReader
+from support.bundles import odd_bundle
+from support.waiting import until
 
 
 @pytest.fixture
-def house(tmp_path: Path) -> Iterator[House]:
+def workspace(tmp_path: Path) -> Iterator[Workspace]:
     """A studio's folder in which a virtual toy is being read at twenty times the speed."""
     bundle = odd_bundle(tmp_path / "home" / "bundles" / "one.plush")
-    made = House(tmp_path / "home", speed=20.0)
-    made.part(Listening).start(Choice("virtual://?person=31", bundle))
-    until(lambda: made.part(Listening).now.t_s > 12.0)
+    made = Workspace(tmp_path / "home", speed=20.0)
+    made.part(LiveReader).start(LiveChoice("virtual://?person=31", bundle))
+    until(lambda: made.part(LiveReader).now.t_s > 12.0)
     yield made
     made.close()
 
@@ -49,9 +44,9 @@ def virtual(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "set"
 
 
-def test_the_last_seconds_are_kept_as_they_came(house: House) -> None:
-    listening, clips = house.part(Listening), house.part(Clips)
-    key = clips.keep(listening, 10.0, " S01 ")
+def test_the_last_seconds_are_kept_as_they_came(workspace: Workspace) -> None:
+    reader, clips = workspace.part(LiveReader), workspace.part(Clips)
+    key = clips.keep(reader, 10.0, " S01 ")
     assert key == "S01/live-1"
     clip = clips.get(key)
     assert clip.head.simulated
@@ -63,30 +58,30 @@ def test_the_last_seconds_are_kept_as_they_came(house: House) -> None:
     assert clip.seconds == pytest.approx((rows.device_ms[-1] - rows.device_ms[0]) / 1000.0, abs=0.02)
     assert 9_900 <= rows.device_ms[-1] - rows.device_ms[0] <= 10_000
     # The very rows that the ring held, in the order of the toy's clock.
-    assert listening.device is not None
-    held = {f.device_ms: f.values for f in listening.device.ring.frames(60.0)}
+    assert reader.device is not None
+    held = {f.device_ms: f.values for f in reader.device.buffer.frames(60.0)}
     assert [held[int(d)] for d in rows.device_ms] == [tuple(v) for v in rows.values.tolist()]
     # Twenty times as fast as real time: rows carry the toy's time, not the computer's.
     assert rows.host_ms is not None
     assert np.abs(np.diff(rows.host_ms) - np.diff(rows.device_ms)).max() <= 1
-    assert clips.keep(listening, 5.0, "S01") == "S01/live-2"
+    assert clips.keep(reader, 5.0, "S01") == "S01/live-2"
     assert [c.key for c in clips.all()] == ["S01/live-2", "S01/live-1"]
     # No recorder takes it up as a session that it would have to go on with.
-    assert next_session(house.recordings / "S01") == "1"
+    assert next_session(workspace.recordings / "S01") == "1"
     # A log that somebody spoilt hides no other clip.
-    with (house.recordings / "S01" / "live-2" / SESSION_LOG).open("a", encoding="utf-8") as log:
+    with (workspace.recordings / "S01" / "live-2" / SESSION_LOG).open("a", encoding="utf-8") as log:
         log.write('{"what": "take", "at_ms": 1, "file": 7, "gesture": [], "rows": "many"}\n')
     assert "S01/live-1" in [c.key for c in clips.all()]
 
 
-def test_from_now_on_rows_are_on_disk_within_a_second(house: House) -> None:
-    listening, clips = house.part(Listening), house.part(Clips)
-    key = clips.begin(listening, "S01")
-    stream = house.recordings / key / "fulldatastream.csv"
+def test_from_now_on_rows_are_on_disk_within_a_second(workspace: Workspace) -> None:
+    reader, clips = workspace.part(LiveReader), workspace.part(Clips)
+    key = clips.begin(reader, "S01")
+    stream = workspace.recordings / key / "fulldatastream.csv"
     until(lambda: clips.recorded_s > 20.0)
     until(lambda: stream.read_bytes().count(b"\n") > 1500, 2.0)
     with pytest.raises(ConfigError, match="is being recorded already"):
-        clips.begin(listening, "S02")
+        clips.begin(reader, "S02")
     with pytest.raises(ConfigError, match="still being recorded"):
         clips.label(key, "Tail pull", 0, 100)
     assert clips.end() == key
@@ -98,17 +93,17 @@ def test_from_now_on_rows_are_on_disk_within_a_second(house: House) -> None:
     assert steps.max() < 60
     events = list(read_events(clip.folder))
     assert [e.what for e in events if e.what != "gap"] == ["open", "finished", "close"]
-    assert events[-1].more["rows"] == clip.rows
+    assert events[-1].details["rows"] == clip.rows
 
 
-def test_a_part_is_labelled_and_added_with_exactly_its_rows(house: House, virtual: Path) -> None:
+def test_a_part_is_labelled_and_added_with_exactly_its_rows(workspace: Workspace, virtual: Path) -> None:
     import shutil
 
-    there = house.folder / "datasets" / "virtual"
+    there = workspace.folder / "datasets" / "virtual"
     shutil.copytree(virtual, there)
-    listening, clips = house.part(Listening), house.part(Clips)
-    key = clips.keep(listening, 10.0, "S77")
-    stream = (house.recordings / key / "fulldatastream.csv").read_bytes()
+    reader, clips = workspace.part(LiveReader), workspace.part(Clips)
+    key = clips.keep(reader, 10.0, "S77")
+    stream = (workspace.recordings / key / "fulldatastream.csv").read_bytes()
     with pytest.raises(ConfigError, match="no label yet"):
         clips.add(key, there)
     label = clips.label(key, "Tail hit 1", 200, 450)
@@ -133,17 +128,17 @@ def test_a_part_is_labelled_and_added_with_exactly_its_rows(house: House, virtua
         part = rows.slice(label.first, label.last)
         assert np.array_equal(cut.values, part.values)
         assert np.array_equal(cut.device_ms, part.device_ms)
-    assert (house.recordings / key / "fulldatastream.csv").read_bytes() == stream, "the clip itself never changes"
+    assert (workspace.recordings / key / "fulldatastream.csv").read_bytes() == stream, "the clip itself never changes"
     assert clips.add(key, there).added["recordings"] == 0, "nothing twice"
 
 
-def test_what_cannot_be_is_refused_in_a_sentence(house: House, virtual: Path, tmp_path: Path) -> None:
-    listening, clips = house.part(Listening), house.part(Clips)
+def test_what_cannot_be_is_refused_in_a_sentence(workspace: Workspace, virtual: Path, tmp_path: Path) -> None:
+    reader, clips = workspace.part(LiveReader), workspace.part(Clips)
     with pytest.raises(DatasetError, match="no code for a person"):
-        clips.keep(listening, 5.0, "Anna Kalniņa")
+        clips.keep(reader, 5.0, "Anna Kalniņa")
     with pytest.raises(DatasetError, match="no code for a person"):
-        clips.begin(listening, "")
-    key = clips.keep(listening, 5.0, "S01")
+        clips.begin(reader, "")
+    key = clips.keep(reader, 5.0, "S01")
     size = clips.get(key).rows
     for first, last in ((-1, 5), (5, 5), (0, size + 1), (9, 3)):
         with pytest.raises(ConfigError, match="no part of the clip"):
@@ -160,36 +155,36 @@ def test_what_cannot_be_is_refused_in_a_sentence(house: House, virtual: Path, tm
     # A simulated clip does not go among real recordings.
     import shutil
 
-    real = house.folder / "datasets" / "real"
+    real = workspace.folder / "datasets" / "real"
     shutil.copytree(virtual, real)
     head = real / "dataset.toml"
     head.write_text(head.read_text(encoding="utf-8").replace("simulated = true", "simulated = false"), encoding="utf-8")
     with pytest.raises(DatasetError, match="virtual"):
         clips.add(key, real)
-    listening.stop()
+    reader.stop()
     with pytest.raises(ConfigError, match="No toy is being read"):
-        clips.begin(listening, "S01")
-    assert clips.keep(listening, 5.0, "S01") == "S01/live-2", "also after the end, while it is on the screen"
+        clips.begin(reader, "S01")
+    assert clips.keep(reader, 5.0, "S01") == "S01/live-2", "also after the end, while it is on the screen"
 
 
-def test_a_replay_of_a_simulation_stays_one(house: House) -> None:
-    listening, clips = house.part(Listening), house.part(Clips)
-    key = clips.keep(listening, 10.0, "S01")
-    listening.start(
-        Choice(f"replay://{(house.recordings / key).as_posix()}/fulldatastream.csv", listening.choice.bundle)
+def test_a_replay_of_a_simulation_stays_one(workspace: Workspace) -> None:
+    reader, clips = workspace.part(LiveReader), workspace.part(Clips)
+    key = clips.keep(reader, 10.0, "S01")
+    reader.start(
+        LiveChoice(f"replay://{(workspace.recordings / key).as_posix()}/fulldatastream.csv", reader.choice.bundle)
     )
-    until(lambda: not listening.now.running)
-    again = clips.get(clips.keep(listening, 5.0, "S02"))
+    until(lambda: not reader.now.running)
+    again = clips.get(clips.keep(reader, 5.0, "S02"))
     assert again.head.device.startswith("replay://")
     assert again.head.simulated
 
 
 def test_a_full_disk_ends_the_clip_with_a_sentence_and_the_toy_is_read_on(
-    house: House, monkeypatch: pytest.MonkeyPatch
+    workspace: Workspace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    listening, clips = house.part(Listening), house.part(Clips)
-    key = clips.begin(listening, "S01")
-    until(lambda: (house.recordings / key / "fulldatastream.csv").read_bytes().count(b"\n") > 300)
+    reader, clips = workspace.part(LiveReader), workspace.part(Clips)
+    key = clips.begin(reader, "S01")
+    until(lambda: (workspace.recordings / key / "fulldatastream.csv").read_bytes().count(b"\n") > 300)
 
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
@@ -199,20 +194,20 @@ def test_a_full_disk_ends_the_clip_with_a_sentence_and_the_toy_is_read_on(
     until(lambda: bool(clips.failed))
     assert "No space left" in clips.failed
     monkeypatch.undo()
-    at = listening.now.t_s
-    until(lambda: listening.now.t_s > at + 1.0)
+    at = reader.now.t_s
+    until(lambda: reader.now.t_s > at + 1.0)
     clip = clips.get(key)
     assert len(clips.rows(clip)) == clip.rows > 300
     assert clips.label(key, "Tail pull", 0, 200).gesture == "Tail pull", "what is there can be used"
 
 
-def test_a_clip_that_nobody_ends_ends_by_itself(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
-    from plushsense.apps.studio import clips as room
+def test_a_clip_that_nobody_ends_ends_by_itself(workspace: Workspace, monkeypatch: pytest.MonkeyPatch) -> None:
+    from plushsense.studio.pages.live import clips as room
 
     assert LONGEST_S >= 60.0
     monkeypatch.setattr(room, "LONGEST_S", 5.0)
-    listening, clips = house.part(Listening), house.part(Clips)
-    key = clips.begin(listening, "S01")
+    reader, clips = workspace.part(LiveReader), workspace.part(Clips)
+    key = clips.begin(reader, "S01")
     until(lambda: not clips.recording)
     time.sleep(0.2)
     assert 500 <= clips.get(key).rows < 800

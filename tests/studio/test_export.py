@@ -13,40 +13,45 @@ from typing import Any
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
 import plushsense as ps
-from exported import bundle_of, flip, sums
-from plushsense.apps.studio.downloads import below, pieces
-from plushsense.apps.studio.exports import BundleFacts, ExportFacts, digest, exports_of, formats, newest, targets
-from plushsense.apps.studio.house import EXPORTS, House
-from plushsense.apps.studio.jobs import DONE, Job, Jobs
-from plushsense.apps.studio.tasks import export as export_task
-from plushsense.apps.studio.tasks import verify as verify_task
-from plushsense.apps.studio.worker import Tell
 from plushsense.core.errors import BadInput, ConfigError
+from plushsense.studio import tasks
+from plushsense.studio.app.guard import path_in, zip_chunks
+from plushsense.studio.app.jobs import DONE, Jobs, StudioJob
+from plushsense.studio.app.worker import TaskReporter
+from plushsense.studio.app.workspace import EXPORTS, Workspace
+from plushsense.studio.pages.export.exports import (
+    BundleFacts,
+    ExportFacts,
+    exports_of,
+    folder_digest,
+    formats,
+    newest_job,
+    targets,
+)
+from support.exported import bundle_of, flip, sums
 
 
-def told(task: Any, **spec: Any) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """What a task returned, and what it told on the way."""
+def run_task(task: Any, **spec: Any) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Return the result of a task and its progress reports."""
     out = io.StringIO()
-    result = task.run(spec, Tell(out))
+    result = task(spec, TaskReporter(out))
     return result, [json.loads(line) for line in out.getvalue().splitlines()]
 
 
 @pytest.fixture
-def little(tmp_path: Path) -> House:
+def little(tmp_path: Path) -> Workspace:
     bundle_of().save(tmp_path / "home" / "bundles" / "m.plush")
-    return House(tmp_path / "home")
+    return Workspace(tmp_path / "home")
 
 
 def test_the_task_writes_what_the_library_writes(
-    little: House, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    little: Workspace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Without compilers and emulators the export stands, and says what would count.
     monkeypatch.setenv("PATH", str(tmp_path / "nothing"))
     place, bundle = little.new(EXPORTS, "one"), str(little.bundles()[0])
-    result, reports = told(export_task, bundle=bundle, place=str(place), also=[], dataset="")
+    result, reports = run_task(tasks.run_export, bundle=bundle, place=str(place), also=[], dataset="")
     ps.export(bundle, tmp_path / "two")
     assert sums(place) == sums(tmp_path / "two")
     assert set(result["files"]) == set(sums(place))
@@ -54,26 +59,29 @@ def test_the_task_writes_what_the_library_writes(
     found = ExportFacts.of(place)
     assert exports_of(little) == [place]
     assert (found.flash_bytes, found.ram_bytes) == (result["flash_bytes"], result["ram_bytes"])
-    assert result["profile"]["digest"] == found.digest == digest(place)
+    assert result["profile"]["digest"] == found.digest == folder_digest(place)
     assert "No emulator to count on" in result["profile"]["refused"]
     assert "qemu-system-arm" in result["profile"]["refused"]
     assert "gcc" in targets()["host"] and "gcc-xtensa-lx106" in targets()["xtensa"]
-    with pytest.raises(BadInput, match="overwrites nothing"):
-        told(export_task, bundle=bundle, place=str(place), also=[], dataset="")
+    with pytest.raises(BadInput, match="already holds something"):
+        run_task(tasks.run_export, bundle=bundle, place=str(place), also=[], dataset="")
 
 
-def test_a_flipped_byte_is_another_export(little: House, tmp_path: Path) -> None:
+def test_a_flipped_byte_is_another_export(little: Workspace, tmp_path: Path) -> None:
     ps.export(little.bundles()[0], tmp_path / "one")
-    before = digest(tmp_path / "one")
+    before = folder_digest(tmp_path / "one")
     flip(tmp_path / "one" / "plush_model.c")
-    assert digest(tmp_path / "one") != before
+    assert folder_digest(tmp_path / "one") != before
 
 
-def test_a_broken_export_is_found(little: House, target_here: Callable[[str], str], tmp_path: Path) -> None:
+def test_a_broken_export_is_found(little: Workspace, target_here: Callable[[str], str], tmp_path: Path) -> None:
     ps.export(little.bundles()[0], tmp_path / "one")
     flip(tmp_path / "one" / "plush_model.c")
-    result, reports = told(verify_task, place=str(tmp_path / "one"), targets=[target_here("cortex-m4")])
-    assert not result["passed"] and result["mismatches"] > 0 and result["first"]
+    spec = {"place": str(tmp_path / "one"), "targets": [target_here("cortex-m4")]}
+    with pytest.raises(BadInput, match=r"plush_model\.c in .* is not what this PlushSense writes"):
+        run_task(tasks.run_verify, **spec)
+    result, reports = run_task(tasks.run_verify, **spec, trust=True)
+    assert not result["own"] and not result["passed"] and result["mismatches"] > 0 and result["first"]
     assert "arduino/PlushSense/src/plush_model.c" in result["changed_copies"]
     assert reports[-1]["progress"]["done"] == reports[-1]["progress"]["total"]
 
@@ -89,11 +97,11 @@ def test_facts_of_bundles(tmp_path: Path) -> None:
     assert BundleFacts.of(tmp_path / "none.plush").problem.startswith("There is no bundle")
 
 
-def test_a_zip_on_the_way(little: House) -> None:
+def test_a_zip_on_the_way(little: Workspace) -> None:
     place = little.new(EXPORTS, "ā one")
     ps.export(little.bundles()[0], place)
-    packed = b"".join(pieces(place))
-    assert packed == b"".join(pieces(place))
+    packed = b"".join(zip_chunks(place))
+    assert packed == b"".join(zip_chunks(place))
     with zipfile.ZipFile(io.BytesIO(packed)) as archive:
         assert archive.testzip() is None
         got = {n.removeprefix("ā one/"): hashlib.sha256(archive.read(n)).hexdigest() for n in archive.namelist()}
@@ -101,31 +109,31 @@ def test_a_zip_on_the_way(little: House) -> None:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="links need rights there")
-def test_a_link_takes_nothing_along(little: House, tmp_path: Path) -> None:
+def test_a_link_takes_nothing_along(little: Workspace, tmp_path: Path) -> None:
     place = little.new(EXPORTS, "one")
     ps.export(little.bundles()[0], place)
     (tmp_path / "secret").write_text("secret")
     (place / "golden" / "secret").symlink_to(tmp_path / "secret")
-    with zipfile.ZipFile(io.BytesIO(b"".join(pieces(place)))) as archive:
+    with zipfile.ZipFile(io.BytesIO(b"".join(zip_chunks(place)))) as archive:
         assert "one/golden/secret" not in archive.namelist()
     (little.folder / EXPORTS / "away").symlink_to(tmp_path)
     for name in ("away", "..", ".", "../bundles"):
         with pytest.raises(ConfigError):
-            below(little, EXPORTS, name)
+            path_in(little, EXPORTS, name)
 
 
 def test_formats_that_lack_something(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("plushsense.apps.studio.exports.importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("plushsense.studio.pages.export.exports.importlib.util.find_spec", lambda name: None)
     assert formats()["onnx-int8"] == "onnx" and formats()["tflite"] == "tflite" and formats()["espdl-esp32"] == "espdl"
 
 
-def test_the_newest_work_on_a_place(little: House) -> None:
+def test_the_newest_work_on_a_place(little: Workspace) -> None:
     work = little.folder / "work"
     work.mkdir()
     for n, (place, state) in enumerate([("a", DONE), ("b", DONE), ("a", "stopped")]):
-        job = Job(str(n), "verify", {"place": str(little.folder / place)}, "t", state=state)
-        (work / f"{n}.json").write_text(json.dumps(vars(job)))
+        job = StudioJob(str(n), "verify", {"place": str(little.folder / place)}, "t", state=state)
+        (work / f"{n}.json").write_text(json.dumps({k: v for k, v in vars(job).items() if k != "message"}))
     jobs = little.part(Jobs)
-    found = newest(jobs, "verify", little.folder / "a")
+    found = newest_job(jobs, "verify", little.folder / "a")
     assert found is not None and found.id == "0"
-    assert newest(jobs, "export", little.folder / "a") is None
+    assert newest_job(jobs, "export", little.folder / "a") is None

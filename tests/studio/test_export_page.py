@@ -15,9 +15,8 @@ from typing import Any
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from browsing import TABLET, axe, connected, marked
-from exported import bundle_of, flip, sums
+from support.browsing import TABLET, axe, connected, marked
+from support.exported import bundle_of, flip, sums
 
 Fixture = Callable[..., Any]
 
@@ -45,7 +44,7 @@ def test_export_verify_and_break(
     marked(page, "name").fill("one")
     marked(page, "do").click()
     marked(page, "export-facts").wait_for(timeout=60_000)
-    command = [sys.executable, "-m", "plushsense.apps.cli.main", "export", str(home / "bundles" / "little.plush")]
+    command = [sys.executable, "-m", "plushsense.cli.main", "export", str(home / "bundles" / "little.plush")]
     subprocess.run([*command, str(tmp_path / "two")], check=True, capture_output=True)
     assert sums(home / "exports" / "one") == sums(tmp_path / "two")
     assert "8,330 bytes" in marked(page, "export-facts").inner_text()
@@ -65,7 +64,7 @@ def test_export_verify_and_break(
     marked(page, "verdict").wait_for(timeout=90_000)
     assert "✓ equal" in marked(page, "verdict").inner_text()
     assert "sanitizers" in marked(page, "runs").inner_text() and "clang" in marked(page, "runs").inner_text()
-    assert "drill" in marked(page, "streams").inner_text()
+    assert "scenario" in marked(page, "streams").inner_text()
     assert "✓ equal" in marked(page, "exports").inner_text()
     assert axe(page) == []
     shots(page, "export-verified")
@@ -75,6 +74,11 @@ def test_export_verify_and_break(
     connected(page)
     assert "changed since" in marked(page, "exports").inner_text(), "the old verdict is no longer shown as one"
     only(page, "cortex-m4")
+    marked(page, "verify").click()
+    page.get_by_text("plush_model.c in").first.wait_for(timeout=90_000)
+    assert "is not what this PlushSense writes" in marked(page, "ended").inner_text()
+    marked(page, "proof").get_by_text("More choices").click()
+    marked(page, "trust").click()
     marked(page, "verify").click()
     page.get_by_text("✗ not equal").first.wait_for(timeout=90_000)
     said = marked(page, "verdict").inner_text()
@@ -139,7 +143,7 @@ def test_each_refusal_is_a_sentence(studio: Fixture, look: Fixture, shots: Fixtu
     (home / "exports").write_text("")
     marked(page, "name").fill("nowhere")
     marked(page, "do").click()
-    page.get_by_text("cannot be written").wait_for(timeout=90_000)
+    page.get_by_text("cannot be created").first.wait_for(timeout=90_000)
     page.goto(f"{url}/export?name=nothing")
     connected(page)
     marked(page, "detail").get_by_text("There is no export").wait_for()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import http.client
-import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -11,11 +10,10 @@ from urllib.parse import parse_qs, urlsplit
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from browsing import Studio, alone, marked
-from conftest import missing
-from plushsense.apps.studio import guard
-from plushsense.apps.studio.guard import BODY_BYTES, CONTENT_POLICY, COOKIE, UPLOAD_BYTES, Guard, Visitors, is_loopback
+from plushsense.studio.app import guard
+from plushsense.studio.app.guard import BODY_BYTES, CONTENT_POLICY, COOKIE, UPLOAD_BYTES, Guard, Visitors, is_loopback
+from support.browsing import Studio, alone, marked
+from support.requirements import missing
 
 Fixture = Callable[..., Any]
 Answer = tuple[int, dict[str, str], bytes]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -11,12 +10,10 @@ from typing import Any
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
-from browsing import DESK, TABLET, axe, marked
-from plushsense.apps.api import simulate
-from plushsense.apps.studio.house import DATASETS, House
-from recorded import record
+from plushsense.studio.app.workspace import DATASETS, Workspace
+from plushsense.workflow.api import simulate
+from support.browsing import DESK, TABLET, axe, marked
+from support.recorded import record
 
 Fixture = Callable[..., Any]
 LONG_MS = 90_000
@@ -43,7 +40,7 @@ def test_from_nothing_to_a_data_set_by_one_click(studio: Fixture, look: Fixture,
     assert "virtual toy" in marked(page, "next-sentence").inner_text()
     marked(page, "next-button").click()
     page.get_by_text("A data set is being made").wait_for()
-    # Work goes on without the page, and is there again on the next.
+    # WorkSection goes on without the page, and is there again on the next.
     page.reload()
     marked(page, "job-done").wait_for(timeout=LONG_MS)
     sentence = marked(page, "next-sentence")
@@ -75,8 +72,8 @@ def test_stopping_work(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
 
 
 def test_sessions_become_a_data_set_and_what_is_new_is_added(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
-    house = House(tmp_path / "home")
-    record(house, "S01")
+    workspace = Workspace(tmp_path / "home")
+    record(workspace, "S01")
     url = studio().url
     browser = look(TABLET)
     page = browser.open(url)
@@ -93,7 +90,7 @@ def test_sessions_become_a_data_set_and_what_is_new_is_added(studio: Fixture, lo
     marked(page, "dataset").get_by_text("recordings: 4").wait_for()
     assert marked(page, "said").count() == 0
     marked(page, "sessions").get_by_text("in the data set “autumn”").wait_for()
-    record(house, "S02")
+    record(workspace, "S02")
     page.reload()
     marked(page, "add").click()
     marked(page, "job-done").get_by_text("new: 4").wait_for()
@@ -166,6 +163,17 @@ def test_recordings_come_in_as_a_zip(studio: Fixture, look: Fixture, tmp_path: P
     assert sorted(p.name for p in (home / DATASETS).iterdir()) == ["brought"]
     assert list((home / "work" / "incoming").iterdir()) == []
     assert not (tmp_path / "outside.csv").exists()
+    assert browser.complaints == []
+
+
+def test_the_button_opens_the_file_chooser(studio: Fixture, look: Fixture, furniture: Path, tmp_path: Path) -> None:
+    browser = look()
+    page = browser.open(studio().url)
+    with page.expect_file_chooser() as choosing:
+        page.get_by_role("button", name="Choose a .zip or .plush file").click()
+    choosing.value.set_files(furniture / "bundles" / "little.plush")
+    marked(page, "said").get_by_text("is here").wait_for()
+    assert [p.name for p in (tmp_path / "home" / "bundles").iterdir()] == ["little.plush"]
     assert browser.complaints == []
 
 

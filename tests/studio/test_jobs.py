@@ -13,28 +13,28 @@ from pathlib import Path
 
 import pytest
 
-from plushsense.apps.studio.house import WORK, House
-from plushsense.apps.studio.jobs import DONE, INCOMING, REFUSED, RUNNING, STOPPED, UNFINISHED, Job, Jobs
 from plushsense.core.errors import ConfigError
+from plushsense.studio.app.jobs import DONE, INCOMING, REFUSED, RUNNING, STOPPED, UNFINISHED, Jobs, StudioJob
+from plushsense.studio.app.workspace import WORK, Workspace
 
 SIMULATE = {"people": 2, "repetitions": 1}
 LONG = {"people": 400, "repetitions": 3}
 
 
 @pytest.fixture
-def house(tmp_path: Path) -> House:
-    return House(tmp_path / "home")
+def workspace(tmp_path: Path) -> Workspace:
+    return Workspace(tmp_path / "home")
 
 
 @pytest.fixture
-def jobs(house: House) -> Iterator[Jobs]:
-    made = Jobs(house)
+def jobs(workspace: Workspace) -> Iterator[Jobs]:
+    made = Jobs(workspace)
     yield made
     made.close()
 
 
-def spec(house: House, name: str, size: dict[str, int]) -> dict[str, object]:
-    return {**size, "dest": str(house.folder / "datasets" / name), "work": str(house.folder / WORK)}
+def spec(workspace: Workspace, name: str, size: dict[str, int]) -> dict[str, object]:
+    return {**size, "dest": str(workspace.folder / "datasets" / name), "work": str(workspace.folder / WORK)}
 
 
 def until(what: Callable[[], object], seconds: float = 60.0) -> None:
@@ -44,13 +44,13 @@ def until(what: Callable[[], object], seconds: float = 60.0) -> None:
         time.sleep(0.02)
 
 
-def ended(job: Job) -> Job:
+def ended(job: StudioJob) -> StudioJob:
     until(lambda: job.state != RUNNING)
     return job
 
 
-def on_disk(house: House, job: Job) -> dict[str, object]:
-    read: dict[str, object] = json.loads((house.folder / WORK / f"{job.id}.json").read_text(encoding="utf-8"))
+def on_disk(workspace: Workspace, job: StudioJob) -> dict[str, object]:
+    read: dict[str, object] = json.loads((workspace.folder / WORK / f"{job.id}.json").read_text(encoding="utf-8"))
     return read
 
 
@@ -65,37 +65,37 @@ def alive(pid: int) -> bool:
     return True
 
 
-def test_work_reports_and_ends_with_its_result(house: House, jobs: Jobs) -> None:
-    job = ended(jobs.start("simulate", spec(house, "a", SIMULATE), "Trying"))
-    assert job.state == DONE, job.said
+def test_work_reports_and_ends_with_its_result(workspace: Workspace, jobs: Jobs) -> None:
+    job = ended(jobs.start("simulate", spec(workspace, "a", SIMULATE), "Trying"))
+    assert job.state == DONE, job.message
     assert job.result["people"] == 2
-    assert (house.folder / "datasets" / "a" / "dataset.toml").is_file()
+    assert (workspace.folder / "datasets" / "a" / "dataset.toml").is_file()
     assert {r["what"] for r in job.reports} == {"recording", "importing"}
     assert job.progress == job.reports[-1]
     assert 0 < job.begun_s <= job.ended_s
-    until(lambda: on_disk(house, job)["state"] == DONE)
-    assert [p for p in (house.folder / WORK).iterdir() if p.name.startswith(UNFINISHED)] == []
+    until(lambda: on_disk(workspace, job)["state"] == DONE)
+    assert [p for p in (workspace.folder / WORK).iterdir() if p.name.startswith(UNFINISHED)] == []
     # Another studio on the same folder knows of it.
-    again = Jobs(house).get(job.id)
+    again = Jobs(workspace).get(job.id)
     assert (again.state, again.result, again.title) == (DONE, job.result, "Trying")
 
 
-def test_what_a_task_refuses_is_a_sentence(house: House, jobs: Jobs) -> None:
-    job = ended(jobs.start("check", {"dataset": str(house.folder / "nothing")}, "Check"))
+def test_what_a_task_refuses_is_a_sentence(workspace: Workspace, jobs: Jobs) -> None:
+    job = ended(jobs.start("check", {"dataset": str(workspace.folder / "nothing")}, "Check"))
     assert job.state == REFUSED
-    assert job.said.startswith("There is no folder")
-    until(lambda: on_disk(house, job)["state"] == REFUSED)
+    assert job.message.startswith("There is no folder")
+    until(lambda: on_disk(workspace, job)["state"] == REFUSED)
 
 
 @pytest.mark.parametrize(("task", "asked"), [("nothing", {}), ("check", {}), ("simulate", {"people": "many"})])
 def test_a_task_that_cannot_be_is_refused(jobs: Jobs, task: str, asked: dict[str, object]) -> None:
     job = ended(jobs.start(task, asked, "x"))
     assert job.state == REFUSED
-    assert job.said.startswith("The work broke off")
+    assert job.message.startswith("The work broke off")
 
 
-def test_stopped_work_ends_soon_and_can_be_begun_again(house: House, jobs: Jobs) -> None:
-    job = jobs.start("simulate", spec(house, "long", LONG), "Long")
+def test_stopped_work_ends_soon_and_can_be_begun_again(workspace: Workspace, jobs: Jobs) -> None:
+    job = jobs.start("simulate", spec(workspace, "long", LONG), "Long")
     until(lambda: job.progress)
     assert jobs.resume(job.id) is job
     with pytest.raises(ConfigError, match="stop it first"):
@@ -103,18 +103,18 @@ def test_stopped_work_ends_soon_and_can_be_begun_again(house: House, jobs: Jobs)
     jobs.stop(job.id)
     ended(job)
     assert job.state == STOPPED
-    assert not (house.folder / "datasets" / "long").exists()
+    assert not (workspace.folder / "datasets" / "long").exists()
     jobs.stop(job.id)
-    job.spec = spec(house, "long", SIMULATE)
+    job.spec = spec(workspace, "long", SIMULATE)
     jobs.resume(job.id)
     assert ended(job).state == DONE
     jobs.drop(job.id)
-    assert jobs.all() == [] and not (house.folder / WORK / f"{job.id}.json").exists()
+    assert jobs.all() == [] and not (workspace.folder / WORK / f"{job.id}.json").exists()
 
 
-def test_closing_stops_everything(house: House) -> None:
-    jobs = Jobs(house)
-    two = [jobs.start("simulate", spec(house, f"long {n}", LONG), "Long") for n in range(2)]
+def test_closing_stops_everything(workspace: Workspace) -> None:
+    jobs = Jobs(workspace)
+    two = [jobs.start("simulate", spec(workspace, f"long {n}", LONG), "Long") for n in range(2)]
     for job in two:
         until(lambda job=job: job.progress)
     jobs.close()
@@ -123,7 +123,7 @@ def test_closing_stops_everything(house: House) -> None:
 
 
 def test_ids_are_unique_in_order_also_when_the_clock_goes_back(
-    house: House, jobs: Jobs, monkeypatch: pytest.MonkeyPatch
+    workspace: Workspace, jobs: Jobs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(time, "time_ns", lambda: 5_000_000_000)
     made = [jobs.start("check", {}, str(n)) for n in range(3)]
@@ -138,21 +138,21 @@ def test_ids_are_unique_in_order_also_when_the_clock_goes_back(
 
 def test_an_id_that_is_none_is_refused(jobs: Jobs) -> None:
     for call in (jobs.get, jobs.resume, jobs.drop):
-        with pytest.raises(ConfigError, match="no work"):
+        with pytest.raises(ConfigError, match="no job"):
             call("nothing")
     jobs.stop("nothing")
 
 
-def test_files_that_nobody_waits_for_are_removed(house: House) -> None:
-    sent = house.folder / WORK / INCOMING
+def test_files_that_nobody_waits_for_are_removed(workspace: Workspace) -> None:
+    sent = workspace.folder / WORK / INCOMING
     sent.mkdir(parents=True)
     for name in ("half.zip", "imported.zip", "stopped.zip"):
         (sent / name).write_bytes(b"PK")
     for number, state, name in ((1, DONE, "imported.zip"), (2, RUNNING, "stopped.zip")):
         spec = {"archive": str(sent / name)}
         job = {"id": str(number), "task": "import", "spec": spec, "title": name, "state": state}
-        (house.folder / WORK / f"{number}.json").write_text(json.dumps(job), encoding="utf-8")
-    assert [j.state for j in Jobs(house).all()] == [STOPPED, DONE]
+        (workspace.folder / WORK / f"{number}.json").write_text(json.dumps(job), encoding="utf-8")
+    assert [j.state for j in Jobs(workspace).all()] == [STOPPED, DONE]
     assert [p.name for p in sent.iterdir()] == ["stopped.zip"]
 
 
@@ -161,44 +161,44 @@ def test_files_that_nobody_waits_for_are_removed(house: House) -> None:
     ["", "{", "[]", "7", "null", '{"id": "bad"}', "[" * 100_000, '{"id":"other","task":"check","spec":{},"title":""}'],
     ids=lambda t: ascii(t)[:12],
 )
-def test_a_broken_file_is_passed_over(house: House, text: str) -> None:
-    (house.folder / WORK).mkdir(parents=True)
-    (house.folder / WORK / "bad.json").write_text(text, encoding="utf-8")
+def test_a_broken_file_is_passed_over(workspace: Workspace, text: str) -> None:
+    (workspace.folder / WORK).mkdir(parents=True)
+    (workspace.folder / WORK / "bad.json").write_text(text, encoding="utf-8")
     good = {"id": "1", "task": "check", "spec": {}, "title": "x", "state": DONE}
-    (house.folder / WORK / "1.json").write_text(json.dumps(good), encoding="utf-8")
-    assert [j.id for j in Jobs(house).all()] == ["1"]
-    assert (house.folder / WORK / "bad.json").exists()
+    (workspace.folder / WORK / "1.json").write_text(json.dumps(good), encoding="utf-8")
+    assert [j.id for j in Jobs(workspace).all()] == ["1"]
+    assert (workspace.folder / WORK / "bad.json").exists()
 
 
 @pytest.mark.skipif(sys.platform == "win32" or os.geteuid() == 0, reason="the folder could be written to all the same")
-def test_a_folder_that_cannot_be_written_to(house: House) -> None:
-    house.folder.mkdir()
-    house.folder.chmod(0o500)
+def test_a_folder_that_cannot_be_written_to(workspace: Workspace) -> None:
+    workspace.folder.mkdir()
+    workspace.folder.chmod(0o500)
     try:
-        job = Jobs(house).start("check", {"dataset": "x"}, "Check")
+        job = Jobs(workspace).start("check", {"dataset": "x"}, "Check")
         assert job.state == REFUSED
-        assert "cannot begin" in job.said and "Permission" in job.said
+        assert "cannot begin" in job.message and "Permission" in job.message
     finally:
-        house.folder.chmod(0o700)
+        workspace.folder.chmod(0o700)
 
 
-def test_a_file_where_the_folder_should_be(house: House) -> None:
-    house.folder.mkdir()
-    (house.folder / WORK).write_text("a file")
-    job = Jobs(house).start("check", {"dataset": "x"}, "Check")
+def test_a_file_where_the_folder_should_be(workspace: Workspace) -> None:
+    workspace.folder.mkdir()
+    (workspace.folder / WORK).write_text("a file")
+    job = Jobs(workspace).start("check", {"dataset": "x"}, "Check")
     assert job.state == REFUSED
-    assert str(house.folder / WORK) in job.said
+    assert str(workspace.folder / WORK) in job.message
 
 
 STUDIO = """
 import sys, time
 from pathlib import Path
-from plushsense.apps.studio.house import House
-from plushsense.apps.studio.jobs import Jobs
-house = House(Path(sys.argv[1]))
-jobs = Jobs(house)
-job = jobs.start("simulate", {"people": 400, "repetitions": 3, "dest": str(house.folder / "d"),
-                              "work": str(house.folder / "work")}, "Long")
+from plushsense.studio.app.workspace import Workspace
+from plushsense.studio.app.jobs import Jobs
+workspace = Workspace(Path(sys.argv[1]))
+jobs = Jobs(workspace)
+job = jobs.start("simulate", {"people": 400, "repetitions": 3, "dest": str(workspace.folder / "d"),
+                              "work": str(workspace.folder / "work")}, "Long")
 while not job.progress:
     time.sleep(0.02)
 print(job.id, jobs._processes[job.id].pid, flush=True)
@@ -207,10 +207,10 @@ time.sleep(600)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="kill is for POSIX")
-def test_the_work_of_a_killed_studio_ends_and_reads_as_stopped(house: House) -> None:
-    house.folder.mkdir()
+def test_the_work_of_a_killed_studio_ends_and_reads_as_stopped(workspace: Workspace) -> None:
+    workspace.folder.mkdir()
     studio = subprocess.Popen(
-        [sys.executable, "-c", STUDIO, str(house.folder)], stdout=subprocess.PIPE, text=True, env=os.environ
+        [sys.executable, "-c", STUDIO, str(workspace.folder)], stdout=subprocess.PIPE, text=True, env=os.environ
     )
     assert studio.stdout is not None
     identity, pid = studio.stdout.readline().split()
@@ -219,22 +219,23 @@ def test_the_work_of_a_killed_studio_ends_and_reads_as_stopped(house: House) -> 
     studio.wait()
     studio.stdout.close()
     until(lambda: not alive(int(pid)))
-    assert list((house.folder / WORK).glob(f"{UNFINISHED}*"))
-    jobs = Jobs(house)
+    assert list((workspace.folder / WORK).glob(f"{UNFINISHED}*"))
+    jobs = Jobs(workspace)
     assert jobs.get(identity).state == STOPPED
-    assert not (house.folder / "d").exists()
-    assert not list((house.folder / WORK).glob(f"{UNFINISHED}*"))
+    assert not (workspace.folder / "d").exists()
+    assert not list((workspace.folder / WORK).glob(f"{UNFINISHED}*"))
 
 
 WORKER_WITH_CHILD = """
-import subprocess, sys, types
-from plushsense.apps.studio import worker
-def run(spec, tell):
+import subprocess, sys
+from plushsense.studio import tasks
+from plushsense.studio.app import worker
+def run(spec, reporter):
     child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
-    tell.progress(pid=child.pid)
+    reporter.progress(pid=child.pid)
     child.wait()
-sys.modules["task_with_child"] = types.SimpleNamespace(run=run)
-worker.TASKS["child"] = "task_with_child"
+tasks.run_child = run
+worker.TASKS["child"] = "run_child"
 sys.exit(worker.main())
 """
 
@@ -262,7 +263,7 @@ def test_a_worker_ends_with_its_studio_and_takes_its_own_processes_along() -> No
 @pytest.mark.parametrize("line", ["\n", "nonsense\n", "[]\n", '{"task": 5, "spec": {}}\n'])
 def test_a_worker_that_is_asked_nonsense_refuses(line: str) -> None:
     worker = subprocess.Popen(
-        [sys.executable, "-m", "plushsense.apps.studio.worker"],
+        [sys.executable, "-m", "plushsense.studio.app.worker"],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -278,23 +279,28 @@ def test_a_worker_that_is_asked_nonsense_refuses(line: str) -> None:
     worker.stdout.close()
 
 
-def test_names_that_may_not_be_left_anywhere_are_not_left_in_the_work_folder(house: House, jobs: Jobs) -> None:
-    place = str(house.folder / "datasets" / "copy")
-    given = {"dataset": str(house.folder), "place": place, "key": str(house.folder / "key"), "words": ["Annabelle"]}
+def test_names_that_may_not_be_left_anywhere_are_not_left_in_the_work_folder(workspace: Workspace, jobs: Jobs) -> None:
+    place = str(workspace.folder / "datasets" / "copy")
+    given = {
+        "dataset": str(workspace.folder),
+        "place": place,
+        "key": str(workspace.folder / "key"),
+        "words": ["Annabelle"],
+    }
     job = ended(jobs.start("pseudonymise", given, "Copy"))
     assert job.state == REFUSED and job.spec["words"] == ["Annabelle"]
-    assert not [p for p in house.folder.rglob("*") if p.is_file() and "Annabelle" in p.read_text(encoding="utf-8")]
+    assert not [p for p in workspace.folder.rglob("*") if p.is_file() and "Annabelle" in p.read_text(encoding="utf-8")]
     # A studio that was started again has them no more: doing without would leave the names in.
-    later = Jobs(house)
+    later = Jobs(workspace)
     again = ended(later.resume(job.id))
-    assert (again.state, again.said) == (
+    assert (again.state, again.message) == (
         REFUSED,
         "Words that may not be left anywhere are not kept: give them again on the publish page.",
     )
 
 
-def test_what_only_looks_is_not_kept(house: House, jobs: Jobs) -> None:
-    job = ended(jobs.start("train", {"dataset": str(house.folder), "dry": True}, "Looking"))
-    assert job.state == REFUSED and job.said
+def test_what_only_looks_is_not_kept(workspace: Workspace, jobs: Jobs) -> None:
+    job = ended(jobs.start("train", {"dataset": str(workspace.folder), "dry": True}, "Looking"))
+    assert job.state == REFUSED and job.message
     until(lambda: job not in jobs.all())
-    assert not list((house.folder / WORK).glob("*.json"))
+    assert not list((workspace.folder / WORK).glob("*.json"))

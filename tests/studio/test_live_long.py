@@ -8,7 +8,6 @@ another machine rounds otherwise. A desk runs two minutes of them, CI all ten.
 from __future__ import annotations
 
 import os
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -16,17 +15,14 @@ from typing import Any
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-sys.path.insert(0, str(Path(__file__).parents[2] / "bench"))
-
 import studio as bench
-from browsing import marked
-from plushsense.apps.engines import classifier_of
 from plushsense.core.gestures import load_gestures
 from plushsense.devices.opening import open_device
 from plushsense.devices.virtual.device import VirtualDevice
-from plushsense.live.loop import run
+from plushsense.live.loop import run_live
 from plushsense.models.bundle import Bundle
+from plushsense.workflow.export import classifier_of
+from support.browsing import marked
 
 Fixture = Callable[..., Any]
 SPEED = 6.0
@@ -57,7 +53,7 @@ def played(bundle: Bundle) -> tuple[list[tuple[str, float, float]], list[tuple[f
     with open_device(f"{TOY}&speed=0&seconds={TOY_S:g}", bundle.layout) as device:
         assert isinstance(device, VirtualDevice)
         events: dict[int, tuple[float, str, str | None]] = {}
-        for decision in run(device, classifier_of(bundle, None, "float")):
+        for decision in run_live(device, classifier_of(bundle, None, "float")):
             for e in decision.events:
                 events[e.number] = (events.get(e.number, (e.since_s,))[0], e.affect, e.gesture)
         zero = device.first_ms or 0

@@ -12,15 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-sys.path.insert(0, str(Path(__file__).parent))
-from bundles import OTHER, odd_bundle
-
-from browsing import DESK, TABLET, Look, Studio, axe, connected, marked
-from plushsense.apps.studio.clips import Clips
-from plushsense.apps.studio.house import House
-from plushsense.core.recfile import read_recording
+from plushsense.core.recorder_csv import read_recording
 from plushsense.dataset.index import open_dataset
+from plushsense.studio.app.workspace import Workspace
+from plushsense.studio.pages.live.clips import Clips
+from support.browsing import DESK, TABLET, Look, Studio, axe, connected, marked
+from support.bundles import OTHER, odd_bundle
 
 Fixture = Callable[..., Any]
 VIRTUAL = ("--device", "virtual://?person=31", "--speed", "2")
@@ -149,7 +146,7 @@ def toy() -> Iterator[Callable[[int], tuple[subprocess.Popen[str], str]]]:
     begun: list[subprocess.Popen[str]] = []
 
     def begin(port: int = 0) -> tuple[subprocess.Popen[str], str]:
-        command = [sys.executable, "-m", "plushsense.apps.cli.main", "toy", "--tcp", str(port), "--json"]
+        command = [sys.executable, "-m", "plushsense.cli.main", "toy", "--tcp", str(port), "--json"]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
         begun.append(process)
         assert process.stdout is not None
@@ -243,7 +240,7 @@ def test_a_hard_case_is_kept_labelled_and_in_the_data_set(
     over = marked(page, "clip-plot").locator(".u-over")
     over.wait_for()
     over.scroll_into_view_if_needed()
-    rows = Clips(House(home)).rows(Clips(House(home)).get("S77/live-1"))
+    rows = Clips(Workspace(home)).rows(Clips(Workspace(home)).get("S77/live-1"))
     seconds = (rows.device_ms - rows.device_ms[0]) / 1000.0
     box = over.bounding_box()
     for share in (0.3, 0.7):

@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import shutil
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from plushsense.apps.api import simulate
-from plushsense.apps.studio.house import BUNDLES, DATASETS, WORK, House
-from plushsense.apps.studio.overview import BundleSeen, DatasetSeen, Overview, Seen, SessionSeen, next_step
-from plushsense.apps.studio.tasks import importing
-from plushsense.apps.studio.worker import Tell
 from plushsense.dataset.marks import Mark, append_marks
-from recorded import record
+from plushsense.studio import tasks
+from plushsense.studio.app.worker import TaskReporter
+from plushsense.studio.app.workspace import BUNDLES, DATASETS, WORK, Workspace
+from plushsense.studio.pages.home.overview import (
+    BundleEntry,
+    DatasetEntry,
+    Overview,
+    SessionEntry,
+    WorkspaceSummary,
+    next_step,
+)
+from plushsense.workflow.api import simulate
+from support.recorded import record
 
 
 class Quiet:
@@ -27,52 +32,52 @@ class Quiet:
         pass
 
 
-TELL = Tell(Quiet())
+REPORTER = TaskReporter(Quiet())
 
 
-def take_in(house: House, sessions: list[Path], name: str, **more: Any) -> dict[str, Any]:
+def take_in(workspace: Workspace, sessions: list[Path], name: str, **more: Any) -> dict[str, Any]:
     spec = {
         "sessions": [str(s) for s in sessions],
-        "recordings": str(house.recordings),
-        "work": str(house.folder / WORK),
-        "dest": str(house.folder / DATASETS / name),
+        "recordings": str(workspace.recordings),
+        "work": str(workspace.folder / WORK),
+        "dest": str(workspace.folder / DATASETS / name),
         "name": name,
         **more,
     }
-    return importing.run(spec, TELL)
+    return tasks.run_import(spec, REPORTER)
 
 
 def test_sessions_wait_until_a_data_set_holds_all_of_them(tmp_path: Path) -> None:
-    house = House(tmp_path / "home")
-    overview = Overview(house)
-    assert overview.look() == Seen()
-    first, second = record(house, "S01"), record(house, "S02")
-    raw = {p: p.read_bytes() for p in house.recordings.rglob("*") if p.is_file()}
+    workspace = Workspace(tmp_path / "home")
+    overview = Overview(workspace)
+    assert overview.look() == WorkspaceSummary()
+    first, second = record(workspace, "S01"), record(workspace, "S02")
+    raw = {p: p.read_bytes() for p in workspace.recordings.rglob("*") if p.is_file()}
     seen = overview.look()
     assert [(s.subject, s.session, s.recordings, s.finished, s.waiting) for s in seen.sessions] == [
         ("S01", "1", 4, True, True),
         ("S02", "1", 4, True, True),
     ]
     assert next_step(seen).about == {"n": 2, "recordings": 8}
-    done = take_in(house, [first], "mine")
+    done = take_in(workspace, [first], "mine")
     assert (done["recordings"], done["rejected"]) == (4, [])
     seen = overview.look()
     assert [s.kept for s in seen.sessions] == [("mine",), ()]
     assert (seen.datasets[0].people, seen.datasets[0].recordings, seen.datasets[0].simulated) == (1, 4, True)
-    done = take_in(house, [first, second], "mine", add=True)
+    done = take_in(workspace, [first, second], "mine", add=True)
     assert done["added"]["recordings"] == 4
     seen = overview.look()
     assert not any(s.waiting for s in seen.sessions)
     assert seen.datasets[0].recordings == 8
-    assert {p: p.read_bytes() for p in house.recordings.rglob("*") if p.is_file()} == raw
-    assert list((house.folder / WORK).iterdir()) == []
+    assert {p: p.read_bytes() for p in workspace.recordings.rglob("*") if p.is_file()} == raw
+    assert list((workspace.folder / WORK).iterdir()) == []
 
 
 def test_real_and_virtual_sessions_are_kept_apart(tmp_path: Path) -> None:
-    house = House(tmp_path / "home")
-    record(house, "S01")
-    record(house, "S02", simulated=False)
-    batches = Overview(house).look().batches()
+    workspace = Workspace(tmp_path / "home")
+    record(workspace, "S01")
+    record(workspace, "S02", simulated=False)
+    batches = Overview(workspace).look().batches()
     assert [[s.subject for s in b] for b in batches] == [["S02"], ["S01"]]
 
 
@@ -88,7 +93,7 @@ def test_what_cannot_be_read_is_listed_with_its_sentence(furniture: Path, tmp_pa
     (home / BUNDLES / "bad.plush").write_bytes(b"nothing")
     (home / "recordings" / "S01" / "1").mkdir(parents=True)
     (home / "recordings" / "S01" / "1" / "session.json").write_text("{")
-    seen = Overview(House(home)).look()
+    seen = Overview(Workspace(home)).look()
     assert {d.path.name for d in seen.datasets if d.refused} == {"head", "empty", "index", "bytes"}
     assert all(d.refused.endswith((".", ")")) for d in seen.datasets if d.refused)
     assert [d.recordings for d in seen.datasets if not d.refused] == [119]
@@ -101,7 +106,7 @@ def test_what_cannot_be_read_is_listed_with_its_sentence(furniture: Path, tmp_pa
 
 def test_changes_on_disk_are_seen(furniture: Path, tmp_path: Path) -> None:
     home = Path(shutil.copytree(furniture, tmp_path / "home"))
-    overview = Overview(House(home))
+    overview = Overview(Workspace(home))
     before = overview.look().datasets[0]
     assert not before.reviewed and before.bytes > 1_000_000
     dataset = home / DATASETS / "virtual"
@@ -115,51 +120,51 @@ def test_changes_on_disk_are_seen(furniture: Path, tmp_path: Path) -> None:
 
 def test_a_simulation_imported_from_elsewhere_stays_one(tmp_path: Path) -> None:
     simulate(tmp_path / "made", people=2, repetitions=1, dataset=tmp_path / "home" / DATASETS / "v")
-    assert Overview(House(tmp_path / "home")).look().datasets[0].simulated
+    assert Overview(Workspace(tmp_path / "home")).look().datasets[0].simulated
 
 
-REAL = DatasetSeen(Path("d"), "real", recordings=9)
-LOOKED = DatasetSeen(Path("d"), "real", recordings=9, reviewed=True)
-ALONE = DatasetSeen(Path("a"), "alone", people=1, recordings=4, reviewed=True)
-MANY = DatasetSeen(Path("v"), "many", people=6, recordings=50, reviewed=True)
-TRIED = DatasetSeen(Path("v"), "virtual", simulated=True, recordings=9)
-BROKEN = DatasetSeen(Path("b"), "broken", "It is broken.")
-NET = BundleSeen(Path("m.plush"), "m")
-TOY_NET = BundleSeen(Path("v.plush"), "v", simulated=True)
-BROKEN_NET = BundleSeen(Path("b.plush"), "b", refused="It is broken.")
-OPEN = SessionSeen(Path("s"), "S01", "1")
-MADE = SessionSeen(Path("s"), "S01", "1", recordings=4)
-KEPT = SessionSeen(Path("s"), "S01", "1", recordings=4, finished=True, kept=("real",))
+REAL = DatasetEntry(Path("d"), "real", recordings=9)
+LOOKED = DatasetEntry(Path("d"), "real", recordings=9, reviewed=True)
+ALONE = DatasetEntry(Path("a"), "alone", people=1, recordings=4, reviewed=True)
+MANY = DatasetEntry(Path("v"), "many", people=6, recordings=50, reviewed=True)
+TRIED = DatasetEntry(Path("v"), "virtual", simulated=True, recordings=9)
+BROKEN = DatasetEntry(Path("b"), "broken", "It is broken.")
+NET = BundleEntry(Path("m.plush"), "m")
+TOY_NET = BundleEntry(Path("v.plush"), "v", simulated=True)
+BROKEN_NET = BundleEntry(Path("b.plush"), "b", refused="It is broken.")
+OPEN = SessionEntry(Path("s"), "S01", "1")
+MADE = SessionEntry(Path("s"), "S01", "1", recordings=4)
+KEPT = SessionEntry(Path("s"), "S01", "1", recordings=4, finished=True, kept=("real",))
 
 
 @pytest.mark.parametrize(
     ("seen", "toy", "key", "page"),
     [
-        (Seen(), "", "try", ""),
-        (Seen(), "virtual://", "try", ""),
-        (Seen(), "serial://COM3", "record", "record"),
-        (Seen(sessions=(OPEN,)), "", "go_on", "record"),
-        (Seen(sessions=(MADE,)), "", "collect", ""),
-        (Seen(datasets=(LOOKED,), sessions=(MADE,), bundles=(NET,)), "", "collect", ""),
-        (Seen(datasets=(BROKEN,)), "", "try", ""),
-        (Seen(datasets=(BROKEN, REAL)), "", "review", "review"),
-        (Seen(datasets=(REAL,), sessions=(KEPT,)), "", "review", "review"),
-        (Seen(datasets=(LOOKED,)), "", "train", "train"),
-        (Seen(datasets=(ALONE,)), "", "more", "record"),
-        (Seen(datasets=(ALONE, MANY)), "", "train", "train"),
-        (Seen(datasets=(TRIED,)), "", "train", "train"),
-        (Seen(datasets=(TRIED,), bundles=(TOY_NET,)), "", "live", "live"),
-        (Seen(datasets=(TRIED, REAL), bundles=(TOY_NET,)), "", "review", "review"),
-        (Seen(datasets=(REAL,), bundles=(NET,)), "", "live", "live"),
-        (Seen(bundles=(NET,)), "", "live", "live"),
-        (Seen(bundles=(BROKEN_NET,)), "", "try", ""),
-        (Seen(datasets=(LOOKED,), bundles=(BROKEN_NET,)), "", "train", "train"),
+        (WorkspaceSummary(), "", "try", ""),
+        (WorkspaceSummary(), "virtual://", "try", ""),
+        (WorkspaceSummary(), "serial://COM3", "record", "record"),
+        (WorkspaceSummary(sessions=(OPEN,)), "", "go_on", "record"),
+        (WorkspaceSummary(sessions=(MADE,)), "", "collect", ""),
+        (WorkspaceSummary(datasets=(LOOKED,), sessions=(MADE,), bundles=(NET,)), "", "collect", ""),
+        (WorkspaceSummary(datasets=(BROKEN,)), "", "try", ""),
+        (WorkspaceSummary(datasets=(BROKEN, REAL)), "", "review", "review"),
+        (WorkspaceSummary(datasets=(REAL,), sessions=(KEPT,)), "", "review", "review"),
+        (WorkspaceSummary(datasets=(LOOKED,)), "", "train", "train"),
+        (WorkspaceSummary(datasets=(ALONE,)), "", "more", "record"),
+        (WorkspaceSummary(datasets=(ALONE, MANY)), "", "train", "train"),
+        (WorkspaceSummary(datasets=(TRIED,)), "", "train", "train"),
+        (WorkspaceSummary(datasets=(TRIED,), bundles=(TOY_NET,)), "", "live", "live"),
+        (WorkspaceSummary(datasets=(TRIED, REAL), bundles=(TOY_NET,)), "", "review", "review"),
+        (WorkspaceSummary(datasets=(REAL,), bundles=(NET,)), "", "live", "live"),
+        (WorkspaceSummary(bundles=(NET,)), "", "live", "live"),
+        (WorkspaceSummary(bundles=(BROKEN_NET,)), "", "try", ""),
+        (WorkspaceSummary(datasets=(LOOKED,), bundles=(BROKEN_NET,)), "", "train", "train"),
     ],
 )
-def test_what_to_do_next(seen: Seen, toy: str, key: str, page: str) -> None:
+def test_what_to_do_next(seen: WorkspaceSummary, toy: str, key: str, page: str) -> None:
     step = next_step(seen, toy=toy, virtual=toy.startswith("virtual"))
     assert (step.key, step.page) == (key, page)
 
 
 def test_while_a_data_set_is_made_nothing_else_is_next() -> None:
-    assert next_step(Seen(), making=True).key == "making"
+    assert next_step(WorkspaceSummary(), making=True).key == "making"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,9 +11,8 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from plushsense.apps.studio.pictures import LARGEST, has_picture, own_picture, picture
 from plushsense.core.gestures import load_gestures
+from plushsense.studio.widgets.pictures import LARGEST, has_picture, own_picture, picture
 
 LABELS = load_gestures("plush-18").labels
 SVG = "{http://www.w3.org/2000/svg}"

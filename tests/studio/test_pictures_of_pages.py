@@ -9,7 +9,6 @@ from __future__ import annotations
 import io
 import os
 import shutil
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,14 +16,13 @@ from typing import Any
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
 import plushsense as ps
-from browsing import DESK, TABLET, Look, Studio, axe, connected, marked
-from conftest import missing
-from plushsense.apps.studio.house import House
-from plushsense.apps.studio.shell import PAGES
-from recorded import record
-from recording_pages import begun, sat, showing
+from plushsense.studio.app.shell import PAGES
+from plushsense.studio.app.workspace import Workspace
+from support.browsing import DESK, TABLET, Look, Studio, axe, connected, marked
+from support.recorded import record
+from support.recording_pages import begun, sat, showing
+from support.requirements import missing
 
 Fixture = Callable[..., Any]
 KEPT = os.environ.get("PLUSHSENSE_SHOTS", "")
@@ -152,7 +150,7 @@ _CUT = """() => {
 def furnished(furniture: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Studio]:
     """One studio for all pictures: a data set, a bundle, a session, a toy at ten times the speed."""
     home = Path(shutil.copytree(furniture, tmp_path_factory.mktemp("pictures") / "home"))
-    record(House(home), "S01")
+    record(Workspace(home), "S01")
     data = home / "datasets" / "virtual"
     ps.evaluate(
         data, split="by-subject:3", preset="loso", epochs=8, workers=1, out=data / "evaluations" / "by-subject-3"

@@ -7,43 +7,47 @@ import json
 import os
 import shutil
 import sys
-import threading
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from plushsense.apps.studio.house import PACKAGES, House
-from plushsense.apps.studio.jobs import DONE, Job, Jobs
-from plushsense.apps.studio.packages import DatasetFacts, PackageFacts, missing_extras, packages_of
-from plushsense.apps.studio.pages.publish_package import checked_by, recognised
-from plushsense.apps.studio.tasks import pseudonymise as pseudonymise_task
-from plushsense.apps.studio.tasks import publish as publish_task
-from plushsense.apps.studio.tasks import validate as validate_task
-from plushsense.apps.studio.words import LANGUAGES, Words
-from plushsense.apps.studio.worker import Tell
 from plushsense.core.errors import DatasetError
-from plushsense.dataset.keyfile import is_drawn
 from plushsense.dataset.people import PEOPLE
-from plushsense.dataset.publish.checking import VALIDATORS
+from plushsense.dataset.privacy.pseudonyms import is_drawn
+from plushsense.dataset.publishing.checking import VALIDATORS
+from plushsense.studio import tasks
+from plushsense.studio.app.jobs import DONE, Jobs, StudioJob
+from plushsense.studio.app.words import LANGUAGES, Words
+from plushsense.studio.app.worker import TaskReporter
+from plushsense.studio.app.workspace import PACKAGES, Workspace
+from plushsense.studio.pages.publish.packages import (
+    DatasetFacts,
+    PackageFacts,
+    missing_extras,
+    newest_validation,
+    packages_of,
+    reidentification_text,
+)
 
 SAID = {"licence": "CC-BY-4.0", "contact": "Ada <ada@example.org>", "consent": "all agreed"}
 
 
-def told(task: Any, **spec: Any) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """What a task returned, and what it told on the way."""
+def run_task(task: Any, **spec: Any) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Return the result of a task and its progress reports."""
     out = io.StringIO()
-    result = task.run(spec, Tell(out))
+    result = task(spec, TaskReporter(out))
     return result, [json.loads(line) for line in out.getvalue().splitlines()]
 
 
 def test_pseudonyms_then_the_advice_is_gone(few: Path) -> None:
-    house = House(few)
-    found = DatasetFacts.of(house.datasets()[0])
+    workspace = Workspace(few)
+    found = DatasetFacts.of(workspace.datasets()[0])
     assert (found.people, found.recordings, found.simulated, found.problem) == (3, 9, True, "")
     assert found.own_codes == ("P01", "P02", "P03") and found.own_dates
-    place, key = house.new("datasets", "shared"), house.folder / "keys" / "people.csv"
-    result, reports = told(pseudonymise_task, dataset=str(found.path), place=str(place), key=str(key), words=[])
+    place, key = workspace.new("datasets", "shared"), workspace.folder / "keys" / "people.csv"
+    spec = {"dataset": str(found.path), "place": str(place), "key": str(key), "words": []}
+    result, reports = run_task(tasks.run_pseudonymise, **spec)
     renamed = DatasetFacts.of(place)
     assert (renamed.own_codes, renamed.own_dates, renamed.recordings) == ((), False, 9)
     assert reports[-1]["progress"] == {"stage": "rewriting", "done": 9, "total": 9}
@@ -65,43 +69,52 @@ def test_columns_and_a_broken_data_set(few: Path) -> None:
     assert "has the format 9" in DatasetFacts.of(folder).problem
 
 
-def test_a_package_by_the_tasks(few: Path, publish_tools: None) -> None:
-    house = House(few)
-    place, key = house.new(PACKAGES, "one"), house.folder / "keys" / "virtual.key"
-    spec = {"dataset": str(house.datasets()[0]), "place": str(place), "key": str(key), "reidentification": False}
+def test_a_package_by_the_tasks(few: Path, publish_tools: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    workspace = Workspace(few)
+    place, key = workspace.new(PACKAGES, "one"), workspace.folder / "keys" / "virtual.key"
+    spec = {"dataset": str(workspace.datasets()[0]), "place": str(place), "key": str(key), "reidentification": False}
     # Where the statements cannot be kept, the package stands all the same, and says so.
-    (house.datasets()[0] / f"dataset.toml.{os.getpid()}-{threading.get_ident()}.part").mkdir()
-    result, reports = told(publish_task, **spec, **SAID, save=True)
+    head, replace = workspace.datasets()[0] / "dataset.toml", os.replace
+
+    def refuse(source: Path, target: Path) -> None:
+        if target == head:
+            raise OSError(28, "No space left on device")
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", refuse)
+    result, reports = run_task(tasks.run_publish, **spec, **SAID, save=True)
     assert any("could not be written into" in said for said in result["warnings"])
     assert result["valid"] and [v["validator"] for v in result["validators"]] == list(VALIDATORS)
     stages = {r["progress"]["stage"] for r in reports}
     assert "writing" in stages and "validating: croissant" in stages
-    found = PackageFacts.of(house, "one")
-    assert packages_of(house) == ["one"] and found.place == place.with_name("one.zip")
+    found = PackageFacts.of(workspace, "one")
+    assert packages_of(workspace) == ["one"] and found.place == place.with_name("one.zip")
     assert "Ada (" in found.citation and found.simulated and found.reidentification == {}
     assert found.contents["data/recordings/"][0] == 9
     assert sum(files for files, _ in found.contents.values()) == result["files"]
     with pytest.raises(DatasetError, match="already holds something"):
-        told(publish_task, **spec, **SAID)
+        run_task(tasks.run_publish, **spec, **SAID)
     with pytest.raises(DatasetError, match="lies in"):
-        told(publish_task, **{**spec, "place": f"{place}2", "key": str(house.datasets()[0] / "k")}, **SAID)
+        run_task(tasks.run_publish, **{**spec, "place": f"{place}2", "key": str(workspace.datasets()[0] / "k")}, **SAID)
     # The zip alone says the same; a damaged folder is found out.
     (place / "gestures.csv").write_text("Shake\n", "utf-8")
-    assert not told(validate_task, place=str(place))[0]["valid"]
+    assert not run_task(tasks.run_validate, place=str(place))[0]["valid"]
     shutil.rmtree(place)
-    alone = PackageFacts.of(house, "one")
+    alone = PackageFacts.of(workspace, "one")
     assert (alone.folder, alone.citation, alone.contents) == (None, found.citation, found.contents)
     work = few / "work"
     work.mkdir()
-    job = Job("1", "validate", {"place": str(alone.place)}, "t", state=DONE, ended_s=alone.made_s + 5)
-    old = Job("0", "publish", {"place": str(place)}, "t", state=DONE, ended_s=alone.made_s - 60)
+    job = StudioJob("1", "validate", {"place": str(alone.place)}, "t", state=DONE, ended_s=alone.made_s + 5)
+    old = StudioJob("0", "publish", {"place": str(place)}, "t", state=DONE, ended_s=alone.made_s - 60)
     for each in (old, job):
         (work / f"{each.id}.json").write_text(json.dumps(vars(each)))
-    proved = checked_by(house.part(Jobs), alone)
+    proved = newest_validation(workspace.part(Jobs), alone)
     assert proved is not None and proved.id == "1"
     job.ended_s = alone.made_s - 30
     (work / "1.json").write_text(json.dumps(vars(job)))
-    assert checked_by(Jobs(house), alone) is None, "what was proved before it was made anew is not shown as its proof"
+    assert newest_validation(Jobs(workspace), alone) is None, (
+        "what was proved before it was made anew is not shown as its proof"
+    )
 
 
 def trial(design: str, sees: str, mean: float, low: float) -> dict[str, Any]:
@@ -113,14 +126,16 @@ def trial(design: str, sees: str, mean: float, low: float) -> dict[str, Any]:
 def test_what_the_figures_mean(language: str) -> None:
     words = Words(language)
     trials = [trial("recordings", "everything", 0.929, 0.884), trial("gestures", "everything", 0.532, 0.44)]
-    said = recognised(words, {"trials": trials, "simulated": False})
+    said = reidentification_text(words, {"trials": trials, "simulated": False})
     assert "93" in said[0] and "27" in said[0] and "88" in said[0] and "3.7" in said[0] and "53" in said[1]
     assert words("publish.means_personal") in said and words("publish.no_sessions") in said
-    guessed = recognised(words, {"trials": [trial("recordings", "everything", 0.04, 0.01)], "simulated": False})
+    guessed = reidentification_text(
+        words, {"trials": [trial("recordings", "everything", 0.04, 0.01)], "simulated": False}
+    )
     assert words("publish.means_guessing") in guessed
-    virtual = recognised(words, {"trials": trials, "simulated": True})
+    virtual = reidentification_text(words, {"trials": trials, "simulated": True})
     assert words("publish.means_simulated") in virtual and words("publish.means_personal") not in virtual
-    assert recognised(words, {}) == [words("publish.nobody_looked")]
+    assert reidentification_text(words, {}) == [words("publish.nobody_looked")]
 
 
 def test_every_validator_has_words() -> None:
@@ -128,5 +143,5 @@ def test_every_validator_has_words() -> None:
 
 
 def test_missing_extras(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("plushsense.apps.studio.packages.importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("plushsense.studio.pages.publish.packages.importlib.util.find_spec", lambda name: None)
     assert missing_extras() == ["publish", "baselines"]

@@ -12,9 +12,8 @@ from typing import Any
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from browsing import TABLET, axe, connected, marked
-from plushsense.dataset.publish.checking import VALIDATORS
+from plushsense.dataset.publishing.checking import VALIDATORS
+from support.browsing import TABLET, axe, connected, marked
 
 Fixture = Callable[..., Any]
 pytestmark = pytest.mark.usefixtures("publish_tools")
@@ -50,7 +49,7 @@ def test_publish_check_and_break(studio: Fixture, look: Fixture, shots: Fixture,
     assert axe(page) == []
     shots(page, "publish-done")
     key, made = few / "keys" / "virtual.key", few / "packages" / "one.zip"
-    command = [sys.executable, "-m", "plushsense.apps.cli.main", "publish", str(few / "datasets" / "virtual")]
+    command = [sys.executable, "-m", "plushsense.cli.main", "publish", str(few / "datasets" / "virtual")]
     said = ("--contact", "Ada <ada@example.org>", "--key", str(key))
     subprocess.run([*command, str(tmp_path / "two"), *said], check=True, capture_output=True)
     assert made.read_bytes() == (tmp_path / "two.zip").read_bytes(), "the command makes the same package, byte for byte"
@@ -121,7 +120,7 @@ def test_pseudonyms_refusals_and_stop(studio: Fixture, look: Fixture, shots: Fix
     assert marked(page, "contact-mail").input_value() == "ada@example.org"
     marked(page, "with-reidentification").click()
     marked(page, "do").click()
-    marked(page, "ended").get_by_text("cannot be made").wait_for(timeout=60_000)
+    marked(page, "ended").get_by_text("cannot be created").wait_for(timeout=60_000)
     page.goto(f"{url}/publish?name=nothing")
     connected(page)
     assert "There is no package 'nothing'" in marked(page, "said").inner_text()

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import sys
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from browsing import DESK, TABLET, axe, connected, marked
-from recording_pages import CALM, begun, choose, events, files, heard, sat, showing, take, until, whats
+import pytest
+
+from support.browsing import DESK, TABLET, axe, connected, marked
+from support.recording_pages import CALM, begun, choose, events, files, heard, sat, showing, take, until, whats
 
 if TYPE_CHECKING:
     from playwright.sync_api import WebSocketRoute
@@ -59,7 +60,7 @@ def test_what_is_typed_is_no_command(studio: Fixture, look: Fixture, tmp_path: P
     assert marked(page, "note").input_value() == "so soft, paws & bears"
     page.keyboard.press("Enter")
     until(lambda: "note" in whats(tmp_path / "home"))
-    note = next(e.more for e in events(tmp_path / "home") if e.what == "note")
+    note = next(e.details for e in events(tmp_path / "home") if e.what == "note")
     assert (note["text"], note["gesture"]) == ("so soft, paws & bears", "Head stroke 1")
     assert note["file"].startswith("Back stroke 1_")
     assert showing(page, "").startswith("idle.1.1.0.0")
@@ -89,7 +90,7 @@ def test_redo_skip_back_pause_and_going_to_a_step(studio: Fixture, look: Fixture
     assert shown.evaluate("async image => { await image.decode(); return image.naturalWidth }") == 32
     assert shown.get_attribute("alt") == "Picture: Back stroke 1"
     take(page, 0)
-    first = events(tmp_path / "home")[-1].more["file"]
+    first = events(tmp_path / "home")[-1].details["file"]
     assert marked(page, "last").inner_text() == f"Last: {first}"
     page.keyboard.press("r")
     showing(page, "idle.0.0.0.1")
@@ -131,6 +132,15 @@ def test_redo_skip_back_pause_and_going_to_a_step(studio: Fixture, look: Fixture
     showing(page, "paused.2.")
     page.keyboard.press("p")
     showing(page, "idle.2.")
+    # A pause breaks off what is running, and going on asks for it again.
+    page.keyboard.press("Space")
+    showing(page, "recording.2.")
+    assert marked(page, "pause").inner_text() == "Break off and pause"
+    marked(page, "pause").click()
+    showing(page, "paused.2.2.0.0")
+    assert "made again" in marked(page, "message").inner_text()
+    marked(page, "main").click()
+    showing(page, "idle.2.2.0.0")
     assert len(files(tmp_path / "home")) == 2
     assert browser.complaints == []
 
@@ -203,6 +213,7 @@ def test_a_lost_connection_loses_nothing(studio: Fixture, look: Fixture, tmp_pat
     browser.context.set_offline(True)
     page.evaluate("() => window.socket.io.engine.close()")
     page.wait_for_function("() => !window.socket.connected")
+    marked(page, "connection-lost").get_by_text("CONNECTION TO THE STUDIO LOST").wait_for()
     # Nobody hears these, now or later.
     for _ in range(3):
         page.keyboard.press("Space")
@@ -212,6 +223,8 @@ def test_a_lost_connection_loses_nothing(studio: Fixture, look: Fixture, tmp_pat
     page.wait_for_function("() => window.socket && window.socket.connected")
     connected(page)
     showing(page, "recording.0.", "idle.1.")
+    marked(page, "state-box").wait_for()
+    assert marked(page, "connection-lost").inner_text() == ""
     if showing(page, "").startswith("recording"):
         page.keyboard.press("Space")
     showing(page, "idle.1.1.0.0")
@@ -225,6 +238,35 @@ def test_a_lost_connection_loses_nothing(studio: Fixture, look: Fixture, tmp_pat
     heard(page)
     assert showing(page, "idle.") == "idle.2.2.0.0"
     assert "Nobody stopped it" in marked(page, "message").inner_text()
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="Windows cannot stop a process for a while")
+def test_a_studio_that_is_gone_is_not_shown_as_recording(studio: Fixture, look: Fixture, shots: Fixture) -> None:
+    server, browser = studio("--device", CALM), look()
+    page = begun(browser.open(server.url + "/record"), server.url, "S01")
+    showing(page, "idle.0.")
+    page.keyboard.press("Space")
+    showing(page, "recording.0.")
+    marked(page, "state").get_by_text("RECORDING. Press again").wait_for()
+    assert axe(page) == []
+    # One that stands still keeps the connection open and answers nothing.
+    server.process.send_signal(signal.SIGSTOP)
+    lost = page.get_by_role("alert").get_by_text("It is not known whether it is still recording")
+    lost.wait_for()
+    server.process.send_signal(signal.SIGCONT)
+    lost.wait_for(state="detached")
+    marked(page, "state").get_by_text("RECORDING. Press again").wait_for()
+    server.kill()
+    lost.wait_for()
+    for name in ("state-box", "number", "main", "signal"):
+        assert not marked(page, name).is_visible()
+    assert axe(page) == []
+    shots(page, "record_lost")
+    server.start()
+    # Another process knows nothing of this page, which is loaded again: what was broken off is to be taken up.
+    page.get_by_text("Unfinished sessions").wait_for()
+    assert lost.count() == 0
+    assert not [c for c in browser.complaints if "Failed to" not in c and "WebSocket" not in c]
 
 
 def test_it_speaks_latvian_and_fits_a_tablet(studio: Fixture, look: Fixture, shots: Fixture, tmp_path: Path) -> None:

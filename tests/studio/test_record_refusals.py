@@ -11,16 +11,15 @@ from typing import Any
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from browsing import axe, connected, marked
-from plushsense.core.recfile import STREAM_NAME, read_stream
-from plushsense.core.signal import load_layout
+from plushsense.core.layouts import load_layout
+from plushsense.core.recorder_csv import STREAM_NAME, read_stream
 from plushsense.devices.opening import open_device
-from plushsense.devices.toy import serve_tcp
+from plushsense.devices.virtual.server import serve_tcp
 from plushsense.devices.virtual.stream import ToySpec
 from plushsense.recording.session import OpenSession
-from pty_toys import QUIET, pty_toy
-from recording_pages import CALM, begun, choose, files, heard, sat, showing, take, until, whats
+from support.browsing import axe, connected, marked
+from support.pty_toys import QUIET, pty_toy
+from support.recording_pages import CALM, begun, choose, files, heard, sat, showing, take, until, whats
 
 Fixture = Callable[..., Any]
 

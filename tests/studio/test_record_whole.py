@@ -3,7 +3,6 @@ and the server killed on the way."""
 
 from __future__ import annotations
 
-import sys
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -11,13 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from browsing import connected, marked
-from plushsense.core.recfile import parse_name
+from plushsense.core.recorder_csv import parse_name
 from plushsense.devices.virtual.session import GESTURES
-from plushsense.recording.sessionfile import SESSION_LOG, SessionHead, read_events
-from pty_toys import check_whole, pty_toy, recordings
-from recording_pages import showing
+from plushsense.recording.session_files import SESSION_LOG, SessionHead, read_events
+from support.browsing import connected, marked
+from support.pty_toys import check_whole, pty_toy, recordings
+from support.recording_pages import showing
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from browsing import DESK, TABLET, axe, connected, marked
-from plushsense.apps.studio.house import House
-from plushsense.apps.studio.reviews import Reviews
-from plushsense.dataset.importers import import_recordings
+from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks, read_marks
-from plushsense.dataset.trim import seconds_of_rows, trims
-from reviewed import ROW_S, made, marks, raw_hash
+from plushsense.dataset.trimming import row_times_s, suggest_trims
+from plushsense.studio.app.workspace import Workspace
+from plushsense.studio.pages.review.selection import Reviews
+from support.browsing import DESK, TABLET, axe, connected, marked
+from support.reviewed import ROW_S, made, marks, raw_hash
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -124,8 +122,8 @@ def test_a_click_moves_the_mark_to_within_a_sample(
     assert set(standing) == set(wanted)
     infos = {r.id: r for r in dataset.recordings}
     for identity, (begin_s, end_s) in wanted.items():
-        seconds = seconds_of_rows(dataset.read(infos[identity]))
-        begin = next(r for r in trims(dataset, [infos[identity]])).shown()
+        seconds = row_times_s(dataset.read(infos[identity]))
+        begin = next(r for r in suggest_trims(dataset, [infos[identity]])).current_rows()
         at = (read_marks(waves)[identity].start, read_marks(waves)[identity].stop)
         assert at == begin
         assert abs(at[0] * ROW_S - begin_s) <= ROW_S, (identity, at, begin_s)
@@ -146,7 +144,7 @@ def wait_for_kept(page: Page, stop_s: float) -> None:
 
 def test_twenty_recordings_by_keyboard_alone(waves: Path, studio: Fixture, look: Fixture) -> None:
     before = raw_hash(waves)
-    suggestions = {t.recording.id: t for t in trims(open_dataset(waves))}
+    suggestions = {t.recording.id: t for t in suggest_trims(open_dataset(waves))}
     browser = look()
     page = browser.open(studio(home=waves.parents[1]).url + "/review")
     page.wait_for_selector("[data-test=table] tbody tr")
@@ -394,7 +392,7 @@ def test_one_recording_has_no_violation_in_any_light(
 def test_links_from_other_pages(waves: Path, studio: Fixture, look: Fixture) -> None:
     started = studio(home=waves.parents[1])
     ids = [r.id for r in open_dataset(waves).recordings if r.gesture == "Wave"]
-    reviews = Reviews(House(waves.parents[1]))
+    reviews = Reviews(Workspace(waves.parents[1]))
     browser = look()
     page = browser.open(started.url + reviews.address(waves, ids[3:6], "Wave taken for Rest"))
     page.wait_for_function("() => document.querySelectorAll('[data-test=table] tbody tr').length === 3")

@@ -2,40 +2,37 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from plushsense.apps.studio import review_prepared
-from plushsense.apps.studio.house import House
-from plushsense.apps.studio.review_filter import DONE, NO_FINDING, TO_DO, Filter, chosen
-from plushsense.apps.studio.review_shown import ACTIVITY, ALL
-from plushsense.apps.studio.reviewing import Review
-from plushsense.apps.studio.reviews import Reviews
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.dataset.index import open_dataset
-from plushsense.dataset.marks import Mark, Standing, append_marks, read_marks
-from plushsense.dataset.trim import trims
-from reviewed import ROW_S, made, marks, raw_hash
+from plushsense.dataset.marks import Mark, MarkState, append_marks, read_marks
+from plushsense.dataset.trimming import suggest_trims
+from plushsense.studio.app.workspace import Workspace
+from plushsense.studio.pages.review import preparation as review_prepared
+from plushsense.studio.pages.review.plots import ACTIVITY, ALL
+from plushsense.studio.pages.review.review import Review
+from plushsense.studio.pages.review.selection import DONE, NO_FINDING, TO_DO, RecordingFilter, Reviews, filter_and_sort
+from support.reviewed import ROW_S, made, marks, raw_hash
 
 ME, VISIT = "me", "visit"
 
 
 @pytest.fixture
-def house(tmp_path: Path) -> Iterator[House]:
+def workspace(tmp_path: Path) -> Iterator[Workspace]:
     made(tmp_path / "home" / "datasets" / "waves", people=2, waves=5)
-    house = House(tmp_path / "home")
-    yield house
-    house.close()
+    workspace = Workspace(tmp_path / "home")
+    yield workspace
+    workspace.close()
 
 
 @pytest.fixture
-def review(house: House) -> Review:
-    review = house.part(Reviews).open("datasets/waves")
+def review(workspace: Workspace) -> Review:
+    review = workspace.part(Reviews).open("datasets/waves")
     review.prepared.wait(60.0)
     assert review.prepared.checked is not None
     return review
@@ -47,18 +44,20 @@ def waves(review: Review) -> list[str]:
 
 def test_what_is_suggested_is_the_librarys(review: Review) -> None:
     dataset = open_dataset(review.path)
-    for trim in trims(dataset):
+    for trim in suggest_trims(dataset):
         assert review.trim(trim.recording.id).suggestion == trim.suggestion
         row = review.rows[trim.recording.id]
         assert row.state == trim.state
         assert row.seconds == pytest.approx(trim.seconds[-1], abs=0.02)
 
 
-def test_suggestions_are_kept_and_not_made_again(house: House, review: Review, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_suggestions_are_kept_and_not_made_again(
+    workspace: Workspace, review: Review, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def refuse(*args: object) -> None:
         raise AssertionError("made again although nothing changed")
 
-    monkeypatch.setattr(review_prepared, "trims", refuse)
+    monkeypatch.setattr(review_prepared, "suggest_trims", refuse)
     again = Review(review.path)
     again.prepared.wait(60.0)
     assert again.prepared.suggestions == review.prepared.suggestions
@@ -86,7 +85,7 @@ def test_accepting_marks_the_suggestion_and_undo_brings_all_back(review: Review)
     while (last := review.undo(VISIT, ME)) is not None:
         undone.append(last.recording)
     assert undone == [third, second, first]
-    assert all(s == Standing() for s in read_marks(review.path).values())
+    assert all(s == MarkState() for s in read_marks(review.path).values())
     assert len(marks(review.path)) == 6, "nothing is ever taken out of the file"
     assert raw_hash(review.path) == before
 
@@ -99,14 +98,14 @@ def test_undo_restores_an_older_mark_by_hand(review: Review) -> None:
     assert review.accept(VISIT, first, ME)
     assert read_marks(review.path)[first].start == 30
     review.undo(VISIT, ME)
-    assert read_marks(review.path)[first] == Standing(start=7, stop=99, how="hand")
+    assert read_marks(review.path)[first] == MarkState(start=7, stop=99, how="hand")
 
 
 def test_where_no_start_is_visible_all_of_it_is_kept_by_hand(review: Review) -> None:
     rest = next(i for i in review.infos if i not in waves(review))
     assert review.rows[rest].state == "none"
     assert review.accept(VISIT, rest, ME)
-    assert review.standing(rest) == Standing(how="hand")
+    assert review.standing(rest) == MarkState(how="hand")
     assert review.rows[rest].done
 
 
@@ -126,7 +125,7 @@ def test_two_windows_do_not_fight(review: Review) -> None:
         review.undo("left", ME)
     assert review.standing(second).start == 44
     assert review.undo("left", ME) is not None, "excluding does not touch the trim"
-    assert review.standing(first) == Standing(excluded=True)
+    assert review.standing(first) == MarkState(excluded=True)
 
 
 def test_marks_of_other_programs_are_seen(review: Review) -> None:
@@ -148,9 +147,9 @@ def test_drafts_stay_inside_and_keep_something(review: Review) -> None:
     review.set(first, stop=10_000)
     assert review.draft(first) is None, "the end is there already"
     review.set(first, start=-5)
-    assert review.shown(first) == (0, 250)
+    assert review.kept_rows(first) == (0, 250)
     assert review.drop(first)
-    assert review.shown(first) == (start, 250)
+    assert review.kept_rows(first) == (start, 250)
     review.exclude(VISIT, first, ME, "odd")
     with pytest.raises(DatasetError, match="take it back in"):
         review.set(first, start=3)
@@ -194,48 +193,48 @@ def test_filters_and_sorting(review: Review) -> None:
     review.accept(VISIT, first, ME)
     rows = review.rows
     every = list(rows)
-    assert chosen(rows.values(), Filter()) == sorted(every)
-    assert chosen(rows.values(), Filter(state=DONE)) == [first]
-    assert len(chosen(rows.values(), Filter(state=TO_DO))) == len(every) - 1
-    assert {rows[i].info.subject for i in chosen(rows.values(), Filter(person="P1"))} == {"P1"}
-    assert chosen(rows.values(), Filter(text=first.upper())) == [first]
+    assert filter_and_sort(rows.values(), RecordingFilter()) == sorted(every)
+    assert filter_and_sort(rows.values(), RecordingFilter(state=DONE)) == [first]
+    assert len(filter_and_sort(rows.values(), RecordingFilter(state=TO_DO))) == len(every) - 1
+    assert {rows[i].info.subject for i in filter_and_sort(rows.values(), RecordingFilter(person="P1"))} == {"P1"}
+    assert filter_and_sort(rows.values(), RecordingFilter(text=first.upper())) == [first]
     longest = max(rows.values(), key=lambda r: r.seconds).id
-    assert chosen(rows.values(), Filter(), by="seconds", down=True)[0] == longest
-    assert longest in chosen(rows.values(), Filter(check="duration", severity="warning"))
-    assert longest not in chosen(rows.values(), Filter(severity=NO_FINDING))
-    assert chosen(rows.values(), Filter(), only=[first, "no such"]) == [first]
-    assert Filter.of({"state": "nonsense", "person": "P1", "x": "y"}) == Filter(person="P1")
+    assert filter_and_sort(rows.values(), RecordingFilter(), by="seconds", down=True)[0] == longest
+    assert longest in filter_and_sort(rows.values(), RecordingFilter(check="duration", severity="warning"))
+    assert longest not in filter_and_sort(rows.values(), RecordingFilter(severity=NO_FINDING))
+    assert filter_and_sort(rows.values(), RecordingFilter(), only=[first, "no such"]) == [first]
+    assert RecordingFilter.of({"state": "nonsense", "person": "P1", "x": "y"}) == RecordingFilter(person="P1")
 
 
 def test_what_is_drawn_is_what_was_recorded(review: Review) -> None:
     first = waves(review)[0]
     read = review.signals(first)
-    shown = read.shown(ALL)
+    shown = read.curves(ALL)
     frames = review.dataset.read(review.infos[first])
     assert np.array_equal(np.array(shown["curves"]).T[-len(frames) :], frames.values)
     assert shown["unit"] == "count"
     assert read.row_at(0.123) == 12 and read.row_at(99.0) == 250 and read.row_at(-3.0) == 0
-    assert len(read.shown(ACTIVITY)["x"]) == 250
+    assert len(read.curves(ACTIVITY)["x"]) == 250
     assert read.seconds[1] == pytest.approx(ROW_S)
 
 
-def test_long_recordings_are_thinned_to_their_extremes(house: House) -> None:
-    from plushsense.apps.studio.review_shown import Signals
-    from reviewed import recording
+def test_long_recordings_are_thinned_to_their_extremes(workspace: Workspace) -> None:
+    from plushsense.studio.pages.review.plots import RecordingSignals
+    from support.reviewed import recording
 
     frames = recording(1, 6000, rows=20_000)
     values = frames.values.astype(float)
     values[12_345, 0] = 99_999.0
     values[500:520] = np.nan
     at = np.arange(20_000) * ROW_S
-    info = open_dataset(house.folder / "datasets" / "waves").recordings[0]
-    layout = open_dataset(house.folder / "datasets" / "waves").layout
-    read = Signals(info, layout, np.append(at, 200.0), at, values, np.zeros(20_000))
-    shown = read.shown(ALL)
+    info = open_dataset(workspace.folder / "datasets" / "waves").recordings[0]
+    layout = open_dataset(workspace.folder / "datasets" / "waves").layout
+    read = RecordingSignals(info, layout, np.append(at, 200.0), at, values, np.zeros(20_000))
+    shown = read.curves(ALL)
     assert shown["thinned"] and len(shown["x"]) <= 3200
     assert max(v for v in shown["curves"][0] if v is not None) == 99_999.0
     assert None in shown["curves"][0]
-    near = read.shown(ALL, 100.0, 110.0)
+    near = read.curves(ALL, 100.0, 110.0)
     assert not near["thinned"] and sum(100.0 <= x <= 110.0 for x in near["x"]) >= 1000
     assert (near["x"][0], near["x"][-1]) == (0.0, at[-1])
 
@@ -254,8 +253,8 @@ def test_an_overlay_names_what_stands_out(review: Review) -> None:
     assert longest not in [c.recording for c in review.overlay("Wave").drawn]
 
 
-def test_links_to_few_and_to_many(house: House, review: Review) -> None:
-    reviews = house.part(Reviews)
+def test_links_to_few_and_to_many(workspace: Workspace, review: Review) -> None:
+    reviews = workspace.part(Reviews)
     few = reviews.address(review.path, waves(review)[:2], "confused")
     assert few.count("recordings=") == 2 and "selection" not in few
     many = reviews.address(review.path, [f"P1/x_{i}" for i in range(500)], "Wave taken for Rest")
@@ -267,12 +266,12 @@ def test_links_to_few_and_to_many(house: House, review: Review) -> None:
             reviews.selection(bad)
 
 
-def test_a_recording_that_came_since_is_there(house: House, review: Review) -> None:
-    from plushsense.core.recfile import write_recording
-    from reviewed import ACCEL, recording
+def test_a_recording_that_came_since_is_there(workspace: Workspace, review: Review) -> None:
+    from plushsense.core.recorder_csv import write_recording
+    from support.reviewed import ACCEL, recording
 
     write_recording(review.path / "recordings" / "P1" / "Wave_5_250.csv", recording(900, 6000), ACCEL)
-    again = house.part(Reviews).open(review.path)
+    again = workspace.part(Reviews).open(review.path)
     again.prepared.wait(60.0)
     assert again is review
     assert again.rows["P1/Wave_5_250"].state == "suggested"
@@ -292,6 +291,6 @@ def test_a_folder_that_cannot_be_written_loses_nothing(review: Review) -> None:
     assert review.standing(first).start == 20
 
 
-def test_places_outside_are_refused(house: House) -> None:
+def test_places_outside_are_refused(workspace: Workspace) -> None:
     with pytest.raises(ConfigError, match="outside"):
-        house.part(Reviews).open("../elsewhere")
+        workspace.part(Reviews).open("../elsewhere")

@@ -2,16 +2,30 @@
 
 from __future__ import annotations
 
+import json
+import re
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
+from xml.dom import minidom
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from browsing import DESK, TABLET, Studio, axe, connected, marked
-from plushsense.apps.studio.shell import LIGHT_COOKIE, PAGES
+from plushsense.recording.session_files import SESSION_HEAD, SESSION_LOG
+from plushsense.studio.app import shell
+from plushsense.studio.app.shell import LIGHT_COOKIE, PAGES
+from plushsense.studio.app.words import Words
+from plushsense.studio.app.workspace import Workspace
+from plushsense.studio.pages.live.clips import PROTOCOL
+from plushsense.studio.pages.train.result_details import confusion_table
+from plushsense.studio.pages.train.results import Confusion
+from plushsense.studio.widgets.pictures import picture
+from plushsense.studio.widgets.work import link, verdict
+from plushsense.workflow.api import simulate
+from support.browsing import DESK, TABLET, Studio, axe, connected, marked
+from support.recorded import record
 
 Fixture = Callable[..., Any]
 
@@ -138,3 +152,71 @@ def test_a_foreign_page_is_refused(header: str, empty: str) -> None:
 def test_a_furnished_home_opens(studio: Fixture, look: Fixture, home: Path) -> None:
     page = look().open(studio(home=home).url)
     assert marked(page, "title").inner_text() == "Home"
+
+
+HOSTILE = "<img src=x onerror='window.ran=1'>"
+WAYS = re.compile(r"ui\.(?:html|markdown)\(|sanitize=False|from html import|innerHTML|outerHTML|insertAdjacent|v-html")
+
+
+def test_html_is_made_in_one_way() -> None:
+    folder = Path(shell.__file__).parents[1]
+    sources = [p for kind in ("*.py", "*.js") for p in folder.rglob(kind) if "vendor" not in p.parts]
+    found = {
+        f"{path.name}: {line.strip()}"
+        for path in sources
+        for line in path.read_text("utf-8").splitlines()
+        if WAYS.search(line)
+    }
+    assert found == {
+        "shell.py: return ui.html(content, sanitize=lambda given: str(escape(given)), tag=kind)",
+        # One of three drawings of ours.
+        "live_view.js: this.n.face.innerHTML = face(eyes);",
+    }
+
+
+def test_what_is_filled_in_is_escaped() -> None:
+    words = Words("en")
+    confusion = Confusion((HOSTILE, "b"), ((1, 2), (3, 4)))
+    made = [
+        confusion_table(words, confusion, False, True),
+        picture("", HOSTILE),
+        verdict(True, HOSTILE),
+        link(HOSTILE, f'/export?name="{HOSTILE}'),
+    ]
+    for each in made:
+        assert "<img" not in each and "&lt;img" in each
+        minidom.parseString(each)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such names")
+def test_no_name_runs_as_script(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
+    home = tmp_path / "home"
+    clip = record(Workspace(home), "S01").rename(home / "recordings" / "S01" / f"live-{HOSTILE}")
+    head = json.loads((clip / SESSION_HEAD).read_text("utf-8"))
+    head["protocol"]["name"] = PROTOCOL
+    (clip / SESSION_HEAD).write_text(json.dumps(head), "utf-8")
+    taken = {"what": "take", "at_ms": 1, "file": f"{HOSTILE}_1_2.csv", "gesture": HOSTILE, "repetition": 1, "rows": 2}
+    with (clip / SESSION_LOG).open("a", encoding="utf-8") as log:
+        log.write(json.dumps(taken) + "\n")
+    simulate(tmp_path / "made", people=1, repetitions=1, dataset=home / "datasets" / HOSTILE)
+    about = home / "datasets" / HOSTILE / "dataset.toml"
+    about.write_text(
+        re.sub(r"(?m)^name = .*", f"name = {json.dumps(HOSTILE)}", about.read_text("utf-8"), count=1), "utf-8"
+    )
+    for kind in ("bundles", "protocols"):
+        (home / kind).mkdir(exist_ok=True)
+        (home / kind / f"{HOSTILE}.{'plush' if kind == 'bundles' else 'toml'}").write_text("{", "utf-8")
+    browser, url = look(), studio(home=home).url
+    for path in (*PAGES.values(), f"/export?name={quote(HOSTILE)}", f"/review?dataset={quote(HOSTILE)}"):
+        page = browser.open(url + path)
+        if path == PAGES["home"]:
+            marked(page, "dataset").get_by_text(HOSTILE).wait_for()
+        if path == PAGES["live"]:
+            page.get_by_role("button", name=f"Open S01/live-{HOSTILE}").click()
+            page.get_by_role("heading", name=HOSTILE).wait_for()
+        # What runs when a picture is missing runs after the picture was asked for.
+        page.wait_for_load_state("networkidle")
+        assert page.locator("img[src=x]").count() == 0, path
+        assert page.evaluate("window.ran") is None, path
+        page.close()
+    assert not [c for c in browser.complaints if "404" in c]

@@ -1,4 +1,4 @@
-"""The ring keeps the newest samples, and a tapped toy reads as the toy itself."""
+"""The buffer keeps the newest samples, and a tapped toy reads as the toy itself."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import threading
 
 import numpy as np
 
-from plushsense.apps.studio.signals import Ring, TappedDevice
 from plushsense.devices.base import Frame
 from plushsense.devices.opening import open_device
+from plushsense.studio.app.toys import SampleBuffer, TappedDevice
 
 
 def frames(*device_ms: int) -> list[Frame]:
@@ -16,46 +16,46 @@ def frames(*device_ms: int) -> list[Frame]:
 
 
 def test_pieces_join_without_a_hole_and_without_twice() -> None:
-    ring = Ring(2, 100)
-    assert len(ring.since(0).seconds) == 0
-    ring.add(frames(1000, 1010, 1020))
-    first = ring.since(0)
+    buffer = SampleBuffer(2, 100)
+    assert len(buffer.since(0).seconds) == 0
+    buffer.add(frames(1000, 1010, 1020))
+    first = buffer.since(0)
     assert first.seconds.tolist() == [0.0, 0.01, 0.02]
     assert first.values.tolist() == [[1000, -1000], [1010, -1010], [1020, -1020]]
-    ring.add(frames(1030))
-    second = ring.since(first.upto)
+    buffer.add(frames(1030))
+    second = buffer.since(first.end)
     assert second.values[:, 0].tolist() == [1030]
-    assert len(ring.since(second.upto).seconds) == 0
+    assert len(buffer.since(second.end).seconds) == 0
 
 
 def test_a_slow_reader_gets_the_newest_in_order() -> None:
-    ring = Ring(2, 10)
-    ring.add(frames(*range(0, 250, 10)))
-    piece = ring.since(0)
+    buffer = SampleBuffer(2, 10)
+    buffer.add(frames(*range(0, 250, 10)))
+    piece = buffer.since(0)
     assert piece.values[:, 0].tolist() == list(range(150, 250, 10))
-    assert piece.upto == ring.count == 25
-    assert ring.since(0, most=3).values[:, 0].tolist() == [220, 230, 240]
+    assert piece.end == buffer.count == 25
+    assert buffer.since(0, most=3).values[:, 0].tolist() == [220, 230, 240]
 
 
 def test_time_goes_on_over_a_reset_of_the_clock() -> None:
-    ring = Ring(2, 100)
-    ring.add(frames(5000, 5010))
-    ring.add(frames(0, 10))
-    seconds = ring.since(0).seconds
+    buffer = SampleBuffer(2, 100)
+    buffer.add(frames(5000, 5010))
+    buffer.add(frames(0, 10))
+    seconds = buffer.since(0).seconds
     assert np.all(np.diff(seconds) >= 0)
     assert seconds.tolist() == [0.0, 0.01, 0.01, 0.02]
 
 
 def test_readers_beside_the_writer_see_whole_samples() -> None:
-    ring = Ring(2, 64)
+    buffer = SampleBuffer(2, 64)
     done = threading.Event()
     torn: list[object] = []
 
     def read() -> None:
         place = 0
         while not done.is_set():
-            piece = ring.since(place)
-            place = piece.upto
+            piece = buffer.since(place)
+            place = piece.end
             if not np.array_equal(piece.values[:, 0], -piece.values[:, 1]):
                 torn.append(piece)
 
@@ -63,12 +63,12 @@ def test_readers_beside_the_writer_see_whole_samples() -> None:
     for reader in readers:
         reader.start()
     for start in range(0, 20_000, 20):
-        ring.add(frames(start, start + 10))
+        buffer.add(frames(start, start + 10))
     done.set()
     for reader in readers:
         reader.join()
     assert torn == []
-    assert ring.count == 2000
+    assert buffer.count == 2000
 
 
 def test_a_tapped_toy_reads_as_the_toy_and_fills_the_ring() -> None:
@@ -78,7 +78,7 @@ def test_a_tapped_toy_reads_as_the_toy_and_fills_the_ring() -> None:
     with TappedDevice(open_device(url)) as tapped:
         got = [f.values for f in tapped]
         assert got == expected
-        assert tapped.ring.count == len(expected) == tapped.counters.frames
-        assert tapped.ring.since(0).values.tolist() == [list(v) for v in expected]
+        assert tapped.buffer.count == len(expected) == tapped.counters.frames
+        assert tapped.buffer.since(0).values.tolist() == [list(v) for v in expected]
         assert tapped.inner is tapped.device
     assert tapped.device.closed

@@ -10,15 +10,15 @@ from pathlib import Path
 
 import pytest
 
-from plushsense.apps.studio import toys as room
-from plushsense.apps.studio.house import House
-from plushsense.apps.studio.toys import PERSONS, Toys
 from plushsense.core.errors import ConfigError, DeviceError
+from plushsense.studio.app import toys as room
+from plushsense.studio.app.toys import PERSONS, Toys
+from plushsense.studio.app.workspace import Workspace
 
 
 @pytest.fixture
 def toys(tmp_path: Path) -> Toys:
-    return Toys(House(tmp_path / "home", devices=("replay:///given.csv",), toy="virtual://?person=2", speed=20.0))
+    return Toys(Workspace(tmp_path / "home", devices=("replay:///given.csv",), toy="virtual://?person=2", speed=20.0))
 
 
 @pytest.fixture
@@ -27,12 +27,12 @@ def server() -> Iterator[Callable[[bytes], str]]:
     sockets: list[socket.socket] = []
 
     def serve(line: bytes) -> str:
-        listening = socket.create_server(("127.0.0.1", 0))
-        sockets.append(listening)
+        reader = socket.create_server(("127.0.0.1", 0))
+        sockets.append(reader)
 
         def talk() -> None:
             try:
-                talking, _ = listening.accept()
+                talking, _ = reader.accept()
                 sockets.append(talking)
                 while line:
                     talking.sendall(line)
@@ -41,7 +41,7 @@ def server() -> Iterator[Callable[[bytes], str]]:
                 pass
 
         threading.Thread(target=talk, daemon=True).start()
-        return f"tcp://127.0.0.1:{listening.getsockname()[1]}"
+        return f"tcp://127.0.0.1:{reader.getsockname()[1]}"
 
     yield serve
     for one in sockets:
@@ -50,11 +50,11 @@ def server() -> Iterator[Callable[[bytes], str]]:
 
 def test_looking_does_not_wait_and_rings(toys: Toys) -> None:
     began = time.monotonic()
-    toys.look(0.2)
-    toys.look(0.2)
+    toys.search(0.2)
+    toys.search(0.2)
     assert time.monotonic() - began < 0.2
     end = time.monotonic() + 30
-    while toys.looking or not toys.looked:
+    while toys.searching or not toys.searched:
         assert time.monotonic() < end
         time.sleep(0.02)
     assert [d.kind for d in toys.listing.devices][-1] == "virtual"
@@ -114,10 +114,10 @@ def test_a_slow_toy_fits_but_not_on_time(toys: Toys, server: Callable[[bytes], s
 def test_a_silent_toy_and_none_at_all(
     toys: Toys, server: Callable[[bytes], str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(room, "_PATIENCE_S", 0.3)
+    monkeypatch.setattr(room, "_TIMEOUT_S", 0.3)
     with pytest.raises(DeviceError, match=r"sent nothing within 0\.3 s"):
         toys.test(server(b""))
     with pytest.raises(DeviceError):
         toys.test("tcp://127.0.0.1:9")
     with pytest.raises(ConfigError, match="No toy is chosen"):
-        Toys(House(Path("nowhere"))).test()
+        Toys(Workspace(Path("nowhere"))).test()

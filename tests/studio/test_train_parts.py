@@ -13,42 +13,49 @@ from typing import Any
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from plushsense.apps.cli.main import main
-from plushsense.apps.config import from_settings
-from plushsense.apps.studio.curves import charts
-from plushsense.apps.studio.house import House
-from plushsense.apps.studio.jobs import Job, Jobs
-from plushsense.apps.studio.orders import Order, free_name, grids, order
-from plushsense.apps.studio.pages.train_results import comparable
-from plushsense.apps.studio.pareto import Point, drawing
-from plushsense.apps.studio.result_rows import TRAINING, Row, front, over_trainings
-from plushsense.apps.studio.results import Confusion, Results, grouped, in_cell
-from plushsense.apps.studio.tasks.telling import Clock
+from plushsense.cli.main import main
 from plushsense.core.errors import BadInput, ConfigError, PlushSenseError
-from plushsense.evaluation.predictions import Predictions
+from plushsense.evaluation.scores import Predictions
 from plushsense.models.bundle import Bundle
+from plushsense.studio.app.jobs import Jobs, StudioJob
+from plushsense.studio.app.words import Words
+from plushsense.studio.app.workspace import Workspace
+from plushsense.studio.pages.train.jobs_section import progress_charts
+from plushsense.studio.pages.train.pareto_plot import pareto_options, pareto_rows, pareto_table
+from plushsense.studio.pages.train.requests import JobRequest, free_name, grids, job_request
+from plushsense.studio.pages.train.results import (
+    TRAINING,
+    Confusion,
+    ResultRow,
+    StoredResults,
+    over_trainings,
+    recordings_of_cell,
+    sum_by_affect,
+)
+from plushsense.studio.pages.train.results_section import comparable_groups
+from plushsense.studio.tasks import Clock
+from plushsense.workflow.config import from_settings
 
 
-def made(house: House, **form: Any) -> Order:
-    return order(house, Jobs(house), {"dataset": str(house.datasets()[0]), **form})
+def made(workspace: Workspace, **form: Any) -> JobRequest:
+    return job_request(workspace, Jobs(workspace), {"dataset": str(workspace.datasets()[0]), **form})
 
 
 # From a form to work ------------------------------------------------------------------------------------------
 
 
 def test_the_command_resolves_to_the_same_settings(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    house = House(home)
+    workspace = Workspace(home)
     form = {"kind": "train", "name": "new one", "preset": "loso", "context": "anywhere", "epochs": 7, "seed": 3}
     form |= {"arch": "14d1_19d2", "filters": "8,12", "padding": "", "classes": "all", "batch": 32, "device": "cpu"}
-    found = made(house, **form, quantize_aware=2, fit_decisions=False)
+    found = made(workspace, **form, quantize_aware=2, fit_decisions=False)
     seen: list[Any] = []
 
     def train(dataset: str, config: Any, **more: Any) -> None:
         seen.append((dataset, config, more["quantize_aware"], more["fit_decisions"]))
         raise ConfigError("seen")
 
-    monkeypatch.setattr("plushsense.apps.api.train", train)
+    monkeypatch.setattr("plushsense.workflow.api.train", train)
     import shlex
 
     assert main(shlex.split(found.command)[1:]) == 2
@@ -80,51 +87,51 @@ def test_the_command_resolves_to_the_same_settings(home: Path, monkeypatch: pyte
     ],
 )
 def test_what_cannot_be_done_is_a_sentence(home: Path, form: dict[str, Any], said: str) -> None:
-    house = House(home)
+    workspace = Workspace(home)
     with pytest.raises(PlushSenseError, match=said):
-        made(house, **form)
+        made(workspace, **form)
 
 
 def test_the_same_work_is_not_begun_twice(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    house = House(home)
-    jobs = Jobs(house)
+    workspace = Workspace(home)
+    jobs = Jobs(workspace)
     monkeypatch.setattr(jobs, "_run", lambda job: None)
-    form = {"dataset": str(house.datasets()[0]), "kind": "train", "name": "one"}
-    first = order(house, jobs, form)
+    form = {"dataset": str(workspace.datasets()[0]), "kind": "train", "name": "one"}
+    first = job_request(workspace, jobs, form)
     jobs.start(first.task, first.spec, first.title)
     with pytest.raises(ConfigError, match="'one' is being trained right now"):
-        order(house, jobs, form)
+        job_request(workspace, jobs, form)
     again = {"dataset": form["dataset"], "kind": "evaluate", "split": "by-subject:5"}
-    proof = order(house, jobs, again)
+    proof = job_request(workspace, jobs, again)
     jobs.start(proof.task, proof.dry, proof.title)
-    order(house, jobs, again)
+    job_request(workspace, jobs, again)
     jobs.start(proof.task, proof.spec, proof.title)
     with pytest.raises(ConfigError, match="running already"):
-        order(house, jobs, again)
+        job_request(workspace, jobs, again)
 
 
 def test_names_and_grids(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    house = House(home)
-    jobs = Jobs(house)
+    workspace = Workspace(home)
+    jobs = Jobs(workspace)
     monkeypatch.setattr(jobs, "_run", lambda job: None)
-    assert free_name(house, jobs, "little") == "little 2"
+    assert free_name(workspace, jobs, "little") == "little 2"
     jobs.start("train", {"out": str(home / "bundles" / "little 2.plush")}, "")
-    assert free_name(house, jobs, "little") == "little 3"
-    assert free_name(house, jobs, "a/b: ž") == "ab ž"
-    assert free_name(house, jobs, "///") == "model"
+    assert free_name(workspace, jobs, "little") == "little 3"
+    assert free_name(workspace, jobs, "a/b: ž") == "ab ž"
+    assert free_name(workspace, jobs, "///") == "model"
     (home / "grids").mkdir()
     (home / "grids" / "b.toml").touch()
     (home / "a.toml").touch()
-    assert [path.name for path in grids(house)] == ["a.toml", "b.toml"]
+    assert [path.name for path in grids(workspace)] == ["a.toml", "b.toml"]
 
 
 def test_without_torch_the_task_says_what_to_install(home: Path, tmp_path: Path) -> None:
     blocked = tmp_path / "blocked" / "torch"
     blocked.mkdir(parents=True)
     blocked.joinpath("__init__.py").write_text("raise ModuleNotFoundError('no torch', name='torch')", encoding="utf-8")
-    spec = made(House(home), kind="train", name="x").spec
+    spec = made(Workspace(home), kind="train", name="x").spec
     env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(blocked.parent), os.environ.get("PYTHONPATH", "")])}
-    command = [sys.executable, "-m", "plushsense.apps.studio.worker"]
+    command = [sys.executable, "-m", "plushsense.studio.app.worker"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=env) as worker:
         assert worker.stdin is not None and worker.stdout is not None
         worker.stdin.write(json.dumps({"task": "train", "spec": spec}) + "\n")
@@ -138,7 +145,7 @@ def test_without_torch_the_task_says_what_to_install(home: Path, tmp_path: Path)
 
 def test_the_clock_does_not_count_what_was_done_before(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
-    monkeypatch.setattr("plushsense.apps.studio.tasks.telling.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("plushsense.studio.tasks.time.monotonic", lambda: now[0])
     clock = Clock()
     # Half of it comes at once from the journal, then a tenth each 10 s.
     assert clock.at(0.1)["left_s"] is None
@@ -151,8 +158,8 @@ def test_the_clock_does_not_count_what_was_done_before(monkeypatch: pytest.Monke
     assert clock.at(0.7)["left_s"] == 30.0
 
 
-def job(task: str, reports: list[dict[str, Any]]) -> Job:
-    return Job("1", task, {}, "", reports=reports)
+def job(task: str, reports: list[dict[str, Any]]) -> StudioJob:
+    return StudioJob("1", task, {}, "", reports=reports)
 
 
 def test_curves_of_a_training() -> None:
@@ -160,7 +167,7 @@ def test_curves_of_a_training() -> None:
         {"stage": "training", "epoch": e, "train_loss": 1 / e, "validation_loss": None, "train_accuracy": 0.1 * e}
         for e in (1, 2, 3)
     ]
-    loss, accuracy = charts(job("train", [{"stage": "reading"}, *rows, {"stage": "deciding", "epoch": 3}]))
+    loss, accuracy = progress_charts(job("train", [{"stage": "reading"}, *rows, {"stage": "deciding", "epoch": 3}]))
     assert (loss.what, loss.x, loss.lines[0]) == ("loss", [1.0, 2.0, 3.0], [1.0, 0.5, 1 / 3])
     assert loss.lines[1] == [None, None, None]
     assert accuracy.lines[0] == pytest.approx([0.1, 0.2, 0.3])
@@ -169,22 +176,22 @@ def test_curves_of_a_training() -> None:
 def test_curves_of_folds_and_of_a_search() -> None:
     folds = [{"fold": "a", "epoch": 1, "train_loss": 3.0}, {"fold": "b", "epoch": 1, "train_loss": 4.0}]
     folds += [{"fold": "a", "epoch": 2, "train_loss": 2.0}, {"fold": "a", "epoch": 0, "train_loss": None}]
-    loss, _ = charts(job("evaluate", folds))
+    loss, _ = progress_charts(job("evaluate", folds))
     assert (loss.names, loss.x, loss.lines) == (("a", "b"), [1.0, 2.0], [[3.0, 2.0], [4.0, None]])
     at = [{"rung": 1, "done": 4, "best": None}, {"rung": 2, "done": 1, "best": {"macro_f1": 0.3}}]
     at += [{"rung": 2, "done": 2, "best": {"macro_f1": 0.3}}, {"rung": 3, "done": 1, "best": {"macro_f1": 0.5}}]
-    (best,) = charts(job("search", at))
+    (best,) = progress_charts(job("search", at))
     assert (best.x, best.lines) == ([1.0, 2.0, 3.0], [[0.3, 0.3, 0.5]])
 
 
 # Results ------------------------------------------------------------------------------------------------------
 
 
-def row(name: str, parameters: int, f1: float | None) -> Row:
+def row(name: str, parameters: int, f1: float | None) -> ResultRow:
     spread = {"spread": "folds", "units": 2, "accuracy": f1, "accuracy_sd": None, "macro_f1": f1, "macro_f1_sd": 0.01}
     words = dict.fromkeys(("dataset", "data", "schedule", "split", "context", "seeds", "trial"), "")
     marks = {"leaky": False, "simulated": True}
-    return Row(
+    return ResultRow(
         id=name, kind="trial", path=Path(name), network=name, parameters=parameters, macs=1, when_s=0.0,
         **words, **marks, **spread,  # type: ignore[arg-type]
     )  # fmt: skip
@@ -193,7 +200,7 @@ def row(name: str, parameters: int, f1: float | None) -> Row:
 def test_the_front_holds_what_none_beats() -> None:
     rows = [row("a", 100, 0.5), row("b", 200, 0.4), row("c", 300, 0.7), row("d", 300, 0.6), row("e", 50, None)]
     rows += [row("f", 400, 0.7)]
-    assert [r.id for r in front(rows)] == ["a", "c"]
+    assert [r.id for r in pareto_rows(rows)] == ["a", "c"]
     # By definition: nobody has at most as many parameters and at least as good a score, and one of them better.
     for r in rows:
         beaten = any(
@@ -204,7 +211,7 @@ def test_the_front_holds_what_none_beats() -> None:
             and (o.parameters, o.macro_f1) != (r.parameters, r.macro_f1)
             for o in rows
         )
-        assert (r in front(rows)) == (not beaten and r.macro_f1 is not None), r.id
+        assert (r in pareto_rows(rows)) == (not beaten and r.macro_f1 is not None), r.id
 
 
 def test_only_the_same_people_and_gestures_are_compared() -> None:
@@ -212,7 +219,7 @@ def test_only_the_same_people_and_gestures_are_compared() -> None:
     rows = [replace(row(f"{i}", 100 + i, 0.5), kind=TRAINING, data="d", apart=("h", "S01")) for i in range(2)]
     rows += [replace(row(f"other {i}", 10, 0.9), kind=TRAINING, data="d", apart=("h", "S02")) for i in range(3)]
     rows += [replace(row("changed", 1, 1.0), kind=TRAINING, data="d", apart=("i", "S01"))]
-    found = comparable(rows, str)
+    found = comparable_groups(rows, str)
     assert [sorted(r.id for r in several) for several in found.values()] == [
         ["0", "1"],
         ["other 0", "other 1", "other 2"],
@@ -226,19 +233,22 @@ def test_what_a_trials_spread_goes_over() -> None:
     assert over_trainings({"folds": 5, "seeds": 3}) == ("trainings", 15)
 
 
-def test_the_drawing_labels_every_point_and_marks_leaky_ones() -> None:
-    points = [Point(1000 * 3**i, 0.2 + 0.1 * i, 0.05, f"net <{i}>", i > 1, i == 0) for i in range(4)]
-    text = drawing(points, title="a & b", x="Parameters", y="Macro-F1", leaky="leaky")
-    from xml.dom import minidom
-
-    tree = minidom.parseString(text)
-    labels = [t.firstChild.data for t in tree.getElementsByTagName("text") if t.firstChild is not None]  # type: ignore[attr-defined]
-    assert {"net <0> (leaky)", "net <1>", "net <2>", "net <3>", "Parameters", "Macro-F1"} <= set(labels)
-    assert len(tree.getElementsByTagName("circle")) == 3
-    assert len(tree.getElementsByTagName("path")) == 1
-    assert len(tree.getElementsByTagName("polyline")) == 1
-    # One point alone, and points on one spot, can be drawn as well.
-    assert "<svg" in drawing(points[:1] * 3, title="", x="", y="", leaky="")
+def test_the_plot_labels_every_point_and_marks_leaky_ones() -> None:
+    rows = [replace(row(f"net <{i}> 8/8 stream", 1000 * 3**i, 0.2 + 0.1 * i), leaky=i == 0) for i in range(4)]
+    bars, front, points = pareto_options(rows, x="Parameters", y="Macro-F1", leaky="leaky")["series"]
+    assert [p["name"] for p in points["data"]] == ["net <0> 8/8,  (leaky)", *(f"net <{i}> 8/8, " for i in range(1, 4))]
+    assert [p["symbol"] for p in points["data"]] == ["diamond", "circle", "circle", "circle"]
+    assert points["labelLayout"] == {"hideOverlap": True}
+    assert front["data"] == [[r.parameters, r.macro_f1] for r in rows]
+    assert bars["data"][:2] == [[1000, pytest.approx(0.19)], [1000, pytest.approx(0.21)]]
+    # Points on one spot can be plotted as well.
+    assert len(pareto_options(rows[:1] * 3, x="", y="", leaky="")["series"][2]["data"]) == 3
+    # The text alternative holds the same data and escapes it.
+    table = pareto_table(Words("en"), rows)
+    assert table.count("<tr>") == 5
+    assert "net &lt;3&gt; 8/8 stream" in table
+    assert "27,000" in table
+    assert "0.500 ± 0.010" in table
 
 
 def test_the_recordings_of_a_cell() -> None:
@@ -248,21 +258,23 @@ def test_the_recordings_of_a_cell() -> None:
         labels, np.array(["P1", "P1", "P1", "P2", "P2"]), np.array(["r1", "r1", "r1", "r2", "r3"]),
         np.arange(5), np.array(["loop"] * 5), np.array(["f"] * 5), np.array([0, 0, 0, 0, 1]), probabilities,
     )  # fmt: skip
-    assert [(m.recording, m.windows, m.of, m.predicted) for m in in_cell(found, ["a"], ["b"])] == [
+    assert [(m.recording, m.windows, m.of, m.predicted) for m in recordings_of_cell(found, ["a"], ["b"])] == [
         ("r1", 2, 3, ("b",)), ("r2", 1, 1, ("b",)),
     ]  # fmt: skip
-    assert [m.recording for m in in_cell(found, ["b"], ["a", "b"])] == ["r3"]
-    assert in_cell(found, ["b"], ["b"]) == []
+    assert [m.recording for m in recordings_of_cell(found, ["b"], ["a", "b"])] == ["r3"]
+    assert recordings_of_cell(found, ["b"], ["b"]) == []
 
 
 def test_affects_are_summed() -> None:
-    found = grouped(Confusion(("a", "b", "c"), ((1, 2, 3), (4, 5, 6), (7, 8, 9))), {"a": "x", "b": None, "c": "x"})
+    found = sum_by_affect(
+        Confusion(("a", "b", "c"), ((1, 2, 3), (4, 5, 6), (7, 8, 9))), {"a": "x", "b": None, "c": "x"}
+    )
     assert found == Confusion(("x", "none"), ((20, 10), (10, 5)))
 
 
 def test_rows_of_a_house_and_what_is_broken(home: Path) -> None:
-    house = House(home)
-    results = Results(house)
+    workspace = Workspace(home)
+    results = StoredResults(workspace)
     (only,) = results.rows()
     assert (only.kind, only.simulated, only.leaky, only.context) == (TRAINING, True, False, "anywhere → stream")
     assert only.dataset == str(home / "datasets" / "virtual")

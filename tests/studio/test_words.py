@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 
-from plushsense.apps.studio.words import LANGUAGES, Words
 from plushsense.core.gestures import load_gestures
+from plushsense.studio.app.words import LANGUAGES, Words
 
 
 def texts(language: str) -> dict[str, Any]:
-    file = resources.files("plushsense.apps.studio").joinpath(f"words/{language}.toml")
+    file = resources.files("plushsense.studio.app").joinpath(f"words/{language}.toml")
     return tomllib.loads(file.read_text(encoding="utf-8"))
 
 

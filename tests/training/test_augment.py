@@ -1,9 +1,19 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 
-from plushsense.training.augment import Turn, rotations
+from plushsense.core.errors import ConfigError
+from plushsense.training.augment import (
+    AUGMENTATIONS,
+    Augmentation,
+    Channels,
+    augmentations,
+    parse_augmentation,
+    rotations,
+)
+from plushsense.training.spec import PRESETS, TrainSpec, preset
 from plushsense.windows.features import Scaler
 
 
@@ -17,28 +27,62 @@ def test_rotations_are_rotations_of_the_asked_spread() -> None:
     assert abs(float((angle**2).mean().sqrt()) - 30.0) < 1.5
 
 
-def test_turned_windows_keep_every_vectors_length_and_the_other_channels() -> None:
+def test_rotated_windows_keep_every_vectors_length_and_the_other_channels() -> None:
     rng = np.random.default_rng(0)
     raw = rng.integers(-9000, 9000, (20, 7, 50))
     scaler = Scaler.fit(raw)
     x = torch.from_numpy(scaler.apply(raw))
-    turn = Turn(((0, 1, 2), (4, 5, 6)), scaler, 45.0, torch.device("cpu"))
-    out = turn(x, torch.Generator().manual_seed(1)).double().numpy()
+    augment = augmentations(["random-rotation:45"], Channels(((0, 1, 2), (4, 5, 6)), scaler, torch.device("cpu")))
+    assert augment is not None
+    out = augment(x, torch.Generator().manual_seed(1)).double().numpy()
     back = out / scaler.scale[:, None] + scaler.offset[:, None]
     for axes in ((0, 1, 2), (4, 5, 6)):
         was = np.linalg.norm(raw[:, axes], axis=1)
         assert np.allclose(np.linalg.norm(back[:, axes], axis=1), was, rtol=1e-3)
         assert np.abs(back[:, axes] - raw[:, axes]).max() > 1000
     assert np.array_equal(out[:, 3].astype(np.float32), x[:, 3].numpy())
-    # One toy: both vectors of a window turn alike.
+    # One toy: both vectors of a window rotate alike.
     a, b = (np.linalg.lstsq(raw[0, s].T, back[0, s].T, rcond=None)[0] for s in ([0, 1, 2], [4, 5, 6]))
     assert np.allclose(a, b, atol=1e-3)
 
 
 def test_without_vectors_or_degrees_nothing_happens() -> None:
     scaler = Scaler(np.zeros(3), np.ones(3))
-    x = torch.randn(4, 3, 10)
-    for vectors, degrees in (((), 45.0), (((0, 1, 2),), 0.0)):
-        turn = Turn(vectors, scaler, degrees, torch.device("cpu"))
-        assert turn.idle
-        assert turn(x, torch.Generator()) is x
+    for vectors, degrees in (((), 45), (((0, 1, 2),), 0)):
+        channels = Channels(vectors, scaler, torch.device("cpu"))
+        assert augmentations([f"random-rotation:{degrees}"], channels) is None
+
+
+def test_a_new_augmentation_is_a_function_and_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def noise(strength: float, channels: Channels):  # type: ignore[no-untyped-def]
+        return lambda x, random: x + strength * torch.randn(x.shape, generator=random)
+
+    monkeypatch.setitem(AUGMENTATIONS, "noise", Augmentation(noise, 1.0, "standard deviations"))
+    spec = preset("people", augment=["random-rotation:45", "noise:0.1"])
+    assert spec.to_dict()["augment"] == ["random-rotation:45", "noise:0.1"] and "turn_deg" not in spec.to_dict()
+    assert spec.key() != PRESETS["people"].key()
+    augment = augmentations(spec.augment, Channels((), Scaler(np.zeros(3), np.ones(3)), torch.device("cpu")))
+    assert augment is not None
+    x = torch.zeros(2, 3, 50)
+    out = augment(x, torch.Generator().manual_seed(0))
+    assert 0.05 < float(out.std()) < 0.2 and float(x.abs().max()) == 0.0
+
+
+def test_an_angle_in_an_earlier_file_means_the_same() -> None:
+    assert preset("loso", turn_deg=20.0) == TrainSpec(augment=("random-rotation:20.0",))
+    assert preset("people", turn_deg=0.0).augment == ()
+    assert preset("people").to_dict()["turn_deg"] == 45.0 and "augment" not in preset("people").to_dict()
+    assert list(TrainSpec().to_dict())[6:8] == ["turn_deg", "seed"]
+
+
+@pytest.mark.parametrize("text", ["random-rotation", "random-rotation:x", "random-rotation:181", "random-rotation:-1"])
+def test_a_strength_that_is_refused(text: str) -> None:
+    with pytest.raises(ConfigError, match=r"0 \(off\) to 180 degrees"):
+        parse_augmentation(text)
+
+
+def test_an_unknown_augmentation_is_refused() -> None:
+    with pytest.raises(ConfigError, match="Did you mean 'random-rotation'"):
+        TrainSpec(augment=("random-rotaton:4",))
+    with pytest.raises(ConfigError, match="Both augment and turn_deg"):
+        preset("people", augment=["random-rotation:4"], turn_deg=3.0)

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from plushsense.core.errors import TrainingError
+from plushsense.jobs.journal import Journal
 from plushsense.models.arch import Arch
 from plushsense.models.reference import Network
-from plushsense.runs.journal import Journal
+from plushsense.training.engine import FitState
 from plushsense.training.spec import TrainSpec
-from plushsense.training.state import FitState
 from plushsense.windows.cut import WindowSet
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed (extra train)")
-from plushsense.training.fit import fit, predict  # noqa: E402
+from plushsense.training.fit import fit, predict
 
 Make = Callable[..., WindowSet]
 SPEC = TrainSpec(epochs=12, batch=16, device="cpu")
@@ -154,7 +154,7 @@ def test_a_long_training_passes_through_the_end_of_a_short_one(made: Make) -> No
 
 @pytest.mark.parametrize("padding", ["stream", "causal"])
 def test_a_training_goes_on_as_if_it_had_never_stopped(made: Make, tmp_path: Path, padding: str) -> None:
-    spec = replace(SPEC, epochs=7, halve_every=2, patience=None, turn_deg=20.0)
+    spec = replace(SPEC, epochs=7, halve_every=2, patience=None, augment=("random-rotation:20",))
     train = replace(made(50), vectors=())
     whole = fit(train, made(20, seed=4), arch(padding=padding), spec, keep=(3, 5))
     saved: list[FitState] = []

@@ -10,11 +10,10 @@ import pytest
 import torch
 
 from plushsense.core.errors import TrainingError
-from plushsense.deploy.calibration import calibration
-from plushsense.deploy.quantize import Ranges, quantize
+from plushsense.deploy.quantize import Ranges, calibration, quantize
 from plushsense.models.arch import Arch
-from plushsense.models.integer import IntegerNetwork
 from plushsense.models.reference import Network, random_weights
+from plushsense.runtime.integer import IntegerNetwork
 from plushsense.training.quantized import Rounded, fine_tune
 from plushsense.training.spec import TrainSpec
 from plushsense.windows.cut import WindowSet

@@ -8,15 +8,15 @@ import pytest
 
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.gestures import Gesture, GestureSet
-from plushsense.core.recfile import Frames, format_rows, recording_filename, write_recording
-from plushsense.core.signal import load_layout
-from plushsense.dataset.importers import import_recordings
+from plushsense.core.layouts import load_layout
+from plushsense.core.recorder_csv import Frames, format_rows, recording_filename, write_recording
+from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks
 from plushsense.dataset.store import Dataset
 from plushsense.evaluation.folds import fold_windows
 from plushsense.scoring.splits import parse_split
-from plushsense.windows.anywhere import AnywhereSpec, cut_anywhere, with_idle
+from plushsense.windows.anywhere import AnywhereSpec, add_idle_gesture, cut_anywhere
 from plushsense.windows.cut import WindowSet, WindowSpec, cut_windows
 
 ACCEL = load_layout("accel-3")
@@ -158,10 +158,10 @@ def replace_clock(frames: Frames) -> Frames:
 def test_a_class_for_idleness_is_added_where_there_is_none(tmp_path: Path) -> None:
     person(tmp_path / "src" / "ana", {(500, 200): "Wave", (1000, 100): "Shake"})
     plain = made(tmp_path, Gesture("Wave"), Gesture("Shake"))
-    assert with_idle(plain.gestures, plain).gestures[2] == Gesture(
+    assert add_idle_gesture(plain.gestures, plain).gestures[2] == Gesture(
         "Idle", "none", nobody=True, idle=True, description="Nothing happens to the toy"
     )
-    w = cut_anywhere(plain, SPEC, with_idle(plain.gestures, plain), EVERY)
+    w = cut_anywhere(plain, SPEC, add_idle_gesture(plain.gestures, plain), EVERY)
     assert len(newest(w, "Idle")) > 500
     assert set(w.subject) == {"ana"}
     assert "ana/fulldatastream (unmarked)" in w.recording_ids
@@ -169,16 +169,16 @@ def test_a_class_for_idleness_is_added_where_there_is_none(tmp_path: Path) -> No
 
 
 def test_the_data_sets_own_idle_gesture_is_taken(dataset: Dataset) -> None:
-    wanted = with_idle(dataset.gestures.subset(["Wave", "Shake"]), dataset)
+    wanted = add_idle_gesture(dataset.gestures.subset(["Wave", "Shake"]), dataset)
     assert wanted.labels == ("Wave", "Shake", "Still")
-    assert with_idle(wanted, dataset) == wanted
+    assert add_idle_gesture(wanted, dataset) == wanted
 
 
 def test_a_gesture_called_idle_that_is_not_is_refused(tmp_path: Path) -> None:
     person(tmp_path / "src" / "ana", {(500, 200): "Wave", (1000, 100): "Idle"})
     data = made(tmp_path, Gesture("Wave"), Gesture("Idle"))
     with pytest.raises(DatasetError, match="not marked as idle"):
-        with_idle(data.gestures, data)
+        add_idle_gesture(data.gestures, data)
 
 
 def test_no_split_lets_a_training_window_touch_what_is_tested(tmp_path: Path) -> None:

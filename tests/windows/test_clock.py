@@ -4,9 +4,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from plushsense.core.recfile import Frames
-from plushsense.core.signal import load_layout
-from plushsense.windows.clock import Clock, resample
+from plushsense.core.layouts import load_layout
+from plushsense.core.recorder_csv import Frames
+from plushsense.windows.clock import SampleClock, resample
 
 ACCEL = load_layout("accel-3")
 
@@ -16,7 +16,7 @@ def frames(clock: list[int], values: list[list[int]]) -> Frames:
 
 
 def streamed(given_frames: Frames) -> list[NDArray[np.int64]]:
-    clock = Clock(ACCEL)
+    clock = SampleClock(ACCEL)
     segments: list[list[NDArray[np.int64]]] = [[]]
     for moment, row in zip(given_frames.device_ms.tolist(), given_frames.values.tolist(), strict=True):
         made = clock.push(moment, row)
@@ -62,7 +62,7 @@ def test_nothing_valid_gives_nothing() -> None:
 
 
 def test_a_causal_rule_does_not_wait_longer_than_one_frame() -> None:
-    clock = Clock(ACCEL)
+    clock = SampleClock(ACCEL)
     assert [len(clock.push(t, (0, 0, 0))) for t in (0, 9, 18, 45)] == [1, 0, 1, 3]
     assert clock.now_us == 40_000
 

@@ -5,9 +5,9 @@ import pytest
 
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.gestures import GestureSet
-from plushsense.core.recfile import Frames, format_rows, recording_filename, write_recording
-from plushsense.core.signal import load_layout
-from plushsense.dataset.importers import import_recordings
+from plushsense.core.layouts import load_layout
+from plushsense.core.recorder_csv import Frames, format_rows, recording_filename, write_recording
+from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.store import Dataset
 from plushsense.windows.cut import WindowSpec, cut_windows, shared_gestures
 
@@ -136,7 +136,7 @@ def test_vectors_are_found_among_the_inputs(dataset: Dataset) -> None:
 
 
 def test_a_recording_with_a_gap_keeps_the_full_windows_before_it(dataset: Dataset, tmp_path: Path) -> None:
-    from plushsense.core.recfile import read_stream
+    from plushsense.core.recorder_csv import read_stream
 
     stream = read_stream(dataset.path / dataset.streams[0].file, ACCEL).frames
     part = stream.slice(1150, 1800)

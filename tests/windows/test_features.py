@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from plushsense.core.errors import BadInput
-from plushsense.core.signal import load_layout, magnitude_limit
-from plushsense.windows.features import SampleInputs, Scaler, inputs, magnitude
+from plushsense.core.layouts import load_layout, magnitude_limit
+from plushsense.windows.features import SampleInputs, Scaler, magnitude, network_inputs
 
 LIMIT = magnitude_limit(3)
 
@@ -28,7 +28,7 @@ def test_plush_inputs_replace_the_axes_by_their_magnitude() -> None:
     layout = load_layout("plush-15")
     rng = np.random.default_rng(0)
     values = rng.integers(-32768, 32768, (50, 13))
-    batch = inputs(values, layout)
+    batch = network_inputs(values, layout)
     assert batch.shape == (50, 11)
     assert np.array_equal(batch[:, :10], values[:, :10])
     one = SampleInputs(layout)

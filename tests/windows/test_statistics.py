@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from plushsense.core.errors import BadInput
-from plushsense.windows.statistics import NAMES, statistic_names, statistics
+from plushsense.windows.features import NAMES, statistic_names, statistics
 
 RATE = 100.0
 

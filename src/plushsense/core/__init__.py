@@ -1,1 +1,1 @@
-"""The words that every other room speaks: errors, signals, gestures, recording files."""
+"""Errors, layouts, gesture sets, recorder files, atomic files and strict loading of TOML, used by all packages."""

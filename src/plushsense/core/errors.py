@@ -7,6 +7,7 @@
     │   ├── GestureError        a gesture set
     │   ├── FileFormatError     a recording file
     │   ├── DatasetError        a data set folder
+    │   │   └── ForgottenError  a person was taken out of it meanwhile
     │   ├── BundleError         a model bundle
     │   ├── ArrayError          arrays given from Python; also a ValueError
     │   └── ConfigError         a setting, a flag, a configuration file
@@ -18,22 +19,24 @@
     │   └── ProgramError        a program that was built and does not end well
     └── MissingExtraError       an optional package that is not installed
 
-Every message is one sentence for the person who reads it: what is wrong, where, what is accepted, what to do.
+Every message is one sentence: what is wrong, where, what is accepted, what to do.
 The command line prints it and exits with status 2.
 """
 
 from __future__ import annotations
 
 import difflib
+import importlib
 from collections.abc import Iterable
+from types import ModuleType
 
 
 class PlushSenseError(Exception):
-    """Anything that PlushSense refuses, said in one sentence."""
+    """An error of PlushSense, whose message is one sentence for the user."""
 
 
 class BadInput(PlushSenseError):
-    """Something the user gave cannot be used."""
+    """Invalid input of the user."""
 
 
 class ArchError(BadInput):
@@ -54,6 +57,10 @@ class FileFormatError(BadInput):
 
 class DatasetError(BadInput):
     """A data set folder that cannot be opened, made or used as asked."""
+
+
+class ForgottenError(DatasetError):
+    """A person was taken out of the data set since it was opened: results may hold that person."""
 
 
 class BundleError(BadInput):
@@ -83,10 +90,10 @@ class DivergedError(TrainingError):
 class ToolError(PlushSenseError):
     """A compiler or emulator that is missing or fails."""
 
-    def __init__(self, message: str, said: str = "") -> None:
+    def __init__(self, message: str, output: str = "") -> None:
         super().__init__(message)
-        self.said = said
-        """All that the tool wrote about it."""
+        self.output = output
+        """The tool's complete output."""
 
 
 class BuildError(ToolError):
@@ -102,7 +109,24 @@ class MissingExtraError(PlushSenseError):
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
-    """A suggestion to end an error with: ``" Did you mean 'x'?"``, or nothing when no known word is close."""
+    """Return a suggestion that ends an error message, or "" when no known word is close."""
     lowered = {k.lower(): k for k in known}
     found = difflib.get_close_matches(word.lower(), list(lowered), n=1, cutoff=0.6)
     return f" Did you mean '{lowered[found[0]]}'?" if found else ""
+
+
+def need(module: str, extra: str) -> ModuleType:
+    """Import ``module``, which the optional dependency group ``extra`` provides.
+
+    Raises:
+        MissingExtraError: with the exact install command, when the package is not there.
+    """
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        top = module.split(".")[0]
+        if error.name is not None and error.name.split(".")[0] != top:
+            raise
+        raise MissingExtraError(
+            f"This needs the package '{top}', which is not installed: run  pip install 'plushsense[{extra}]'"
+        ) from error

@@ -1,4 +1,4 @@
-"""What people do with the toy: gestures, their affect and family, and the set that fixes their class order."""
+"""Gestures, their affect and family, and gesture sets, which fix the class order."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.core.errors import GestureError, nearest
-from plushsense.core.tomlfile import builtin_names, read_named, refuse_unknown
+from plushsense.core.toml import builtin_names, load_table, read_named
 
 AFFECTS = ("positive", "neutral", "negative", "none")
 NOBODY = "none"
 
 
 def plain_label(label: str) -> str:
-    """A label as it is compared: without case, and with ``_`` and runs of space as one space."""
+    """Return a label as it is compared: in lower case, with ``_`` and runs of spaces as one space."""
     return " ".join(label.replace("_", " ").split()).casefold()
 
 
 @dataclass(frozen=True)
 class Gesture:
-    """One gesture: its label, the affect it carries ("none" where nobody said), and its family of look-alikes.
+    """A gesture: its label, its affect ("none" where unknown) and its family of similar gestures.
 
-    ``free_choice`` marks a label under which everybody did something else; ``nobody`` one that is recorded without a
-    person (the toy at rest). ``idle``: it means that nothing happens, so that it never makes an event; ``energetic``:
-    so abrupt that threshold rules may notice it before the network does.
+    ``free_choice`` marks a label under which each person did something else; ``nobody`` one that is recorded without a
+    person (the toy at rest). An ``idle`` gesture never starts an event; an ``energetic`` one is so abrupt that
+    threshold rules may detect it before the network does.
     """
 
     label: str
@@ -38,16 +38,8 @@ class Gesture:
     description: str = ""
 
     def __post_init__(self) -> None:
-        for key in ("label", "affect", "family", "description"):
-            if not isinstance(getattr(self, key), str):
-                raise GestureError(f"Gesture {self.label!r}: {key} is {getattr(self, key)!r}; it must be a text.")
-        for key in ("free_choice", "nobody", "idle", "energetic"):
-            if not isinstance(getattr(self, key), bool):
-                raise GestureError(
-                    f"Gesture '{self.label}': {key} is {getattr(self, key)!r}; it must be true or false."
-                )
         if not plain_label(self.label):
-            raise GestureError("A gesture has an empty label: give it a word.")
+            raise GestureError("A gesture has an empty label: give it one.")
         if self.affect not in AFFECTS:
             raise GestureError(
                 f"Gesture '{self.label}' has the affect '{self.affect}'; accepted are {', '.join(AFFECTS)}."
@@ -85,8 +77,8 @@ class GestureSet:
         return tuple(g.affect for g in self.gestures)
 
     @property
-    def tells_affect(self) -> bool:
-        """Whether any gesture carries an affect; in a set where none does, a gesture without one is nothing odd."""
+    def has_affect(self) -> bool:
+        """Return whether any gesture of the set has an affect."""
         return any(g.affect != "none" for g in self.gestures)
 
     @property
@@ -95,12 +87,12 @@ class GestureSet:
         return tuple(g.family for g in self.gestures)
 
     def find(self, label: str) -> Gesture | None:
-        """The gesture of a label, ignoring case and ``_`` against space; None when it is not in the set."""
-        wanted = plain_label(label)
-        return next((g for g in self.gestures if plain_label(g.label) == wanted), None)
+        """Return the gesture of a label, ignoring case and ``_`` against space; None when it is not in the set."""
+        plain = plain_label(label)
+        return next((g for g in self.gestures if plain_label(g.label) == plain), None)
 
     def get(self, label: str) -> Gesture:
-        """The gesture of a label; GestureError with the nearest one when it is not in the set."""
+        """Return the gesture of a label; raise GestureError with the nearest label when it is not in the set."""
         found = self.find(label)
         if found is None:
             raise GestureError(
@@ -110,41 +102,33 @@ class GestureSet:
         return found
 
     def index(self, label: str) -> int:
-        """Class index of a label."""
+        """Return the class index of a label."""
         return self.gestures.index(self.get(label))
 
     def subset(self, labels: Iterable[str]) -> GestureSet:
-        """The gestures of ``labels``, in this set's order."""
-        wanted = {self.get(label) for label in labels}
-        return GestureSet(self.name, tuple(g for g in self.gestures if g in wanted), self.inferred)
+        """Return the set of the gestures of ``labels``, in this set's order."""
+        chosen = {self.get(label) for label in labels}
+        return GestureSet(self.name, tuple(g for g in self.gestures if g in chosen), self.inferred)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, ready for JSON."""
+        """Return plain values, ready for JSON."""
         return asdict(self)
 
     @classmethod
     def from_dict(cls, table: dict[str, Any], where: str = "gesture set") -> GestureSet:
-        """A gesture set from plain values (a TOML file, a bundle)."""
-        refuse_unknown(table, cls.__dataclass_fields__, where, GestureError)
-        gestures = []
-        try:
-            for entry in table["gestures"]:
-                if not isinstance(entry, dict):
-                    raise TypeError(f"{entry!r} is not a table")
-                refuse_unknown(entry, Gesture.__dataclass_fields__, f"{where}, gestures", GestureError)
-                gestures.append(Gesture(**entry))
-            return cls(str(table["name"]), tuple(gestures), bool(table.get("inferred", False)))
-        except KeyError as missing:
-            raise GestureError(f"The {where} lacks the key {missing}: add it.") from None
-        except TypeError as cause:
-            raise GestureError(f"The {where} holds an entry that does not fit: {cause}.") from None
+        """Return the gesture set that plain values describe (a TOML file, a bundle).
+
+        Raises:
+            GestureError: for an unknown or missing key, or a value that does not fit.
+        """
+        return load_table(table, cls, where, GestureError)
 
     @classmethod
     def infer(cls, labels: Iterable[str], name: str = "inferred") -> GestureSet:
-        """The set that a folder of recordings implies: its labels in alphabetical order, affect unknown.
+        """Return the set of the labels in a folder of recordings: in alphabetical order, affect unknown.
 
         Labels that differ only in case, or ``_`` against space, are one gesture; the first spelling wins.
-        ``Custom`` is the GestureRecorder's own word for a gesture of the recorder's choice: free choice.
+        ``Custom`` is the GestureRecorder's label for a gesture of free choice.
         """
         spellings: dict[str, str] = {}
         for label in labels:
@@ -154,11 +138,11 @@ class GestureSet:
 
 
 def gesture_set_names() -> tuple[str, ...]:
-    """Names of the built-in gesture sets."""
+    """Return the names of the built-in gesture sets."""
     return builtin_names("gestures")
 
 
 def load_gestures(name_or_path: str | Path) -> GestureSet:
-    """A built-in gesture set by name, or one of the user's own by the path of its TOML file."""
+    """Load a built-in gesture set by name, or one of the user's own by the path of its TOML file."""
     table, source = read_named(name_or_path, "gestures", "gesture set", GestureError)
     return GestureSet.from_dict(table, f"gesture set '{source}'")

@@ -1,1 +1,1 @@
-"""What was recorded: the folder, the importers, the checks at the door."""
+"""The data set: its folder, importing, checks, marks, trimming, privacy, publishing."""

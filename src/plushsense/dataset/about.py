@@ -1,4 +1,4 @@
-"""Who made a data set and whom to ask about it: the table ``[about]`` of ``dataset.toml``, which publishing needs.
+"""Authors, contact and terms of a data set: the table ``[about]`` of ``dataset.toml``, which publishing needs.
 
     [about]
     title = "Touch on a plush companion"
@@ -12,12 +12,11 @@ Every key may be left out; an older data set has no such table.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from dataclasses import MISSING, asdict, dataclass, fields
-from typing import Any, TypeVar
+from dataclasses import asdict, dataclass, fields
+from typing import Any
 
 from plushsense.core.errors import DatasetError
-from plushsense.core.tomlfile import refuse_unknown
+from plushsense.core.toml import load_table
 
 _EMAIL = re.compile(r"[^@\s<>]+@[^@\s<>]+\.[^@\s<>]+")
 _DOI = re.compile(r"10\.\d{4,9}/\S+")
@@ -27,7 +26,7 @@ _CONTACT = re.compile(r"\s*(?P<name>[^<>]*?)\s*<\s*(?P<email>[^<>]+?)\s*>\s*")
 
 @dataclass(frozen=True)
 class Creator:
-    """One who made the data set, as it is to be cited: "Family, Given", or an organisation's name."""
+    """An author to be cited: "Family, Given", or the name of an organisation."""
 
     name: str
     orcid: str = ""
@@ -35,10 +34,10 @@ class Creator:
 
     def __post_init__(self) -> None:
         if not self.name.strip():
-            raise ValueError("a creator has no name")
+            raise DatasetError("a creator has no name: give one.")
         if self.orcid and not _is_orcid(self.orcid):
-            raise ValueError(
-                f"'{self.orcid}' is no ORCID iD: sixteen digits like 0000-0002-1825-0097, the last one a check digit"
+            raise DatasetError(
+                f"'{self.orcid}' is no ORCID iD: sixteen digits like 0000-0002-1825-0097, the last one a check digit."
             )
 
 
@@ -51,14 +50,14 @@ class Contact:
 
     def __post_init__(self) -> None:
         if self.email and not _EMAIL.fullmatch(self.email):
-            raise ValueError(f"'{self.email}' is no e-mail address: name@place.tld is accepted")
+            raise DatasetError(f"'{self.email}' is no e-mail address: name@place.tld is accepted.")
 
     def __bool__(self) -> bool:
         return bool(self.name and self.email)
 
     @classmethod
     def parse(cls, text: str) -> Contact:
-        """A contact from ``Name <mail>``.
+        """Read a contact of the form ``Name <mail>``.
 
         Raises:
             DatasetError: for another form.
@@ -73,7 +72,7 @@ class Contact:
 
 @dataclass(frozen=True)
 class Funding:
-    """Who paid, and the number of the award."""
+    """A funder and the number of the award."""
 
     funder: str
     award: str = ""
@@ -81,9 +80,9 @@ class Funding:
 
 @dataclass(frozen=True)
 class About:
-    """What a stranger needs to know about a data set; ``paper`` is the DOI of the publication that describes it.
+    """Description of a data set for others; ``paper`` is the DOI of the publication that describes it.
 
-    ``collected`` says in a few words how the recordings came about, ``limits`` what they should not be used for.
+    ``collected`` states how the recordings were made, ``limits`` what they should not be used for.
     """
 
     title: str = ""
@@ -104,14 +103,14 @@ class About:
         for key in ("doi", "paper"):
             value = getattr(self, key)
             if value and not _DOI.fullmatch(value):
-                raise ValueError(f"{key} is '{value}': a bare DOI is accepted, like 10.5281/zenodo.1234")
+                raise DatasetError(f"{key} is '{value}': a bare DOI is accepted, like 10.5281/zenodo.1234.")
         if self.homepage and not re.fullmatch(r"https?://\S+", self.homepage):
-            raise ValueError(f"homepage is '{self.homepage}': an address that begins with https:// is accepted")
+            raise DatasetError(f"homepage is '{self.homepage}': an address that begins with https:// is accepted.")
         if not re.fullmatch(r"[a-zA-Z]{2,3}(-[a-zA-Z0-9]{2,8})*", self.language):
-            raise ValueError(f"language is '{self.language}': a code like en is accepted")
+            raise DatasetError(f"language is '{self.language}': a code like en is accepted.")
 
     def to_table(self) -> dict[str, Any]:
-        """Plain values for TOML; what was left out stays out."""
+        """Return plain values for TOML, without those that were left out."""
         table = {}
         plain = About()
         for f in fields(self):
@@ -121,60 +120,12 @@ class About:
 
     @classmethod
     def from_table(cls, table: object, where: str) -> About:
-        """The table of a TOML file.
+        """Read the table of a TOML file.
 
         Raises:
             DatasetError: for an unknown key, with the nearest known one, or a value that does not fit.
         """
-        known = _mapping(table, where)
-        refuse_unknown(known, [f.name for f in fields(cls)], where, DatasetError)
-        values: dict[str, Any] = {}
-        try:
-            for key, value in known.items():
-                match key:
-                    case "creators":
-                        values[key] = tuple(_part(Creator, v, f"{where}, creators") for v in _list(value, key))
-                    case "funding":
-                        values[key] = tuple(_part(Funding, v, f"{where}, funding") for v in _list(value, key))
-                    case "contact":
-                        values[key] = _part(Contact, value, f"{where}, contact")
-                    case "keywords":
-                        values[key] = tuple(_text(v, key) for v in _list(value, key))
-                    case _:
-                        values[key] = _text(value, key)
-            return cls(**values)
-        except ValueError as cause:
-            raise DatasetError(f"{where[0].upper()}{where[1:]} cannot be used: {cause}.") from None
-
-
-P = TypeVar("P", Creator, Contact, Funding)
-
-
-def _part(kind: type[P], table: object, where: str) -> P:
-    given = _mapping(table, where)
-    refuse_unknown(given, [f.name for f in fields(kind)], where, DatasetError)
-    for f in fields(kind):
-        if f.default is MISSING and f.name not in given:
-            raise ValueError(f"an entry of {where.rsplit(', ', 1)[-1]} lacks '{f.name}'")
-    return kind(**{key: _text(value, key) for key, value in given.items()})
-
-
-def _mapping(table: object, where: str) -> Mapping[str, Any]:
-    if not isinstance(table, dict):
-        raise DatasetError(f"{where[0].upper()}{where[1:]} is {table!r}; it must be a table.")
-    return table
-
-
-def _list(value: object, key: str) -> list[Any]:
-    if not isinstance(value, list):
-        raise ValueError(f"{key} is {value!r}; it must be a list")
-    return value
-
-
-def _text(value: object, key: str) -> str:
-    if not isinstance(value, str):
-        raise ValueError(f"{key} is {value!r}; it must be a text")
-    return value
+        return load_table(table, cls, where, DatasetError)
 
 
 def _without_blanks(value: Any) -> Any:
@@ -184,7 +135,7 @@ def _without_blanks(value: Any) -> Any:
 
 
 def _is_orcid(text: str) -> bool:
-    """Whether the check digit fits (ISO 7064, MOD 11-2)."""
+    """Return whether a text is an ORCID iD with a correct check digit (ISO 7064, MOD 11-2)."""
     if not _ORCID.fullmatch(text):
         return False
     total = 0

@@ -1,7 +1,7 @@
-"""One file that brings a data set back: a zip with a manifest, checked after it was written and before it is used.
+"""Backup of a data set: one zip with a manifest, verified after writing and before restoring.
 
-In it is everything that people made: raw files, session files, marks, the people's table, evaluations, and whatever
-else lies there. Left out is what is made anew: ``cache/`` and the index. The same data set gives the same bytes.
+It holds raw files, session files, marks, the people's table, evaluations and all other files, but not what can be
+rebuilt: ``cache/`` and the index. The same data set gives the same bytes.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import json
 import os
 import re
 import stat
-import uuid
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -20,10 +19,10 @@ from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
 from plushsense.core.errors import DatasetError
-from plushsense.core.folders import whole_folder
-from plushsense.dataset.archives import DAMAGED, entry_of
-from plushsense.dataset.contents import contents
-from plushsense.dataset.index import open_dataset, rebuild
+from plushsense.core.files import new_folder, replacing_file
+from plushsense.dataset.files import list_files
+from plushsense.dataset.importing.archives import DAMAGED, zip_entry
+from plushsense.dataset.index import open_dataset, rebuild_index
 from plushsense.dataset.store import HEAD, Dataset
 
 MANIFEST = "plushsense-backup.json"
@@ -39,7 +38,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Backup:
-    """What is in a backup; ``hash`` is the data set's, ``left_out`` the links, which are not followed."""
+    """Summary of a backup; ``hash`` is the data set's, ``left_out`` lists links, which are not followed."""
 
     file: str
     name: str
@@ -51,7 +50,7 @@ class Backup:
     left_out: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, ready for JSON."""
+        """Return plain values for JSON."""
         return asdict(self) | {"left_out": list(self.left_out)}
 
 
@@ -71,42 +70,36 @@ def backup(dataset: str | Path, file: str | Path, progress: Progress | None = No
     if folder.resolve() in target.resolve().parents:
         raise DatasetError(f"'{target}' lies in the data set itself: give a place outside of '{folder}'.")
     source = open_dataset(folder)
-    part = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.part")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        found = [c for c in contents(folder) if c.kind not in _LEFT_OUT]
+        found = [c for c in list_files(folder) if c.kind not in _LEFT_OUT]
         kept = [c.path for c in found if c.kind != "link"]
         total = 2 * sum((folder / path).stat().st_size for path in kept)
         done = 0
         files = []
-        with part.open("xb") as out:
-            with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+        with replacing_file(target) as part:
+            with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as archive:
                 for path in kept:
                     files.append(_store(archive, folder, path))
                     done += files[-1]["bytes"]
                     if progress is not None:
                         progress(done, total)
                 _put(archive, MANIFEST, _manifest(source, files))
-            out.flush()
-            os.fsync(out.fileno())
-        _verified(part, lambda n: progress(total // 2 + n, total) if progress is not None else None)
-        if target.exists():
-            raise DatasetError(f"'{target}' appeared meanwhile: a backup never replaces another; give a new name.")
-        os.replace(part, target)
+            _verified(part, lambda n: progress(total // 2 + n, total) if progress is not None else None)
+            if target.exists():
+                raise DatasetError(f"'{target}' appeared meanwhile: a backup never replaces another; give a new name.")
     except OSError as cause:
         raise DatasetError(
             f"The backup '{target}' cannot be made ({cause.strerror or cause}; '{cause.filename or target}'): "
             "check the path and the disk."
         ) from None
-    finally:
-        part.unlink(missing_ok=True)
-    return _said(
+    return _summary(
         target, json.loads(_manifest(source, files)), tuple(c.path.as_posix() for c in found if c.kind == "link")
     )
 
 
 def check_backup(file: str | Path, progress: Progress | None = None) -> Backup:
-    """Read a backup through: every file that it says is there, none besides, and each as it was.
+    """Verify that a backup holds exactly the files of its manifest, each unchanged.
 
     Raises:
         DatasetError: naming what is missing, damaged or no backup at all.
@@ -114,7 +107,7 @@ def check_backup(file: str | Path, progress: Progress | None = None) -> Backup:
     path = Path(file)
     total = path.stat().st_size if path.is_file() else 0
     manifest = _verified(path, lambda n: progress(min(n, total), total) if progress is not None else None)
-    return _said(path, manifest)
+    return _summary(path, manifest)
 
 
 def restore(file: str | Path, dest: str | Path, progress: Progress | None = None) -> Dataset:
@@ -124,10 +117,10 @@ def restore(file: str | Path, dest: str | Path, progress: Progress | None = None
         DatasetError: for a damaged backup, one whose files would leave ``dest``, or a ``dest`` that holds something.
     """
     path, folder = Path(file), Path(dest)
-    with _opened(path) as (archive, manifest):
+    with _open_backup(path) as (archive, manifest):
         total = sum(entry["bytes"] for entry in manifest["files"])
         done = 0
-        with whole_folder(folder, DatasetError, last=HEAD) as work:
+        with new_folder(folder, DatasetError, last=HEAD) as work:
             for entry in manifest["files"]:
                 target = work / entry["path"]
                 target.parent.mkdir(parents=True, exist_ok=True)
@@ -136,7 +129,7 @@ def restore(file: str | Path, dest: str | Path, progress: Progress | None = None
                 done += entry["bytes"]
                 if progress is not None:
                     progress(done, total)
-            again = rebuild(work).dataset
+            again = rebuild_index(work).dataset
             if again.hash != manifest["hash"]:
                 raise DatasetError(
                     f"The backup '{path}' restores another data set than was saved ({len(again.recordings)} "
@@ -159,7 +152,7 @@ def _manifest(source: Dataset, files: list[dict[str, Any]]) -> str:
 
 
 def _put(archive: zipfile.ZipFile, name: str, text: str) -> None:
-    archive.writestr(entry_of(name), text.encode("utf-8"))
+    archive.writestr(zip_entry(name), text.encode("utf-8"))
 
 
 def _store(archive: zipfile.ZipFile, folder: Path, path: PurePosixPath) -> dict[str, Any]:
@@ -167,7 +160,7 @@ def _store(archive: zipfile.ZipFile, folder: Path, path: PurePosixPath) -> dict[
     size = 0
     with (folder / path).open("rb") as file:
         before = os.fstat(file.fileno())
-        with archive.open(entry_of(path.as_posix()), "w", force_zip64=before.st_size >= 1 << 31) as member:
+        with archive.open(zip_entry(path.as_posix()), "w", force_zip64=before.st_size >= 1 << 31) as member:
             while chunk := file.read(_CHUNK):
                 digest.update(chunk)
                 size += len(chunk)
@@ -178,7 +171,7 @@ def _store(archive: zipfile.ZipFile, folder: Path, path: PurePosixPath) -> dict[
     return {"path": path.as_posix(), "bytes": size, "sha256": digest.hexdigest()}
 
 
-def _said(file: Path, manifest: dict[str, Any], left_out: tuple[str, ...] = ()) -> Backup:
+def _summary(file: Path, manifest: dict[str, Any], left_out: tuple[str, ...] = ()) -> Backup:
     files = manifest["files"]
     return Backup(
         str(file),
@@ -196,14 +189,13 @@ def _damaged(path: Path, why: object) -> DatasetError:
     return DatasetError(f"The backup '{path}' is damaged ({why}): take another copy of it.")
 
 
-# Whatever a damaged zip can make its reader raise.
-# A member that the manifest names may be missing, too.
+# What the reader raises on a damaged zip, or on a member of the manifest that is missing.
 _BROKEN: tuple[type[Exception], ...] = (*DAMAGED, KeyError, IndexError)
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[tuple[zipfile.ZipFile, dict[str, Any]]]:
-    """A backup with its manifest, once its members are known to be those of the manifest."""
+def _open_backup(path: Path) -> Iterator[tuple[zipfile.ZipFile, dict[str, Any]]]:
+    """Open a backup and check that its members are those of its manifest."""
     try:
         archive = zipfile.ZipFile(path)
     except FileNotFoundError:
@@ -218,23 +210,23 @@ def _opened(path: Path) -> Iterator[tuple[zipfile.ZipFile, dict[str, Any]]]:
         if MANIFEST not in names:
             raise DatasetError(f"'{path}' is no backup of PlushSense (it holds no {MANIFEST}), or a damaged one.")
         for info in members:
-            if reason := _refused(info):
+            if reason := _refusal(info):
                 raise DatasetError(f"The backup '{path}' is not used: '{info.filename}' in it is {reason}.")
         if len(set(names)) != len(names):
             raise _damaged(path, "a name stands in it twice")
         manifest = _manifest_of(path, archive)
         listed = {entry["path"] for entry in manifest["files"]}
         if odd := sorted(listed ^ (set(names) - {MANIFEST})):
-            said = "is missing" if odd[0] in listed else "is not in the manifest"
-            raise _damaged(path, f"'{odd[0]}' {said}")
+            reason = "is missing" if odd[0] in listed else "is not in the manifest"
+            raise _damaged(path, f"'{odd[0]}' {reason}")
         yield archive, manifest
 
 
-def _refused(info: zipfile.ZipInfo) -> str:
-    """Why a member is not taken out; "" where nothing is wrong with it."""
+def _refusal(info: zipfile.ZipInfo) -> str:
+    """Return why a member must not be unpacked; "" when it may."""
     name = info.filename
     parts = name.split("/")
-    # The reader cuts a name at a zero byte; the original name tells.
+    # zipfile cuts a name at a zero byte; ``orig_filename`` keeps it.
     if name.startswith("/") or "\\" in name or re.match(r"[A-Za-z]:", name) or "\0" in info.orig_filename:
         return "an absolute path or one of another system"
     if any(part in ("", ".", "..") for part in parts):
@@ -291,11 +283,11 @@ def _read(path: Path, archive: zipfile.ZipFile, entry: dict[str, Any], out: IO[b
         raise _damaged(path, f"'{entry['path']}' is not what was saved")
 
 
-def _verified(path: Path, tell: Callable[[int], None]) -> dict[str, Any]:
-    with _opened(path) as (archive, manifest):
+def _verified(path: Path, progress: Callable[[int], None]) -> dict[str, Any]:
+    with _open_backup(path) as (archive, manifest):
         done = 0
         for entry in manifest["files"]:
             _read(path, archive, entry)
             done += entry["bytes"]
-            tell(done)
+            progress(done)
     return manifest

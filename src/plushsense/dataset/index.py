@@ -1,10 +1,10 @@
-"""The index of a data set: made anew from the raw files and the marks, whenever either changed."""
+"""The index of a data set: rebuilt from the raw files and the marks whenever one of them changed."""
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import itertools
+import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,23 +13,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import DatasetError, FileFormatError
+from plushsense.core.errors import DatasetError, FileFormatError, ForgottenError
 from plushsense.core.gestures import NOBODY, Gesture, plain_label
-from plushsense.core.recfile import Frames, ReadResult, parse_name, read_bytes, read_recording, read_stream
-from plushsense.dataset.freshness import (
+from plushsense.core.recorder_csv import Frames, ReadResult, parse_name, read_bytes, read_recording, read_stream
+from plushsense.dataset.files import (
     RECORDINGS_INDEX,
     STAMP,
     STREAMS_INDEX,
-    is_fresh,
+    current_stamp,
+    is_index_fresh,
+    is_same_raw_data,
     missing_files,
     raw_files,
-    same_files,
-    taken,
     write_stamp,
 )
-from plushsense.dataset.marks import Standing, read_marks
-from plushsense.dataset.quality import Examined, findings, measured_rate_hz, usual_rows
-from plushsense.dataset.quality.finding import PARTLY_THERE
+from plushsense.dataset.generation import Generation
+from plushsense.dataset.marks import MarkState, read_marks
+from plushsense.dataset.quality.findings import PARTLY_THERE
+from plushsense.dataset.quality.measurements import Examination, measured_rate_hz, usual_rows
+from plushsense.dataset.quality.registry import import_flags
 from plushsense.dataset.store import (
     RECORDINGS,
     STREAMS,
@@ -45,7 +47,7 @@ Progress = Callable[[int, int], None]
 
 
 @dataclass
-class _Read:
+class _RawFile:
     path: Path
     subject: str
     result: ReadResult
@@ -53,17 +55,17 @@ class _Read:
 
 
 @dataclass
-class Rebuilt:
-    """What came of rebuilding: files that could not be read, with the reason."""
+class IndexBuild:
+    """Result of building the index: the data set, and the files that could not be read with the reason."""
 
     dataset: Dataset
     unreadable: dict[str, str] = field(default_factory=dict)
 
 
 def open_dataset(path: str | Path) -> Dataset:
-    """Open a data set folder; the index is made anew when the raw files, the marks or the head changed since.
+    """Open a data set folder; the index is rebuilt if the raw files, the marks or the head changed.
 
-    On a disk that cannot be written the index is made in memory each time it is out of date.
+    On a read-only disk the index is rebuilt in memory each time it is out of date.
 
     Raises:
         DatasetError: when the folder is missing, empty, or not a data set, or a raw file is gone or cannot be read
@@ -72,21 +74,27 @@ def open_dataset(path: str | Path) -> Dataset:
     folder = Path(path)
     head = DatasetHead.read(folder)
     try:
-        if is_fresh(folder):
+        generation = Generation.of(folder)
+        if is_index_fresh(folder):
             return Dataset(
                 folder,
                 head,
                 read_index(folder / RECORDINGS_INDEX, RecordingInfo),
                 read_index(folder / STREAMS_INDEX, StreamInfo),
+                generation,
             )
         if missing := missing_files(folder):
             raise DatasetError(
                 f"'{folder}' lacks {len(missing)} raw file{'s' if len(missing) > 1 else ''} that it had "
                 f"('{missing[0]}'): bring them back, or delete {STAMP} there to go on without them."
             )
-        stamp = taken(folder)
-        # A decision changes no raw file: the index stays, and only the marks are laid over it anew.
-        built = _remarked(folder, head) if same_files(folder, stamp) else build(folder, head)
+        stamp = current_stamp(folder)
+        # Marks change no raw file: reuse the index and apply the marks again.
+        built = (
+            _with_present_marks(folder, head, generation)
+            if is_same_raw_data(folder, stamp)
+            else build_index(folder, head)
+        )
     except OSError as cause:
         raise DatasetError(f"'{folder}' cannot be read: {cause.strerror or cause} ({cause.filename}).") from None
     if built.unreadable:
@@ -96,99 +104,117 @@ def open_dataset(path: str | Path) -> Dataset:
             f"{f', nor can {len(built.unreadable) - 1} other files' if len(built.unreadable) > 1 else ''}: "
             f"bring it back, or take it out of the data set. {reason}"
         )
-    # A read-only disk: the index is only there to be fast.
-    with contextlib.suppress(OSError):
-        write(built.dataset, stamp)
+    try:
+        with generation.writing():
+            write_index_files(built.dataset, stamp)
+    except ForgottenError:
+        if Generation.of(folder) != generation:
+            return open_dataset(folder)
+        # An interrupted removal: the data are readable, and the index is written when it is finished.
+    except OSError:
+        # A read-only disk: the index only saves time.
+        pass
     return built.dataset
 
 
-def _remarked(folder: Path, head: DatasetHead) -> Rebuilt:
-    """The index on disk with the marks as they stand; for raw files that are as they were when it was made."""
+def _with_present_marks(folder: Path, head: DatasetHead, generation: Generation) -> IndexBuild:
+    """Apply the present marks to the index on disk; the raw files must be unchanged."""
     bare = [
         replace(r, start=0, stop=r.rows, excluded=False) for r in read_index(folder / RECORDINGS_INDEX, RecordingInfo)
     ]
     streams = read_index(folder / STREAMS_INDEX, StreamInfo)
-    return Rebuilt(Dataset(folder, head, with_marks(bare, read_marks(folder)), streams))
+    return IndexBuild(Dataset(folder, head, apply_marks(bare, read_marks(folder)), streams, generation))
 
 
-def rebuild(folder: Path, head: DatasetHead | None = None, progress: Progress | None = None) -> Rebuilt:
-    """Make the index anew; while a raw file cannot be read, the index on disk is left as it is."""
-    stamp = taken(folder)
-    built = build(folder, head or DatasetHead.read(folder), progress)
+def rebuild_index(folder: Path, head: DatasetHead | None = None, progress: Progress | None = None) -> IndexBuild:
+    """Rebuild the index; while a raw file cannot be read, the index on disk stays as it is.
+
+    Raises:
+        ForgottenError: when a person was taken out meanwhile.
+    """
+    stamp = current_stamp(folder)
+    built = build_index(folder, head or DatasetHead.read(folder), progress)
     if not built.unreadable:
-        write(built.dataset, stamp)
+        with built.dataset.generation.writing():
+            write_index_files(built.dataset, stamp)
     return built
 
 
-def write(dataset: Dataset, stamp: dict[str, Any] | None = None) -> None:
+def write_index_files(dataset: Dataset, stamp: dict[str, Any] | None = None) -> None:
     """Replace the index files by what ``dataset`` holds; ``stamp`` is what was `taken` before the raw files were read.
 
     Raises:
         OSError: when the disk refuses.
     """
-    stamp = stamp or taken(dataset.path)
+    stamp = stamp or current_stamp(dataset.path)
     write_index(dataset.path / STREAMS_INDEX, dataset.streams, StreamInfo)
     write_index(dataset.path / RECORDINGS_INDEX, dataset.recordings, RecordingInfo)
     write_stamp(dataset.path, stamp)
 
 
-def build(folder: Path, head: DatasetHead, progress: Progress | None = None) -> Rebuilt:
+def build_index(folder: Path, head: DatasetHead, progress: Progress | None = None) -> IndexBuild:
     """Read every raw file, locate the recordings in their streams and apply the marks; nothing is written."""
+    generation = Generation.of(folder)
     files = raw_files(folder)
     unreadable: dict[str, str] = {}
-    streams: list[_Read] = []
-    recordings: list[_Read] = []
+    streams: list[_RawFile] = []
+    recordings: list[_RawFile] = []
     for done, (kind, path) in enumerate(files):
         reader = read_stream if kind == STREAMS else read_recording
         relative = path.relative_to(folder).as_posix()
         try:
             data = read_bytes(path)
             result = reader(path, head.layout, data)
-            read = _Read(path, path.relative_to(folder / kind).parts[0], result, hashlib.sha256(data).hexdigest())
+            read = _RawFile(path, path.relative_to(folder / kind).parts[0], result, hashlib.sha256(data).hexdigest())
         except FileFormatError as cause:
             unreadable[relative] = str(cause)
             continue
         (streams if kind == STREAMS else recordings).append(read)
         if progress is not None:
             progress(done + 1, len(files))
-    infos = [*_from_files(folder, head, recordings, streams), *_from_labels(folder, head, streams)]
-    infos = with_marks(infos, read_marks(folder))
+    infos = [
+        *_recordings_from_files(folder, head, recordings, streams),
+        *_recordings_from_labels(folder, head, streams),
+    ]
+    infos = apply_marks(infos, read_marks(folder))
     infos.sort(key=lambda r: r.id)
-    return Rebuilt(Dataset(folder, head, infos, [_stream_info(folder, head, s) for s in streams]), unreadable)
+    found = Dataset(folder, head, infos, [_stream_info(folder, head, s) for s in streams], generation)
+    return IndexBuild(found, unreadable)
 
 
-AGAIN = "again-"
+DUPLICATE_FOLDER = "again-"
 
 
 def _session(relative: Path, labelled: bool = False) -> str:
-    """The session of a raw file by its path below ``recordings/`` or ``streams/``: the folder in the person's.
+    """Return the session of a raw file from its path below ``recordings/`` or ``streams/``.
 
-    Without one it is 1; but streams with labels lie side by side, and each is a session by its own name.
+    It is the folder in the person's. Without one it is 1; but streams with labels lie side by side, and each is a
+    session named after its file.
     """
     inner = relative.parts[1:-1]
-    if inner and not inner[0].startswith(AGAIN):
+    if inner and not inner[0].startswith(DUPLICATE_FOLDER):
         return inner[0]
     return relative.stem if labelled else "1"
 
 
-def _stream_session(folder: Path, read: _Read) -> str:
+def _stream_session(folder: Path, read: _RawFile) -> str:
     return _session(read.path.relative_to(folder / STREAMS), read.result.frames.labels is not None)
 
 
 def _subject(folder_name: str, gesture: Gesture | None) -> str:
-    """Whose a recording is: its folder's person, but nobody's where the gesture is made by nobody."""
+    """Return whose a recording is: the person of its folder, or nobody if nobody makes the gesture."""
     return NOBODY if gesture is not None and gesture.nobody else folder_name
 
 
-def _stream_id(folder: Path, read: _Read) -> str:
+def _stream_id(folder: Path, read: _RawFile) -> str:
     return read.path.relative_to(folder / STREAMS).with_suffix("").as_posix()
 
 
-def _stream_info(folder: Path, head: DatasetHead, read: _Read) -> StreamInfo:
+def _stream_info(folder: Path, head: DatasetHead, read: _RawFile) -> StreamInfo:
     frames = read.result.frames
     steps = np.diff(frames.device_ms)
     broken = (steps < 0) | (steps > head.layout.gap_ms)
-    said = findings(Examined(frames, head.layout, None, None, stream=True))
+    flags = import_flags(Examination(frames, head.layout, None, None, stream=True))
     return StreamInfo(
         id=_stream_id(folder, read),
         subject=read.subject,
@@ -197,15 +223,15 @@ def _stream_info(folder: Path, head: DatasetHead, read: _Read) -> StreamInfo:
         rows=len(frames),
         seconds=float(steps[~broken].sum()) / 1000.0,
         restarts=int(broken.sum()),
-        flags=tuple(read.result.warnings + said),
+        flags=tuple(read.result.warnings + flags),
         sha256=read.sha256,
     )
 
 
 def _locate(recording: ReadResult, stream: ReadResult, at: _RowLookup) -> tuple[int, int]:
-    """Row of the stream at which a recording begins, and how many of its rows follow there; (−1, 0) when absent."""
+    """Return the stream row at which a recording begins and how many of its rows follow there; (−1, 0) if absent."""
     frames, whole = recording.frames, stream.frames
-    # Delays that were added up begin at 0 in every file: only their differences can be compared.
+    # Clocks summed from delays begin at 0 in every file, so only differences are comparable.
     relative = recording.integrated or stream.integrated
     rows: Iterable[int]
     if frames.host_ms is not None and whole.host_ms is not None:
@@ -221,7 +247,7 @@ def _locate(recording: ReadResult, stream: ReadResult, at: _RowLookup) -> tuple[
         same = (frames.device_ms[:n] + shift == whole.device_ms[row : row + n]) & (
             frames.values[:n] == whole.values[row : row + n]
         ).all(axis=1)
-        # Rows that the host stamped alike may be missing from one of the two files: the start decides.
+        # Rows with equal host stamps may be missing from one of the files, so compare from the start.
         agreeing = int(np.argmin(same)) if not same.all() else n
         if agreeing > best[1]:
             best = (row, agreeing)
@@ -229,14 +255,16 @@ def _locate(recording: ReadResult, stream: ReadResult, at: _RowLookup) -> tuple[
 
 
 def _best_stream(
-    folder: Path, recording: _Read, session: str, streams: Iterable[_Read], lookups: dict[int, _RowLookup]
-) -> tuple[_Read | None, int, int]:
-    """The person's stream that holds most of a recording, its row there, and how many rows follow; (None, −1, 0).
+    folder: Path, recording: _RawFile, session: str, streams: Iterable[_RawFile], lookups: dict[int, _RowLookup]
+) -> tuple[_RawFile | None, int, int]:
+    """Find the person's stream that holds most of a recording, its row there, and how many rows follow.
 
-    The session's own first. Another session's only if it holds all of it: a day that begins with the same stamps is
-    not where the recording was made.
+    Returns (None, −1, 0) if no stream holds it.
+
+    The session's own stream comes first; another one counts only if it holds the whole recording, since two days may
+    begin with the same time stamps.
     """
-    best: tuple[_Read | None, int, int] = (None, -1, 0)
+    best: tuple[_RawFile | None, int, int] = (None, -1, 0)
     for own in (True, False):
         for stream in streams:
             if (_stream_session(folder, stream) == session) is not own:
@@ -249,7 +277,9 @@ def _best_stream(
     return best
 
 
-def _from_files(folder: Path, head: DatasetHead, recordings: list[_Read], streams: list[_Read]) -> list[RecordingInfo]:
+def _recordings_from_files(
+    folder: Path, head: DatasetHead, recordings: list[_RawFile], streams: list[_RawFile]
+) -> list[RecordingInfo]:
     named = []
     gestures: dict[str, Gesture | None] = {}
     for read in recordings:
@@ -263,19 +293,19 @@ def _from_files(folder: Path, head: DatasetHead, recordings: list[_Read], stream
         found = gestures[name.label]
         named.append((read, name, found.label if found else name.label))
     usual = usual_rows((label, len(read.result.frames)) for read, _, label in named)
-    by_subject: dict[str, list[_Read]] = {}
+    by_subject: dict[str, list[_RawFile]] = {}
     for stream in streams:
         by_subject.setdefault(stream.subject, []).append(stream)
-    # Duplicates are by content: the first in name order is the original.
+    # Duplicates have equal content; the first in name order is the original.
     originals: dict[str, str] = {}
     lookups = {id(s): _RowLookup.of(s.result.frames) for s in streams}
     infos = []
     for read, name, label in named:
         frames = read.result.frames
         identity = read.path.relative_to(folder / RECORDINGS).with_suffix("").as_posix()
-        flags = read.result.warnings + findings(Examined(frames, head.layout, name.rows, usual[label]))
+        flags = read.result.warnings + import_flags(Examination(frames, head.layout, name.rows, usual[label]))
         known = gestures[name.label]
-        if known is None or (known.affect == "none" and head.gestures.tells_affect):
+        if known is None or (known.affect == "none" and head.gestures.has_affect):
             flags.append(f"its label '{name.label}' is not in the gesture set '{head.gestures.name}': no affect")
         if read.sha256 in originals:
             flags.append(f"the same content as {originals[read.sha256]}")
@@ -330,8 +360,8 @@ class _RowLookup:
         return found
 
 
-def _from_labels(folder: Path, head: DatasetHead, streams: list[_Read]) -> list[RecordingInfo]:
-    """Recordings of streams that carry a label on every row: one for each run of equal labels.
+def _recordings_from_labels(folder: Path, head: DatasetHead, streams: list[_RawFile]) -> list[RecordingInfo]:
+    """Return the recordings of streams with a label on every row: one for each run of equal labels.
 
     Rows without a label belong to none.
     """
@@ -343,13 +373,13 @@ def _from_labels(folder: Path, head: DatasetHead, streams: list[_Read]) -> list[
         frames = read.result.frames
         edges = [0, *(np.flatnonzero(labels[1:] != labels[:-1]) + 1).tolist(), len(labels)]
         for number, (first, last) in enumerate(itertools.pairwise(edges)):
-            said = str(labels[first])
-            if not plain_label(said):
+            text = str(labels[first])
+            if not plain_label(text):
                 continue
-            found = head.gestures.find(said)
-            label = found.label if found else said
+            found = head.gestures.find(text)
+            label = found.label if found else text
             part = frames.slice(first, last)
-            flags = findings(Examined(part, head.layout, None, None))
+            flags = import_flags(Examination(part, head.layout, None, None))
             infos.append(
                 RecordingInfo(
                     id=f"{_stream_id(folder, read)}#{number:03d} {label}",
@@ -374,8 +404,8 @@ def _from_labels(folder: Path, head: DatasetHead, streams: list[_Read]) -> list[
     return infos
 
 
-def with_marks(infos: Iterable[RecordingInfo], marks: dict[str, Standing]) -> list[RecordingInfo]:
-    """The recordings as the marks leave them."""
+def apply_marks(infos: Iterable[RecordingInfo], marks: dict[str, MarkState]) -> list[RecordingInfo]:
+    """Return the recordings with the marks applied."""
     out = []
     for info in infos:
         mark = marks.get(info.id)
@@ -390,3 +420,8 @@ def with_marks(infos: Iterable[RecordingInfo], marks: dict[str, Standing]) -> li
             info = RecordingInfo(**values)
         out.append(info)
     return out
+
+
+def as_dataset(dataset: Dataset | str | os.PathLike[str]) -> Dataset:
+    """Return the data set itself, or open the one at a path."""
+    return dataset if isinstance(dataset, Dataset) else open_dataset(Path(dataset))

@@ -1,4 +1,4 @@
-"""Marks: what people decided about recordings. Append-only; a raw file never changes."""
+"""Marks: decisions about recordings, appended to ``marks.jsonl``. Raw files never change."""
 
 from __future__ import annotations
 
@@ -14,22 +14,23 @@ from typing import Any, BinaryIO
 from filelock import FileLock
 
 from plushsense.core.errors import DatasetError, nearest
-from plushsense.core.tomlfile import refuse_unknown
+from plushsense.core.toml import refuse_unknown
 
 MARKS = "marks.jsonl"
 BY_HAND, SUGGESTED = "hand", "suggested"
-NEEDED = ("recording", "action", "who")
+_REQUIRED = ("recording", "action", "who")
 _LOCK_S = 30.0
 ACTIONS = ("trim", "untrim", "exclude", "include", "accept", "unaccept")
 
 
 @dataclass(frozen=True)
 class Mark:
-    """One decision: ``trim`` keeps rows ``start`` to ``stop``; ``untrim``, ``include`` and ``unaccept`` undo.
+    """A decision about a recording.
 
-    ``accept`` says that what the check ``check`` found is known and no fault. ``recording`` is the id of a recording or
-    a stream, or "" for the data set as a whole. ``how`` a trim came about: "hand" set by a person, "suggested" accepted
-    as suggested; "" in marks from before that was kept, which count as set by hand.
+    ``trim`` keeps rows ``start`` to ``stop``, ``exclude`` takes the recording out of use, ``accept`` states that the
+    findings of the check ``check`` are known and no fault; ``untrim``, ``include`` and ``unaccept`` undo them.
+    ``recording`` is the id of a recording or a stream, or "" for the whole data set. ``how`` is the origin of a trim:
+    "hand" (set by a person) or "suggested" (accepted as suggested); "" in older marks, which count as set by hand.
     """
 
     recording: str
@@ -44,9 +45,10 @@ class Mark:
 
 
 @dataclass(frozen=True)
-class Standing:
-    """Where the marks leave one recording; ``accepted`` are the checks whose findings somebody accepted, ``how`` is the
-    standing trim's.
+class MarkState:
+    """State of a recording after all its marks.
+
+    ``accepted`` holds the checks whose findings were accepted; ``how`` is that of the trim in force.
     """
 
     excluded: bool = False
@@ -57,12 +59,12 @@ class Standing:
 
     @property
     def trimmed(self) -> bool:
-        """Whether a trim stands, be it one that keeps the whole recording."""
+        """Whether a trim is in force, even one that keeps the whole recording."""
         return bool(self.how) or (self.start, self.stop) != (0, -1)
 
 
-def _checked(mark: Mark, where: str) -> Mark:
-    """The mark, when its values are of the right type and range."""
+def _validated(mark: Mark, where: str) -> Mark:
+    """Return the mark if its values have the right type and range."""
     for key in ("recording", "action", "who", "why", "when", "check", "how"):
         if not isinstance(getattr(mark, key), str):
             raise DatasetError(f"{where}: {key} is {getattr(mark, key)!r}; it must be a text.")
@@ -87,8 +89,8 @@ def _checked(mark: Mark, where: str) -> Mark:
     return mark
 
 
-def matching(pattern: str, known: Iterable[str], what: str) -> list[str]:
-    """The ids that a pattern names: the id itself, or a glob such as ``P19/*``.
+def match_ids(pattern: str, known: Iterable[str], what: str) -> list[str]:
+    """Return the ids that a pattern matches: the id itself, or a glob such as ``P19/*``.
 
     Raises:
         DatasetError: when it names none, with the nearest one.
@@ -105,20 +107,20 @@ def matching(pattern: str, known: Iterable[str], what: str) -> list[str]:
 
 
 def append_marks(folder: Path, marks: Iterable[Mark]) -> None:
-    """Add marks at the end, under a file lock, so that two programs can mark at once.
+    """Append marks under a file lock, so that two programs can mark at once.
 
     Raises:
         DatasetError: for a mark that cannot be, or a folder that cannot be written.
     """
     lines = []
     for mark in marks:
-        table = asdict(_checked(mark, f"The mark of '{mark.recording}'"))
+        table = asdict(_validated(mark, f"The mark of '{mark.recording}'"))
         table["when"] = mark.when or datetime.now(timezone.utc).isoformat(timespec="seconds")
         lines.append(json.dumps(table, ensure_ascii=False) + "\n")
     path = folder / MARKS
     try:
         with FileLock(folder / (MARKS + ".lock"), timeout=_LOCK_S), path.open("a+b") as file:
-            # What a crash left without an end must not swallow the next mark.
+            # An incomplete last line must not merge with the next mark.
             if file.seek(0, os.SEEK_END) > 0:
                 file.seek(-1, os.SEEK_END)
                 if file.read(1) != b"\n":
@@ -128,34 +130,35 @@ def append_marks(folder: Path, marks: Iterable[Mark]) -> None:
         raise DatasetError(f"'{path}' cannot be written: {cause.strerror or cause}.") from None
 
 
-def read_marks(folder: Path) -> dict[str, Standing]:
-    """Where the marks leave each marked recording.
+def read_marks(folder: Path) -> dict[str, MarkState]:
+    """Return the state of each marked recording.
 
-    A line that is no JSON was torn by a crash while writing and is passed over; one that is JSON but no mark is an
-    error.
+    A line that is not JSON was torn by a crash and is skipped; JSON that is not a mark is an error.
 
     Raises:
         DatasetError: naming the line.
     """
-    return FollowedMarks(folder).standing()
+    return MarksFollower(folder).states()
 
 
-class FollowedMarks:
-    """The marks of a data set, read again only as far as other programs added to them. Not for two threads at once."""
+class MarksFollower:
+    """The marks of a data set, read again only as far as other programs added to them. Not thread-safe."""
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / MARKS
-        self._standing: dict[str, Standing] = {}
+        self._states: dict[str, MarkState] = {}
         self._seen: tuple[int, int, int] | None = None
         self._lines = self._bytes = 0
 
     @property
     def changed(self) -> bool:
-        """Whether the file is another than when `standing` was last asked for."""
+        """Whether the file changed since `states` was last called."""
         return self._now() != self._seen
 
-    def standing(self) -> dict[str, Standing]:
-        """As `read_marks`; each call gives a new dictionary where something changed, the same one otherwise.
+    def states(self) -> dict[str, MarkState]:
+        """Return the state of each marked recording, as `read_marks`.
+
+        The dictionary is a new one if something changed, and the same one otherwise.
 
         Raises:
             DatasetError: naming the line.
@@ -164,31 +167,31 @@ class FollowedMarks:
         if now == self._seen:
             return self._given
         if now is None:
-            # Taken back as a whole, which nothing here does: as if no mark had been.
-            self._standing, self._lines, self._bytes = {}, 0, 0
+            # The file was removed by another program.
+            self._states, self._lines, self._bytes = {}, 0, 0
             self._seen, self._given = now, {}
             return self._given
         try:
             with self._path.open("rb") as file:
                 if self._seen is None or now[0] != self._seen[0] or now[1] < self._bytes or not self._goes_on(file):
-                    self._standing, self._lines, self._bytes = {}, 0, 0
+                    self._states, self._lines, self._bytes = {}, 0, 0
                 file.seek(self._bytes)
                 *whole, rest = file.read().split(b"\n")
         except OSError as cause:
             raise DatasetError(f"'{self._path}' cannot be read: {cause.strerror or cause}.") from None
-        standing = dict(self._standing)
+        states = dict(self._states)
         for line in whole:
-            self._take(line, self._lines + 1, standing)
+            self._take(line, self._lines + 1, states)
             self._lines += 1
             self._bytes += len(line) + 1
-        self._standing = dict(standing)
-        # What has no end yet may be a mark, or the beginning of one.
-        self._take(rest, self._lines + 1, standing)
+        self._states = dict(states)
+        # A line without an end may be a mark, or the beginning of one.
+        self._take(rest, self._lines + 1, states)
         self._tail = whole[-1] if whole else self._tail
-        self._seen, self._given = now, standing
-        return standing
+        self._seen, self._given = now, states
+        return states
 
-    _given: dict[str, Standing] = {}  # noqa: RUF012 (replaced, never changed)
+    _given: dict[str, MarkState] = {}  # noqa: RUF012, RUF100
     _tail = b""
 
     def _now(self) -> tuple[int, int, int] | None:
@@ -201,11 +204,11 @@ class FollowedMarks:
         return now.st_ino, now.st_size, now.st_mtime_ns
 
     def _goes_on(self, file: BinaryIO) -> bool:
-        """Whether the last line that was read still stands where it stood."""
+        """Return whether the last line that was read is still at its place."""
         file.seek(max(0, self._bytes - len(self._tail) - 1))
         return self._bytes == 0 or file.read(len(self._tail) + 1) == self._tail + b"\n"
 
-    def _take(self, line: bytes, number: int, standing: dict[str, Standing]) -> None:
+    def _take(self, line: bytes, number: int, states: dict[str, MarkState]) -> None:
         where = f"'{self._path}' line {number}"
         try:
             table: Any = json.loads(line.decode("utf-8"))
@@ -214,14 +217,14 @@ class FollowedMarks:
         if not isinstance(table, dict):
             raise DatasetError(f"{where} is no mark: each line is one JSON object.")
         refuse_unknown(table, Mark.__dataclass_fields__, where, DatasetError)
-        if lacking := [key for key in NEEDED if key not in table]:
-            raise DatasetError(f"{where} lacks {', '.join(lacking)}: a mark says at least {', '.join(NEEDED)}.")
-        mark = _checked(Mark(**table), where)
-        standing[mark.recording] = after(standing.get(mark.recording, Standing()), mark)
+        if lacking := [key for key in _REQUIRED if key not in table]:
+            raise DatasetError(f"{where} lacks {', '.join(lacking)}: a mark says at least {', '.join(_REQUIRED)}.")
+        mark = _validated(Mark(**table), where)
+        states[mark.recording] = apply_mark(states.get(mark.recording, MarkState()), mark)
 
 
-def after(now: Standing, mark: Mark) -> Standing:
-    """Where one more mark leaves a recording."""
+def apply_mark(now: MarkState, mark: Mark) -> MarkState:
+    """Return the state of a recording after one more mark."""
     match mark.action:
         case "trim":
             return replace(now, start=mark.start, stop=mark.stop, how=mark.how)
@@ -237,8 +240,8 @@ def after(now: Standing, mark: Mark) -> Standing:
             return replace(now, accepted=now.accepted - {mark.check})
 
 
-def taking_back(mark: Mark, before: Standing, who: str, why: str = "") -> Mark:
-    """The mark that undoes ``mark`` where it was made on a recording that stood as ``before``."""
+def inverse_mark(mark: Mark, before: MarkState, who: str, why: str = "") -> Mark:
+    """Return the mark that undoes ``mark`` on a recording whose state was ``before``."""
     match mark.action:
         case "trim" | "untrim" if before.trimmed:
             return Mark(mark.recording, "trim", who, why, start=before.start, stop=before.stop, how=before.how)

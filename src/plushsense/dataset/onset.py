@@ -1,7 +1,7 @@
-"""Where a gesture begins and ends inside its recording, read from how much the signals move.
+"""Onset and offset detection: where a gesture begins and ends inside its recording, from signal activity.
 
-Offline, base install only. The recorder starts with a key and the person begins when ready, so a recording holds a
-little rest, the gesture, a little rest. Every step counts in units of the device's own noise:
+The recorder starts with a key and the person begins when ready, so a recording holds some rest, the gesture, and some
+rest. All steps use units of the device's own noise:
 
 1. each sensor's speed (change over 0.1 s, lightly smoothed), over its speed at rest; a vector's axes count as one
    sensor. Contact sensors (capacitive, proximity) also by how far they are from the level before the touch, since
@@ -24,8 +24,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.recfile import Frames
-from plushsense.core.signal import Layout
+from plushsense.core.layouts import Layout
+from plushsense.core.recorder_csv import Frames
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -39,8 +39,8 @@ _CONTACT = ("capacitive", "proximity")
 class OnsetSpec:
     """The numbers of the method. Shares are of the way from rest to height, on a logarithmic scale.
 
-    ``onset_at``, ``offset_at``: where the walk outwards ends; ``clear_at``: what is clear activity. ``quiet_s`` of
-    quiet end the walk. ``least_contrast``: below it nothing happens. Activity shorter than ``least_s`` is a knock.
+    The walk outwards ends at ``onset_at`` and ``offset_at`` after ``quiet_s`` of quiet; activity above ``clear_at`` is
+    clear. Below ``least_contrast`` there is no gesture, and activity shorter than ``least_s`` is a knock.
     """
 
     smooth_s: float = 0.05
@@ -63,10 +63,10 @@ SPEC = OnsetSpec()
 
 @dataclass(frozen=True)
 class Suggestion:
-    """Rows ``start`` to ``stop`` of a recording hold the gesture, as far as the signals tell.
+    """Suggested trim: rows ``start`` to ``stop`` of a recording hold the gesture.
 
-    Where no onset is visible (it moves already at the first row, or nothing happens at all) ``start`` is 0 and its
-    confidence 0; likewise ``stop`` is the end. ``contrast``: height over rest. ``why`` says what was not visible.
+    If no onset is visible (movement at the first row, or no activity at all), ``start`` and its confidence are 0;
+    likewise ``stop`` is the end. ``contrast`` is activity at its height over rest, ``why`` states what is not visible.
     """
 
     start: int
@@ -108,11 +108,11 @@ def suggest(frames: Frames, layout: Layout, before: Frames | None = None, spec: 
     start, stop = onset(spec.onset_at), offset(spec.offset_at)
     if (stop - start) * period_s < spec.least_s:
         return replace(nothing, why="only a knock")
-    # How far the answer moves when the threshold does is how sharp the edge is.
+    # The edge is sharp if the result hardly changes with the threshold.
     loose = [onset(spec.onset_at + d) for d in (-0.15, 0.1)], [offset(spec.offset_at + d) for d in (-0.1, 0.1)]
     spread = [period_s * (max(at, *moved) - min(at, *moved)) for at, moved in zip((start, stop), loose, strict=True)]
     trust = min(1.0, max(0.0, np.log(contrast / spec.least_contrast) / np.log(20.0 / spec.least_contrast)))
-    said = [
+    reasons = [
         "it moves already at the first row" if start == 0 else "",
         "it moves still at the last row" if stop == n else "",
     ]
@@ -124,7 +124,7 @@ def suggest(frames: Frames, layout: Layout, before: Frames | None = None, spec: 
         round(float(trust * np.exp(-spread[0] / 0.5)), 2) if start > 0 else 0.0,
         round(float(trust * np.exp(-spread[1] / 0.5)), 2) if stop < n else 0.0,
         contrast,
-        "; ".join(filter(None, said)),
+        "; ".join(filter(None, reasons)),
     )
 
 
@@ -137,7 +137,7 @@ def _period_s(frames: Frames) -> float:
 def _activity(
     frames: Frames, layout: Layout, before: Frames | None, period_s: float, spec: OnsetSpec
 ) -> tuple[Floats, Floats, float]:
-    """Activity before and in the recording, (k,) and (n,), in units of the noise; and what it is at rest."""
+    """Return the activity before and in the recording, (k,) and (n,), in units of the noise, and its level at rest."""
     values = frames.values
     past = _unbroken(before, frames, layout, period_s) if before is not None else values[:0]
     k = len(past) if len(past) * period_s >= spec.stretch_s else 0
@@ -147,14 +147,14 @@ def _activity(
     n, half = len(smooth), max(1, round(spec.half_s / period_s))
     at = np.arange(n)
     ahead, behind = np.minimum(at + half, n - 1), np.maximum(at - half, 0)
-    # At the edges the span is shorter, the speed is not.
+    # At the edges the span is shorter; scale to the same speed.
     change = (smooth[ahead] - smooth[behind]) * (2 * half / (ahead - behind))[:, None]
     speed = np.stack([np.sqrt((change[:, s] ** 2).mean(axis=1)) for s in _sensors(layout)], axis=1)
     calm = _quietest((speed / np.maximum(np.median(speed, axis=0), 0.5)).mean(axis=1), spec.stretch_s / period_s)
-    # Somebody who moves about in the countdown is no measure of the noise.
+    # Movement in the countdown must not count as noise.
     quiet = np.median(speed[calm], axis=0)
     noise = np.minimum(np.median(speed[:k], axis=0), spec.noise_factor * quiet) if k else quiet
-    # Half a count: below that an integer sensor shows nothing.
+    # At least half a count, the resolution of an integer sensor.
     parts = [speed / np.maximum(noise, 0.5)]
     contact = [i for i, c in enumerate(layout.channels) if c.kind in _CONTACT]
     if contact:
@@ -166,9 +166,9 @@ def _activity(
 
 
 def _off_level(x: Floats, busy: Floats, k: int, calm: slice, period_s: float, spec: OnsetSpec) -> Floats:
-    """How far contact sensors are from their level before the touch, in units of how they wander at rest.
+    """Return how far contact sensors are from their level before the touch, in units of their variation at rest.
 
-    The level is taken where it is calmest around the start: a second hand that steadies the toy comes before it.
+    The level is taken at the calmest moment around the start, after a second hand has steadied the toy.
     """
     width = max(3, round(spec.level_s / period_s))
     begin = max(0, k - round(0.7 / period_s))
@@ -181,7 +181,7 @@ def _off_level(x: Floats, busy: Floats, k: int, calm: slice, period_s: float, sp
 
 
 def _unbroken(before: Frames, frames: Frames, layout: Layout, period_s: float) -> NDArray[np.int64]:
-    """The rows before that run without a gap or a clock reset into the recording."""
+    """Return the rows before the recording that lead into it without a gap or a clock reset."""
     if not len(before):
         return before.values
     steps = np.diff(np.append(before.device_ms, frames.device_ms[0]))
@@ -190,7 +190,7 @@ def _unbroken(before: Frames, frames: Frames, layout: Layout, period_s: float) -
 
 
 def _valid(values: NDArray[np.int64], layout: Layout) -> Floats:
-    """Sensor garbage bridged by a straight line."""
+    """Replace invalid values by linear interpolation."""
     bad = (values < layout.valid_min_int) | (values > layout.valid_max_int)
     x = values.astype(np.float64)
     for c in np.flatnonzero(bad.any(axis=0)):
@@ -200,27 +200,27 @@ def _valid(values: NDArray[np.int64], layout: Layout) -> Floats:
 
 
 def _median3(x: Floats) -> Floats:
-    """Running median of three rows: one row out of line, a garbled byte, is no movement."""
+    """Return the running median of three rows, which removes single garbled rows."""
     around = np.stack([np.vstack([x[:1], x[:-1]]), x, np.vstack([x[1:], x[-1:]])])
     return np.asarray(np.median(around, axis=0))
 
 
 def _sensors(layout: Layout) -> list[list[int]]:
-    """Channels that count as one sensor: the axes of a vector together, every other channel alone."""
+    """Group channels by sensor: the axes of a vector together, every other channel alone."""
     vectors = [[layout.index(axis) for axis in vector] for vector in layout.vectors]
     taken = {i for vector in vectors for i in vector}
     return [*vectors, *([i] for i in range(layout.n_channels) if i not in taken)]
 
 
 def _mean(x: Floats, width: int) -> Floats:
-    """Centred moving mean over ``width`` rows; the edges are repeated."""
+    """Return the centred moving mean over ``width`` rows; the edges are repeated."""
     padding = [(width // 2, width - 1 - width // 2), *[(0, 0)] * (x.ndim - 1)]
     sums = np.cumsum(np.insert(np.pad(x, padding, mode="edge"), 0, 0.0, axis=0), axis=0)
     return np.asarray((sums[width:] - sums[:-width]) / width)
 
 
 def _quietest(busy: Floats, width: float) -> slice:
-    """The stretch of ``width`` rows that is least busy."""
+    """Return the stretch of ``width`` rows with the least activity."""
     w = min(len(busy), max(3, round(width)))
     sums = np.cumsum(np.insert(busy, 0, 0.0))
     at = int(np.argmin(sums[w:] - sums[:-w]))
@@ -228,7 +228,7 @@ def _quietest(busy: Floats, width: float) -> slice:
 
 
 def _clear(activity: Floats, threshold: float, period_s: float, spec: OnsetSpec) -> tuple[int, int]:
-    """First and last row of clear activity; a knock (the key that stops the recording) is none."""
+    """Return the first and last row of clear activity, ignoring knocks (the key that stops the recording)."""
     hot = np.flatnonzero(activity >= threshold)
     breaks = np.flatnonzero(np.diff(hot) * period_s > spec.join_s)
     firsts, lasts = hot[np.append(0, breaks + 1)], hot[np.append(breaks, len(hot) - 1)]
@@ -240,9 +240,9 @@ def _clear(activity: Floats, threshold: float, period_s: float, spec: OnsetSpec)
 
 
 def _walk_back(activity: Floats, rest: Floats, threshold: float, quiet: int) -> int:
-    """The row of ``activity`` before which it was below the threshold for ``quiet`` rows; 0 when there is none.
+    """Return the row of ``activity`` before which it stays below the threshold for ``quiet`` rows; 0 if there is none.
 
-    ``rest`` is what was before its first row.
+    ``rest`` holds the activity before its first row.
     """
     low = np.concatenate([rest[-quiet:], activity]) < threshold
     k = len(low) - len(activity)

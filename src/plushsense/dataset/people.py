@@ -1,4 +1,4 @@
-"""Who was recorded: ``subjects.csv`` in the data set's folder. Codes and groups, never names.
+"""People of a data set: ``subjects.csv`` in its folder, with codes and groups and never names.
 
 The first columns are ``subject,age_group,gender,consent``; a user may add others (``handedness``, …), which are kept.
 """
@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from plushsense.core.errors import DatasetError
-from plushsense.dataset.store import write_atomically
+from plushsense.core.files import write_file
 
 PEOPLE = "subjects.csv"
 COLUMNS = ("subject", "age_group", "gender", "consent")
@@ -20,7 +20,7 @@ COLUMNS = ("subject", "age_group", "gender", "consent")
 
 @dataclass(frozen=True)
 class PersonInfo:
-    """One person by code. What nobody said is ""; ``more`` holds the columns of the user's own."""
+    """One person by code; unknown values are "", ``more`` holds columns that the user added."""
 
     subject: str
     age_group: str = ""
@@ -30,7 +30,7 @@ class PersonInfo:
 
 
 def read_people(path: Path) -> dict[str, PersonInfo]:
-    """The people of a file (or of the data set folder ``path``) by code; none where there is no such file.
+    """Read the people of a file (or of the data set folder ``path``) by code; empty if there is no such file.
 
     Raises:
         DatasetError: for a file without a column ``subject``, a row without a code, or a code that stands there twice.
@@ -69,7 +69,7 @@ def read_people(path: Path) -> dict[str, PersonInfo]:
 
 
 def write_people(folder: Path, people: Iterable[PersonInfo]) -> None:
-    """Replace the people's file of the data set in ``folder``, in the order of the codes."""
+    """Replace the people's file of the data set in ``folder``, sorted by code."""
     listed = sorted(people, key=lambda p: p.subject)
     more = list(dict.fromkeys(key for p in listed for key in p.more))
     out = io.StringIO()
@@ -78,4 +78,4 @@ def write_people(folder: Path, people: Iterable[PersonInfo]) -> None:
     for p in listed:
         own = {"subject": p.subject, "age_group": p.age_group, "gender": p.gender, "consent": p.consent}
         writer.writerow(p.more | own)
-    write_atomically(folder / PEOPLE, out.getvalue())
+    write_file(folder / PEOPLE, out.getvalue())

@@ -1,4 +1,4 @@
-"""How long gestures last, before and after trimming, in all and by age group or gender; and what channels read.
+"""Statistics of a data set: durations before and after trimming, by gesture and group of people, and channel values.
 
 The summary statistics of the authors' ``b_training_data_analysis.m``: mean, median, variance and range by gesture.
 """
@@ -17,12 +17,12 @@ from plushsense.core.gestures import NOBODY
 from plushsense.dataset.people import PEOPLE, PersonInfo, read_people
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset, RecordingInfo
 
-NOT_SAID = "not said"
+NOT_GIVEN = "not said"
 
 
 @dataclass(frozen=True)
-class Spread:
-    """Some numbers in short; ``variance`` is the sample variance (n − 1, as MATLAB's), None for one number."""
+class SummaryStatistics:
+    """Summary of some numbers; ``variance`` is the sample variance (n − 1, as MATLAB's), None for one number."""
 
     mean: float
     median: float
@@ -31,8 +31,8 @@ class Spread:
     max: float
 
     @classmethod
-    def of(cls, numbers: Sequence[float]) -> Spread:
-        """The spread of at least one number."""
+    def of(cls, numbers: Sequence[float]) -> SummaryStatistics:
+        """Return the summary of at least one number."""
         x = np.asarray(numbers, dtype=np.float64)
         variance = float(x.var(ddof=1)) if len(x) > 1 else None
         return cls(float(x.mean()), float(np.median(x)), variance, float(x.min()), float(x.max()))
@@ -51,18 +51,18 @@ class Duration:
     recordings: int
     people: int
     trimmed: int
-    before_s: Spread
-    after_s: Spread
-    before_rows: Spread
-    after_rows: Spread
+    before_s: SummaryStatistics
+    after_s: SummaryStatistics
+    before_rows: SummaryStatistics
+    after_rows: SummaryStatistics
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, ready for JSON."""
+        """Return plain values for JSON."""
         return asdict(self)
 
 
 def duration_table(dataset: Dataset, by: str | None = None) -> list[Duration]:
-    """Durations of the used recordings, a row for each gesture that has any, and for each group of people.
+    """Return durations of the used recordings, one row per gesture and group of people.
 
     Seconds are rows over the recording's own measured rate; a recording of a single row has none and is left out.
 
@@ -81,7 +81,7 @@ def duration_table(dataset: Dataset, by: str | None = None) -> list[Duration]:
 
 
 def _class_order(dataset: Dataset, gesture: str) -> int:
-    """Class index; labels that the gesture set does not know come last."""
+    """Return the class index; labels that the gesture set does not contain come last."""
     labels = dataset.gestures.labels
     return labels.index(gesture) if gesture in labels else len(labels)
 
@@ -93,15 +93,15 @@ def _duration(gesture: str, group: str, mine: list[RecordingInfo]) -> Duration:
         len(mine),
         len({r.subject for r in mine} - {NOBODY, UNKNOWN_SUBJECT}),
         sum(r.stop - r.start < r.rows for r in mine),
-        Spread.of([r.rows / r.rate_hz for r in mine]),
-        Spread.of([(r.stop - r.start) / r.rate_hz for r in mine]),
-        Spread.of([r.rows for r in mine]),
-        Spread.of([r.stop - r.start for r in mine]),
+        SummaryStatistics.of([r.rows / r.rate_hz for r in mine]),
+        SummaryStatistics.of([(r.stop - r.start) / r.rate_hz for r in mine]),
+        SummaryStatistics.of([r.rows for r in mine]),
+        SummaryStatistics.of([r.stop - r.start for r in mine]),
     )
 
 
 class _Grouping:
-    """Which group a person is in."""
+    """Maps each person to a group by a column of subjects.csv."""
 
     def __init__(self, dataset: Dataset, by: str | None) -> None:
         self.by = by.casefold() if by else ""
@@ -124,17 +124,17 @@ class _Grouping:
         if not self.by:
             return ""
         if subject in (NOBODY, UNKNOWN_SUBJECT):
-            return "nobody" if subject == NOBODY else NOT_SAID
+            return "nobody" if subject == NOBODY else NOT_GIVEN
         if self.by == "subject":
             return subject
         person = self.people.get(subject, PersonInfo(subject))
         own = {"age_group": person.age_group, "gender": person.gender} | person.more
-        return own.get(self.by) or NOT_SAID
+        return own.get(self.by) or NOT_GIVEN
 
 
 @dataclass(frozen=True)
 class ChannelSummary:
-    """What one channel read during one gesture: mean and standard deviation over all valid rows, in the raw unit."""
+    """Mean and standard deviation of one channel during one gesture, over all valid rows, in the raw unit."""
 
     gesture: str
     channel: str
@@ -144,15 +144,15 @@ class ChannelSummary:
     sd: float
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, ready for JSON."""
+        """Return plain values for JSON."""
         return asdict(self)
 
 
 def channel_table(dataset: Dataset) -> list[ChannelSummary]:
-    """Mean and standard deviation of each channel by gesture, over the used recordings after trimming.
+    """Compute mean and standard deviation of each channel by gesture, over the used recordings after trimming.
 
-    Reads every recording. Rows outside a channel's valid range do not count; all rows weigh alike, so a recording that
-    nobody stopped weighs much.
+    Reads every recording. Rows outside a channel's valid range do not count; all rows have equal weight, so a
+    recording that was never stopped dominates.
     """
     layout = dataset.layout
     steps = np.array([c.step for c in layout.channels])

@@ -5,7 +5,7 @@ recordings/<subject>/*.csv   raw recordings, never rewritten
 streams/<subject>/*.csv      raw session streams; a file with a label on every row is a stream too
 marks.jsonl                  trim, exclude: who and why, append-only
 recordings.csv, streams.csv  the index: rebuilt from the above, replaced atomically
-index.json                   what the index was made from: when that changed, it is made anew
+index.json                   stamp of what the index was made from: if that changed, it is rebuilt
 subjects.csv                 the people by code: age group, gender, consent reference (`dataset.people`)
 cache/                       can be deleted
 """
@@ -17,9 +17,7 @@ import hashlib
 import html
 import io
 import json
-import os
-import threading
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
@@ -27,12 +25,14 @@ from typing import Any, Self, TypeVar
 
 import tomli_w
 
-from plushsense.core.errors import DatasetError
+from plushsense.core.errors import DatasetError, FileFormatError
+from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY, GestureSet
-from plushsense.core.recfile import Frames, read_recording, read_stream
-from plushsense.core.signal import Layout
-from plushsense.core.tomlfile import read_toml, refuse_unknown
+from plushsense.core.layouts import Layout
+from plushsense.core.recorder_csv import Frames, ReadResult, read_recording, read_stream
+from plushsense.core.toml import load_table, read_toml
 from plushsense.dataset.about import About
+from plushsense.dataset.generation import Generation
 
 FORMAT_VERSION = 1
 HEAD = "dataset.toml"
@@ -43,7 +43,7 @@ UNKNOWN_SUBJECT = "unknown"
 
 @dataclass(frozen=True)
 class _Row:
-    """A row of an index file; plain text there, typed here."""
+    """A typed row of an index file."""
 
     @classmethod
     def from_text(cls, row: dict[str, str], where: str) -> Self:
@@ -87,7 +87,7 @@ class _Row:
 
 @dataclass(frozen=True)
 class RecordingInfo(_Row):
-    """One recording of the index.
+    """A row of the recording index.
 
     Its rows are ``first_row`` to ``first_row + rows`` of ``file``; ``start`` to ``stop`` of these remain after
     trimming. In ``stream`` they begin at ``stream_row`` (−1: not found there). ``start_ms`` is the device clock at the
@@ -115,7 +115,7 @@ class RecordingInfo(_Row):
 
 @dataclass(frozen=True)
 class StreamInfo(_Row):
-    """One session stream of the index."""
+    """A row of the stream index."""
 
     id: str
     subject: str
@@ -128,37 +128,27 @@ class StreamInfo(_Row):
     sha256: str
 
 
-def write_atomically(path: Path, text: str) -> None:
-    """Replace a text file in one step: readers see the old one or the new one, also where threads write it at once."""
-    part = path.with_name(f"{path.name}.{os.getpid()}-{threading.get_ident()}.part")
-    try:
-        part.write_text(text, encoding="utf-8", newline="\n")
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
-
-
 def write_index(path: Path, rows: Iterable[_Row], kind: type[_Row]) -> None:
     """Write an index file atomically."""
     out = io.StringIO()
     writer = csv.DictWriter(out, [f.name for f in fields(kind)], lineterminator="\n")
     writer.writeheader()
     writer.writerows(row.to_text() for row in rows)
-    write_atomically(path, out.getvalue())
+    write_file(path, out.getvalue())
 
 
 R = TypeVar("R", bound=_Row)
 
 
 def read_index(path: Path, kind: type[R]) -> list[R]:
-    """The rows of an index file."""
+    """Read the rows of an index file."""
     with path.open(encoding="utf-8", newline="") as file:
         return [kind.from_text(row, path.name) for row in csv.DictReader(file)]
 
 
 @dataclass(frozen=True)
 class DatasetHead:
-    """What ``dataset.toml`` says."""
+    """Contents of ``dataset.toml``."""
 
     name: str
     layout: Layout
@@ -171,7 +161,7 @@ class DatasetHead:
     about: About = field(default_factory=About)
 
     def to_toml(self) -> str:
-        """The file's text."""
+        """Return the text of ``dataset.toml``."""
         table = {
             "format": FORMAT_VERSION,
             "name": self.name,
@@ -188,7 +178,7 @@ class DatasetHead:
 
     @classmethod
     def read(cls, folder: Path) -> DatasetHead:
-        """The head of the data set in ``folder``.
+        """Read the head of the data set in ``folder``.
 
         Raises:
             DatasetError: when the folder is not there or is no data set.
@@ -204,21 +194,45 @@ class DatasetHead:
         version = table.pop("format", None)
         if version != FORMAT_VERSION:
             raise DatasetError(f"'{path}' has the format {version}; this version reads {FORMAT_VERSION}.")
-        known = ("name", "version", "licence", "consent", "source", "simulated", "about", "layout", "gesture_set")
-        refuse_unknown(table, known, f"'{path}'", DatasetError)
-        try:
-            layout = Layout.from_dict(table.pop("layout"), f"layout in '{path}'")
-            gestures = GestureSet.from_dict(table.pop("gesture_set"), f"gesture set in '{path}'")
-            about = About.from_table(table.pop("about", {}), f"[about] in '{path}'")
-            return cls(layout=layout, gestures=gestures, about=about, **table)
-        except (KeyError, TypeError) as cause:
-            raise DatasetError(f"'{path}' lacks something: {cause}.") from None
+        file = load_table(table, _HeadFile, f"'{path}'", DatasetError)
+        layout = Layout.from_dict(file.layout, f"layout in '{path}'")
+        gestures = GestureSet.from_dict(file.gesture_set, f"gesture set in '{path}'")
+        about = About.from_table(file.about, f"[about] in '{path}'")
+        return cls(
+            file.name, layout, gestures, file.version, file.licence, file.consent, file.source, file.simulated, about
+        )
+
+
+@dataclass(frozen=True)
+class _HeadFile:
+    """The keys of ``dataset.toml``."""
+
+    name: str
+    layout: dict[str, Any]
+    gesture_set: dict[str, Any]
+    version: str = "1.0.0"
+    licence: str = ""
+    consent: str = ""
+    source: str = ""
+    simulated: bool = False
+    about: dict[str, Any] = field(default_factory=dict)
 
 
 class Dataset:
-    """A data set, opened for reading."""
+    """A data set, opened for reading.
 
-    def __init__(self, path: Path, head: DatasetHead, recordings: list[RecordingInfo], streams: list[StreamInfo]):
+    ``generation`` guards results derived from it; pass the one from before any file was read.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        head: DatasetHead,
+        recordings: list[RecordingInfo],
+        streams: list[StreamInfo],
+        generation: Generation | None = None,
+    ):
+        self.generation = generation or Generation.of(path)
         self.path = path
         self.head = head
         self.recordings = recordings
@@ -231,12 +245,12 @@ class Dataset:
 
     @property
     def gestures(self) -> GestureSet:
-        """All gestures of the data set, in class order."""
+        """The gesture set, in class order."""
         return self.head.gestures
 
     @property
     def subjects(self) -> list[str]:
-        """Codes of the people, sorted; nobody and the unknown are not people."""
+        """Codes of the people, sorted, without "none" (nobody) and "unknown"."""
         people = {r.subject for r in self.recordings} - {NOBODY, UNKNOWN_SUBJECT}
         return sorted(people)
 
@@ -246,22 +260,30 @@ class Dataset:
         return [r for r in self.recordings if not r.excluded]
 
     def read(self, recording: RecordingInfo) -> Frames:
-        """The rows of one recording that remain after trimming."""
+        """Read the rows of one recording that remain after trimming."""
         if self.layout.is_labelled:
             return self.read_stream(recording.stream).slice(
                 recording.first_row + recording.start, recording.first_row + recording.stop
             )
-        frames = read_recording(self.path / recording.file, self.layout).frames
+        frames = self._frames(read_recording, recording.file)
         return frames.slice(recording.start, recording.stop)
 
     def read_stream(self, stream: str) -> Frames:
-        """The rows of one session stream; the last one read is kept, since its recordings come in a row."""
+        """Read the rows of one session stream and cache them, since recordings are read stream by stream."""
         if self._cached is None or self._cached[0] != stream:
             info = self._streams_by_id.get(stream)
             if info is None:
                 raise DatasetError(f"Data set '{self.head.name}' has no stream '{stream}'.")
-            self._cached = (stream, read_stream(self.path / info.file, self.layout).frames)
+            self._cached = (stream, self._frames(read_stream, info.file))
         return self._cached[1]
+
+    def _frames(self, read: Callable[[Path, Layout], ReadResult], file: str) -> Frames:
+        try:
+            return read(self.path / file, self.layout).frames
+        except FileFormatError:
+            # A file that is missing since the data set was opened may have been removed with its person.
+            self.generation.check()
+            raise
 
     _cached: tuple[str, Frames] | None = None
 
@@ -282,7 +304,7 @@ class Dataset:
         return digest.hexdigest()
 
     def summary(self) -> dict[str, Any]:
-        """Counts for a report: people, recordings, streams, duration by gesture."""
+        """Return counts for a report: people, recordings, streams, duration by gesture."""
         by_gesture = []
         for gesture in self.gestures.gestures:
             mine = [r for r in self.used if r.gesture == gesture.label]

@@ -1,1 +1,1 @@
-"""From a trained bundle to the toy: whole numbers, C that gives the same answers, and the proof that it does."""
+"""Deployment of a trained bundle: quantization, C code with identical answers, and its verification."""

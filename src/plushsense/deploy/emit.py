@@ -1,11 +1,9 @@
-"""The export folder: the C library as it is, this model as data, golden vectors, and the facts of it all."""
+"""The export folder: the C library, the model as C data, golden vectors and a JSON file of facts."""
 
 from __future__ import annotations
 
 import json
 import re
-import shutil
-import uuid
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
@@ -14,11 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.core.errors import BadInput
+from plushsense.core.files import new_folder
 from plushsense.core.gestures import NOBODY
 from plushsense.deploy.golden import write_golden
-from plushsense.live.personal import for_strangers
+from plushsense.live.adaptation import without_subject
 from plushsense.models.bundle import Bundle
-from plushsense.models.image import HEAD_BYTES, IntegerModel, head, layout_check, memory_bytes
+from plushsense.runtime.image import HEAD_BYTES, IntegerModel, image_head, layout_check, memory_bytes
 
 FACTS = "export.json"
 IMAGE = "plush_model.bin"
@@ -34,8 +33,8 @@ Extra = Callable[[Path, dict[str, Any]], object]
 
 
 @dataclass(frozen=True)
-class Exported:
-    """What an export wrote: ``files`` relative to ``folder``.
+class ExportResult:
+    """Result of an export; ``files`` are relative to ``folder``.
 
     ``flash_bytes`` is the model's data (the code comes on top: ``plushsense profile`` measures it), ``ram_bytes`` the
     memory of one toy with its struct, where pointers have 32 bits.
@@ -48,7 +47,7 @@ class Exported:
     facts: dict[str, Any]
 
     def to_dict(self) -> dict[str, Any]:
-        """The object that ``plushsense export --json`` prints."""
+        """Return the object that ``plushsense export --json`` prints."""
         return {
             **{key: value for key, value in self.facts.items() if key != "files"},
             "folder": str(self.folder),
@@ -58,8 +57,8 @@ class Exported:
         }
 
 
-def emit(model: IntegerModel, bundle: Bundle, out: str | Path, extras: Sequence[Extra] = ()) -> Exported:
-    """Write an export folder; it appears whole or not at all.
+def emit(model: IntegerModel, bundle: Bundle, out: str | Path, extras: Sequence[Extra] = ()) -> ExportResult:
+    """Write an export folder, atomically.
 
     Args:
         model: what the toy will compute with, made from ``bundle``.
@@ -71,29 +70,18 @@ def emit(model: IntegerModel, bundle: Bundle, out: str | Path, extras: Sequence[
         BadInput: when the folder holds something already, or cannot be written.
     """
     out = Path(out)
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise BadInput(f"'{out}' is there already, and an export overwrites nothing: give a new or empty folder.")
-    part = out.with_name(f".{out.name}-unfinished-{uuid.uuid4().hex[:8]}")
-    try:
-        part.mkdir(parents=True)
+    with new_folder(out, BadInput) as part:
         facts = _write(model, bundle, part)
         for extra in extras:
             extra(part, facts)
         found = sorted(p.relative_to(part).as_posix() for p in part.rglob("*") if p.is_file())
         facts["files"] = sorted({*found, FACTS})
         (part / FACTS).write_text(json.dumps(facts, indent=1, ensure_ascii=False) + "\n", "utf-8", newline="\n")
-        if out.exists():
-            out.rmdir()
-        part.rename(out)
-    except OSError as cause:
-        raise BadInput(f"The export '{out}' cannot be written ({cause}): choose another place.") from None
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
-    return Exported(out, tuple(facts["files"]), facts["model_bytes"], facts["memory_bytes"] + TOY_BYTES, facts)
+    return ExportResult(out, tuple(facts["files"]), facts["model_bytes"], facts["memory_bytes"] + TOY_BYTES, facts)
 
 
 def read_facts(folder: str | Path) -> dict[str, Any]:
-    """The facts of an export folder.
+    """Read the facts of an export folder.
 
     Raises:
         BadInput: when it is none.
@@ -113,18 +101,31 @@ def read_facts(folder: str | Path) -> dict[str, Any]:
 
 
 def _write(model: IntegerModel, bundle: Bundle, folder: Path) -> dict[str, Any]:
-    library = files("plushsense.deploy") / "c"
-    for name in LIBRARY:
-        (folder / name).write_bytes((library / name).read_bytes())
-    bundle = replace(bundle, provenance=without_people(bundle.provenance), personal=for_strangers(bundle.personal))
-    image = model.to_bytes()
-    facts = _facts(model, bundle, len(image))
-    (folder / IMAGE).write_bytes(image)
-    (folder / MODEL[0]).write_text(_header(facts), encoding="utf-8", newline="\n")
-    (folder / MODEL[1]).write_text(_source(model, facts), encoding="utf-8", newline="\n")
+    bundle = replace(bundle, provenance=without_people(bundle.provenance), personal=without_subject(bundle.personal))
+    code = code_files(model, bundle)
+    for name, content in code.items():
+        (folder / name).write_bytes(content)
+    facts = _facts(model, bundle, len(code[IMAGE]))
     bundle.save(folder / BUNDLE)
     write_golden(model, bundle.scaler, folder / GOLDEN)
     return facts
+
+
+def code_files(model: IntegerModel, bundle: Bundle) -> dict[str, bytes]:
+    """Return the contents of the library and model files of an export, by name.
+
+    Everything that a program of an export is compiled from: C sources, headers and the model's bytes. They depend on
+    the model and on names in the bundle alone, so that a folder that was given away can be compared with them.
+    """
+    library = files("plushsense.deploy") / "c"
+    image = model.to_bytes()
+    facts = _facts(model, bundle, len(image))
+    return {
+        **{name: (library / name).read_bytes() for name in LIBRARY},
+        MODEL[0]: _header(facts).encode(),
+        MODEL[1]: _source(model, facts).encode(),
+        IMAGE: image,
+    }
 
 
 def _facts(model: IntegerModel, bundle: Bundle, model_bytes: int) -> dict[str, Any]:
@@ -165,7 +166,7 @@ def _facts(model: IntegerModel, bundle: Bundle, model_bytes: int) -> dict[str, A
 
 
 def without_people(provenance: Mapping[str, Any]) -> dict[str, Any]:
-    """A bundle's provenance for strangers: how many people it was trained on, not who. Once more changes nothing."""
+    """Return a bundle's provenance with the number of people instead of their names; idempotent."""
     people = {
         key: {str(n) for n in provenance[key]} - {NOBODY} for key in _PEOPLE if isinstance(provenance.get(key), list)
     }
@@ -187,7 +188,7 @@ def without_people(provenance: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def c_names(labels: Sequence[str]) -> tuple[str, ...]:
-    """Labels as the ends of C identifiers, each different: ``Back stroke 1`` becomes ``BACK_STROKE_1``."""
+    """Convert labels to distinct suffixes of C identifiers: ``Back stroke 1`` becomes ``BACK_STROKE_1``."""
     found: list[str] = []
     for label in labels:
         plain = "".join(c if c.isascii() and c.isalnum() else " " for c in label)
@@ -200,7 +201,7 @@ def c_names(labels: Sequence[str]) -> tuple[str, ...]:
 
 
 def comment(text: str) -> str:
-    """Text as it may stand in a C comment; compilers refuse marks that would show the code in another order."""
+    """Make a text safe for a C comment: without its delimiters, backslashes and unprintable characters."""
     plain = "".join(c if c.isprintable() else " " for c in text)
     return plain.replace("\\", "/").replace("*/", "* /").replace("/*", "/ *")
 
@@ -259,7 +260,7 @@ extern const uint8_t plush_model[PLUSH_MODEL_BYTES];
 
 def _source(model: IntegerModel, facts: dict[str, Any]) -> str:
     sections = model.sections()
-    top = head(b"".join(piece for _, piece in sections))
+    top = image_head(b"".join(piece for _, piece in sections))
     lines = [
         "/*",
         f" * The model {comment(facts['title'])}: the bytes of {IMAGE}, section by section.",

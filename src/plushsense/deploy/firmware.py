@@ -11,9 +11,9 @@ from importlib.resources import files
 from typing import Any
 
 from plushsense.core.errors import LayoutError
-from plushsense.core.signal import DELAY_MS, DEVICE_MS, Channel, Layout
+from plushsense.core.layouts import DELAY_MS, DEVICE_MS, Channel, Layout
 from plushsense.deploy.emit import c_names, comment
-from plushsense.deploy.made_frames import measured
+from plushsense.deploy.golden import measured
 from plushsense.windows.features import Scaler
 
 TEMPLATES = (
@@ -42,8 +42,8 @@ _MOST_DECIMALS = 9
 
 
 @dataclass(frozen=True)
-class _Source:
-    """Where a channel comes from: ``kind`` as the C calls it, pad, GPIO or axis, factor in steps of 1/65536."""
+class _ChannelSource:
+    """Source of a channel: ``kind`` as in the C enum, pad, GPIO or axis, factor in steps of 1/65536."""
 
     kind: str
     pad: int = 0
@@ -52,7 +52,7 @@ class _Source:
 
 
 def firmware(layout: Layout, scaler: Scaler, facts: Mapping[str, Any]) -> dict[str, str]:
-    """The files of `TEMPLATES` by name, for a model with these ``facts`` (of ``export.json``).
+    """Render the files of `TEMPLATES` for a model with these ``facts`` (of ``export.json``), by name.
 
     Raises:
         LayoutError: for a step that no line can carry.
@@ -76,7 +76,7 @@ def firmware(layout: Layout, scaler: Scaler, facts: Mapping[str, Any]) -> dict[s
         "period": f"{layout.period_us / 1000:g}",
         "gap": str(layout.gap_ms),
         "warm": f"{facts['span'] * layout.period_us / 1e6:.2g}",
-        "fields_shown": textwrap.fill(
+        "fields": textwrap.fill(
             comment(" ".join(layout.wire)), 110, initial_indent=" *     ", subsequent_indent=" *     "
         ),
         "line_bytes": str(_line_bytes(layout, written)),
@@ -84,7 +84,7 @@ def firmware(layout: Layout, scaler: Scaler, facts: Mapping[str, Any]) -> dict[s
         "number": "uint64_t" if decimal else "uint32_t",
         "order": "\n".join(f"    {names.get(field, field.upper())}," for field in layout.wire),
         "written": _rows(layout, [f"{times}, {decimals}" for times, decimals in written]),
-        "usual": _rows(layout, [f"{usual}, {spread}" for usual, spread in _usual(layout, scaler)]),
+        "usual": _rows(layout, [f"{usual}, {spread}" for usual, spread in _statistics(layout, scaler)]),
         "eyes": "18, 19, 23",
         "voice": "5",
     }
@@ -151,21 +151,21 @@ static const struct {{
 }};"""
 
 
-def _table(layout: Layout, sources: list[_Source], number: str) -> str:
+def _table(layout: Layout, sources: list[_ChannelSource], number: str) -> str:
     rows = []
     for channel, s in zip(layout.channels, sources, strict=True):
         at = s.pin if s.kind == "TOUCH" and number == "pin" else s.pad
-        said = {"TOTAL": ": the sum of all pads", "OTHER": ": see read_other()"}.get(s.kind, "")
-        said = ": NO PAD IS LEFT for it" if s.kind == "TOUCH" and at == _NO_PAD else said
+        note = {"TOTAL": ": the sum of all pads", "OTHER": ": see read_other()"}.get(s.kind, "")
+        note = ": NO PAD IS LEFT for it" if s.kind == "TOUCH" and at == _NO_PAD else note
         rows.append(
-            f"    {{FROM_{s.kind}, {at}, {s.factor}}}, /* {comment(channel.name)}, {comment(channel.unit)}{said} */"
+            f"    {{FROM_{s.kind}, {at}, {s.factor}}}, /* {comment(channel.name)}, {comment(channel.unit)}{note} */"
         )
     what = "the GPIO" if number == "pin" else "the touch pad (T0 is GPIO 4; T2 2, T3 15, T4 13, T5 12, T6 14, T7 27)"
     return _SOURCES.format(what=what, rows="\n".join(rows))
 
 
-def _sources(layout: Layout) -> list[_Source]:
-    found: list[_Source] = []
+def _sources(layout: Layout) -> list[_ChannelSource]:
+    found: list[_ChannelSource] = []
     pads = iter(_PADS)
     axes = dict(_FIRST_AXIS)
     others = 0
@@ -173,20 +173,20 @@ def _sources(layout: Layout) -> list[_Source]:
         factor = _motion_factor(channel)
         if channel.kind in _PADDED and channel.step == 1.0:
             if channel.name in _TOTALS:
-                found.append(_Source("TOTAL"))
+                found.append(_ChannelSource("TOTAL"))
             else:
-                found.append(_Source("TOUCH", *next(pads, (_NO_PAD, _NO_PAD))))
+                found.append(_ChannelSource("TOUCH", *next(pads, (_NO_PAD, _NO_PAD))))
         elif factor is not None and axes[channel.kind] < _FIRST_AXIS[channel.kind] + 3:
-            found.append(_Source("MOTION", axes[channel.kind], 0, factor))
+            found.append(_ChannelSource("MOTION", axes[channel.kind], 0, factor))
             axes[channel.kind] += 1
         else:
-            found.append(_Source("OTHER", others))
+            found.append(_ChannelSource("OTHER", others))
             others += 1
     return found
 
 
 def _motion_factor(channel: Channel) -> int | None:
-    """From the motion sensor's counts to steps of this channel in 1/65536; None where nobody knows."""
+    """Return the factor from sensor counts to steps of the channel, in 1/65536; None for an unknown unit."""
     unit = _MOTION.get(channel.kind, {}).get(channel.unit)
     if unit is None or channel.offset != 0:
         return None
@@ -195,7 +195,7 @@ def _motion_factor(channel: Channel) -> int | None:
 
 
 def _written(channel: Channel) -> tuple[int, int]:
-    """How the line format writes a channel's integer: times how much, with how many decimals."""
+    """Return how the line format writes a channel's integer: its multiplier and the number of decimals."""
     decimals = 0
     while decimals < _MOST_DECIMALS and round(channel.step * 10**decimals, 6) != round(channel.step * 10**decimals):
         decimals += 1
@@ -214,8 +214,8 @@ def _line_bytes(layout: Layout, written: list[tuple[int, int]]) -> int:
     return clocks + values + len(layout.wire) + 1
 
 
-def _usual(layout: Layout, scaler: Scaler) -> list[tuple[int, int]]:
-    """Of each channel the mean and the spread in training, as far as the scaling tells it, within the valid range."""
+def _statistics(layout: Layout, scaler: Scaler) -> list[tuple[int, int]]:
+    """Return mean and spread of each channel in training, as far as the scaler has them, within the valid range."""
     mean, spread = measured(layout, scaler)
     rows = []
     for at, wide, low, high in zip(
@@ -235,7 +235,7 @@ def _filled(text: str, words: Mapping[str, str]) -> str:
 
 
 def _chosen(text: str, conditions: Mapping[str, bool], words: Mapping[str, str]) -> str:
-    """``text`` without the parts between ``@if name@`` and ``@end@`` whose condition does not hold, words filled in."""
+    """Drop the parts between ``@if name@`` and ``@end@`` whose condition is false, and fill in the variables."""
     kept: list[str] = []
     holding: list[bool] = []
     for line in text.split("\n"):

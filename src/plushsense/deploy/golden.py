@@ -1,4 +1,6 @@
-"""Golden vectors: frames that a toy may meet at its worst, and what the rooms that define a toy say to them.
+"""Generated frames for golden vectors and test scenarios, and the answers to them.
+
+No recording is used.
 
 The frames are made up: an export is given away, and no person's recording belongs in it.
 """
@@ -13,13 +15,233 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import BadInput
-from plushsense.deploy.made_frames import golden_frames
-from plushsense.models.events import AFFECT_CODES, EventMachine, Update
-from plushsense.models.gate import Gate
-from plushsense.models.health import Health
-from plushsense.models.image import IntegerModel
-from plushsense.windows.clock import Clock
-from plushsense.windows.features import SampleInputs, Scaler
+from plushsense.core.layouts import MAGNITUDE_FRACTION_BITS, Layout
+from plushsense.runtime.events import AFFECT_CODES
+from plushsense.runtime.fixed import InputScale
+from plushsense.runtime.health import HealthSettings
+from plushsense.runtime.image import IntegerModel
+from plushsense.runtime.machine import Moment, ToyMachine
+from plushsense.windows.features import Scaler
+
+_MS_BITS = 32
+_SEARCHED = 4096  # numbers on each side of a channel's mean
+_INT32 = -(1 << 31), (1 << 31) - 1
+
+
+def golden_frames(
+    layout: Layout,
+    scaler: Scaler,
+    span: int,
+    seed: int = 1,
+    inputs: InputScale | None = None,
+    health: HealthSettings | None = None,
+) -> Ints:
+    """Generate frames (n, 1 + C) that cover the edge cases; the first column is the toy's clock in ms.
+
+    Each part lasts longer than ``span``, so that every restart is followed by answers: touches and blows with a
+    jittering clock and lost frames; values out of range (also from the start, where there is no valid one yet); gaps
+    just bridged and just too long; equal stamps; a clock that starts again; channels at the ends of their range, and
+    jumping between them; sensors that fail and recover as the ``health`` settings tell it; the clock's wrap at 2^32.
+    With the scale of the ``inputs``, also samples in the middle between two whole numbers of which one is read as the
+    next 8-bit number: there a wrong rounding shows.
+    """
+    generator = FrameGenerator(layout, scaler, np.random.default_rng(seed))
+    part = span + 150
+    generator.touches(6, garbage_channel=0)
+    generator.touches(part + 300, lost=0.03, blows=0.02)
+    generator.touches(part, garbage=0.05)
+    generator.wait(layout.gap_ms)
+    generator.touches(60)
+    generator.wait(layout.gap_ms + 1)
+    generator.touches(part, equal=0.1, blows=0.01)
+    generator.now = 5
+    generator.touches(part)
+    for kind in ("low", "high", "jump"):
+        generator.extremes(span + 30, kind)
+    if inputs is not None:
+        generator.wait(layout.gap_ms + 1)
+        generator.halves(part, inputs)
+    generator.touches(part)
+    if health is not None:
+        generator.troubles(health, part)
+    generator.now = (1 << _MS_BITS) - 1 - part * 6
+    generator.touches(part + 300, blows=0.02)
+    return np.array(generator.rows, dtype=np.int64)
+
+
+class FrameGenerator:
+    """Generator of frames; ``now`` is the time of the next one in ms."""
+
+    def __init__(self, layout: Layout, scaler: Scaler, rng: np.random.Generator) -> None:
+        self.layout, self.rng = layout, rng
+        self.low, self.high = layout.valid_min_int, layout.valid_max_int
+        self.mean, self.spread = measured(layout, scaler)
+        self.rows: list[list[int]] = []
+        self.now = 1000
+        self._owed = 0.0
+        self._walk = np.zeros(len(self.mean))
+        self._blow = np.zeros(len(self.mean))
+        self._phase = rng.uniform(0, 6, len(self.mean))
+
+    def pace(self) -> int:
+        """Return the milliseconds to the next frame, one period on average."""
+        self._owed += self.layout.period_us / 1000
+        whole = int(self._owed)
+        self._owed -= whole
+        return whole
+
+    def wait(self, ms: int) -> None:
+        """Set the next frame's time to ``ms`` after the last one."""
+        self.now = self.rows[-1][0] + ms
+
+    def put(self, values: Ints) -> None:
+        self.rows.append([self.now & 0xFFFFFFFF, *values.tolist()])
+
+    def touches(
+        self,
+        n: int,
+        *,
+        lost: float = 0.0,
+        garbage: float = 0.0,
+        equal: float = 0.0,
+        blows: float = 0.0,
+        garbage_channel: int | None = None,
+        stuck: dict[int, int] | None = None,
+    ) -> None:
+        """Add ``n`` frames similar to gestures: a slow drift, a rhythm at times, noise, and decaying impacts.
+
+        ``lost``, ``garbage`` (of a channel), ``equal`` (stamps) and ``blows`` are how likely each is in a frame;
+        ``stuck`` holds channels at one value.
+        """
+        rng, c = self.rng, len(self.mean)
+        for k in range(n):
+            self._walk = 0.98 * self._walk + 0.2 * rng.normal(size=c)
+            self._blow *= 0.6
+            if blows and rng.random() < blows:
+                self._blow = rng.normal(size=c) * 12
+            rhythm = np.sin(len(self.rows) * (0.05 + 0.02 * (k // 97 % 9)) + self._phase) * (k // 61 % 3)
+            signal = self.mean + self.spread * (self._walk + self._blow + rhythm + 0.1 * rng.normal(size=c))
+            values = np.clip(np.rint(signal), self.low, self.high).astype(np.int64)
+            spoilt = np.flatnonzero(rng.random(c) < garbage)
+            if garbage_channel is not None:
+                spoilt = np.array([garbage_channel])
+            for channel in spoilt:
+                values[channel] = self._garbage(int(channel))
+            for held, value in (stuck or {}).items():
+                values[held] = value
+            if rng.random() >= lost:
+                self.put(values)
+            if rng.random() >= equal:
+                self.now += max(0, self.pace() + int(rng.integers(-2, 3)))
+
+    def frozen(self, n: int) -> None:
+        """Repeat the last frame ``n`` times."""
+        for _ in range(n):
+            self.put(np.array(self.rows[-1][1:], dtype=np.int64))
+            self.now += self.pace()
+
+    def frames_of(self, ms: int) -> int:
+        """Return the number of frames in ``ms`` milliseconds, rounded up."""
+        return -(-ms * 1000 // self.layout.period_us)
+
+    def troubles(self, health: HealthSettings, after: int) -> None:
+        """Add sensor failures long enough to be detected, each followed by recovery and ``after`` frames of touches.
+
+        A channel out of range or stuck beyond what touches reach, first for a moment only; then all of them frozen;
+        then good frames too few to be believed, and a gap amid the failure.
+        """
+        few, enough = self.frames_of(health.fault_ms) // 2, self.frames_of(health.fault_ms + health.recover_ms) + 20
+        back = self.frames_of(health.recover_ms) + after
+        if health.fault_ms:
+            ends = self._beyond(health)
+            self.touches(few + 3, stuck=ends)
+            self.touches(30)
+            self.touches(enough, stuck=ends)
+            self.touches(self.frames_of(health.recover_ms) // 2)
+            self.touches(20, garbage=0.5)
+            self.touches(back, blows=0.02)
+            self.touches(enough, garbage_channel=len(self.mean) - 1)
+            self.wait(self.layout.gap_ms + 40)
+            self.touches(back)
+        if health.still_ms:
+            self.frozen(self.frames_of(health.still_ms) * 3 // 4)
+            self.wait(self.layout.gap_ms + 10)
+            self.frozen(4)
+            self.touches(self.frames_of(health.still_ms) // 2)
+            self.frozen(self.frames_of(health.still_ms) + 20)
+            self.now = 40
+            self.touches(back, blows=0.02)
+
+    def _beyond(self, health: HealthSettings) -> dict[int, int]:
+        """Return a channel and a value at which it counts as stuck, or one out of range where no value does."""
+        for channel, (high, most) in enumerate(zip(health.high, self.high.tolist(), strict=False)):
+            if high < most:
+                return {channel: min(int(most), high + 3)}
+        for channel, (low, least) in enumerate(zip(health.low, self.low.tolist(), strict=False)):
+            if low > least:
+                return {channel: max(int(least), low - 3)}
+        return {0: self._garbage(0)}
+
+    def extremes(self, n: int, kind: str) -> None:
+        """Add frames at the ends of the valid ranges, every other one beside them, so that none counts as stuck."""
+        for k in range(n):
+            top = kind == "high" or (kind == "jump" and bool(k // 3 % 2))
+            beside = np.minimum(k % 2, self.high - self.low)
+            self.put(self.high - beside if top else self.low + beside)
+            self.now += self.pace()
+
+    def halves(self, n: int, inputs: InputScale) -> None:
+        """Add frames two periods apart for n samples, so that interpolated ones lie half a step beside an edge."""
+        apart, rest = divmod(2 * self.layout.period_us, 1000)
+        if rest or not 0 < apart <= self.layout.gap_ms:
+            return
+        edges = self._edges(inputs)
+        for _ in range(n // 4):
+            first = np.rint(np.clip(self.mean, self.low, self.high)).astype(np.int64)
+            second = first.copy()
+            for channel, found in edges.items():
+                edge, swing = int(self.rng.choice(found)), int(self.rng.integers(0, 40))
+                first[channel], second[channel] = edge + swing, edge - 1 - swing
+            for values in (first, second):
+                self.put(np.clip(values, self.low, self.high))
+                self.now += apart
+
+    def _edges(self, inputs: InputScale) -> dict[int, Ints]:
+        """Return by input channel the values near its mean at which the 8-bit code changes."""
+        names = self.layout.inputs
+        around = np.zeros((2 * _SEARCHED, len(names)), dtype=np.int64)
+        direct = {i: self.layout.index(n) for i, n in enumerate(names) if n in self.layout.names}
+        for i, channel in direct.items():
+            around[:, i] = np.arange(-_SEARCHED, _SEARCHED) + round(float(self.mean[channel]))
+        codes = inputs.apply(around)
+        found = {}
+        for i, channel in direct.items():
+            edges = around[1:, i][codes[1:, i] != codes[:-1, i]]
+            inside = edges[(edges > self.low[channel] + 41) & (edges < self.high[channel] - 41)]
+            if len(inside):
+                found[channel] = inside
+        return found
+
+    def _garbage(self, channel: int) -> int:
+        """Return a value out of the channel's range, if 32 bits hold one."""
+        low, high = int(self.low[channel]), int(self.high[channel])
+        outside = [v for v in (low - 1, high + 1, *_INT32) if not low <= v <= high and _INT32[0] <= v <= _INT32[1]]
+        return int(self.rng.choice(outside)) if outside else int(self.rng.integers(low, high))
+
+
+def measured(layout: Layout, scaler: Scaler) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return mean and spread of each measured channel, as the scaler of the inputs has them."""
+    c = len(layout.channels)
+    mean, spread = np.zeros(c), np.full(c, 100.0)
+    derived = {d.name: d.of for d in layout.derived}
+    for name, offset, scale in zip(layout.inputs, scaler.offset, scaler.scale, strict=True):
+        parts = derived.get(name, (name,))
+        unit = len(parts) ** 0.5 * (1 << MAGNITUDE_FRACTION_BITS) if name in derived else 1.0
+        for part in parts:
+            mean[layout.index(part)] = offset / unit
+            spread[layout.index(part)] = max(1.0, 1 / scale / unit)
+    return mean, spread
+
 
 FRAMES, ANSWERS = "frames.bin", "answers.bin"
 ANSWER, EVENT, HEALTH = range(3)
@@ -49,13 +271,13 @@ Ints = NDArray[np.int64]
 
 
 def column(rows: NDArray[Any], name: str, kind: int = ANSWER) -> NDArray[Any]:
-    """One column of the rows of a kind."""
+    """Return one column of the rows of a kind."""
     found: NDArray[Any] = rows[rows[:, 0] == kind][:, COLUMNS[kind].index(name)]
     return found
 
 
 def answers_of(model: IntegerModel, frames: Ints, silences: Container[int] = ()) -> NDArray[np.int32]:
-    """What the toy says to frames (n, 1 + C), the first column its clock in ms: rows (m, 12 + 2 K) int32.
+    """Compute the rows (m, 12 + 2 K) int32 that the toy answers to frames (n, 1 + C); the first column is ms.
 
     A row is an answer, something that happened to an event, or a change of what health says; its columns are those of
     `COLUMNS`, then the K logits in steps of 1/256 and the K smoothed probabilities in steps of 2^-27, which are 0 but
@@ -64,110 +286,97 @@ def answers_of(model: IntegerModel, frames: Ints, silences: Container[int] = ())
     an event in a step stands before the step's answer, what health says after all else of its frame.
 
     Args:
-        silences: the frames after which nothing is heard for a while (``plush_silence``).
+        silences: the frames after which a silence is reported (``plush_silence``).
     """
-    return _Toy(model).rows_of(frames, silences)
+    toy = _toy(model)
+    table = _RowTable(toy, model)
+    table.read(frames, silences)
+    return table.array()
 
 
-class _Toy:
-    """Drives the rooms that define a toy as `plushsense.live.stream.StreamReader` does, in the C's own clock."""
+def answers_over_swaps(parts: Sequence[tuple[IntegerModel, Ints]]) -> list[NDArray[np.int32]]:
+    """Return what the toy answers when models for the same channels are swapped in mid-stream (``plush_swap``).
 
-    def __init__(self, model: IntegerModel) -> None:
-        arch, rules = model.network.arch, model.rules
-        self.model, self.arch = model, arch
-        self.affects = [AFFECT_CODES[g.affect] for g in model.gestures.gestures]
-        self.clock, self.inputs, self.stepper = Clock(model.layout), SampleInputs(model.layout), model.network.stepper()
-        self.health, self.gate = Health(rules.health, model.layout), Gate(rules.gate)
-        self.machine = EventMachine(rules.events, model.smoothing, model.gestures)
+    Args:
+        parts: each model with the frames (n, 1 + C) that it reads.
+
+    Returns:
+        The rows of each part as of `answers_of`. An event that is open at a swap ends with it: the row stands at the
+        end of the part, as of the next frame. Frames and counts go on, and the toy is warming.
+    """
+    toy, frame, tables = _toy(parts[0][0]), 0, []
+    for n, (model, frames) in enumerate(parts, 1):
+        table = _RowTable(toy, model, frame)
+        table.read(frames)
+        if n < len(parts):
+            following = _toy(parts[n][0])
+            table.add(following.continue_from(toy))
+            toy, frame = following, table.frame
+        tables.append(table.array())
+    return tables
+
+
+def _toy(model: IntegerModel) -> ToyMachine:
+    return ToyMachine(model.network.stepper(), model.layout, model.gestures, model.rules, model.smoothing)
+
+
+class _RowTable:
+    """Rows of the output of a toy; ``frame`` is the number of the current frame."""
+
+    def __init__(self, toy: ToyMachine, model: IntegerModel, frame: int = 0) -> None:
+        self.toy, self.frame = toy, frame
+        self.affects = [AFFECT_CODES[a] for a in model.gestures.affects]
         self.rows: list[list[int]] = []
-        self.frame = self.seen = 0
-        self.restart()
 
-    def restart(self) -> None:
-        self.stepper.reset()
-        self.gate.reset()
-        self.block: list[list[int]] = []
-        self.count = 0
-
-    def rows_of(self, frames: Ints, silences: Container[int]) -> NDArray[np.int32]:
-        for self.frame, (ms, *values) in enumerate(frames.tolist()):
-            said = self.health.fault, self.health.suspect
-            self.push(ms, values)
-            now = self.health.fault, self.health.suspect
-            if now != said:
-                state = FAULT if now[0] else TRACKING if self.count >= self.arch.span else WARMING
-                self.say(HEALTH, ms, self.health.faults, state, int(now[1]))
+    def read(self, frames: Ints, silences: Container[int] = ()) -> None:
+        """Feed frames to the toy and add all that comes of them."""
+        health = self.toy.frames
+        for ms, *values in frames.tolist():
+            before = health.fault, health.suspect
+            for moment in self.toy.push(ms, values):
+                self.add(moment)
+            if (health.fault, health.suspect) != before:
+                self.add_health(ms)
             if self.frame in silences:
-                self.tell(self.machine.lost(self.seen))
-        table = np.array(self.rows, dtype=np.int64).reshape(len(self.rows), HEAD + 2 * self.arch.classes)
-        return (table & 0xFFFFFFFF).astype(np.uint32).view(np.int32)
+                self.add(self.toy.silence())
+            self.frame += 1
 
-    def say(self, kind: int, ms: int, *what: int, logits: Sequence[int] = (), mean: Sequence[int] = ()) -> None:
-        counts = self.clock.restarts, self.clock.invalid
-        blank = [0] * self.arch.classes
-        row = [
-            kind,
-            self.frame,
-            ms,
-            *what,
-            *[0] * (HEAD - 5 - len(what)),
-            *counts,
-            *(logits or blank),
-            *(mean or blank),
-        ]
-        self.rows.append(row)
+    def array(self) -> NDArray[np.int32]:
+        """Return the rows as 32-bit integers."""
+        rows = np.array(self.rows, dtype=np.int64).reshape(len(self.rows), HEAD + 2 * len(self.affects))
+        return (rows & 0xFFFFFFFF).astype(np.uint32).view(np.int32)
 
-    def tell(self, updates: Sequence[Update]) -> None:
-        for u in updates:
-            self.say(EVENT, u.now, u.number, u.kind, u.gesture, u.affect, u.source, u.since)
-
-    def push(self, ms: int, values: list[int]) -> None:
-        clock, health, layout = self.clock, self.health, self.model.layout
-        if ms < self.seen or ms - self.seen > layout.gap_ms:
-            self.tell(self.machine.lost(self.seen))
-            health.clear()
-        self.seen = ms
-        found = health.push(ms, values)
-        if found == "fault":
-            self.tell(self.machine.lost(ms))
-        if found:
-            clock.forget()
-            self.restart()
-        if health.fault:
+    def add(self, moment: Moment) -> None:
+        """Add the updates of a moment, and its answer if it is a step."""
+        for u in moment.updates:
+            self._add(EVENT, self._ms(u.now), u.number, u.kind, u.gesture, u.affect, u.source, self._ms(u.since))
+        if moment.cause != "step":
             return
-        samples = clock.push(ms, values)
-        if clock.restarted:
-            self.restart()
-        for later, sample in zip(range(len(samples) - 1, -1, -1), samples, strict=True):
-            self.sample(((clock.now_us or 0) - later * layout.period_us) // 1000, sample)
+        ms, count, answer = self._ms(moment.time_us), self.toy.samples.samples, moment.answer
+        if answer is None or moment.logits is None or moment.smoothed is None:
+            self._add(ANSWER, ms, count, WARMING)
+            return
+        what = answer.best, self.affects[answer.best], answer.share, answer.kind, answer.known
+        numbers = [*moment.logits.tolist(), *moment.smoothed.tolist()]
+        self._add(ANSWER, ms, count, TRACKING, *what, numbers=numbers)
 
-    def sample(self, ms: int, sample: Ints) -> None:
-        arch, suspect = self.arch, self.health.suspect
-        self.count += 1
-        inputs = self.inputs(sample)
-        fired = self.gate.push(inputs, suspect)
-        if fired >= 0:
-            rule = self.model.rules.gate.rules[fired]
-            self.tell(self.machine.gate(rule.affect, rule.gesture, ms))
-        self.block.append(inputs)
-        if self.count % arch.step != arch.span % arch.step:
-            return
-        logits = self.stepper.push(np.array(self.block, dtype=np.int64))
-        self.block = []
-        if not logits:
-            self.tell(self.machine.blind_step(ms))
-            self.say(ANSWER, ms, self.count, WARMING)
-            return
-        answer, updates = self.machine.step(logits[-1], ms, suspect)
-        self.tell(updates)
-        best = answer.best, self.affects[answer.best], answer.share, answer.kind, answer.known
-        mean = self.machine.mean
-        assert mean is not None
-        self.say(ANSWER, ms, self.count, TRACKING, *best, logits=logits[-1].tolist(), mean=mean[:-1].tolist())
+    def add_health(self, ms: int) -> None:
+        """Add the current state of the health check."""
+        frames = self.toy.frames
+        state = FAULT if frames.fault else WARMING if self.toy.samples.warming else TRACKING
+        self._add(HEALTH, ms, frames.faults, state, int(frames.suspect))
+
+    def _ms(self, time_us: int) -> int:
+        return (time_us + self.toy.frames.zero_us) // 1000
+
+    def _add(self, kind: int, ms: int, *what: int, numbers: Sequence[int] = ()) -> None:
+        counts = self.toy.frames.restarts, self.toy.frames.invalid
+        row = [kind, self.frame, ms, *what, *[0] * (HEAD - 5 - len(what)), *counts, *numbers]
+        self.rows.append(row + [0] * (HEAD + 2 * len(self.affects) - len(row)))
 
 
 def write_golden(model: IntegerModel, scaler: Scaler, folder: Path) -> list[Path]:
-    """Write the golden vectors into a folder: `FRAMES`, `ANSWERS` and what they hold."""
+    """Write the golden vectors with a README into a folder, and return the paths."""
     span, inputs = model.network.arch.span, model.network.inputs
     frames = golden_frames(model.layout, scaler, span, inputs=inputs, health=model.rules.health)
     answers = answers_of(model, frames)
@@ -200,7 +409,7 @@ to the C in this export and compares every number.
 
 
 def read_golden(folder: Path, channels: int, classes: int) -> tuple[Ints, NDArray[np.int32]]:
-    """The frames (n, 1 + C) and rows (m, 12 + 2 K) of a folder.
+    """Read the frames (n, 1 + C) and rows (m, 12 + 2 K) of a folder.
 
     Raises:
         BadInput: for a file that is missing or does not hold whole rows.

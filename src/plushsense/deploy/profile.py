@@ -1,23 +1,397 @@
-"""What an export costs: instructions, bytes, stack on each emulated chip, and what that would mean on real ones.
-
-The counts are exact and the same in every run. Times are estimates, derived from them: nothing ran on a real chip.
-"""
+"""Cost of an export's C on a target: instructions by stage, bytes by section, stack, required symbols."""
 
 from __future__ import annotations
 
+import re
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from plushsense.core.errors import BadInput, ToolError
-from plushsense.deploy.cores import CORES, Estimate, estimate
-from plushsense.deploy.counting import STEPS, Cost, count
-from plushsense.deploy.emit import read_facts
-from plushsense.deploy.targets import TARGETS, missing_tools, require, target_named
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import BadInput, ProgramError, ToolError
+from plushsense.deploy.emit import GOLDEN, LIBRARY, MODEL, read_facts
+from plushsense.deploy.golden import read_golden
+from plushsense.deploy.proof.vectors import Export
+from plushsense.deploy.targets import (
+    C_FOLDER,
+    TARGETS,
+    Program,
+    build,
+    missing_tools,
+    require,
+    target_named,
+    tool,
+    tool_output,
+)
 from plushsense.models.arch import Arch
 
-SAID = (
+
+@dataclass(frozen=True)
+class Core:
+    """A chip: its clock, the target on which instructions are counted, and bounds of cycles per instruction.
+
+    ``flash_mb_s`` is set where code and model lie in flash behind a serial bus and a small cache: how fast that bus
+    fills the cache, in MB/s. ``why`` says where the two bounds come from.
+    """
+
+    name: str
+    title: str
+    mhz: int
+    target: str
+    cycles_low: float
+    cycles_high: float
+    why: str
+    flash_mb_s: float | None = None
+
+    @property
+    def reasons(self) -> str:
+        """Explanation of the bounds as text."""
+        if self.flash_mb_s is None:
+            return self.why
+        return (
+            f"{self.why}; high also fetches code and model from the serial flash anew for every sample, at "
+            f"{self.flash_mb_s:g} MB/s, as if its cache had kept nothing (in RAM they never are)"
+        )
+
+
+_LX = (
+    "counted on lx106, a sibling without zero-overhead loops and with division in software, so the count is rather too "
+    "high; seven pipeline stages (ESP32 datasheet), so what was just loaded or multiplied is there one or two cycles "
+    "late, and in the inner loop nearly every instruction waits for it; the S3's vector unit is not used"
+)
+# 2 bits at 80 MHz are 20 MB/s (esptool, SPI flash modes: DIO), less command, address and waiting of each cache line.
+_DIO = 15.0
+
+CORES: dict[str, Core] = {
+    "esp32": Core("esp32", "ESP32 (Xtensa LX6)", 240, "xtensa", 1.3, 2.4, _LX, _DIO),
+    "esp32-s2": Core("esp32-s2", "ESP32-S2 (Xtensa LX7)", 240, "xtensa", 1.3, 2.4, _LX, _DIO),
+    "esp32-s3": Core("esp32-s3", "ESP32-S3 (Xtensa LX7)", 240, "xtensa", 1.3, 2.4, _LX, _DIO),
+    "esp32-c3": Core(
+        "esp32-c3",
+        "ESP32-C3 (RV32IMC)",
+        160,
+        "riscv32",
+        1.1,
+        2.0,
+        "its own instruction set; four pipeline stages in order (technical reference manual), so what was just loaded "
+        "is there about one cycle late, and a taken branch costs one or two cycles more",
+        _DIO,
+    ),
+    "nrf52": Core(
+        "nrf52",
+        "nRF52 (Cortex-M4)",
+        64,
+        "cortex-m4",
+        1.2,
+        2.2,
+        "its own instruction set; a load takes one or two cycles and a taken branch two to four (Arm, Cortex-M4 "
+        "technical reference manual, table of instructions); high adds two cycles of waiting for the flash to each "
+        "load of weights",
+    ),
+    "rp2040": Core(
+        "rp2040",
+        "RP2040 (Cortex-M0+)",
+        133,
+        "cortex-m0",
+        1.4,
+        2.0,
+        "its own instruction set, counted on a core that runs it too; a load takes two cycles, a taken branch two, "
+        "a product one (Arm, Cortex-M0+ instruction summary)",
+        12.0,
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Estimated time of one step on a core, in ms, between two bounds."""
+
+    core: Core
+    instructions: int
+    step_ms: float
+    low_ms: float
+    high_ms: float
+
+    @property
+    def fits(self) -> str:
+        """``yes``, ``no``, or ``unsure`` when it depends on where in the band the chip lies."""
+        return "yes" if self.high_ms <= self.step_ms else "no" if self.low_ms > self.step_ms else "unsure"
+
+    @property
+    def answer(self) -> str:
+        """Verdict as text, with the share of the core and the remaining time of a step."""
+        low, high = (f"{100 * ms / self.step_ms:.2g}" for ms in (self.low_ms, self.high_ms))
+        if self.fits == "yes":
+            return f"yes, uses about {low} to {high} % of the core, {self.step_ms - self.high_ms:.0f} ms left a step"
+        if self.fits == "unsure":
+            return f"not sure, it would use about {low} to {float(high):g} % of the core"
+        return f"no, it would use {float(low):g} % of the core or more"
+
+    @property
+    def verdict(self) -> str:
+        """Verdict as a whole sentence."""
+        return f"fits {1000 / self.step_ms:g} Hz: {self.answer}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the estimate as plain values for JSON."""
+        core = self.core
+        return {
+            "estimate": True,
+            "chip": core.title,
+            "mhz": core.mhz,
+            "counted_on": core.target,
+            "instructions": self.instructions,
+            "cycles_per_instruction": [core.cycles_low, core.cycles_high],
+            "flash_mb_s": core.flash_mb_s,
+            "low": round(self.low_ms, 3),
+            "high": round(self.high_ms, 3),
+            "fits": self.fits,
+            "verdict": self.verdict,
+            "why": core.reasons,
+        }
+
+
+def estimate(core: Core, instructions: int, flash_bytes: int, samples: int, step_ms: float) -> Estimate:
+    """Estimate the time of a step from its instructions and samples, and the bytes of code and data in flash."""
+    low = instructions * core.cycles_low / core.mhz / 1000
+    high = instructions * core.cycles_high / core.mhz / 1000
+    if core.flash_mb_s is not None:
+        high += samples * flash_bytes / core.flash_mb_s / 1000
+    return Estimate(core, instructions, step_ms, low, high)
+
+
+STEPS = 50  # decisions that are counted
+STAGES = ("health", "inputs", "gate", "network", "dense", "decision", "events", "pooling")
+_HEAP = ("malloc", "calloc", "realloc", "free", "reallocarray", "aligned_alloc", "sbrk", "_sbrk", "_Znw", "_Zna")
+# The compiler's helpers for floating point: __addsf3, __mulsf3, __floatsidf, __aeabi_fadd, __aeabi_i2d …
+_FLOAT = re.compile(r"^__(\w*[sdt]f\d?$|float|fix|aeabi_[fd](?!iv)|aeabi_u?[il]2[fd])")
+_SECTIONS = {"text": (".text", ".literal"), "rodata": (".rodata", ".srodata"), "data": (".data", ".sdata")}
+_SECTIONS["bss"] = (".bss", ".sbss")
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Cost on one target, in instructions and bytes; None where the target counts nothing (the host).
+
+    ``step`` is the mean over `STEPS` decisions with frames up to a fifth of a period early or late, ``even`` with
+    even stamps, ``step_most`` the largest step; ``gap`` is the largest single call, which bridges the longest gap.
+    ``stages`` add up to ``step``; ``clock`` (with the check of values) is the remainder, ``gate`` is 0 for a model
+    without one.
+    ``stack_push``, ``stack_begin`` and ``stack_memory_bytes`` are the stack depths of these functions, without a
+    callback; ``stack_functions`` is the frame of each function as the compiler reports it.
+    """
+
+    target: str
+    step: int | None
+    step_most: int | None
+    even: int | None
+    gap: int | None
+    begin: int | None
+    stages: Mapping[str, int]
+    sections: Mapping[str, Mapping[str, int]]
+    toy_bytes: int
+    memory_bytes: int
+    stack_push: int | None
+    stack_begin: int | None
+    stack_memory_bytes: int | None
+    stack_functions: Mapping[str, int]
+    needs: tuple[str, ...]
+
+    @property
+    def flash_bytes(self) -> int:
+        """Bytes of code, tables and model."""
+        return sum(part[name] for part in self.sections.values() for name in ("text", "rodata", "data"))
+
+    @property
+    def ram_bytes(self) -> int:
+        """Bytes of one toy, its memory and static data; without stack."""
+        kept = sum(part[name] for part in self.sections.values() for name in ("data", "bss"))
+        return self.toy_bytes + self.memory_bytes + kept
+
+    @property
+    def heap(self) -> tuple[str, ...]:
+        """Symbols of a heap that the object needs: should be empty."""
+        return tuple(s for s in self.needs if s.startswith(_HEAP))
+
+    @property
+    def floats(self) -> tuple[str, ...]:
+        """Helpers for floating point that the object needs: should be empty."""
+        return tuple(s for s in self.needs if _FLOAT.match(s))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the cost as plain values for JSON."""
+        return {
+            "title": TARGETS[self.target].title,
+            "instructions_per_step": self.step,
+            "instructions_per_step_most": self.step_most,
+            "instructions_per_step_even": self.even,
+            "instructions_longest_call": self.gap,
+            "instructions_begin": self.begin,
+            "stages": dict(self.stages),
+            "sections": {name: dict(part) for name, part in self.sections.items()},
+            "flash_bytes": self.flash_bytes,
+            "ram_bytes": self.ram_bytes,
+            "toy_bytes": self.toy_bytes,
+            "memory_bytes": self.memory_bytes,
+            "stack_push_bytes": self.stack_push,
+            "stack_begin_bytes": self.stack_begin,
+            "stack_memory_bytes_call": self.stack_memory_bytes,
+            "stack_functions": dict(self.stack_functions),
+            "needs": list(self.needs),
+            "heap": list(self.heap),
+            "floating_point": list(self.floats),
+        }
+
+
+def count(
+    folder: Path, target: str, facts: Mapping[str, Any], optimise: str = "-O2", *, code: Path | None = None
+) -> Cost:
+    """Build the C of an export folder for a target, run it there and count instructions; the folder is only read.
+
+    ``code`` is the folder of the C where that is not the export's own.
+
+    Raises:
+        ToolError: when a tool is missing, or refuses what stands in the folder.
+        BadInput: when the golden frames are missing.
+    """
+    code = code or folder
+    step = int(facts["step"])
+    even, jittered = _streams(folder, facts)
+    with tempfile.TemporaryDirectory(prefix="plushsense-profile-") as temporary:
+        work = Path(temporary)
+        blobs = {"EVEN": _written(even, work / "even"), "JITTERED": _written(jittered, work / "jittered")}
+        sources = [C_FOLDER / "profile.c", code / MODEL[1]]
+        whole = build(
+            target,
+            [*sources, code / LIBRARY[1]],
+            work / "whole",
+            include=[code],
+            optimise=optimise,
+            blobs=blobs,
+            flags=["-fstack-usage"],
+        )
+        head, rows_even, rows_jittered = _whole(whole, step)
+        counts = TARGETS[target].counts
+        stages: dict[str, int] = {}
+        if counts:
+            defines = {"PLUSH_STAGES": 1}
+            staged = build(
+                target, sources, work / "stages", include=[code], defines=defines, optimise=optimise, blobs=blobs
+            )
+            stages = _stages(staged)
+            stages = {"clock": _mean(rows_jittered[:-1, 0]) - sum(stages.values()), **stages}
+        objects = {"plushsense": whole.objects[2], "plush_model": whole.objects[1]}
+        return Cost(
+            target=target,
+            step=_mean(rows_jittered[:-1, 0]) if counts else None,
+            step_most=int(rows_jittered[:-1, 0].max()) if counts else None,
+            even=_mean(rows_even[:, 0]) if counts else None,
+            gap=int(rows_jittered[-1, 1]) if counts else None,
+            begin=head[2] if counts else None,
+            stages=stages,
+            sections={name: _sections(target, file) for name, file in objects.items()},
+            toy_bytes=head[0],
+            memory_bytes=head[1],
+            stack_push=head[5] if counts else None,
+            stack_begin=head[4] if counts else None,
+            stack_memory_bytes=head[3] if counts else None,
+            stack_functions=_stack_usage(objects["plushsense"].with_suffix(".su")),
+            needs=_needs(target, objects["plushsense"]),
+        )
+
+
+def _mean(counts: Ints) -> int:
+    return round(float(counts.mean()))
+
+
+def _streams(folder: Path, facts: Mapping[str, Any]) -> tuple[Ints, Ints]:
+    """Return frames at even times, and the same readings with jitter and the longest bridged gap at the end.
+
+    The readings are the clean touches near the beginning of the golden frames. What is counted begins and ends with a
+    frame without jitter, so that it holds whole samples only.
+    """
+    span, step, period_us = int(facts["span"]), int(facts["step"]), int(facts["period_us"])
+    frames, _ = read_golden(folder / GOLDEN, len(facts["channels"]), int(facts["classes"]))
+    clean = frames[6 : 6 + span, 1:]
+    if len(clean) < span:
+        raise BadInput(f"'{folder / GOLDEN}' holds too few frames: export the model again.")
+    n = span + STEPS * step
+    values = np.resize(clean, (n, clean.shape[1]))
+    at_us = 1_000_000 + np.arange(n) * period_us
+    jitter = np.random.default_rng(5).integers(-period_us // 5, period_us // 5 + 1, n)
+    jitter[[0, span - 1, n - 1]] = 0
+    even = np.column_stack([at_us // 1000, values])
+    jittered = np.column_stack([(at_us + jitter) // 1000, values])
+    last = np.concatenate([[jittered[-1, 0] + int(facts["gap_ms"])], values[0]])
+    return even, np.vstack([jittered, last])
+
+
+def _written(frames: Ints, file: Path) -> Path:
+    file.write_bytes(frames.astype("<i4").tobytes())
+    return file
+
+
+def _whole(program: Program, step: int) -> tuple[list[int], Ints, Ints]:
+    """Run the program: return six numbers about the toy, and two tables of rows (`STEPS`, 3).
+
+    The rows follow the first decision of the even and of the jittered stream; the latter has one more, of the gap.
+    """
+    numbers = np.frombuffer(program.run(), dtype="<u4").astype(np.int64)
+    if not len(numbers):
+        raise ProgramError(
+            f"The C in the export refuses its own model on {program.target.name}: export the model again."
+        )
+    table = numbers[6:].reshape(-1, 3)
+    first = int(np.flatnonzero(table[:, 2] == 2)[0])
+    even, jittered = (part[part[:, 2] == 1][1:] for part in (table[:first], table[first + 1 : -1]))
+    if (len(even), len(jittered)) != (STEPS, STEPS + 1):
+        raise ProgramError(
+            f"The C in the export gave {len(even)} answers on {program.target.name} where {STEPS} steps of {step} "
+            "samples should: plushsense verify says where it goes wrong."
+        )
+    return numbers[:6].tolist(), even, jittered
+
+
+def _stages(program: Program) -> dict[str, int]:
+    rows = np.frombuffer(program.run(), dtype="<i4").astype(np.int64).reshape(-1, len(STAGES))
+    return {name: _mean(rows[:, i]) for i, name in enumerate(STAGES)}
+
+
+def _sections(target: str, file: Path) -> dict[str, int]:
+    """Return the bytes of an object file by kind of section."""
+    found = dict.fromkeys(_SECTIONS, 0)
+    for line in tool_output([tool(target, "size"), "-A", str(file)]).splitlines():
+        words = line.split()
+        for name, begins in _SECTIONS.items():
+            if len(words) == 3 and any(words[0] == b or words[0].startswith(b + ".") for b in begins):
+                found[name] += int(words[1])
+    return found
+
+
+def _needs(target: str, file: Path) -> tuple[str, ...]:
+    """Return the undefined symbols of an object file."""
+    lines = tool_output([tool(target, "nm"), "-u", str(file)]).splitlines()
+    return tuple(sorted(words[-1] for line in lines if (words := line.split())))
+
+
+def _stack_usage(file: Path) -> dict[str, int]:
+    """Read the stack frame of each function from the compiler's report, largest first; refuse a dynamic one."""
+    found: dict[str, int] = {}
+    lines: Sequence[str] = file.read_text().splitlines() if file.is_file() else ()
+    for line in lines:
+        place, size, kind = line.split("\t")
+        if kind != "static":
+            raise BadInput(f"The stack of {place} is not known when compiling ({kind}): take out what makes it so.")
+        found[place.rsplit(":", 1)[-1]] = int(size)
+    return dict(sorted(found.items(), key=lambda item: -item[1]))
+
+
+SUMMARY = (
     "Instructions are counted on emulators and exact. Times are estimates from them, between two bounds: nothing ran "
     "on a real chip."
 )
@@ -25,8 +399,10 @@ SAID = (
 
 @dataclass(frozen=True)
 class Profile:
-    """Costs by target, and estimates by core for which its target was counted. ``missing`` names, by target that was
-    left out, the Debian packages that it needs."""
+    """Costs by target, and estimates by core whose target was counted.
+
+    ``missing`` maps each target that was left out to the Debian packages that it needs.
+    """
 
     facts: Mapping[str, Any]
     arch: Arch
@@ -42,24 +418,26 @@ class Profile:
 
     @property
     def macs_by_layer(self) -> dict[str, int]:
-        """Multiply-accumulates of a step by layer; the dense layer is worked out once a step."""
+        """Multiply-accumulates of a step by layer; the dense layer is computed once a step."""
         names = (f"layer {n}" for n in range(1, len(self.arch.layers) + 1))
         macs = {name: m * self.arch.step for name, m in zip(names, self.arch.macs_per_position, strict=True)}
         return macs | {"dense": self.arch.classes * self.arch.filters[-1]}
 
     @property
     def window_instructions(self) -> dict[str, int]:
-        """An estimate, by target: what the network would take if it recomputed its whole span at every step, at as
-        many instructions for a multiply-accumulate as were counted."""
+        """Estimated instructions, by target, if the network recomputed its whole span at every step.
+
+        The instructions of a multiply-accumulate are taken from the counts.
+        """
         ratio = self.arch.macs_per_window / self.arch.macs_per_step
         return {name: round(c.stages["network"] * ratio) for name, c in self.costs.items() if c.stages}
 
     def to_dict(self) -> dict[str, Any]:
-        """The object that ``plushsense profile --json`` prints."""
+        """Return the object that ``plushsense profile --json`` prints."""
         counted = {name: c for name, c in self.costs.items() if c.step is not None}
         return {
             "title": self.arch.title,
-            "said": SAID,
+            "said": SUMMARY,
             "optimise": self.optimise,
             "step": self.arch.step,
             "step_ms": self.step_ms,
@@ -83,43 +461,51 @@ def profile(
     targets: Sequence[str] = (),
     *,
     optimise: str = "-O2",
+    trust: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Profile:
-    """Count what the C in an export folder costs. The folder is only read.
+    """Count the cost of the C in an export folder; the folder is only read.
 
     Args:
         folder: made by ``plushsense export``.
         targets: names of `TARGETS`; without any, all that count instructions and are installed here.
-        optimise: how the compilers are told to optimise.
+        optimise: optimisation flag of the compilers.
+        trust: also compile and run library and model files that are not what this version writes.
         progress: called with targets done and targets in all.
 
     Raises:
-        BadInput: when the folder is no export, or lacks something.
-        ToolError: when a target that was asked for is not installed here, when none is, or when a compiler refuses
+        BadInput: when the folder is no export, lacks something, or holds C that is not what this version writes and
+            ``trust`` is not given.
+        ToolError: when a requested target is not installed here, when none is, or when a compiler refuses
             what stands in the folder.
     """
     folder = Path(folder)
     facts = read_facts(folder)
     arch = _arch(folder, facts)
-    wanted = list(dict.fromkeys(targets)) or [name for name, target in TARGETS.items() if target.counts]
-    missing = {name: lacks for name in wanted if (lacks := missing_tools(target_named(name).name))}
+    export = Export(folder)
+    if not trust:
+        export.require_unchanged()
+    names = list(dict.fromkeys(targets)) or [name for name, target in TARGETS.items() if target.counts]
+    missing = {name: lacks for name in names if (lacks := missing_tools(target_named(name).name))}
     if targets:
         for name in missing:
             require(name)
-    there = [name for name in wanted if name not in missing]
-    if not there:
+    installed = [name for name in names if name not in missing]
+    if not installed:
         packages = " ".join(dict.fromkeys(p for lacks in missing.values() for p in lacks))
         raise ToolError(
             "No emulator to count on is installed here: install Debian's "
             f"{packages} (or some of them), or give --target host for sizes on this computer only."
         )
     costs = {}
-    for done, name in enumerate(there):
-        if progress is not None:
-            progress(done, len(there))
-        costs[name] = count(folder, name, facts, optimise)
+    with tempfile.TemporaryDirectory(prefix="plushsense-profile-") as work:
+        code = export.code(Path(work) / "code")
+        for done, name in enumerate(installed):
+            if progress is not None:
+                progress(done, len(installed))
+            costs[name] = count(folder, name, facts, optimise, code=code)
     if progress is not None:
-        progress(len(there), len(there))
+        progress(len(installed), len(installed))
     estimates = {
         name: estimate(core, cost.step, cost.flash_bytes, arch.step, float(facts["step_ms"]))
         for name, core in CORES.items()

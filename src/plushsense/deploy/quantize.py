@@ -1,18 +1,18 @@
-"""A trained network in whole numbers: batch normalisation folded, 8-bit weights and activations, fixed-point scales.
+"""Quantization of a trained network: folded batch normalisation, 8-bit weights and activations, fixed-point scales.
 
-Folding is exact: a normalisation after ReLU moves into the layer that reads it, and at the last layer through the
-mean into the dense layer. Where the 8 bits of each input and activation lie is found on windows of the training
-people only (`calibrate`).
+Folding is exact: a normalisation after ReLU moves into the next layer, and after the last layer through the mean into
+the dense layer. The 8-bit ranges of inputs and activations are measured on windows of the training people only
+(`calibrate`).
 
-What rounding the weights does to a mean sum is known from the mean of what a layer reads, and goes into its bias.
-On makeability that takes the windows on which int8 and float disagree from 4 % to 1.5 %: inputs lie around the
-middle of their 8 bits, so that every weight's error counts 128 times over.
+The mean error that rounding the weights causes is computed from the mean input of each layer and subtracted in its
+bias. On makeability this lowers the share of windows on which int8 and float disagree from 4 % to 1.5 %: inputs lie
+around code 128, so that the error of a weight is multiplied by 128.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,28 +20,41 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import ArchError, BundleError
 from plushsense.models.arch import NORM_EPSILON, Arch
-from plushsense.models.fixed import InputScale, LogitScale, Requantize, split_ratio
-from plushsense.models.integer import IntegerDense, IntegerLayer, IntegerNetwork
+from plushsense.models.bundle import Bundle
 from plushsense.models.reference import Network
+from plushsense.runtime.decisions import DecideSpec
+from plushsense.runtime.fixed import (
+    PROBABILITY_BITS,
+    InputScale,
+    LogitScale,
+    Requantize,
+    smoothing_weight,
+    softmax,
+    split_ratio,
+)
+from plushsense.runtime.image import IntegerModel
+from plushsense.runtime.integer import IntegerDense, IntegerLayer, IntegerNetwork, deployable
 from plushsense.windows.features import Scaler
 
 Floats = NDArray[np.float64]
 
-# Part of every journalled result: raise it when the same windows and weights would give other whole numbers.
+# Part of every journalled result: raise it when the same windows and weights would give other integers.
 QUANTIZE_VERSION = 1
 
-_AT_ONCE = 16  # windows: what their layers read is held whole
+_BATCH = 16  # windows
 
-# The share of what training windows show that may lie outside. Of people who were not met more does, and that costs
-# more than coarser steps: on 5 of makeability's 27 folds the answers moved least with these (Kullback-Leibler, 5e-4).
+# Share of the training values that may lie outside the ranges. More values of new people do, and clipping costs more
+# than coarser steps: on 5 of makeability's 27 folds these changed the answers least (Kullback-Leibler, 5e-4).
 _INPUTS_OUTSIDE = 1e-4
 _OUTSIDE = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
 class Ranges:
-    """What 8 bits have to hold: scaled inputs from ``low`` to ``high`` (C,), activations of each layer from 0 to
-    ``tops`` (F,), before normalisation; and the ``means`` of both: of the inputs (C,), then of each layer (F,)."""
+    """Value ranges of a network: scaled inputs ``low`` to ``high`` (C,), activations of each layer 0 to ``tops`` (F,).
+
+    Activations are before normalisation; ``means`` holds the means of the inputs (C,), then of each layer (F,).
+    """
 
     low: Floats
     high: Floats
@@ -49,13 +62,13 @@ class Ranges:
     means: tuple[Floats, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, ready for JSON."""
+        """Return the ranges as plain values for JSON."""
         lists = {name: [part.tolist() for part in getattr(self, name)] for name in ("tops", "means")}
         return {"low": self.low.tolist(), "high": self.high.tolist(), **lists}
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> Ranges:
-        """Ranges from plain values.
+        """Read ranges from plain values.
 
         Raises:
             BundleError: for a key that is missing.
@@ -73,7 +86,7 @@ class Ranges:
             raise BundleError(f"The calibration in the bundle cannot be read ({cause}): train again.") from None
 
     def check(self, arch: Arch) -> None:
-        """Refuse ranges of another network: BundleError."""
+        """Raise BundleError for ranges of another network."""
         needed = [arch.channels, arch.channels, *arch.filters, arch.channels, *arch.filters]
         parts = [self.low, self.high, *self.tops, *self.means]
         if [p.shape for p in parts] != [(n,) for n in needed] or not all(np.isfinite(p).all() for p in parts):
@@ -81,11 +94,11 @@ class Ranges:
 
 
 def calibrate(network: Network, x: NDArray[np.floating[Any]]) -> Ranges:
-    """The ranges of scaled training windows (N, C, T) on their way through the network."""
+    """Measure the ranges of scaled training windows (N, C, T) in every layer of the network."""
     low, high = np.quantile(x, [_INPUTS_OUTSIDE, 1 - _INPUTS_OUTSIDE], axis=(0, 2))
     seen: list[list[Floats]] = [[] for _ in network.arch.filters]
-    for at in range(0, len(x), _AT_ONCE):
-        for kept, z in zip(seen, network.rectified(x[at : at + _AT_ONCE]), strict=True):
+    for at in range(0, len(x), _BATCH):
+        for kept, z in zip(seen, network.rectified(x[at : at + _BATCH]), strict=True):
             kept.append(z.reshape(-1, z.shape[2]))
     rows = [np.concatenate(kept) for kept in seen]
     tops = tuple(np.quantile(row, 1 - _OUTSIDE, axis=0) for row in rows)
@@ -94,7 +107,7 @@ def calibrate(network: Network, x: NDArray[np.floating[Any]]) -> Ranges:
 
 
 def refuse_undeployable(arch: Arch) -> None:
-    """Refuse a network that has no meaning in the toy: ArchError with the reason and the nearest one that has."""
+    """Raise ArchError for a network that cannot be deployed, with the reason and the nearest one that can."""
     if arch.padding != "stream":
         raise ArchError(
             f"{arch.title} has the padding '{arch.padding}', with which a decision cannot be made sample by sample: "
@@ -108,7 +121,7 @@ def refuse_undeployable(arch: Arch) -> None:
 
 
 def folded(arch: Arch, weights: Mapping[str, NDArray[Any]]) -> list[tuple[Floats, Floats]]:
-    """The float network without normalisation: weights (F, C, K) and biases (F,) of each layer, then of the dense one.
+    """Fold normalisation into the next layer: return weights (F, C, K) and biases (F,) of each layer and the dense one.
 
     Each normalisation is moved into the layer that reads it; exact for networks that can be deployed.
     """
@@ -124,7 +137,7 @@ def folded(arch: Arch, weights: Mapping[str, NDArray[Any]]) -> list[tuple[Floats
 
 
 def quantize(arch: Arch, weights: Mapping[str, NDArray[Any]], scaler: Scaler, ranges: Ranges) -> IntegerNetwork:
-    """The network in whole numbers.
+    """Quantize the network.
 
     Raises:
         ArchError: for a network that cannot be deployed.
@@ -150,14 +163,14 @@ def quantize(arch: Arch, weights: Mapping[str, NDArray[Any]], scaler: Scaler, ra
 
 
 def _codes(mean: Floats, start: Floats, unit: Floats) -> Floats:
-    """The mean of what a layer reads, as its 8-bit numbers (0 where a filter is switched off)."""
+    """Return the mean 8-bit code of a layer's input (0 where a filter is switched off)."""
     return np.divide(mean - start, unit, out=np.zeros_like(mean), where=unit != 0)
 
 
 def _eight_bits(w: Floats, b: Floats, read: Floats) -> tuple[NDArray[np.int8], NDArray[np.int64], Floats]:
-    """Weights (F, C, …) and biases (F,) in units (F,) of their own: the largest weight becomes ±127.
+    """Quantize weights (F, C, …) and biases (F,) per filter: the largest weight becomes ±127.
 
-    ``read`` (C,) is the mean of the numbers that are read: what rounding does to the sums of these, the bias undoes.
+    ``read`` (C,) is the mean input; the bias compensates the mean error of the rounded weights.
     """
     rows = np.abs(w).reshape(len(w), -1).max(axis=1)
     size = np.maximum(np.maximum(rows / 127, np.abs(b) / (1 << 29)), 1e-30)
@@ -168,7 +181,7 @@ def _eight_bits(w: Floats, b: Floats, read: Floats) -> tuple[NDArray[np.int8], N
 
 
 def _split(ratios: Floats, full: int) -> NDArray[np.int64]:
-    """Columns before, multiplier, after of each ratio; a sum of full / ratio gives ``full``."""
+    """Return columns (before, multiplier, after) of each ratio; a sum of full / ratio gives ``full``."""
     return np.array([split_ratio(float(r), full / float(r)) for r in ratios], dtype=np.int64).T
 
 
@@ -181,3 +194,66 @@ def _input_scale(scaler: Scaler, low: Floats, unit: Floats) -> InputScale:
         there = ((middle - offset) * scale - start) / size
         rows.append((middle, before, multiplier, round((there + 0.5) * 2.0**after), after))
     return InputScale(*np.array(rows, dtype=np.int64).T)
+
+
+_MOST = 1024  # windows
+
+
+def calibration(
+    arch: Arch, weights: Mapping[str, NDArray[np.float32]], scaler: Scaler, x: NDArray[np.integer[Any]]
+) -> dict[str, Any]:
+    """Return the calibration of raw training windows (N, C, T) for the bundle: plain values without samples.
+
+    Empty for a network that cannot be deployed, and without windows.
+    """
+    if not deployable(arch) or not len(x):
+        return {}
+    # Evenly spaced over all windows, so that every person is among them.
+    some = np.unique(np.linspace(0, len(x) - 1, min(len(x), _MOST)).round().astype(np.int64))
+    return calibrate(Network(arch, weights), scaler.apply(x[some, :, x.shape[2] - arch.span :])).to_dict()
+
+
+def calibrated(bundle: Bundle, x: NDArray[np.integer[Any]]) -> Bundle:
+    """Return the bundle with the calibration of raw windows (N, C, T) of its training people.
+
+    Raises:
+        ArchError: for a network that cannot be deployed; BundleError: without windows.
+    """
+    refuse_undeployable(bundle.arch)
+    if not len(x):
+        raise BundleError("There are no windows to calibrate on: give those that the network was trained on.")
+    return replace(bundle, calibration=calibration(bundle.arch, bundle.weights, bundle.scaler, x))
+
+
+def integer_network(bundle: Bundle) -> IntegerNetwork:
+    """Return the bundle's network in integers; deterministic.
+
+    Raises:
+        ArchError: for a network that cannot be deployed; BundleError: for a bundle without calibration.
+    """
+    refuse_undeployable(bundle.arch)
+    if not bundle.calibration:
+        raise BundleError(
+            "The bundle holds no calibration (it was made by an earlier PlushSense): train it again, or give the data "
+            "set that it was trained on, with plushsense export BUNDLE OUT --dataset DS."
+        )
+    return quantize(bundle.arch, bundle.weights, bundle.scaler, Ranges.from_dict(bundle.calibration))
+
+
+def integer_model(bundle: Bundle, decide: DecideSpec | None = None) -> IntegerModel:
+    """Return all that the toy computes with; ``decide`` None: the bundle's own decision settings.
+
+    Raises:
+        ArchError, BundleError: as for `integer_network`; ConfigError: for unknown decision settings.
+    """
+    spec = decide or DecideSpec.from_dict(bundle.decision)
+    step_s = bundle.arch.step * bundle.layout.period_us / 1e6
+    weight = smoothing_weight(spec.smoothing_s, step_s)
+    return IntegerModel(integer_network(bundle), bundle.layout, bundle.gestures, weight, spec.rules(step_s))
+
+
+def integer_probabilities(network: IntegerNetwork, x: NDArray[np.integer[Any]]) -> NDArray[np.float32]:
+    """Compute the probabilities (N, K) of raw windows (N, C, T) with a deployed network, without smoothing."""
+    rows = [softmax(logits) for logits in network.forward(x)]
+    found = np.array(rows, dtype=np.float32).reshape(len(x), network.arch.classes)
+    return found / np.float32(1 << PROBABILITY_BITS)

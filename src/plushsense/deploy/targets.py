@@ -1,8 +1,8 @@
-"""Machines that a C program can be built for and run on here: this one, and chips that QEMU plays.
+"""Machines on which an exported C program can be built and run: this computer and chips emulated by QEMU.
 
-The emulators run on a clock of their own (``-icount``), so that counts are the same in every run. They count
-instructions, not cycles, and nothing here is a real chip. A microcontroller is a line of `TARGETS`, its start-up and
-linker script are in ``c/runtime``. Recipes: Debian 12's packages.
+The emulators run with ``-icount``, so that counts are the same in every run. They count instructions, not cycles, and
+are no real chips. A microcontroller is an entry of `TARGETS`; its start-up code and linker script are in ``c/runtime``.
+Package names are those of Debian 12.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ RUNTIME = C_FOLDER / "runtime"
 
 @dataclass(frozen=True)
 class Target:
-    """One machine: how to compile for it and how to run there.
+    """A machine: how to compile for it and how to run a program there.
 
     ``packages`` names Debian's package of each tool that must be on the path. ``libraries`` are files that the
     compiler must find (``-print-file-name``), with their package. ``runtime`` and ``script`` are files of `RUNTIME`;
@@ -113,14 +113,14 @@ TARGETS: dict[str, Target] = {
 
 @dataclass(frozen=True)
 class Program:
-    """A program that was built: its ``file``, and the object file of each of its sources, in their order."""
+    """A built program: its ``file``, and the object file of each source, in order."""
 
     target: Target
     file: Path
     objects: tuple[Path, ...]
 
     def run(self, *, timeout_s: float = 120.0) -> bytes:
-        """What the program writes to standard output.
+        """Run the program and return its standard output.
 
         Raises:
             ProgramError: when it ends with another status than 0, crashes (98 on an emulator), or takes too long.
@@ -136,22 +136,24 @@ class Program:
         except OSError as cause:
             raise ToolError(f"{where} cannot be started with {command[0]}: {cause.strerror or cause}.") from None
         if done.returncode != 0:
-            said = done.stderr.decode(errors="replace").strip()
-            last = f" It said: {_shortened(said)}" if said else ""
-            raise ProgramError(f"{where} ended with status {done.returncode} instead of 0.{last}", said)
+            errors = done.stderr.decode(errors="replace").strip()
+            last = f" Its error: {_error_line(errors)}" if errors else ""
+            raise ProgramError(f"{where} ended with status {done.returncode} instead of 0.{last}", errors)
         return done.stdout
 
 
 def target_named(name: str) -> Target:
-    """The target of this name; ConfigError for an unknown one."""
+    """Return the target of this name; ConfigError for an unknown one."""
     if name not in TARGETS:
         raise ConfigError(f"Unknown target '{name}': accepted are {', '.join(TARGETS)}.{nearest(name, TARGETS)}")
     return TARGETS[name]
 
 
 def missing_tools(target: str, *, cc: str | None = None) -> list[str]:
-    """Debian packages that must be installed before programs can be built for this target and run: none when all is
-    here. ``cc`` is another compiler than the target's own."""
+    """Return the Debian packages that are missing for building and running programs of a target.
+
+    ``cc`` names another compiler than the target's own.
+    """
     machine = target_named(target)
     tools = dict(machine.packages)
     if cc is not None:
@@ -164,7 +166,7 @@ def missing_tools(target: str, *, cc: str | None = None) -> list[str]:
 
 
 def require(target: str, *, cc: str | None = None) -> None:
-    """ToolError, with what to install, when something for this target is missing."""
+    """Raise ToolError, with what to install, when something for this target is missing."""
     if missing := missing_tools(target, cc=cc):
         packages = " ".join(missing)
         raise ToolError(
@@ -185,7 +187,7 @@ def build(
     cc: str | None = None,
     flags: Sequence[str] = (),
 ) -> Program:
-    """A program from C (or assembly) sources, one of which has ``main``; made in ``out_dir``, nothing else is touched.
+    """Build a program from C (or assembly) sources, one of which has ``main``, in ``out_dir``.
 
     ``target.h`` is on the include path. Each file of ``blobs`` becomes bytes from the symbol NAME to NAME_end
     (``extern const uint8_t NAME[], NAME_end[]``), at a multiple of 16. ``flags`` are for the sources, not for the
@@ -193,7 +195,7 @@ def build(
 
     Raises:
         ToolError: when a compiler or emulator is missing.
-        BuildError: when the compiler or linker refuses; ``said`` is all of what it said.
+        BuildError: when the compiler or linker refuses; its ``output`` holds all messages.
     """
     machine = target_named(target)
     require(target, cc=cc)
@@ -212,7 +214,7 @@ def build(
         if blobs:
             (Path(work) / "blobs.S").write_text(_blobs(blobs))
             around.append("blobs.S")
-        # A loop of the runtime must not become a call of the very function that it implements.
+        # Keeps the compiler from turning a loop of memset() into a call of memset().
         runtime = ["-O2", "-fno-tree-loop-distribute-patterns"] if machine.run else ["-O2"]
         command = [compiler, *machine.flags, f"-I{RUNTIME}", *runtime, "-c", *around]
         _compile(command, Path(work), "the runtime")
@@ -225,7 +227,7 @@ def build(
 
 
 def tool(target: str, name: str) -> str:
-    """A tool that comes with the target's compiler, as ``nm`` or ``size``; ToolError when it is not there."""
+    """Return a tool that comes with the target's compiler, such as ``nm`` or ``size``; ToolError when it is missing."""
     compiler = target_named(target).compiler
     found = compiler.removesuffix("gcc") + name
     if shutil.which(found) is None:
@@ -233,42 +235,42 @@ def tool(target: str, name: str) -> str:
     return found
 
 
-def said_by(command: Sequence[str]) -> str:
-    """Standard output of a tool; ToolError when it fails."""
+def tool_output(command: Sequence[str]) -> str:
+    """Return the standard output of a tool; ToolError when it fails."""
     done = subprocess.run(command, capture_output=True, stdin=subprocess.DEVNULL)
     if done.returncode != 0:
-        said = done.stderr.decode(errors="replace").strip()
-        raise ToolError(f"{command[0]} failed: {_shortened(said)}")
+        errors = done.stderr.decode(errors="replace").strip()
+        raise ToolError(f"{command[0]} failed: {_error_line(errors)}")
     return done.stdout.decode(errors="replace")
 
 
 def _compile(command: Sequence[str], cwd: Path, what: str) -> None:
     try:
-        # The compiler's own words, whatever the person's language: tests and people look for them.
+        # English messages in every locale.
         env = os.environ | {"LC_ALL": "C"}
         done = subprocess.run(command, cwd=cwd, stdin=subprocess.DEVNULL, capture_output=True, env=env)
     except OSError as cause:
         raise ToolError(f"{command[0]} cannot be started: {cause.strerror or cause}.") from None
     if done.returncode != 0:
-        said = done.stderr.decode(errors="replace").strip()
-        raise BuildError(f"{command[0]} refused {what}: {_shortened(said)}", said)
+        errors = done.stderr.decode(errors="replace").strip()
+        raise BuildError(f"{command[0]} refused {what}: {_error_line(errors)}", errors)
 
 
-def _shortened(said: str) -> str:
-    """The first line of a tool's words that names an error, else the last line."""
-    lines = [line.strip() for line in said.splitlines() if line.strip()]
+def _error_line(output: str) -> str:
+    """Return the first line of a tool's output that names an error, else the last line."""
+    lines = [line.strip() for line in output.splitlines() if line.strip()]
     words = (" error:", "undefined reference", "multiple definition", "overflowed", "ERROR:")
-    telling = [line for line in lines if any(w in line for w in words) and not line.startswith("collect2")]
-    return (telling or lines[-1:] or ["it said nothing"])[0]
+    matching = [line for line in lines if any(w in line for w in words) and not line.startswith("collect2")]
+    return (matching or lines[-1:] or ["no output"])[0]
 
 
 @cache
 def _finds(compiler: str, file: str) -> bool:
-    return Path(said_by([compiler, f"-print-file-name={file}"]).strip()).is_absolute()
+    return Path(tool_output([compiler, f"-print-file-name={file}"]).strip()).is_absolute()
 
 
 def _blobs(blobs: Mapping[str, Path]) -> str:
-    """Assembly that takes files in as they are."""
+    """Return assembly that includes files as bytes."""
     lines = [
         "#define JOIN(a, b) a##b",
         "#define JOINED(a, b) JOIN(a, b)",

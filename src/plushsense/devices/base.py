@@ -1,4 +1,4 @@
-"""What every toy offers: frames to iterate over, counters of what went wrong, and a clean end."""
+"""The interface of an open toy: frames to iterate over, counters of faults, and closing."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from dataclasses import asdict, dataclass
 from types import TracebackType
 from typing import NamedTuple, Self
 
-from plushsense.core.signal import Layout
+from plushsense.core.layouts import Layout
 
 
 class Frame(NamedTuple):
-    """One sample of all channels.
+    """A sample of all channels.
 
     ``host_ms`` when it arrived (epoch), ``device_ms`` on the toy's own clock (the truth for rate and loss),
     ``values`` (C,) in integer steps, in the order of ``layout.channels``.
@@ -27,7 +27,7 @@ class Frame(NamedTuple):
 
 @dataclass
 class Counters:
-    """What has come and what went wrong on the way.
+    """Numbers of received frames and of transmission faults.
 
     Attributes:
         frames: whole frames.
@@ -44,14 +44,14 @@ class Counters:
     reconnects: int = 0
 
     def to_dict(self) -> dict[str, int]:
-        """Plain values, ready for JSON."""
+        """Return plain values, ready for JSON."""
         return asdict(self)
 
 
-class LossMeter:
-    """Lost frames from the device clock: a step well above the running median period is a hole.
+class LossCounter:
+    """Count lost frames by the device clock: a step well above the running median period is a gap.
 
-    A clock that goes back, or on by more than ``pause_ms``, was restarted or paused: nothing is counted.
+    A clock that goes back, or advances by more than ``pause_ms``, was restarted or paused: nothing is counted.
     """
 
     def __init__(self, span: int = 101, pause_ms: int = 10_000) -> None:
@@ -62,7 +62,7 @@ class LossMeter:
         self._stale = 0
 
     def push(self, device_ms: int) -> int:
-        """How many frames are missing between the frame before and this one."""
+        """Return how many frames are missing between the previous frame and this one."""
         last, self._last = self._last, device_ms
         if last is None:
             return 0
@@ -70,7 +70,7 @@ class LossMeter:
         if not 0 <= step <= self._pause_ms:
             return 0
         self._steps.append(step)
-        # A median of 101 steps hardly moves: it is sorted anew only now and then.
+        # A median of 101 steps changes slowly, so it is computed only now and then.
         self._stale += 1
         if self._median <= 0.0 or self._stale >= 10 or len(self._steps) < 20:
             self._median = float(sorted(self._steps)[len(self._steps) // 2])
@@ -87,13 +87,12 @@ class Device(ABC):
     when `close` is called, also from another thread; a toy that went away raises DeviceError.
 
     Attributes:
-        url: as it was opened.
-        layout: of the frames.
-        counters: live.
-        wait_s: for how long `read` waits at most; 0 looks only whether something is there, as for many toys in turn.
-        arrived_s: when the bytes of the last frames were there, before they were parsed, on `time.perf_counter`'s
-            clock; of a source that keeps time itself (a replay, a virtual toy), when the first of them was due. None
-            where nothing was told.
+        url: the URL that opened it.
+        layout: layout of the frames.
+        counters: numbers of frames and faults so far.
+        wait_s: longest wait of `read`; 0 polls, for reading many toys in turn.
+        arrived_s: time at which the bytes of the last frames arrived, before they were parsed, by `time.perf_counter`;
+            for a replay or a virtual toy, the time at which the first of them was due. None where it is unknown.
     """
 
     def __init__(self, url: str, layout: Layout) -> None:
@@ -106,14 +105,14 @@ class Device(ABC):
 
     @abstractmethod
     def read(self) -> list[Frame] | None:
-        """The frames that arrived since the last call, waiting at most about ``wait_s``; None at the end.
+        """Return the frames since the last call, waiting at most about ``wait_s``; return None at the end.
 
         Raises:
             DeviceError: when the toy went away.
         """
 
-    def _shut(self) -> None:  # noqa: B027 (most sources have nothing to release)
-        """Release what is open; called once."""
+    def _shut(self) -> None:  # noqa: B027, RUF100
+        """Release the resources; called once."""
 
     def close(self) -> None:
         """Close the device. Closing twice is harmless."""
@@ -141,14 +140,14 @@ class Device(ABC):
 
 
 def now_ms() -> int:
-    """Host time, milliseconds since 1970."""
+    """Return the host time, milliseconds since 1970."""
     return time.time_ns() // 1_000_000
 
 
 class Pacer:
-    """Holds a source to its own clock, ``speed`` times as fast; speed 0 never waits.
+    """Pace a source by its own clock, ``speed`` times as fast; speed 0 never waits.
 
-    Times are reckoned from the start, so that errors do not add up. A hole in the clock of more than
+    Times are computed from the start, so that errors do not add up. A gap in the clock of more than
     ``longest_s``, or a clock that goes back, is not waited for.
     """
 
@@ -160,7 +159,7 @@ class Pacer:
         self._last: int | None = None
 
     def due_s(self, device_ms: int) -> float:
-        """Seconds from now until this moment of the device clock is due; 0 or less: it is due."""
+        """Return the seconds until this moment of the device clock is due; 0 or less when it is due now."""
         if self._speed <= 0.0:
             return 0.0
         if self._last is None:

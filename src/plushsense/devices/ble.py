@@ -1,4 +1,4 @@
-"""A toy over Bluetooth Low Energy: the wire format in the notifications of a UART-like service (through bleak)."""
+"""Bluetooth Low Energy toys: the wire format in the notifications of a UART-like service (through bleak)."""
 
 from __future__ import annotations
 
@@ -15,16 +15,15 @@ from types import ModuleType
 from typing import Any
 from urllib.parse import unquote
 
-from plushsense.core.errors import ConfigError, DeviceError
-from plushsense.core.extras import need
-from plushsense.core.signal import Layout
+from plushsense.core.errors import ConfigError, DeviceError, need
+from plushsense.core.layouts import Layout
 from plushsense.devices.base import Device, Frame, now_ms
-from plushsense.devices.opening import Address
+from plushsense.devices.opening import DeviceAddress
 from plushsense.devices.wire import LineParser
 
 UART_SERVICE = "6e400001-b5a3-f393-e0a9-e50e24dcca9e"
 UART_TX = "6e400003-b5a3-f393-e0a9-e50e24dcca9e"
-"""Nordic UART service: what the toy sends is notified here (Nordic Semiconductor, nRF Connect SDK, "NUS")."""
+"""Nordic UART service and its notifying characteristic (Nordic Semiconductor, nRF Connect SDK, "NUS")."""
 
 FIND_S = 10.0
 _CONNECT_S = 20.0
@@ -34,14 +33,14 @@ _UUID = re.compile(r"[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{12
 
 @dataclass(frozen=True)
 class BleTarget:
-    """Which toy, and where it speaks.
+    """The device to connect to and the characteristic to read.
 
     Attributes:
-        name: as advertised; or else
-        address: as the system gives it: six bytes, on macOS a UUID.
+        name: advertised name; or
+        address: the system's address: six bytes, on macOS a UUID.
         service: UUID of the service.
-        tx: UUID of the characteristic that notifies; None: the only one of the service that does.
-        find_s: how long to look for it, seconds.
+        tx: UUID of the notifying characteristic; None: the service's only one.
+        find_s: longest search, seconds.
     """
 
     name: str | None = None
@@ -52,16 +51,16 @@ class BleTarget:
 
 
 @dataclass(frozen=True)
-class Backends:
-    """Bleak's own hooks: client and scanner classes in place of the platform's; None: the platform's."""
+class BleBackends:
+    """Client and scanner classes of bleak; None: the platform's."""
 
     client: type[Any] | None = None
     scanner: type[Any] | None = None
 
 
 @dataclass(frozen=True)
-class Seen:
-    """One device that advertises: address, name ("" for none), signal strength in dBm, advertised services."""
+class BleAdvertisement:
+    """An advertising device: address, name ("" for none), signal strength in dBm, advertised services."""
 
     address: str
     name: str
@@ -74,7 +73,7 @@ _loops: list[asyncio.AbstractEventLoop] = []
 
 
 def bluetooth_loop() -> asyncio.AbstractEventLoop:
-    """The event loop of all Bluetooth, one for the program: bleak keeps its connection to the system in it."""
+    """Return the event loop shared by all Bluetooth devices: bleak keeps its system connection in it."""
     with _started:
         if not _loops:
             loop = asyncio.new_event_loop()
@@ -86,21 +85,21 @@ def bluetooth_loop() -> asyncio.AbstractEventLoop:
 class BleDevice(Device):
     """Frames from the notifications of a Bluetooth toy. One that disconnects raises DeviceError.
 
-    bleak lives in an event loop in a thread of its own (`bluetooth_loop`); `read` takes what that has put aside.
-    Notifications cut the lines anywhere; the first line is joined in its middle, as on a serial port.
+    bleak runs in the event loop of another thread (`bluetooth_loop`), which queues the notifications for `read`.
+    Notifications split lines anywhere; the first line may be incomplete, as on a serial port.
     """
 
-    def __init__(self, url: str, layout: Layout, target: BleTarget, backends: Backends | None = None) -> None:
+    def __init__(self, url: str, layout: Layout, target: BleTarget, backends: BleBackends | None = None) -> None:
         super().__init__(url, layout)
         self._bleak = need("bleak", extra="ble")
         self._target = target
-        self._backends = backends or Backends()
+        self._backends = backends or BleBackends()
         self._parser = LineParser(layout, self.counters, joining=True)
-        self._heard: queue.SimpleQueue[tuple[float, int, bytes] | None] = queue.SimpleQueue()
+        self._received: queue.SimpleQueue[tuple[float, int, bytes] | None] = queue.SimpleQueue()
         self._over: asyncio.Event | None = None
         self._loop = bluetooth_loop()
         opened: Future[None] = Future()
-        self._talk = asyncio.run_coroutine_threadsafe(self._work(opened), self._loop)
+        self._task = asyncio.run_coroutine_threadsafe(self._work(opened), self._loop)
         try:
             opened.result()
         except BaseException:
@@ -108,51 +107,51 @@ class BleDevice(Device):
             raise
 
     def read(self) -> list[Frame] | None:
-        """What has arrived, waiting at most ``wait_s``."""
+        """Return the received frames, waiting at most ``wait_s``."""
         frames: list[Frame] = []
         wait = True
         while not self.closed:
             try:
-                heard = self._heard.get(timeout=self.wait_s) if wait else self._heard.get_nowait()
+                received = self._received.get(timeout=self.wait_s) if wait else self._received.get_nowait()
             except queue.Empty:
                 return frames
-            if heard is None:
+            if received is None:
                 if self.closed:
                     return None
-                self._heard.put(None)  # for the next call, when frames came before the end
+                self._received.put(None)  # for the next call, when frames came before the end
                 if frames:
                     return frames
                 self._parser.finish()
                 raise DeviceError(f"'{self.url}' went away (disconnected): was it switched off or out of reach?")
-            at, host, data = heard
+            at, host, data = received
             if wait:
                 self.arrived_s = at
             frames += [Frame(host, line.device_ms, line.values) for line in self._parser.feed(data)]
             wait = False
         return None
 
-    def _hear(self, _: Any, data: bytearray) -> None:
-        self._heard.put((time.perf_counter(), now_ms(), bytes(data)))
+    def _on_notification(self, _: Any, data: bytearray) -> None:
+        self._received.put((time.perf_counter(), now_ms(), bytes(data)))
 
     def _shut(self) -> None:
         self._loop.call_soon_threadsafe(self._end)
-        self._heard.put(None)
+        self._received.put(None)
         with contextlib.suppress(TimeoutError):
-            self._talk.result(5.0)
+            self._task.result(5.0)
 
     def _end(self) -> None:
         if self._over is not None:
             self._over.set()
 
     async def _work(self, opened: Future[None]) -> None:
-        """Find, connect, listen; until the toy has gone or `close` was called."""
+        """Find, connect and receive, until the toy disconnects or `close` is called."""
         self._over = over = asyncio.Event()
         if self.closed:
             over.set()
         steps = asyncio.ensure_future(self._listen(over, opened))
         stop = asyncio.ensure_future(over.wait())
         try:
-            # Closing also ends a search or a connection that is still under way.
+            # Closing also ends a search or a connection in progress.
             await asyncio.wait((steps, stop), return_when=asyncio.FIRST_COMPLETED)
             if not steps.done() and not opened.done():
                 steps.cancel()
@@ -167,7 +166,7 @@ class BleDevice(Device):
                     broken = DeviceError(f"'{self.url}': {in_words(cause)}.")
                 opened.set_exception(broken)
         finally:
-            self._heard.put(None)
+            self._received.put(None)
 
     async def _listen(self, over: asyncio.Event, opened: Future[None]) -> None:
         device = await self._find()
@@ -179,12 +178,12 @@ class BleDevice(Device):
             await asyncio.wait_for(client.connect(), _CONNECT_S)
         except TimeoutError:
             raise DeviceError(
-                f"'{self.url}' is there but does not let itself be connected within {_CONNECT_S:g} s: "
+                f"'{self.url}' was found but could not be connected within {_CONNECT_S:g} s: "
                 "is another computer or phone connected to it?"
             ) from None
         try:
             characteristic = self._characteristic(list(client.services))
-            await client.start_notify(characteristic, self._hear)
+            await client.start_notify(characteristic, self._on_notification)
             opened.set_result(None)
             await over.wait()
         finally:
@@ -192,7 +191,7 @@ class BleDevice(Device):
                 await asyncio.wait_for(client.disconnect(), 3.0)
 
     async def _find(self) -> Any:
-        """The device as the scanner knows it; connecting to a bare address is not reliable (bleak's manual)."""
+        """Scan for the device; connecting to an address without a scan is not reliable (bleak's manual)."""
         target = self._target
         found: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
         names: dict[str, str] = {}
@@ -200,8 +199,8 @@ class BleDevice(Device):
         def advertised(device: Any, data: Any) -> None:
             name = data.local_name or device.name or ""
             names[device.address] = name
-            wanted = _same(device.address, target.address) if target.address else name == target.name
-            if wanted and not found.done():
+            matches = _same(device.address, target.address) if target.address else name == target.name
+            if matches and not found.done():
                 found.set_result(device)
 
         with contextlib.suppress(TimeoutError):
@@ -239,40 +238,40 @@ class BleDevice(Device):
         return match
 
 
-def scan(seconds: float, backends: Backends | None = None) -> list[Seen]:
-    """What advertises within so many seconds, the nearest first.
+def scan(seconds: float, backends: BleBackends | None = None) -> list[BleAdvertisement]:
+    """Return the devices that advertise within a number of seconds, the strongest signal first.
 
     Raises:
         DeviceError: when Bluetooth cannot be used, in one sentence.
         MissingExtraError: without bleak.
     """
     bleak = need("bleak", extra="ble")
-    seen: dict[str, Seen] = {}
+    seen: dict[str, BleAdvertisement] = {}
 
     def advertised(device: Any, data: Any) -> None:
         name = data.local_name or device.name or ""
         services = tuple(str(uuid).lower() for uuid in data.service_uuids)
-        seen[device.address] = Seen(device.address, name, int(data.rssi), services)
+        seen[device.address] = BleAdvertisement(device.address, name, int(data.rssi), services)
 
     async def look() -> None:
-        async with _scanner(bleak, backends or Backends(), advertised):
+        async with _scanner(bleak, backends or BleBackends(), advertised):
             await asyncio.sleep(seconds)
 
     try:
         asyncio.run_coroutine_threadsafe(look(), bluetooth_loop()).result()
-    except Exception as cause:  # noqa: BLE001 (backends raise what their system raises)
+    except Exception as cause:  # noqa: BLE001, RUF100
         words = in_words(cause)
         raise DeviceError(f"{words[0].upper()}{words[1:]}.") from None
     return sorted(seen.values(), key=lambda s: (-s.rssi, s.name, s.address))
 
 
-def _scanner(bleak: ModuleType, backends: Backends, advertised: Callable[[Any, Any], None]) -> Any:
+def _scanner(bleak: ModuleType, backends: BleBackends, advertised: Callable[[Any, Any], None]) -> Any:
     chosen = {} if backends.scanner is None else {"backend": backends.scanner}
     return bleak.BleakScanner(detection_callback=advertised, **chosen)
 
 
 def in_words(cause: Exception) -> str:
-    """What bleak or the system under it complains about, for a person; without a stop at the end."""
+    """Describe an error of bleak or the system below it, without a full stop at the end."""
     reason = str(getattr(getattr(cause, "reason", None), "name", ""))
     text = " ".join(" ".join(str(part) for part in cause.args).split()) or type(cause).__name__
     low = text.lower()
@@ -285,11 +284,11 @@ def in_words(cause: Exception) -> str:
     if isinstance(cause, OSError) or "serviceunknown" in low:
         why = getattr(cause, "strerror", None) or text
         return f"Bluetooth cannot be used here: its system service does not answer ({why})"
-    return f"Bluetooth says: {text.rstrip('.')}"
+    return f"Bluetooth reports: {text.rstrip('.')}"
 
 
-def _same(address: str, wanted: str) -> bool:
-    return address.replace("-", ":").lower() == wanted.replace("-", ":").lower()
+def _same(address: str, other: str) -> bool:
+    return address.replace("-", ":").lower() == other.replace("-", ":").lower()
 
 
 def _listed(uuids: Any) -> str:
@@ -297,7 +296,7 @@ def _listed(uuids: Any) -> str:
     return ", ".join(texts) if texts else "none"
 
 
-def _uuid(address: Address, key: str) -> str | None:
+def _uuid(address: DeviceAddress, key: str) -> str | None:
     text = address.query.get(key)
     if text is None:
         return None
@@ -311,7 +310,7 @@ def _uuid(address: Address, key: str) -> str | None:
     return full
 
 
-def open_url(address: Address, layout: Layout) -> BleDevice:
+def open_ble(address: DeviceAddress, layout: Layout) -> BleDevice:
     """Open ``ble://AA:BB:CC:DD:EE:FF?service=UUID&tx=UUID`` or ``ble://name:PlushName?find_s=10``."""
     address.check_keys(("service", "tx", "find_s"))
     place = unquote(address.place).strip("/")

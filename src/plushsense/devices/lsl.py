@@ -1,26 +1,30 @@
-"""A toy, or any other sensor, that publishes on the lab streaming layer (LSL, through pylsl)."""
+"""Receive and publish toys and other sensors by the lab streaming layer (LSL, through pylsl)."""
 
 from __future__ import annotations
 
 import math
 import os
+import socket
 import threading
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 from urllib.parse import quote, unquote
 
-from plushsense.core.errors import ConfigError, DeviceError
-from plushsense.core.extras import need
-from plushsense.core.signal import DEVICE_MS, Layout
-from plushsense.devices.base import Device, Frame, LossMeter, now_ms
-from plushsense.devices.opening import Address
+from plushsense.core.errors import ConfigError, DeviceError, need
+from plushsense.core.layouts import DEVICE_MS, Layout, load_layout
+from plushsense.devices.base import Device, Frame, LossCounter, now_ms
+from plushsense.devices.opening import DeviceAddress
+from plushsense.devices.virtual.device import VirtualDevice
+from plushsense.devices.virtual.server import ToyCounters
+from plushsense.devices.virtual.stream import PerformedGesture, Prompts, ToySpec
 
 FIND_S = 5.0
 KEYS = {"name": "name", "type": "type", "source": "source_id"}
-"""What a URL may look for, and the property of a stream that this is."""
+"""Search keys of a URL, and the stream property that each stands for."""
 
 _LIMIT = 2**53
 _BACK_MS = 1000
@@ -29,7 +33,7 @@ _lock = threading.Lock()
 
 
 def load_pylsl() -> ModuleType:
-    """pylsl, with liblsl's chatter on standard error turned off (unless the user has configured liblsl).
+    """Import pylsl and turn off liblsl's messages on standard error, unless the user has configured liblsl.
 
     Raises:
         MissingExtraError: without the package.
@@ -49,15 +53,15 @@ def load_pylsl() -> ModuleType:
 
 
 @dataclass(frozen=True)
-class Columns:
-    """Where in a sample the channels stand, in layout order, and the toy's own clock (None: it is not there)."""
+class LslColumns:
+    """The indices of the layout's channels in a sample, and of the device clock (None without one)."""
 
     channels: tuple[int, ...]
     clock: int | None = None
 
 
-def match_columns(layout: Layout, labels: list[str] | None, width: int, what: str) -> Columns:
-    """By label, in any order, when the stream's labels are the layout's; by position when there are none such.
+def match_columns(layout: Layout, labels: list[str] | None, width: int, what: str) -> LslColumns:
+    """Match a stream's columns to the layout by label, or by position when no label is the layout's.
 
     By position fits a stream as wide as the layout's channels or as its wire. Case and outer spaces of labels do not
     count, and a stream may carry more than the layout asks for.
@@ -76,12 +80,14 @@ def match_columns(layout: Layout, labels: list[str] | None, width: int, what: st
                 f"{what} {fault}; it carries {', '.join(labels or ())}: "
                 f"choose the layout that fits with ?layout= (asked for was {layout.name})."
             )
-        return Columns(tuple(texts.index(key) for key in known), texts.index(DEVICE_MS) if DEVICE_MS in texts else None)
+        return LslColumns(
+            tuple(texts.index(key) for key in known), texts.index(DEVICE_MS) if DEVICE_MS in texts else None
+        )
     if width == layout.n_channels:
-        return Columns(tuple(range(width)))
+        return LslColumns(tuple(range(width)))
     if width == len(layout.wire):
         clock = layout.wire.index(DEVICE_MS) if DEVICE_MS in layout.wire else None
-        return Columns(tuple(layout.wire.index(name) for name in layout.names), clock)
+        return LslColumns(tuple(layout.wire.index(name) for name in layout.names), clock)
     named = f" ({', '.join(texts[:6])}{', …' if len(texts) > 6 else ''})" if texts else ""
     raise DeviceError(
         f"{what} has {width} channels{named}, and layout {layout.name} needs {layout.n_channels}, or the "
@@ -103,7 +109,7 @@ class LslDevice(Device):
         super().__init__(url, layout)
         self._pylsl = load_pylsl()
         self._lock = threading.Lock()
-        self._loss = LossMeter()
+        self._loss = LossCounter()
         self._last_ms: int | None = None
         low, high = layout.valid_min_int.tolist(), layout.valid_max_int.tolist()
         self._valid = list(zip(low, high, strict=True))
@@ -111,7 +117,7 @@ class LslDevice(Device):
         found = self._find(key, value, find_s)
         if found.channel_format() == self._pylsl.cf_string:
             raise DeviceError(f"'{url}' is a stream of texts; a toy sends numbers: name another stream.")
-        # Not recovering by itself: going away is said, and coming back is ReconnectingDevice's.
+        # Without recovery by liblsl: ReconnectingDevice handles a stream that ends and comes back.
         self._inlet: Any = self._pylsl.StreamInlet(found, recover=False)
         try:
             labels = stream_labels(self._inlet.info(timeout=FIND_S))
@@ -122,8 +128,8 @@ class LslDevice(Device):
                 f"'{url}' is announced but does not answer: is its program still running, and no firewall between?"
             ) from None
         if found.channel_format() == self._pylsl.cf_float32 and self._columns.clock is not None:
-            # 24 bits hold milliseconds exactly for less than five hours.
-            self._columns = Columns(self._columns.channels)
+            # A float32 holds milliseconds exactly for less than five hours only.
+            self._columns = LslColumns(self._columns.channels)
 
     def _find(self, key: str, value: str, find_s: float) -> Any:
         mark = '"' if "'" in value else "'"
@@ -143,7 +149,7 @@ class LslDevice(Device):
         )
 
     def read(self) -> list[Frame] | None:
-        """What has arrived, waiting at most ``wait_s``."""
+        """Return the received frames, waiting at most ``wait_s``."""
         with self._lock:
             if self.closed:
                 return None
@@ -196,7 +202,7 @@ class LslDevice(Device):
 
 
 def _steps(value: float, step: float) -> int | None:
-    """A value in integer steps; None for one that is no number or, at a step of 1, not whole."""
+    """Return a value in integer steps; None when it is not finite or, at a step of 1, not whole."""
     if not math.isfinite(value):
         return None
     number = value / step
@@ -206,7 +212,7 @@ def _steps(value: float, step: float) -> int | None:
 
 
 def stream_labels(info: Any) -> list[str] | None:
-    """The labels in a full stream description, in order; None where there are none."""
+    """Return the labels in a full stream description, in order; None when there are none."""
     labels: list[str] = []
     channel = info.desc().child("channels").child("channel")
     while not channel.empty() and len(labels) < 10_000:
@@ -216,18 +222,18 @@ def stream_labels(info: Any) -> list[str] | None:
 
 
 def name_url(name: str) -> str:
-    """The URL that opens a stream by its name, whatever that is."""
+    """Return the URL that opens a stream by its name."""
     prefix = "name:" if name.partition(":")[0].lower() in KEYS else ""
     return f"lsl://{prefix}{quote(name)}"
 
 
 def stream_url(info: Any, *, unique_name: bool = True) -> str:
-    """The URL that opens a stream: by name where that is unique, else by its source."""
+    """Return the URL that opens a stream: by name where that is unique, else by its source."""
     source = info.source_id()
     return name_url(info.name()) if unique_name or not source else f"lsl://source:{quote(source)}"
 
 
-def open_url(address: Address, layout: Layout) -> LslDevice:
+def open_lsl(address: DeviceAddress, layout: Layout) -> LslDevice:
     """Open ``lsl://NAME``, ``lsl://type:EEG`` or ``lsl://source:ID``; ``?find_s=5`` bounds the search."""
     address.check_keys(("find_s",))
     place = unquote(address.place).removesuffix("/")
@@ -240,3 +246,151 @@ def open_url(address: Address, layout: Layout) -> LslDevice:
             "(plushsense devices lists them)."
         )
     return LslDevice(address.url, layout, key.lower(), value, address.number("find_s", FIND_S, 0.1, 600.0))
+
+
+STREAM_TYPE = "Touch"
+_DRIFT = 200e-6
+_FAR_S = 10.0
+_LINGER_S = 0.25
+"""Time for readers to take the last samples: they are lost when the stream ends."""
+
+
+class LslOutlet:
+    """A published stream: the layout's channels by name, in their units, and ``device_ms``, the toy's own clock.
+
+    Doubles carry every value exactly (integers to 2⁵³). Time stamps are the device clock laid on LSL's: the smallest
+    delay seen is taken for the delay, and it may grow by 200 ppm, so that they are even and follow a slow drift.
+
+    Raises:
+        ConfigError: for an empty name.
+        MissingExtraError: without pylsl.
+    """
+
+    def __init__(self, layout: Layout, name: str) -> None:
+        if not name.strip():
+            raise ConfigError("An LSL stream needs a name.")
+        self.layout = layout
+        self.name = name
+        self._pylsl = pylsl = load_pylsl()
+        source = f"plushsense:{socket.gethostname()}:{name}"
+        labels = (*layout.names, DEVICE_MS)
+        info = pylsl.StreamInfo(name, STREAM_TYPE, len(labels), layout.rate_hz, pylsl.cf_double64, source)
+        about = info.desc()
+        about.append_child_value("manufacturer", "PlushSense")
+        about.append_child_value("layout", layout.name)
+        channels = about.append_child("channels")
+        units = (*(c.unit or "none" for c in layout.channels), "ms")
+        kinds = (*(c.kind for c in layout.channels), "clock")
+        for label, unit, kind in zip(labels, units, kinds, strict=True):
+            channel = channels.append_child("channel")
+            for key, value in (("label", label), ("unit", unit), ("type", kind)):
+                channel.append_child_value(key, value)
+        self._steps = [c.step for c in layout.channels]
+        self._delay_s = 0.0
+        self._last_ms: int | None = None
+        self._last_stamp = 0.0
+        self._outlet: Any = pylsl.StreamOutlet(info)
+
+    @property
+    def url(self) -> str:
+        """The URL that opens this stream."""
+        return name_url(self.name)
+
+    def push(self, frames: Sequence[Frame]) -> None:
+        """Publish new frames: the last one with the current time, the others by the toy's clock."""
+        now = self._pylsl.local_clock()
+        begin = 0
+        for end in range(1, len(frames) + 1):
+            if end < len(frames) and frames[end].device_ms >= frames[end - 1].device_ms:
+                continue
+            run, begin = frames[begin:end], end  # up to the end, or to a clock that began anew
+            self._update_delay(run[0].device_ms, run[-1].device_ms, now)
+            for frame in run:
+                self._last_stamp = max(self._last_stamp, self._delay_s + frame.device_ms / 1000.0)
+                values = [
+                    float(v) if step == 1.0 else round(v * step, 9)
+                    for v, step in zip(frame.values, self._steps, strict=True)
+                ]
+                self._outlet.push_sample([*values, float(frame.device_ms)], self._last_stamp)
+
+    def _update_delay(self, first_ms: int, last_ms: int, now: float) -> None:
+        """Update the delay between LSL's clock and the toy's by a run of frames, the last of which came now."""
+        delay, before_ms = now - last_ms / 1000.0, self._last_ms
+        self._last_ms = last_ms
+        if before_ms is None or first_ms < before_ms or delay - self._delay_s > _FAR_S:
+            self._delay_s = delay
+        else:
+            self._delay_s = min(delay, self._delay_s + _DRIFT * (last_ms - before_ms) / 1000.0)
+
+    def close(self) -> None:
+        """Close the stream. Closing it again has no effect."""
+        if self._outlet is not None and self._outlet.have_consumers():
+            time.sleep(_LINGER_S)
+        self._outlet = None
+
+    def __enter__(self) -> LslOutlet:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def forward(device: Device, outlet: LslOutlet, stop: threading.Event | None = None) -> int:
+    """Publish a device's frames until it ends or ``stop`` is set; return their number.
+
+    Raises:
+        ConfigError: when the device's channels are not the outlet's.
+        DeviceError: when the toy went away (one opened with ``reconnect=True`` is waited for).
+    """
+    if device.layout.channels != outlet.layout.channels:
+        raise ConfigError(
+            f"'{device.url}' speaks layout {device.layout.name}, and the stream '{outlet.name}' was made for "
+            f"{outlet.layout.name}: make both with the same."
+        )
+    count = 0
+    while not device.closed and not (stop is not None and stop.is_set()):
+        frames = device.read()
+        if frames is None:
+            break
+        outlet.push(frames)
+        count += len(frames)
+    return count
+
+
+def serve_lsl(
+    name: str,
+    spec: ToySpec | None = None,
+    *,
+    layout: Layout | None = None,
+    speed: float = 1.0,
+    seconds: float = 0.0,
+    on_ready: Callable[[str], None] | None = None,
+    on_performed: Callable[[PerformedGesture], None] | None = None,
+    prompts: Prompts | None = None,
+    stop: threading.Event | None = None,
+) -> ToyCounters:
+    """Publish the virtual toy as an LSL stream until ``stop`` is set; arguments as in `serve_tcp`.
+
+    Lines that the toy loses or corrupts are missing from the stream.
+
+    Raises:
+        ConfigError: for a speed of 0: a stream has no reader who would hold it back.
+    """
+    if not speed > 0.0:
+        raise ConfigError(f"The toy's speed on LSL is {speed:g}; it must be above 0.")
+    counters = ToyCounters()
+
+    def begun(gesture: PerformedGesture) -> None:
+        counters.gestures += 1
+        if on_performed is not None:
+            on_performed(gesture)
+
+    toy = VirtualDevice("virtual://", layout or load_layout("plush-15"), spec or ToySpec(), speed, seconds)
+    toy.on_performed = begun
+    if prompts is not None:
+        toy.follow(prompts)
+    with toy, LslOutlet(toy.layout, name) as outlet:
+        if on_ready is not None:
+            on_ready(outlet.url)
+        counters.sent = forward(toy, outlet, stop)
+    return counters

@@ -1,4 +1,4 @@
-"""A toy is a URL: `open_device` turns one into an open device."""
+"""Open devices by URL."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from pathlib import Path
 from urllib.parse import unquote
 
 from plushsense.core.errors import ConfigError, DeviceError, nearest
-from plushsense.core.signal import Layout, load_layout
+from plushsense.core.layouts import Layout, load_layout
 from plushsense.devices.base import Device
 from plushsense.devices.reconnect import ReconnectingDevice
 
 DEFAULT_LAYOUT = "plush-15"
 
 SCHEMES: dict[str, str] = {
-    "serial": "plushsense.devices.serial",
-    "ble": "plushsense.devices.ble",
-    "tcp": "plushsense.devices.tcp",
-    "lsl": "plushsense.devices.lsl",
-    "replay": "plushsense.devices.replay",
-    "virtual": "plushsense.devices.virtual.device",
+    "serial": "plushsense.devices.bytestreams:open_serial",
+    "ble": "plushsense.devices.ble:open_ble",
+    "tcp": "plushsense.devices.bytestreams:open_tcp",
+    "lsl": "plushsense.devices.lsl:open_lsl",
+    "replay": "plushsense.devices.replay:open_replay",
+    "virtual": "plushsense.devices.virtual.device:open_virtual",
 }
-"""Scheme to the room with its ``open_url(address, layout) -> Device``; imported when it is needed."""
+"""Scheme to ``module:function``; the function takes (address, layout) and returns the open `Device`."""
 
 EXAMPLES = (
     "serial:///dev/ttyUSB0?baud=115200, serial://COM3, ble://AA:BB:CC:DD:EE:FF, ble://name:PlushName, tcp://host:port, "
@@ -35,8 +35,8 @@ EXAMPLES = (
 
 
 @dataclass
-class Address:
-    """A device URL taken apart: ``place`` stands between ``scheme://`` and ``?``, ``query`` has the settings."""
+class DeviceAddress:
+    """The parts of a device URL: ``place`` is between ``scheme://`` and ``?``, ``query`` holds the settings."""
 
     url: str
     scheme: str
@@ -54,7 +54,7 @@ class Address:
                 )
 
     def whole(self, key: str, default: int, low: int = 0, high: int = 2**31 - 1) -> int:
-        """A setting that is a whole number."""
+        """Return a setting that is a whole number."""
         text = self.query.get(key)
         if text is None:
             return default
@@ -63,7 +63,7 @@ class Address:
         return int(text)
 
     def number(self, key: str, default: float, low: float = 0.0, high: float = 1e6) -> float:
-        """A setting that is a number."""
+        """Return a setting that is a number."""
         text = self.query.get(key)
         if text is None:
             return default
@@ -76,8 +76,8 @@ class Address:
         return value
 
 
-def parse_url(url: str) -> Address:
-    """Take a device URL apart. A path without a scheme is a replay; so is a Windows path like ``C:\\x.csv``.
+def parse_url(url: str) -> DeviceAddress:
+    """Parse a device URL. A path without a scheme is a replay; so is a Windows path like ``C:\\x.csv``.
 
     Raises:
         ConfigError: for an unknown scheme or a setting that is no ``key=value``.
@@ -88,11 +88,11 @@ def parse_url(url: str) -> Address:
     match = re.match(r"([A-Za-z][A-Za-z0-9+.\-]+):(//)?", text)
     if match is None or (match[2] is None and match[1].lower() not in SCHEMES):
         if Path(text).is_file():
-            return Address(text, "replay", text)
+            return DeviceAddress(text, "replay", text)
         if re.fullmatch(r"/dev/\S+|COM\d+", text):
             raise ConfigError(f"'{text}' is a port, no recording to replay: write serial://{text}.")
         place, query = _split_query(text, text)
-        return Address(text, "replay", place, query)
+        return DeviceAddress(text, "replay", place, query)
     scheme = match[1].lower()
     if scheme not in SCHEMES:
         raise ConfigError(
@@ -100,7 +100,7 @@ def parse_url(url: str) -> Address:
             f"{nearest(scheme, SCHEMES)}"
         )
     place, query = _split_query(text[match.end() :], text)
-    return Address(text, scheme, place, query)
+    return DeviceAddress(text, scheme, place, query)
 
 
 def _split_query(rest: str, url: str) -> tuple[str, dict[str, str]]:
@@ -118,7 +118,7 @@ def _split_query(rest: str, url: str) -> tuple[str, dict[str, str]]:
     return place, query
 
 
-# What ends in order where a connection only breaks off.
+# Schemes whose data have an end; the others only disconnect.
 _ENDING = ("replay", "virtual")
 
 
@@ -149,10 +149,11 @@ def open_device(
     address = parse_url(os.fspath(url))
     chosen: Layout | str = address.query.get("layout") or layout or DEFAULT_LAYOUT
     resolved = chosen if isinstance(chosen, Layout) else load_layout(chosen)
-    room = importlib.import_module(SCHEMES[address.scheme])
+    module, function = SCHEMES[address.scheme].split(":")
+    open_address = getattr(importlib.import_module(module), function)
 
     def opened() -> Device:
-        device = room.open_url(address, resolved)
+        device = open_address(address, resolved)
         if not isinstance(device, Device):
             raise DeviceError(f"'{address.url}': the scheme {address.scheme} opened nothing that is a toy.")
         return device

@@ -1,4 +1,4 @@
-"""A toy that may go away and come back: unplugged, switched off, out of reach. The gap is kept, not hidden."""
+"""Reconnect to a toy that was unplugged, switched off or out of reach, and record the gap."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from dataclasses import asdict, dataclass
 from typing import Literal
 
 from plushsense.core.errors import DeviceError
-from plushsense.core.signal import Layout
+from plushsense.core.layouts import Layout
 from plushsense.devices.base import Counters, Device, Frame, now_ms
 
-State = Literal["connected", "waiting"]
+ConnectionState = Literal["connected", "waiting"]
 
 RETRY_S = 0.5
 
 
 @dataclass
-class Gap:
-    """A time without the toy, from the last frame before it to the first one after.
+class ConnectionGap:
+    """A time without connection, from the last frame before it to the first one after.
 
     Attributes:
         host_ms_begin: of the last frame before; when it went away, if there was none.
@@ -37,12 +37,12 @@ class Gap:
     reason: str = ""
 
     def to_dict(self) -> dict[str, int | str | None]:
-        """Plain values, ready for JSON."""
+        """Return plain values, ready for JSON."""
         return asdict(self)
 
 
 class ReconnectingDevice(Device):
-    """Frames of a toy that is opened again, every 0.5 s, whenever it went away after it once was there.
+    """Frames of a toy that is reopened, with a try every 0.5 s, whenever the connection is lost.
 
     Counters go on over all connections; ``lost`` counts within each of them, and what a gap swallowed is in ``gaps``.
     While the toy is away `read` returns no frames, each time after about ``wait_s``.
@@ -71,8 +71,8 @@ class ReconnectingDevice(Device):
         ends: bool = False,
     ) -> None:
         super().__init__(url, layout)
-        self.state: State = "connected"
-        self.gaps: list[Gap] = []
+        self.state: ConnectionState = "connected"
+        self.gaps: list[ConnectionGap] = []
         self._open_inner = open_inner
         self._for_s = for_s
         self._ends = ends
@@ -86,7 +86,7 @@ class ReconnectingDevice(Device):
         self._count()
 
     def read(self) -> list[Frame] | None:
-        """What has arrived, waiting at most about ``wait_s``; an empty list while the toy is away.
+        """Return the received frames, waiting at most about ``wait_s``; an empty list while the toy is away.
 
         Raises:
             DeviceError: when it did not come back within ``for_s``.
@@ -126,23 +126,23 @@ class ReconnectingDevice(Device):
     def _lost(self, inner: Device, reason: str) -> list[Frame]:
         self._count()
         self._before = Counters(**self.counters.to_dict())
-        # Gone again before a frame came: it is still the same gap, and the next try is not made at once.
+        # Disconnected again before a frame came: the same gap goes on, and the next try is delayed.
         again = bool(self.gaps) and self.gaps[-1].host_ms_end is None
         if not again:
             last = self._last
             begin, before = (last.host_ms, last.device_ms) if last is not None else (now_ms(), None)
-            self.gaps.append(Gap(begin, device_ms_before=before, reason=reason))
+            self.gaps.append(ConnectionGap(begin, device_ms_before=before, reason=reason))
             self._waiting_since = time.monotonic()
         with self._lock:
             self.inner = None
             self.state = "waiting"
-        # Closing and opening may take seconds (a scan, a silent host): not in the thread that reads.
+        # Closing and opening may take seconds (a scan, a host that does not answer), so another thread does it.
         self._awake.clear()
         threading.Thread(target=self._seek, args=(inner, again), name="plushsense-reconnect", daemon=True).start()
         return []
 
     def _seek(self, gone: Device, pause: bool) -> None:
-        """Try until the toy is there, the device is closed or an error comes that trying again will not mend."""
+        """Try to open the toy until it succeeds, the device is closed or a permanent error occurs."""
         gone.close()
         while not self.closed:
             if pause:
@@ -155,7 +155,7 @@ class ReconnectingDevice(Device):
             except DeviceError:
                 pause = True
                 continue
-            except Exception as cause:  # noqa: BLE001 (raised where it is read, not lost in this thread)
+            except Exception as cause:  # noqa: BLE001, RUF100
                 found = cause
             with self._lock:
                 if not self.closed:

@@ -1,4 +1,4 @@
-"""A recording or a whole session's stream, played back as if the toy were there."""
+"""Replay a recording or a session's stream like a connected toy."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from urllib.parse import unquote
 import numpy as np
 
 from plushsense.core.errors import DeviceError, FileFormatError
-from plushsense.core.recfile import Frames, parse_name, read_recording, read_stream
-from plushsense.core.signal import Layout
-from plushsense.devices.base import Device, Frame, LossMeter, Pacer, now_ms
-from plushsense.devices.opening import Address
+from plushsense.core.layouts import Layout
+from plushsense.core.recorder_csv import Frames, parse_name, read_recording, read_stream
+from plushsense.devices.base import Device, Frame, LossCounter, Pacer, now_ms
+from plushsense.devices.opening import DeviceAddress
 
 _BLOCK = 500
 
@@ -21,7 +21,7 @@ _BLOCK = 500
 class ReplayDevice(Device):
     """Frames of a file, at the pace of the device clock (``speed`` 1), faster, or without waiting (0).
 
-    ``host_ms`` is the one in the file where there is one. ``warnings`` says what was odd about the file.
+    ``host_ms`` is the one in the file where there is one. ``warnings`` are those of the file.
     """
 
     def __init__(self, url: str, layout: Layout, path: Path, speed: float = 1.0) -> None:
@@ -35,14 +35,14 @@ class ReplayDevice(Device):
         self.counters.malformed = result.malformed
         self._frames: Frames = result.frames
         self._at = 0
-        self._loss = LossMeter()
+        self._loss = LossCounter()
         self._pacer = Pacer(speed)
         self._wait_s: float | None = None
         low, high = layout.valid_min_int, layout.valid_max_int
         self._garbage = np.any((result.frames.values < low) | (result.frames.values > high), axis=1)
 
     def read(self) -> list[Frame] | None:
-        """The frames that are due, waiting at most about ``wait_s``; None at the end of the file."""
+        """Return the frames that are due, waiting at most about ``wait_s``; return None at the end of the file."""
         frames: list[Frame] = []
         until = time.monotonic() + self.wait_s
         while len(frames) < _BLOCK and not self.closed:
@@ -72,12 +72,12 @@ class ReplayDevice(Device):
 
 
 def _path(place: str) -> Path:
-    """The path in a URL: ``/C:/x.csv`` is a Windows path, ``%20`` a space unless a file is called so."""
+    """Return the path in a URL: ``/C:/x.csv`` is a Windows path, ``%20`` a space unless it is in the file's name."""
     text = place[1:] if re.match(r"/[A-Za-z]:[\\/]", place) else place
     return Path(text if Path(text).exists() else unquote(text)).expanduser()
 
 
-def open_url(address: Address, layout: Layout) -> ReplayDevice:
+def open_replay(address: DeviceAddress, layout: Layout) -> ReplayDevice:
     """Open ``replay:///path?speed=1``; a folder stands for the stream in it."""
     address.check_keys(("speed",))
     speed = address.number("speed", 1.0)

@@ -1,6 +1,6 @@
-"""The line format: integers separated by spaces, one frame a line, as bytes both ways.
+"""Parse and format the wire format: integers separated by spaces, one frame a line.
 
-Whatever comes in is survived: noise, half lines and lines without end are counted, and memory stays bounded.
+Any input is accepted: noise, incomplete and endless lines are counted, and memory stays bounded.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from plushsense.core.signal import DELAY_MS, DEVICE_MS, Layout
-from plushsense.devices.base import Counters, LossMeter
+from plushsense.core.layouts import DELAY_MS, DEVICE_MS, Layout
+from plushsense.devices.base import Counters, LossCounter
 
 _INTEGER = re.compile(rb"[+-]?[0-9]{1,18}\Z")
 _DECIMAL = re.compile(rb"[+-]?(?:[0-9]{1,18}(?:\.[0-9]{0,18})?|\.[0-9]{1,18})(?:[eE][+-]?[0-9]{1,2})?\Z")
@@ -21,7 +21,7 @@ _LONGEST_DELAY_MS = 2**31
 
 @dataclass(frozen=True)
 class ParsedLine:
-    """One frame from the wire: ``device_ms``, and ``values`` (C,) in integer steps, in layout order.
+    """A parsed frame: ``device_ms``, and ``values`` (C,) in integer steps, in layout order.
 
     ``garbage`` marks a value outside its channel's valid range: kept as it came.
     """
@@ -32,18 +32,18 @@ class ParsedLine:
 
 
 class LineParser:
-    """Bytes in any pieces to frames.
+    """Parse a stream of bytes to frames.
 
     Fields are separated by any run of spaces, tabs, commas or semicolons, lines by ``\\n``, ``\\r`` or both. Where a
     layout's wire has no ``device_ms`` the delays are added up (a lost line then leaves no trace in the clock); one
-    above 2³¹ ms is no delay but noise.
-    Channels with a step of 1 take integers only, others decimals too. Empty lines are nothing.
+    above 2³¹ ms is noise.
+    Channels with a step of 1 take integers only, others decimals too. Empty lines are ignored.
 
     Args:
-        layout: whose wire order is read.
-        counters: to count in; a new one by default.
-        joining: the source is joined in the middle of its talk (a serial line): what comes before the first line end
-            is half a line and dropped; it is counted as malformed unless it happens to be a whole frame.
+        layout: the layout of the lines.
+        counters: the counters to update; new ones by default.
+        joining: reading begins in the middle of a line (a serial port): what comes before the first line end is
+            dropped, and counted as malformed unless it happens to be a whole frame.
     """
 
     def __init__(self, layout: Layout, counters: Counters | None = None, *, joining: bool = False) -> None:
@@ -55,14 +55,14 @@ class LineParser:
         self._skipping = False
         self._clock_ms = 0
         self._begun = False
-        self._loss = LossMeter()
+        self._loss = LossCounter()
         self._fields = len(layout.wire)
         self._channels = [(layout.index(name), layout.wire.index(name)) for name in layout.names]
         self._steps = [c.step for c in layout.channels]
         low, high = layout.valid_min_int.tolist(), layout.valid_max_int.tolist()
         self._valid = list(zip(low, high, strict=True))
         self._clock_at = layout.wire.index(DEVICE_MS) if DEVICE_MS in layout.wire else -1
-        # A whole line of whole numbers that are small enough in any case: one look instead of one a field.
+        # Matches a whole line of small integers at once, which is faster than matching each field.
         self._plain = (
             re.compile(rb" *[+-]?[0-9]{1,15}(?: +[+-]?[0-9]{1,15}){%d} *\Z" % (self._fields - 1))
             if all(step == 1.0 for step in self._steps)
@@ -71,9 +71,9 @@ class LineParser:
         self._delay_at = layout.wire.index(DELAY_MS) if DELAY_MS in layout.wire else -1
 
     def feed(self, data: bytes) -> list[ParsedLine]:
-        """The frames that end within these bytes; the rest of the last line is kept for the next call."""
+        """Return the frames that end within these bytes; keep the rest of the last line for the next call."""
         parsed: list[ParsedLine] = []
-        # Also a lone \r ends a line: two halves joined by a lost \n are then never read as one frame.
+        # A lone \r also ends a line, so that two lines joined by a lost \n are never read as one frame.
         data = data.replace(b"\r", b"\n")
         start = 0
         while True:
@@ -88,7 +88,7 @@ class LineParser:
                 parsed.append(line)
 
     def finish(self) -> None:
-        """The source has ended: half a line that is still waiting is counted as malformed."""
+        """Count an unfinished last line as malformed, at the end of the source."""
         if self._pending.translate(_SEPARATORS).strip() and not self._skipping:
             self.counters.malformed += 1
         self._pending.clear()
@@ -124,7 +124,7 @@ class LineParser:
         if self._clock_at >= 0:
             device_ms = numbers[self._clock_at]
         else:
-            # The first delay refers to a frame nobody saw: the clock starts at 0.
+            # The first delay refers to a frame before the first one: the clock starts at 0.
             self._clock_ms += numbers[self._delay_at] if self._begun else 0
             if self._clock_ms > _LIMIT:
                 self._clock_ms = 0
@@ -142,7 +142,7 @@ class LineParser:
         return ParsedLine(device_ms, values, garbage)
 
     def _numbers(self, fields: list[bytes], line: bytes) -> list[int] | None:
-        """All fields as integers (channels in steps, clocks in ms), or None for a line that is no frame."""
+        """Return all fields as integers (channels in steps, clocks in ms), or None for a line that is no frame."""
         if len(fields) != self._fields:
             return None
         if self._plain is not None and self._plain.match(line) is not None:
@@ -184,7 +184,7 @@ def _steps(field: bytes, step: float) -> int | None:
 
 
 def format_line(layout: Layout, values: Sequence[int], device_ms: int, delay_ms: int) -> bytes:
-    """One frame as the toy sends it: ``values`` (C,) in integer steps, layout order; ended by ``\\n``."""
+    """Format a frame as the toy sends it: ``values`` (C,) in integer steps, layout order; ended by a line feed."""
     fields = []
     for name in layout.wire:
         if name == DEVICE_MS:

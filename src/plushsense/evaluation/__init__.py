@@ -1,1 +1,1 @@
-"""How well it reads whom: folds, scores, and every single prediction."""
+"""Evaluation of one model on people left out: folds, predictions and scores."""

@@ -1,6 +1,6 @@
-"""Cross-validation: folds, one training a fold through the journal, every prediction kept, scores at the end.
+"""Cross-validation: one training for each fold through the journal, all predictions kept, then scored.
 
-What trains is handed in: a picklable callable, so that this room needs no PyTorch and folds run side by side.
+Training is passed in as a picklable callable, so that this package needs no PyTorch and folds run in parallel.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError
-from plushsense.evaluation.deployed import beside
+from plushsense.core.gestures import NOBODY
 from plushsense.evaluation.folds import WindowFold, fold_windows
-from plushsense.evaluation.predictions import Predictions, gather, write_predictions
-from plushsense.evaluation.scores import FoldRecord, scores
-from plushsense.runs.journal import Journal, Result, job_id
-from plushsense.runs.pool import Job, Report, run_jobs
+from plushsense.evaluation.scores import FoldRecord, Predictions, compute_scores, gather_predictions, write_predictions
+from plushsense.jobs.journal import Journal, Result, job_id
+from plushsense.jobs.pool import Job, Report, run_jobs
+from plushsense.scoring import metrics
 from plushsense.scoring.splits import Split, parse_split
 from plushsense.windows.cut import WindowSet
 
@@ -30,9 +30,9 @@ _VERSION = 1
 
 @dataclass(frozen=True)
 class FoldOutput:
-    """What one training leaves: probabilities (N, K) of the test windows, the history's rows, time, best epoch.
+    """The outcome of one training: probabilities (N, K) of the test windows, history, seconds, best epoch.
 
-    ``deployed`` (N, K): what the same network says of them once it is deployed; None where nobody asked.
+    ``deployed`` (N, K): probabilities of the same network in 8 bits; None where they are not computed.
     """
 
     probabilities: NDArray[np.float32]
@@ -46,17 +46,17 @@ EpochProgress = Callable[[int, int, dict[str, Any]], None]
 
 
 class FitPredict(Protocol):
-    """Trains on the first windows, watches the second, reads the third; picklable, the same for the same input."""
+    """A picklable callable that trains on the first windows, validates on the second and predicts the third."""
 
     def __call__(
         self, train: WindowSet, validation: WindowSet, test: WindowSet, progress: EpochProgress, /
     ) -> FoldOutput:
-        """``progress`` is called with (epoch, epochs at most, the epoch's row)."""
+        """Train and predict; ``progress`` is called with (epoch, epochs at most, the epoch's row)."""
         ...
 
 
 class FoldProgress(NamedTuple):
-    """Where an evaluation stands: ``epoch`` of ``epochs`` in ``fold``; epoch 0: that fold is done.
+    """Progress of an evaluation: ``epoch`` of ``epochs`` in ``fold``; epoch 0: the fold is done.
 
     ``row``: the epoch's row of the history, where what trains gives one.
     """
@@ -72,7 +72,10 @@ class FoldProgress(NamedTuple):
 
 @dataclass
 class Evaluation:
-    """The outcome of `evaluate`. ``to_dict`` is what a report or ``--json`` shows."""
+    """The outcome of `evaluate`.
+
+    ``to_dict`` is what reports and ``--json`` print.
+    """
 
     split: Split
     context: str
@@ -89,7 +92,7 @@ class Evaluation:
         return self.predictions_path
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, ready for JSON."""
+        """Return plain values, ready for JSON."""
         return {
             "split": self.split.text,
             "context": self.context,
@@ -102,11 +105,11 @@ class Evaluation:
         }
 
     def __repr__(self) -> str:
-        shown = self.table["accuracy"]["mean"]
+        accuracy = self.table["accuracy"]["mean"]
         leaky = ", leaky" if self.split.leaky else ""
         return (
             f"Evaluation({self.split.text}{leaky}, trained on {self.train_context}, scored on {self.context}: "
-            f"accuracy {shown:.3f} over {len(self.predictions)} windows)"
+            f"accuracy {accuracy:.3f} over {len(self.predictions)} windows)"
         )
 
 
@@ -140,11 +143,11 @@ def evaluate(
     """
     if journal is not None and key is None:
         raise ConfigError("A journal needs a key that says what was trained: give evaluate(..., key={...}).")
-    asked = parse_split(split)
-    folds = fold_windows(train_windows, score_windows, asked, seed)
+    parsed = parse_split(split)
+    folds = fold_windows(train_windows, score_windows, parsed, seed)
     base = {"version": _VERSION, "key": dict(key or {}), "windows": _prints(train_windows, score_windows)}
-    jobs = [Job(job_id({**base, "fold": fold_print(fold)}), fold) for fold in folds]
-    told = _Teller(len(folds), progress)
+    jobs = [Job(job_id({**base, "fold": fold_fingerprint(fold)}), fold) for fold in folds]
+    reporter = _FoldReporter(len(folds), progress)
     results = run_jobs(
         jobs,
         _FoldWork(fit_predict),
@@ -152,8 +155,8 @@ def evaluate(
         workers=workers,
         cluster=cluster,
         journal=journal,
-        on_done=told.done,
-        on_report=told.epoch,
+        on_done=reporter.done,
+        on_report=reporter.epoch,
     )
     outcomes = [results[job.id] for job in jobs]
     records = [
@@ -167,14 +170,14 @@ def evaluate(
         for fold, outcome in zip(folds, outcomes, strict=True)
     ]
     tested = [(fold.name, fold.test) for fold in folds]
-    predictions = gather(score_windows, tested, [outcome["probabilities"] for outcome in outcomes])
-    table = scores(predictions, records, score_windows.affects, asked.apart)
+    predictions = gather_predictions(score_windows, tested, [outcome["probabilities"] for outcome in outcomes])
+    table = compute_scores(predictions, records, score_windows.affects, parsed.apart)
     if all("deployed" in outcome for outcome in outcomes):
-        deployed = gather(score_windows, tested, [outcome["deployed"] for outcome in outcomes])
-        after = scores(deployed, records, score_windows.affects, asked.apart)
-        table["int8"] = beside(table, after, predictions, deployed)
+        deployed = gather_predictions(score_windows, tested, [outcome["deployed"] for outcome in outcomes])
+        after = compute_scores(deployed, records, score_windows.affects, parsed.apart)
+        table["int8"] = compare_deployed(table, after, predictions, deployed)
     return Evaluation(
-        split=asked,
+        split=parsed,
         context=context_of(score_windows),
         train_context=context_of(train_windows),
         seeds=[seed],
@@ -186,7 +189,7 @@ def evaluate(
 
 @dataclass(frozen=True)
 class _FoldWork:
-    """One fold as a job."""
+    """The work of one fold, as a job."""
 
     fit_predict: FitPredict
 
@@ -201,12 +204,12 @@ class _FoldWork:
         found = {"probabilities": out.probabilities}
         if out.deployed is not None:
             found["deployed"] = out.deployed
-        wanted = (len(task.test), len(score.labels))
+        expected = (len(task.test), len(score.labels))
         for what, probabilities in found.items():
             found[what] = probabilities = np.asarray(probabilities, dtype=np.float32)
-            if probabilities.shape != wanted:
+            if probabilities.shape != expected:
                 raise ConfigError(
-                    f"fit_predict gave {what} of the shape {probabilities.shape}; {wanted} (windows, classes) is "
+                    f"fit_predict gave {what} of the shape {probabilities.shape}; {expected} (windows, classes) is "
                     "expected."
                 )
         return {
@@ -217,8 +220,8 @@ class _FoldWork:
         }
 
 
-class _Teller:
-    """Turns what jobs say into `FoldProgress`."""
+class _FoldReporter:
+    """Turns the callbacks of `run_jobs` into `FoldProgress`."""
 
     def __init__(self, folds: int, progress: Callable[[FoldProgress], None] | None) -> None:
         self._folds, self._progress = folds, progress
@@ -227,41 +230,87 @@ class _Teller:
     def done(self, job: Job, result: Result, resumed: bool) -> None:
         self._done += 1
         self._resumed += resumed
-        self._tell(job, 0, 0)
+        self._report(job, 0, 0)
 
     def epoch(self, job: Job, message: tuple[int, int, dict[str, Any]]) -> None:
-        self._tell(job, *message)
+        self._report(job, *message)
 
-    def _tell(self, job: Job, epoch: int, epochs: int, row: dict[str, Any] | None = None) -> None:
+    def _report(self, job: Job, epoch: int, epochs: int, row: dict[str, Any] | None = None) -> None:
         if self._progress is not None:
             at = (self._done, self._folds, job.task.name, epoch, epochs, self._resumed)
             self._progress(FoldProgress(*at, row))
 
 
 def context_of(windows: WindowSet) -> str:
-    """The kind of context of a set: "anywhere" or "stream" where any window has a real past, else "loop" or
-    "inside"."""
+    """Return the kind of context: "anywhere" or "stream" where any window has a real past, else "loop" or "inside"."""
     present = set(np.unique(windows.context).tolist())
     return next((kind for kind in ("anywhere", "stream", "loop") if kind in present), "inside")
 
 
 def _prints(train: WindowSet, score: WindowSet) -> list[str]:
-    """The content of both sets, hashed: other windows are other jobs."""
-    first = windows_print(train)
-    return [first, first if score is train else windows_print(score)]
+    """Return the hashes of both sets; other windows give other job ids."""
+    first = windows_fingerprint(train)
+    return [first, first if score is train else windows_fingerprint(score)]
 
 
-def windows_print(windows: WindowSet) -> str:
-    """The content of a set, hashed: what jobs on it go by."""
+def windows_fingerprint(windows: WindowSet) -> str:
+    """Return the hash of a set's content, for the ids of jobs on it."""
     digest = hashlib.sha256(repr((windows.x.shape, windows.labels, windows.recording_ids)).encode())
     for array in (windows.x, windows.y, windows.recording):
         digest.update(np.ascontiguousarray(array).data)
     return digest.hexdigest()
 
 
-def fold_print(fold: WindowFold) -> str:
-    """Which windows a fold trains on, validates on and tests, hashed."""
+def fold_fingerprint(fold: WindowFold) -> str:
+    """Return the hash of the windows that a fold trains on, validates on and tests."""
     digest = hashlib.sha256()
     for index in (fold.train, fold.validation, fold.test):
         digest.update(len(index).to_bytes(8, "little") + index.astype("<i8").tobytes())
     return digest.hexdigest()
+
+
+def compare_deployed(
+    before: Mapping[str, Any], after: Mapping[str, Any], predictions: Predictions, deployed: Predictions
+) -> dict[str, Any]:
+    """Compare the deployed network with the float one, as plain values.
+
+    Args:
+        before, after: the figures of both (see `plushsense.evaluation.scores.compute_scores`).
+        predictions, deployed: of the same windows, in the same order.
+
+    Returns:
+        ``accuracy`` and ``macro_f1`` of the deployed network; ``loss``, the same of what each person (or fold, as
+        ``over`` says) lost, float minus int8, with the interval of its mean; ``agreement``, the share of the windows
+        on which both say the same class; ``probability_difference``, the mean over the windows of the largest one;
+        ``rows``, one a person or fold.
+    """
+    same = predictions.predicted == deployed.predicted
+    people = before["over"] == "subjects"
+    name, of = ("subject", predictions.subject) if people else ("fold", predictions.fold)
+    keys = tuple(metrics.column_metrics())
+    rows = []
+    for one, other in zip(before[before["over"]], after[after["over"]], strict=True):
+        mine = of == one[name]
+        row = {name: one[name], "windows": int(mine.sum())}
+        for score in keys:
+            row |= {score: one[score], f"{score}_int8": other[score], f"{score}_loss": _less(one, other, score)}
+        rows.append(row | {"agreement": float(same[mine].mean()) if mine.any() else None})
+    counted = predictions.subject != NOBODY if people else np.ones(len(same), dtype=np.bool_)
+    apart = np.abs(predictions.probabilities - deployed.probabilities).max(axis=1)
+    return {
+        **{score: after[score] for score in keys},
+        "loss": {score: metrics.summary([_number(row[f"{score}_loss"]) for row in rows]) for score in keys},
+        "over": before["over"],
+        "agreement": float(same[counted].mean()) if counted.any() else None,
+        "probability_difference": float(apart[counted].mean()) if counted.any() else None,
+        "rows": rows,
+    }
+
+
+def _less(one: Mapping[str, Any], other: Mapping[str, Any], score: str) -> float | None:
+    before, after = one[score], other[score]
+    return None if before is None or after is None else float(before - after)
+
+
+def _number(value: float | None) -> float:
+    return float("nan") if value is None else value

@@ -1,7 +1,7 @@
-"""A split of recordings (or windows) as the windows that each fold trains on, validates on and scores.
+"""Folds of windows: which windows each fold of a split trains on, validates on and tests.
 
-Windows to train on and windows to score may be cut from the same recordings with another context; the split is
-made over recordings, so that both agree on it.
+Windows to train on and to score may be cut from the same recordings with different contexts; the split is made over
+recordings and so is the same for both.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from plushsense.windows.cut import WindowSet
 
 @dataclass(frozen=True)
 class WindowFold:
-    """One fold: ``train`` and ``validation`` index the windows to train on, ``test`` those to score."""
+    """A fold of windows: ``train`` and ``validation`` index the windows to train on, ``test`` those to score."""
 
     name: str
     subjects: tuple[str, ...]
@@ -28,7 +28,9 @@ class WindowFold:
 
 
 def fold_windows(train: WindowSet, score: WindowSet, split: Split, seed: int = 0) -> list[WindowFold]:
-    """The folds of ``split``. No window that touches a tested recording in its stream is trained or validated on.
+    """Return the folds of ``split`` as windows.
+
+    No window that touches a tested recording in its stream is trained or validated on.
 
     Raises:
         BadInput: when the two sets do not belong together, or the split cannot be made of them.
@@ -63,7 +65,7 @@ def fold_windows(train: WindowSet, score: WindowSet, split: Split, seed: int = 0
 
 @dataclass(frozen=True)
 class _Recordings:
-    """What both sets say about each recording, (R,); rows in a stream as ids and (R, 2), −1 where there is none."""
+    """The recordings (R,) of both sets; rows in a stream as ids and (R, 2), −1 where there is none."""
 
     ids: NDArray[np.str_]
     subject: NDArray[np.str_]
@@ -77,18 +79,18 @@ class _Recordings:
         subject, stream = (np.concatenate([getattr(s, name) for s in sets]) for name in ("subject", "stream"))
         y = np.concatenate([s.y for s in sets])
         rows = np.concatenate([s.recording_rows for s in sets])
-        # Of all windows of a recording, one that knows its place in a stream speaks for it.
+        # Of all windows of a recording, take one whose place in a stream is known.
         order = np.lexsort((rows[:, 0] < 0, ids))
         unique, first = np.unique(ids[order], return_index=True)
         pick = order[first]
         return cls(unique, subject[pick], y[pick], stream[pick], rows[pick])
 
     def place(self, windows: WindowSet) -> Index:
-        """The recording of each window, as an index into these, (N,)."""
+        """Return the recording of each window as an index into these, (N,)."""
         return np.searchsorted(self.ids, _ids(windows)).astype(np.int64)
 
     def rows(self, index: Index) -> tuple[NDArray[np.str_], Index]:
-        """Stream and rows of some recordings, as `purge` takes them."""
+        """Return stream and rows of some recordings, as `purge` takes them."""
         return self.stream[index], self.stream_rows[index]
 
 

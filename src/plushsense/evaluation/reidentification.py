@@ -1,4 +1,4 @@
-"""How well a simple program tells the person from the touch: what a data officer must know before data are published.
+"""Re-identification: how well a simple program recognises people by their touch, before data are published.
 
 The attacker is given recordings under the people's codes and one new recording, and says whose it is. It reads
 statistics of each recording (those of the paper's baselines, see ``windows/statistics``) with extremely randomised
@@ -17,16 +17,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import BadInput
-from plushsense.core.extras import need
+from plushsense.core.errors import BadInput, need
 from plushsense.core.gestures import NOBODY
-from plushsense.core.recfile import Frames
-from plushsense.core.signal import Layout
+from plushsense.core.layouts import Layout
+from plushsense.core.recorder_csv import Frames
+from plushsense.core.templates import fill_text
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
 from plushsense.scoring.metrics import summary
 from plushsense.windows.clock import resample
-from plushsense.windows.features import magnitude
-from plushsense.windows.statistics import statistics
+from plushsense.windows.features import magnitude, statistics
 
 Floats = NDArray[np.float64]
 Texts = NDArray[np.str_]
@@ -60,8 +59,8 @@ _PLAN = (
 
 
 @dataclass(frozen=True)
-class Trial:
-    """How often one program named the right person in one design.
+class ReidentificationTrial:
+    """The result of one program in one design: how often it named the right person.
 
     ``top1`` and ``top5`` are ``{mean, sd, ci95}`` over people (bootstrap over people); ``by_person`` is each one's
     top-1, ``precision`` how often the program is right when it says that person, ``chance`` and ``chance5`` what
@@ -85,18 +84,18 @@ class Trial:
         return [p for p, share in self.by_person.items() if min(share, self.precision[p]) >= CLEARLY]
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, ready for JSON."""
+        """Return plain values, ready for JSON."""
         return dict(vars(self))
 
 
 @dataclass(frozen=True)
 class Reidentified:
-    """What was tried; ``skipped`` says which designs the data do not allow, and why.
+    """The results of a re-identification; ``skipped`` holds the designs that the data do not allow, with the reason.
 
     ``of_one_person`` are gestures that only one person made: their label alone names that person.
     """
 
-    trials: tuple[Trial, ...]
+    trials: tuple[ReidentificationTrial, ...]
     people: int
     recordings: int
     sessions: int
@@ -106,12 +105,12 @@ class Reidentified:
     trees: int
     simulated: bool
 
-    def find(self, design: str, sees: str) -> Trial | None:
-        """One trial; None where it was not possible."""
+    def find(self, design: str, sees: str) -> ReidentificationTrial | None:
+        """Return the trial of a design and a program; None where it was not possible."""
         return next((t for t in self.trials if (t.design, t.sees) == (design, sees)), None)
 
     def under(self, codes: Mapping[str, str]) -> Reidentified:
-        """The same under other codes, such as those of a package; who is not in ``codes`` keeps theirs."""
+        """Return the results with other codes for the people; a person missing in ``codes`` keeps theirs."""
 
         def renamed(shares: dict[str, float]) -> dict[str, float]:
             return {codes.get(p, p): share for p, share in shares.items()}
@@ -120,7 +119,7 @@ class Reidentified:
         return replace(self, trials=tuple(trials))
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, ready for JSON."""
+        """Return plain values, ready for JSON."""
         return {
             "people": self.people,
             "recordings": self.recordings,
@@ -135,7 +134,9 @@ class Reidentified:
 
 
 def reidentify(dataset: Dataset, *, seed: int = 1, trees: int = 150, progress: Progress | None = None) -> Reidentified:
-    """Try to tell the people of a data set apart; excluded recordings, nobody's and the unknown's are left out.
+    """Measure how well the people of a data set can be told apart by their recordings.
+
+    Excluded recordings and those of nobody or of unknown people are left out.
 
     Args:
         seed: the same seed gives the same figures.
@@ -193,7 +194,7 @@ def reidentify(dataset: Dataset, *, seed: int = 1, trees: int = 150, progress: P
 
 
 def features(frames: Frames, layout: Layout) -> dict[str, Floats] | None:
-    """What each program sees of one recording; None for one too short to say anything of.
+    """Return what each program sees of one recording; None for a recording that is too short.
 
     Statistics are taken of the longest stretch without a gap, at even samples.
     """
@@ -221,7 +222,7 @@ def _clock(device_ms: NDArray[np.int64]) -> Floats:
 
 
 def _dealt(person: Texts, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Each person's recordings dealt over the folds, at random."""
+    """Assign each person's recordings to folds at random."""
     group = np.zeros(len(person), dtype=np.int64)
     for name in np.unique(person):
         mine = rng.permutation(np.flatnonzero(person == name))
@@ -235,7 +236,7 @@ def _gesture_groups(gesture: Texts) -> NDArray[np.int64]:
 
 
 def _turns(person: Texts, session: Texts) -> NDArray[np.int64]:
-    """Of people of several sessions, the number of the session, which is a turn to be tested; −1 of the others."""
+    """Return the number of the session, which is tested in turn; −1 for people with one session."""
     group = np.full(len(person), -1, dtype=np.int64)
     for name in np.unique(person):
         mine = person == name
@@ -256,7 +257,7 @@ def _impossible(gesture: Texts, turns: NDArray[np.int64]) -> dict[str, str]:
 
 def _trial(
     design: str, sees: str, x: Floats, person: Texts, group: NDArray[np.int64], forest: Any, seed: int, trees: int
-) -> Trial:
+) -> ReidentificationTrial:
     names, truth = np.unique(person, return_inverse=True)
     top1 = np.full(len(truth), np.nan)
     top5 = np.full(len(truth), np.nan)
@@ -284,7 +285,7 @@ def _trial(
     said = {str(names[k]): named[tested] == k for k in people}
     right = {p: float(top1[tested][at].mean()) if at.any() else 0.0 for p, at in said.items()}
     five = [float(top5[tested & (truth == k)].mean()) for k in people]
-    return Trial(
+    return ReidentificationTrial(
         design,
         sees,
         len(names),
@@ -296,3 +297,44 @@ def _trial(
         mine,
         right,
     )
+
+
+def verdict(found: Reidentified) -> str:
+    """Return the verdict as one Markdown paragraph.
+
+    Raises:
+        MissingExtraError: when jinja2 is not installed.
+    """
+    sentences = _fill("reidentification_verdict.md.j2", found=found, hundred=_hundred, interval=_range)
+    return " ".join(sentences.splitlines())
+
+
+def report(found: Reidentified, command: str) -> str:
+    """Return the whole report in Markdown; ``command`` is how it was made."""
+    trial = found.find("recordings", "everything")
+    by_person = None if trial is None else sorted(trial.by_person.items(), key=lambda item: (-item[1], item[0]))
+    return _fill(
+        "reidentification.md.j2",
+        found=found,
+        command=command,
+        verdict=verdict(found),
+        by_person=by_person,
+        designs=DESIGNS,
+        sees=SEES,
+        folds=FOLDS,
+    )
+
+
+def _fill(template: str, **values: Any) -> str:
+    return fill_text("plushsense.evaluation", template, **values)
+
+
+def _hundred(share: float | None) -> str:
+    if share is None:
+        return "an unknown number"
+    return f"{100 * share:.0f}" if share >= 0.095 or share == 0 else f"{100 * share:.1f}"
+
+
+def _range(trial: ReidentificationTrial) -> str:
+    ci = trial.top1["ci95"]
+    return f" (95 % interval {_hundred(ci[0])} to {_hundred(ci[1])})" if ci else ""

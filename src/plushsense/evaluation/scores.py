@@ -1,29 +1,144 @@
-"""The figures of an evaluation, all from its predictions.
+"""Predictions of an evaluation, their files, and the scores computed from them.
 
-Where people are kept apart, one value a person is averaged, and the toy at rest with nobody (subject "none") is
-reported apart; elsewhere one value a fold, over all it tested. The pooled figures, the classes and the confusions
-count every scored window, nobody's included, as the paper does.
+Where people are kept apart, means are over people, and recordings of nobody (subject "none": the toy at rest) are
+reported separately; otherwise means are over folds. Pooled scores, classes and confusions count every scored window,
+as the paper does.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from plushsense.core.errors import BadInput, need
+from plushsense.core.files import replacing_file
 from plushsense.core.gestures import NOBODY
-from plushsense.evaluation.predictions import Predictions
 from plushsense.scoring import metrics
 from plushsense.scoring.metrics import Counts
+from plushsense.scoring.splits import Index
+from plushsense.windows.cut import WindowSet
+
+_P = "p_"
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """The predictions of an evaluation: one row for each scored window, fold after fold.
+
+    ``recording`` is the recording's id, ``window`` the window's number within it (from 0), ``context`` what its past
+    is, ``truth`` and ``predicted`` class indices into ``labels``, ``probabilities`` (N, K) float32.
+    """
+
+    labels: tuple[str, ...]
+    subject: NDArray[np.str_]
+    recording: NDArray[np.str_]
+    window: NDArray[np.int64]
+    context: NDArray[np.str_]
+    fold: NDArray[np.str_]
+    truth: NDArray[np.int64]
+    probabilities: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.truth)
+
+    @property
+    def predicted(self) -> NDArray[np.int64]:
+        """The class of the highest probability, (N,)."""
+        best: NDArray[np.int64] = np.argmax(self.probabilities, axis=1).astype(np.int64)
+        return best
+
+
+def gather_predictions(
+    windows: WindowSet, folds: Sequence[tuple[str, Index]], probabilities: Sequence[NDArray[np.float32]]
+) -> Predictions:
+    """Collect the predictions of all folds: (name, index of the windows it tested) and the probabilities of each."""
+    order = np.concatenate([test for _, test in folds])
+    ids = np.array(windows.recording_ids, dtype=np.str_)
+    # The windows of a recording are in the order of time.
+    by_recording = np.argsort(windows.recording, kind="stable")
+    sorted_recording = windows.recording[by_recording]
+    number = np.empty(len(windows), dtype=np.int64)
+    number[by_recording] = np.arange(len(windows)) - np.searchsorted(sorted_recording, sorted_recording)
+    return Predictions(
+        labels=windows.labels,
+        subject=windows.subject[order],
+        recording=ids[windows.recording[order]],
+        window=number[order],
+        context=windows.context[order],
+        fold=np.repeat([name for name, _ in folds], [len(test) for _, test in folds]),
+        truth=windows.y[order],
+        probabilities=np.concatenate(probabilities),
+    )
+
+
+def write_predictions(path: str | Path, predictions: Predictions) -> Path:
+    """Write subject, recording, window, context, fold, truth, predicted and a ``p_<label>`` a class, as Parquet.
+
+    Truth and prediction are written as labels. The file is replaced in one step.
+
+    Raises:
+        MissingExtraError: without polars (extra ``train``).
+    """
+    polars = need("polars", extra="train")
+    path = Path(path)
+    label = np.array(predictions.labels, dtype=np.str_)
+    columns: dict[str, NDArray[Any]] = {
+        "subject": predictions.subject,
+        "recording": predictions.recording,
+        "window": predictions.window,
+        "context": predictions.context,
+        "fold": predictions.fold,
+        "truth": label[predictions.truth],
+        "predicted": label[predictions.predicted],
+    }
+    for k, name in enumerate(predictions.labels):
+        columns[_P + name] = np.ascontiguousarray(predictions.probabilities[:, k])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing_file(path) as part:
+        polars.DataFrame(columns).write_parquet(part)
+    return path
+
+
+def read_predictions(path: str | Path) -> Predictions:
+    """Read a file of `write_predictions`.
+
+    Raises:
+        MissingExtraError: without polars (extra ``train``); BadInput: for a file that is missing, or of something else.
+    """
+    polars = need("polars", extra="train")
+    path = Path(path)
+    again = "evaluate again"
+    if not path.is_file():
+        raise BadInput(f"There are no predictions at '{path}': they were moved or deleted; {again}.")
+    try:
+        table = polars.read_parquet(path)
+        labels = tuple(name.removeprefix(_P) for name in table.columns if name.startswith(_P))
+        of = {name: k for k, name in enumerate(labels)}
+        text = {
+            name: np.array(table[name].to_list(), dtype=np.str_) for name in ("subject", "recording", "context", "fold")
+        }
+        return Predictions(
+            labels,
+            window=table["window"].to_numpy().astype(np.int64),
+            truth=np.array([of[label] for label in table["truth"].to_list()], dtype=np.int64),
+            probabilities=table.select([_P + name for name in labels]).to_numpy().astype(np.float32),
+            **text,
+        )
+    except (OSError, KeyError, polars.exceptions.PolarsError) as cause:
+        raise BadInput(f"'{path}' holds no predictions of an evaluation ({cause}): {again}.") from None
+
 
 Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
 class FoldRecord:
-    """What is known of a fold besides its predictions; ``windows`` are (trained on, validated on, tested)."""
+    """A fold besides its predictions; ``windows`` are (trained on, validated on, tested)."""
 
     name: str
     subjects: tuple[str, ...]
@@ -32,40 +147,42 @@ class FoldRecord:
     seconds: float
 
 
-def scores(predictions: Predictions, folds: list[FoldRecord], affects: tuple[str, ...], apart: bool) -> dict[str, Any]:
-    """All figures, as plain values; what cannot be computed is None.
+def compute_scores(
+    predictions: Predictions, folds: list[FoldRecord], affects: tuple[str, ...], apart: bool
+) -> dict[str, Any]:
+    """Compute all scores as plain values; what cannot be computed is None.
 
     Args:
         affects: the affect of each class; apart: whether people are kept apart.
     """
-    board = _Board(predictions)
+    scorer = _Scorer(predictions)
     people = predictions.subject != NOBODY
     counted = people if apart else np.ones(len(people), dtype=np.bool_)
     named = sorted(set(predictions.subject[people].tolist()))
     of_fold = [predictions.fold == fold.name for fold in folds]
     of_person = [predictions.subject == person for person in named]
-    single = [board.figures(m) for m in (of_person if apart else [m & counted for m in of_fold])]
+    single = [scorer.figures(m) for m in (of_person if apart else [m & counted for m in of_fold])]
     # The paper's average runs over all 18 classes, so the toy at rest with nobody counts in its fold.
-    all_classes = [metrics.macro_f1(board.counts(m), all_classes=True) for m in of_fold]
-    everything = board.counts(np.ones(len(people), dtype=np.bool_))
+    all_classes = [metrics.macro_f1(scorer.counts(m), all_classes=True) for m in of_fold]
+    everything = scorer.counts(np.ones(len(people), dtype=np.bool_))
     return {
-        **{name: metrics.summary([f[name] for f in single]) for name in ("accuracy", "macro_f1", "macro_recall")},
+        **{name: metrics.summary([f[name] for f in single]) for name in metrics.METRICS},
         "macro_f1_all_classes": metrics.summary(all_classes),
         "over": "subjects" if apart else "folds",
-        "by_recording": board.by_recording(counted),
-        "pooled": _plain(_of_counts(everything)),
+        "by_recording": scorer.by_recording(counted),
+        "pooled": _plain(metrics.scores_of(everything)),
         "per_class": _per_class(everything, predictions.labels, affects),
         "confusion": {"labels": list(predictions.labels), "counts": everything.tolist()},
         "confusion_affect": _grouped(everything, affects),
-        "by_context": board.by_context(counted),
-        "nobody": None if people.all() else board.size(~people) | {"accuracy": board.figures(~people)["accuracy"]},
-        "folds": [_fold(fold, board, mask & counted) for fold, mask in zip(folds, of_fold, strict=True)],
-        "subjects": [_person(name, board, m) for name, m in zip(named, of_person, strict=True)],
+        "by_context": scorer.by_context(counted),
+        "nobody": None if people.all() else scorer.size(~people) | {"accuracy": scorer.figures(~people)["accuracy"]},
+        "folds": [_fold(fold, scorer, mask & counted) for fold, mask in zip(folds, of_fold, strict=True)],
+        "subjects": [_person(name, scorer, m) for name, m in zip(named, of_person, strict=True)],
     }
 
 
-class _Board:
-    """Figures of any part of the predictions."""
+class _Scorer:
+    """Computes scores of parts of the predictions, given as masks (N,)."""
 
     def __init__(self, predictions: Predictions) -> None:
         self._all = predictions
@@ -77,17 +194,17 @@ class _Board:
         return metrics.confusion(self._all.truth[mask], self._read[mask], self._classes)
 
     def figures(self, mask: Mask) -> dict[str, float]:
-        return _of_counts(self.counts(mask))
+        return metrics.scores_of(self.counts(mask))
 
     def size(self, mask: Mask) -> dict[str, int]:
         return {"windows": int(mask.sum()), "recordings": len(np.unique(self._recording[mask]))}
 
     def by_recording(self, mask: Mask) -> dict[str, Any]:
-        """Accuracy and macro-F1 of the vote over each recording's windows."""
+        """Return the scores of the vote over each recording's windows."""
         recording = self._recording[mask]
         ids, read = metrics.vote(self._all.probabilities[mask], recording)
         _, first = np.unique(recording, return_index=True)
-        found = _of_counts(metrics.confusion(self._all.truth[mask][first], read, self._classes))
+        found = metrics.scores_of(metrics.confusion(self._all.truth[mask][first], read, self._classes))
         return _plain(found) | {"recordings": len(ids)}
 
     def by_context(self, mask: Mask) -> dict[str, Any]:
@@ -99,16 +216,8 @@ class _Board:
         return table
 
 
-def _of_counts(counts: Counts) -> dict[str, float]:
-    return {
-        "accuracy": metrics.accuracy(counts),
-        "macro_recall": metrics.macro_recall(counts),
-        "macro_f1": metrics.macro_f1(counts),
-    }
-
-
 def _plain(figures: dict[str, float]) -> dict[str, float | None]:
-    """Figures for JSON, which knows no NaN."""
+    """Replace NaN, which JSON does not know, by None."""
     return {name: float(value) if np.isfinite(value) else None for name, value in figures.items()}
 
 
@@ -132,7 +241,7 @@ def _grouped(counts: Counts, groups: tuple[str, ...]) -> dict[str, Any]:
     return {"labels": list(names), "counts": table.tolist()}
 
 
-def _fold(fold: FoldRecord, board: _Board, mask: Mask) -> dict[str, Any]:
+def _fold(fold: FoldRecord, scorer: _Scorer, mask: Mask) -> dict[str, Any]:
     return {
         "fold": fold.name,
         "subject": fold.subjects[0] if len(fold.subjects) == 1 else None,
@@ -140,19 +249,18 @@ def _fold(fold: FoldRecord, board: _Board, mask: Mask) -> dict[str, Any]:
         "train_windows": fold.windows[0],
         "validation_windows": fold.windows[1],
         "test_windows": fold.windows[2],
-        **_plain(board.figures(mask)),
-        "by_recording_accuracy": board.by_recording(mask)["accuracy"],
+        **_plain(scorer.figures(mask)),
+        "by_recording_accuracy": scorer.by_recording(mask)["accuracy"],
         "epochs": fold.epochs,
         "seconds": fold.seconds,
     }
 
 
-def _person(name: str, board: _Board, mask: Mask) -> dict[str, Any]:
-    found = _plain(board.figures(mask))
+def _person(name: str, scorer: _Scorer, mask: Mask) -> dict[str, Any]:
+    found = _plain(scorer.figures(mask))
     return {
         "subject": name,
-        **board.size(mask),
-        "accuracy": found["accuracy"],
-        "macro_f1": found["macro_f1"],
-        "by_recording_accuracy": board.by_recording(mask)["accuracy"],
+        **scorer.size(mask),
+        **{key: found[key] for key in metrics.column_metrics()},
+        "by_recording_accuracy": scorer.by_recording(mask)["accuracy"],
     }

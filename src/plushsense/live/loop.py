@@ -1,4 +1,4 @@
-"""A device and a model run together: decisions as they fall, and in the end a summary."""
+"""Live loop: a device and a model run together, with decisions as they are made and a summary at the end."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ import numpy as np
 
 from plushsense.core.errors import ConfigError
 from plushsense.devices.base import Device, Frame
-from plushsense.live.integer import BothEngines
-from plushsense.live.stream import Decision, StreamReader, check_layout
+from plushsense.runtime.classifier import BothEngines, Decision, StreamReader, check_layout
 
 _KEPT = 72_000  # latencies kept: the last hour at 20 decisions a second
 SILENCE_S = 0.75
@@ -21,8 +20,8 @@ SILENCE_S = 0.75
 
 
 @dataclass(frozen=True)
-class Summary:
-    """What a live run did.
+class LiveSummary:
+    """Summary of a live run.
 
     Attributes:
         decisions: all of them; ``warming`` of these came without an answer.
@@ -36,7 +35,7 @@ class Summary:
             over the last hour; a replay that does not wait hands over hundreds at once, and they stand in a queue.
         late: decisions that came more than a step after the bytes.
         events: how many began.
-        no_signal: how often nothing was heard, or the clock had a gap or was reset.
+        no_signal: how often no frame came, or the clock had a gap or was reset.
         faults: how often sensors could not be believed.
     """
 
@@ -55,7 +54,7 @@ class Summary:
     faults: int = 0
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, ready for JSON."""
+        """Return plain values, ready for JSON."""
         return {
             "decisions": self.decisions,
             "warming": self.warming,
@@ -73,8 +72,8 @@ class Summary:
         }
 
 
-class Run(Iterator[Decision]):
-    """A live run: iterate for decisions; `summary` tells at any time how it went.
+class LiveRun(Iterator[Decision]):
+    """Live run: iterate for decisions; `summary` gives its figures at any time.
 
     A device that sends no frame for ``silence_s`` gives one decision of the state ``no signal``, and its event ends; so
     does an event that is going on when the device ends.
@@ -94,7 +93,7 @@ class Run(Iterator[Decision]):
         self.device = device
         self.classifier = classifier
         self._seconds, self._silence_s = seconds, silence_s
-        self._begun = self._heard = time.perf_counter()
+        self._begun = self._last_frames_s = time.perf_counter()
         self._silent = False
         self._decisions = self._warming = self._late = self._events = self._no_signal = 0
         self._latencies: list[float] = []
@@ -102,7 +101,7 @@ class Run(Iterator[Decision]):
         self._due: deque[Decision] = deque()
         self.over = False
 
-    def __iter__(self) -> Run:
+    def __iter__(self) -> LiveRun:
         return self
 
     def __next__(self) -> Decision:
@@ -113,23 +112,23 @@ class Run(Iterator[Decision]):
         return self._due.popleft()
 
     def poll(self) -> list[Decision]:
-        """Read the device once, and decide; `over` says whether that was the end. For many runs in turn."""
+        """Read the device once; return its decisions. `over` says whether that was the end."""
         frames = None if self.device.closed else self.device.read()
         now = time.perf_counter()
         if frames is None:
             self.over = True
             return [self._noted(self.classifier.silence())] if self.classifier.in_event else []
         if not frames:
-            return self._hear_nothing(now)
+            return self._no_frames(now)
         arrived = self.device.arrived_s
         arrived = now if arrived is None else arrived
         decided = self._read(frames, arrived)
         # Only now: what the reading of frames takes is not the toy's silence.
-        self._heard, self._silent = time.perf_counter(), False
+        self._last_frames_s, self._silent = time.perf_counter(), False
         return decided
 
-    def _hear_nothing(self, now: float) -> list[Decision]:
-        quiet = now - self._heard
+    def _no_frames(self, now: float) -> list[Decision]:
+        quiet = now - self._last_frames_s
         if self._seconds is not None and quiet >= self._seconds:
             self.over = True
         if self._silent or quiet < self._silence_s:
@@ -166,13 +165,13 @@ class Run(Iterator[Decision]):
 
     @property
     def latencies_s(self) -> list[float]:
-        """From bytes to decision, of the last hour, in no order."""
+        """Latencies from bytes to decision, of the last hour, in no order."""
         return list(self._latencies)
 
-    def summary(self) -> Summary:
-        """How it went so far."""
+    def summary(self) -> LiveSummary:
+        """Return the figures so far."""
         seconds = self.classifier.time_s
-        return Summary(
+        return LiveSummary(
             self._decisions,
             self._warming,
             seconds,
@@ -190,27 +189,27 @@ class Run(Iterator[Decision]):
 
 
 def percentiles_ms(latencies_s: Sequence[float]) -> dict[str, float | None]:
-    """p50, p95 and p99 in milliseconds; None where there is nothing."""
+    """Return p50, p95 and p99 in milliseconds; None where there is nothing."""
     if not latencies_s:
         return {"p50": None, "p95": None, "p99": None}
     p50, p95, p99 = (round(float(v) * 1000.0, 3) for v in np.percentile(latencies_s, (50, 95, 99)))
     return {"p50": p50, "p95": p95, "p99": p99}
 
 
-def run(
+def run_live(
     device: Device,
     classifier: StreamReader | BothEngines,
     *,
     seconds: float | None = None,
     silence_s: float = SILENCE_S,
-) -> Run:
+) -> LiveRun:
     """Run a model on an open device.
 
     Args:
         device: an open one; closing it stays with the caller.
         classifier: it begins a new stream.
         seconds: stop after so much device time (so that a replay at any speed ends at the same place), or
-            when the device has said nothing for so long; None runs until the device ends.
+            when the device has sent nothing for so long; None runs until the device ends.
         silence_s: host time without a frame after which there is no signal.
 
     Raises:
@@ -221,4 +220,104 @@ def run(
         raise ConfigError(f"seconds is {seconds!r}; give a positive duration, or leave it out to run until the end.")
     check_layout(device.layout, classifier.layout)
     classifier.reset()
-    return Run(device, classifier, seconds, silence_s)
+    return LiveRun(device, classifier, seconds, silence_s)
+
+
+_PAUSE_S = 0.001  # when no toy had anything to say; a frame at 100 Hz comes every 10 ms
+
+
+@dataclass(frozen=True)
+class ManySummary:
+    """Summary of a run of many toys.
+
+    Attributes:
+        toys: how many; ``decisions`` of all of them, ``late`` of these came more than a step after their bytes.
+        wall_s: host time; ``cpu_s`` what this process computed in it, ``busy`` the share.
+        latency_ms: p50, p95, p99 and max from the arrival of the bytes to the decision, over all toys.
+    """
+
+    toys: int
+    decisions: int
+    late: int
+    wall_s: float
+    cpu_s: float
+    latency_ms: dict[str, float | None]
+
+    @property
+    def busy(self) -> float:
+        """Share of one core."""
+        return self.cpu_s / self.wall_s if self.wall_s > 0 else 0.0
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        return {
+            "toys": self.toys,
+            "decisions": self.decisions,
+            "late": self.late,
+            "wall_s": round(self.wall_s, 3),
+            "cpu_s": round(self.cpu_s, 3),
+            "busy": round(self.busy, 4),
+            "latency_ms": dict(self.latency_ms),
+        }
+
+
+class ManyRun(Iterator[tuple[int, Decision]]):
+    """Run of many toys: iterate for (number of the toy, decision); a toy that has ended is left out.
+
+    `runs` holds each toy's own run.
+    """
+
+    def __init__(self, runs: Sequence[LiveRun]) -> None:
+        self.runs = tuple(runs)
+        self._begun, self._cpu = time.perf_counter(), time.process_time()
+        self._flow = self._turns()
+
+    def __iter__(self) -> ManyRun:
+        return self
+
+    def __next__(self) -> tuple[int, Decision]:
+        return next(self._flow)
+
+    def _turns(self) -> Iterator[tuple[int, Decision]]:
+        going = list(enumerate(self.runs))
+        while going:
+            received = False
+            for number, one in going:
+                before = one.device.counters.frames
+                for decision in one.poll():
+                    yield number, decision
+                received = received or one.device.counters.frames != before
+            going = [(number, one) for number, one in going if not one.over]
+            if not received:
+                time.sleep(_PAUSE_S)
+
+    def summary(self) -> ManySummary:
+        """Return the figures so far."""
+        each = [one.summary() for one in self.runs]
+        latencies = [latency for one in self.runs for latency in one.latencies_s]
+        return ManySummary(
+            len(each),
+            sum(one.decisions for one in each),
+            sum(one.late for one in each),
+            time.perf_counter() - self._begun,
+            time.process_time() - self._cpu,
+            percentiles_ms(latencies) | {"max": round(1000.0 * max(latencies), 3) if latencies else None},
+        )
+
+
+def run_many(toys: Sequence[tuple[Device, StreamReader | BothEngines]], *, seconds: float | None = None) -> ManyRun:
+    """Run a model on each of many open devices, in one thread.
+
+    Args:
+        toys: devices, which are then read without waiting, each with a classifier of its own.
+        seconds: as of `plushsense.live.loop.run_live`, for each.
+
+    Raises:
+        ConfigError: for a classifier that two toys share, and as `run` does.
+        DeviceError: while iterating, when a toy went away; open devices with ``reconnect`` to wait for it.
+    """
+    if len({id(classifier) for _, classifier in toys}) < len(toys):
+        raise ConfigError("Two toys share a classifier, which follows one stream: make one for each.")
+    for device, _ in toys:
+        device.wait_s = 0.0
+    return ManyRun([run_live(device, classifier, seconds=seconds) for device, classifier in toys])

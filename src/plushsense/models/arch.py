@@ -6,15 +6,101 @@ One block is Conv1d → ReLU → normalisation; after the blocks the mean over t
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, cast, get_args
+from typing import Any, Literal, NoReturn, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import ArchError, nearest
-from plushsense.models.symbol import MAX_LAYERS, MAX_NUMBER, fail, layer_start, parse_filters, parse_symbol, slashed
+
+MAX_LAYERS = 4
+MAX_NUMBER = 4096  # of a kernel, a dilation, a filter count: far above use, far below what would exhaust memory
+
+
+def parse_symbol(spec: str) -> tuple[tuple[int, int], ...]:
+    """Return the (kernel, dilation) pairs of a symbol.
+
+    Raises:
+        ArchError: showing the symbol and a caret under the place that does not fit.
+    """
+    if not spec:
+        fail("nothing is given: write kernel lengths joined by '_', as in 14d1_39d2_41d4", spec, 0)
+    layers: list[tuple[int, int]] = []
+    at = 0
+    while True:
+        if len(layers) == MAX_LAYERS:
+            fail(f"more than {MAX_LAYERS} layers: take some away", spec, at)
+        kernel, at = _number(spec, at, f"the kernel length of layer {len(layers) + 1}")
+        dilation = 1
+        if spec[at : at + 1] == "d":
+            dilation, at = _number(spec, at + 1, f"the dilation of layer {len(layers) + 1}")
+        layers.append((kernel, dilation))
+        if at == len(spec):
+            return tuple(layers)
+        if spec[at] != "_":
+            known = "'_' or the end" if "d" in spec[max(spec.rfind("_", 0, at), 0) : at] else "'d', '_' or the end"
+            fail(f"unknown token {spec[at]!r}: accepted here are {known}", spec, at)
+        at += 1
+
+
+def parse_filters(text: str) -> tuple[int, ...]:
+    """Return the filter counts of ``"8,12,16"``.
+
+    Raise ArchError with a caret under what is not a whole number from 1.
+    """
+    counts: list[int] = []
+    at = 0
+    while True:
+        at += len(text[at:]) - len(text[at:].lstrip(" "))
+        count, at = _number(text, at, f"filter count {len(counts) + 1}", symbol=False)
+        counts.append(count)
+        at += len(text[at:]) - len(text[at:].lstrip(" "))
+        if at == len(text):
+            return tuple(counts)
+        if text[at] != ",":
+            fail(
+                f"unknown token {text[at]!r}: write counts joined by commas, as in 8,12,16",
+                text,
+                at,
+                symbol=False,
+            )
+        at += 1
+
+
+def slashed(filters: Iterable[int]) -> str:
+    """Return filter counts joined by slashes: ``8/12/16``."""
+    return "/".join(map(str, filters))
+
+
+def _number(text: str, at: int, what: str, symbol: bool = True) -> tuple[int, int]:
+    """Return the number that starts at ``at``, 1 to MAX_NUMBER, and the place after it."""
+    end = at
+    while end < len(text) and text[end] in "0123456789":
+        end += 1
+    if end == at:
+        ends = at == len(text) or text[at] in "_,"
+        found = "nothing stands here" if ends else f"unknown token {text[at]!r}"
+        fail(f"{found}: {what} is expected, a whole number from 1", text, at, symbol)
+    if text[at:end].strip("0") == "":
+        fail(f"{what} is 0: the smallest is 1", text, at, symbol)
+    if end - at > 9 or int(text[at:end]) > MAX_NUMBER:
+        fail(f"{what} is too large: the largest is {MAX_NUMBER}", text, at, symbol)
+    return int(text[at:end]), end
+
+
+def layer_start(spec: str, layer: int) -> int:
+    """Return the place in the symbol at which a layer (from 0) begins."""
+    return sum(len(part) + 1 for part in spec.split("_")[:layer])
+
+
+def fail(why: str, text: str, at: int, symbol: bool = True) -> NoReturn:
+    """Raise ArchError: what is wrong, the text, and a caret under place ``at``."""
+    printable = "".join(c if c.isprintable() else "?" for c in text)
+    what = "Architecture" if symbol else "Filters"
+    raise ArchError(f"{what} '{printable}', place {at + 1}: {why}.\n    {printable}\n    {' ' * at}^")
+
 
 Padding = Literal["stream", "causal", "mirror"]
 Norm = Literal["batch", "layer"]
@@ -55,7 +141,7 @@ TABLE3_MISPRINT = ("100_151", (32, 48))
 
 @dataclass(frozen=True)
 class ConvLayer:
-    """One block: ``filters`` kernels of ``kernel`` taps, ``dilation`` samples apart."""
+    """Convolution layer: ``filters`` kernels of ``kernel`` taps, ``dilation`` samples apart."""
 
     kernel: int
     dilation: int
@@ -73,7 +159,7 @@ class Arch:
 
     ``window`` and ``step`` are in samples. ``pool`` exists under ``stream`` only: the positions that the mean
     runs over. Left at None it becomes the largest multiple of ``step`` that keeps the span within the window;
-    where the receptive field leaves no room for that, the window rounded down to a multiple of ``step``.
+    where the receptive field leaves no space for that, the window rounded down to a multiple of ``step``.
     """
 
     layers: tuple[ConvLayer, ...]
@@ -105,8 +191,8 @@ class Arch:
                     "whole window: leave pool out."
                 )
         elif self.pool is None:
-            room = self.window - self.receptive_field + 1
-            object.__setattr__(self, "pool", (room if room >= self.step else self.window) // self.step * self.step)
+            free = self.window - self.receptive_field + 1
+            object.__setattr__(self, "pool", (free if free >= self.step else self.window) // self.step * self.step)
         else:
             _in_range("pool", self.pool, self.step, 1_000_000)
             if self.pool % self.step:
@@ -130,7 +216,7 @@ class Arch:
         step: int = 5,
         pool: int | None = None,
     ) -> Arch:
-        """A network from its symbol and its filter counts (``(8, 12)`` or ``"8,12"``; extra are ignored).
+        """Return a network from its symbol and its filter counts (``(8, 12)`` or ``"8,12"``; extra are ignored).
 
         Raises:
             ArchError: with the symbol and a caret under the place, or saying which setting does not fit.
@@ -246,7 +332,7 @@ class Arch:
         ``stream``: a ring of reach + 1 samples before each layer, and pool / step block sums of 16 bits for
         each feature. Otherwise the ring of the window, without the activations that are recomputed from it.
         What a toy really needs is a little more (rings filled up to fours, the clock, sums, probabilities):
-        `plushsense.models.image.memory_bytes`.
+        `plushsense.runtime.image.memory_bytes`.
         """
         if self.pool is None:
             return self.window * self.channels
@@ -255,7 +341,10 @@ class Arch:
 
     @property
     def table3(self) -> str | None:
-        """What the paper's Table 3 prints for this network ("13.2k"); None where it is not in the table."""
+        """Parameter count that the paper's Table 3 prints for this network ("13.2k").
+
+        None where it is not in the table.
+        """
         if (self.channels, self.classes) != (11, 18):
             return None
         for row, spec in enumerate(PAPER_FILTERS):
@@ -264,7 +353,7 @@ class Arch:
         return None
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, ready for JSON; the layers as their symbol."""
+        """Return plain values, ready for JSON; the layers as their symbol."""
         return {
             "symbol": self.symbol,
             "filters": list(self.filters),
@@ -279,7 +368,7 @@ class Arch:
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> Arch:
-        """The network that ``to_dict`` described; ArchError for a missing, unknown or unfit key."""
+        """Return the network that ``to_dict`` described; raise ArchError for a missing, unknown or unfit key."""
         known = ("symbol", "filters", "channels", "classes", "padding", "norm", "window", "step", "pool")
         for key in table:
             if key not in known:
@@ -297,7 +386,7 @@ class Arch:
 
 
 def reflected(length: int, left: int) -> NDArray[np.intp]:
-    """Indices that extend ``length`` samples by ``left`` mirrored ones, (left + length,).
+    """Return the indices (left + length,) that extend ``length`` samples by ``left`` mirrored ones.
 
     The edge sample is not repeated; where the samples do not suffice they are reflected again, as
     ``numpy.pad`` does with mode ``reflect``.

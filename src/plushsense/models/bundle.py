@@ -6,12 +6,9 @@ content and tensors, and the content. Never pickle. The same bundle gives the sa
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import math
-import os
-import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,8 +21,9 @@ from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
 from plushsense.core.errors import BadInput, BundleError
+from plushsense.core.files import write_file
 from plushsense.core.gestures import GestureSet
-from plushsense.core.signal import Layout
+from plushsense.core.layouts import Layout
 from plushsense.models.arch import Arch
 from plushsense.models.reference import Network, check_weights
 from plushsense.windows.features import Scaler
@@ -43,7 +41,7 @@ class Bundle:
     live decisions are smoothed, where the weights come from (data set hash, subjects, code version, split,
     scores). ``calibration`` says what 8 bits have to hold in a deployed network (``deploy/quantize``): ranges of the
     training windows, nobody's samples. It may be empty, and is in bundles of before. ``personal`` says to whom the
-    dense layer was adapted, and what it was before (`plushsense.live.personal`); empty: to nobody.
+    dense layer was adapted, and what it was before (`plushsense.live.adaptation`); empty: to nobody.
 
     Raises:
         BundleError: when the parts do not fit each other.
@@ -82,11 +80,11 @@ class Bundle:
 
     @property
     def adapted_to(self) -> str | None:
-        """The code of the person to whom it was adapted, "somebody" where that is not told; None: to nobody."""
+        """Code of the person to whom it was adapted, "somebody" where it is unknown; None: not adapted."""
         return str(self.personal.get("subject", "somebody")) if self.personal else None
 
     def network(self) -> Network:
-        """The network in NumPy, ready to answer."""
+        """Return the network in NumPy."""
         return Network(self.arch, self.weights)
 
     def save(self, path: str | Path) -> Path:
@@ -97,19 +95,11 @@ class Bundle:
         """
         path = Path(path)
         data = self.to_bytes()
-        part = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.part")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            with part.open("wb") as out:
-                out.write(data)
-                out.flush()
-                os.fsync(out.fileno())
-            part.replace(path)
+            write_file(path, data)
         except OSError as cause:
             raise BundleError(f"The bundle '{path}' cannot be written ({cause}): choose another place.") from None
-        finally:
-            with contextlib.suppress(OSError):
-                part.unlink(missing_ok=True)
         return path
 
     @classmethod
@@ -134,7 +124,7 @@ class Bundle:
 
     @classmethod
     def from_bytes(cls, data: bytes, path: str | Path = "in memory") -> Bundle:
-        """The bundle that ``to_bytes`` wrote; ``path`` names it in errors.
+        """Return the bundle that ``to_bytes`` wrote; ``path`` names it in errors.
 
         Raises:
             BundleError: as for ``load``.
@@ -178,7 +168,7 @@ class Bundle:
         return bundle
 
     def _implied(self) -> dict[str, Any]:
-        """What follows from the parts, written out for readers in other languages."""
+        """Return what follows from the parts, for readers in other languages."""
         return {
             "features": list(self.layout.inputs),
             "clock": {
@@ -192,7 +182,7 @@ class Bundle:
         }
 
     def to_bytes(self) -> bytes:
-        """What ``save`` writes."""
+        """Return the bytes of the file that ``save`` writes."""
         content: dict[str, Any] = _plain(
             {
                 "arch": self.arch.to_dict(),
@@ -218,7 +208,7 @@ class Bundle:
 
 
 def _header(data: bytes, path: str | Path) -> dict[str, Any]:
-    """The JSON of a bundle, once the length of the file is known to be right."""
+    """Return the JSON header of a bundle, after checking the length of the file."""
     stranger = f"'{path}' is not a PlushSense bundle: give a *.plush file made by plushsense train"
     length = int.from_bytes(data[:8], "little")
     if len(data) < 10 or data[8:9] != b"{":
@@ -262,7 +252,7 @@ def _digest(content: str, weights: Mapping[str, NDArray[Any]]) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """A value for JSON: NumPy and paths made plain, keys text, numbers that are not finite null."""
+    """Return a value ready for JSON: NumPy and paths made plain, keys text, numbers that are not finite null."""
     if isinstance(value, Mapping):
         return {str(k): _plain(v) for k, v in value.items()}
     if isinstance(value, np.ndarray):

@@ -1,4 +1,4 @@
-"""The network in PyTorch's own layers: the same numbers as ``models/reference`` to 1e-5.
+"""Network of PyTorch layers, equal to `plushsense.models.reference` to 1e-5.
 
 Training begins from its weights; what ``training/fast`` cannot do (see ``training/engine``) trains with its layers.
 
@@ -14,7 +14,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.extras import need
+from plushsense.core.errors import need
 from plushsense.models.arch import NORM_EPSILON, Arch
 from plushsense.models.reference import check_weights, check_windows
 
@@ -28,7 +28,7 @@ from torch.nn import functional as F
 
 
 def _mirrored(x: Tensor, left: int) -> Tensor:
-    """``x`` (N, C, 1, T) extended as ``models.arch.reflected`` says; flipping trains faster than an index."""
+    """Extend ``x`` (N, C, 1, T) as `models.arch.reflected` does; flipping trains faster than an index."""
     while left:
         some = min(left, x.shape[3] - 1)
         x = torch.cat([x[..., 1 : some + 1].flip(3), x], dim=3)
@@ -76,7 +76,7 @@ class Net(nn.Module):
         self.dense = nn.Linear(arch.filters[-1], arch.classes)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Logits (N, K); of windows longer than the span the last ``arch.span`` samples are read."""
+        """Return logits (N, K); of windows longer than the span the last ``arch.span`` samples are read."""
         check_windows(self.arch, tuple(x.shape))
         z = x[:, :, x.shape[2] - self.arch.span :].unsqueeze(2).contiguous(memory_format=torch.channels_last)
         for block in self.blocks:
@@ -84,7 +84,7 @@ class Net(nn.Module):
         return cast(Tensor, self.dense(z.mean(dim=(2, 3))))
 
     def _tensors(self) -> dict[str, Tensor]:
-        """The tensors by their names in a weights dict; ``conv.weight`` is (F, C, 1, K) here."""
+        """Return the tensors by their names in a weights dict; ``conv.weight`` is (F, C, 1, K) here."""
         named: dict[str, Tensor] = {"dense.weight": self.dense.weight, "dense.bias": self.dense.bias}
         for i, module in enumerate(self.blocks):
             block = cast(_Block, module)
@@ -93,7 +93,7 @@ class Net(nn.Module):
         return {name: named[name] for name in self.arch.weight_shapes}
 
     def export_weights(self) -> dict[str, NDArray[np.float32]]:
-        """A copy of the weights as float32 arrays, as ``models/reference`` and the bundle take them."""
+        """Return a copy of the weights as float32 arrays, as ``models.reference`` and the bundle take them."""
         shapes = self.arch.weight_shapes
         return {
             name: np.array(tensor.detach().cpu().numpy(), dtype=np.float32).reshape(shapes[name])

@@ -1,4 +1,4 @@
-"""What a network means, in NumPy floats: the answer to a window, and the same answer sample by sample.
+"""Reference of the networks in NumPy floats: logits of whole windows, and the same logits sample by sample.
 
 Everything is computed in float64 from float32 weights, time-major inside. ``Network.forward`` reads windows;
 a ``Stepper`` reads a stream and keeps what the next decision still needs.
@@ -16,7 +16,75 @@ from numpy.typing import ArrayLike, NDArray
 
 from plushsense.core.errors import BadInput, BundleError
 from plushsense.models.arch import NORM_EPSILON, Arch, ConvLayer, reflected
-from plushsense.models.state import CHUNK, Floats, Pool, Ring
+
+Floats = NDArray[np.float64]
+
+CHUNK = 256  # samples that are worked on at once: their taps stay in the cache
+
+
+class SampleRing:
+    """Ring buffer of the samples that a layer still reads.
+
+    Rows move to the front only when the space behind them is used up.
+    """
+
+    def __init__(self, layer: ConvLayer, channels: int) -> None:
+        self.layer = layer
+        self.rows = np.zeros((layer.reach + 2 * CHUNK, channels))
+        self.end = 0
+
+    def feed(self, x: Floats) -> Floats:
+        """Add rows (n, C); return the taps (m, kernel · C) of the positions that they complete."""
+        reach = self.layer.reach
+        if self.end + len(x) > len(self.rows):
+            kept = min(reach, self.end)
+            self.rows[:kept] = self.rows[self.end - kept : self.end]
+            self.end = kept
+        first = max(self.end - reach, 0)
+        self.rows[self.end : self.end + len(x)] = x
+        self.end += len(x)
+        n, c = self.end - reach - first, self.rows.shape[1]
+        if n <= 0:
+            return np.empty((0, self.layer.kernel * c))
+        row = 8 * c
+        shape, strides = (n, self.layer.kernel, c), (row, self.layer.dilation * row, 8)
+        return np.ndarray(shape, np.float64, self.rows, first * row, strides).reshape(n, -1)
+
+
+class Pool:
+    """The running mean of the last ``blocks`` · ``step`` rows, from one sum a step.
+
+    Sums are only ever added up anew, never subtracted, so that nothing drifts.
+    """
+
+    def __init__(self, step: int, blocks: int, features: int) -> None:
+        self.step = step
+        self.blocks = blocks
+        self.done = np.empty((0, features))  # sums of whole steps, at most blocks − 1
+        self.open = np.zeros(features)  # sum of the step that is filling
+        self.held = 0
+
+    def feed(self, z: Floats) -> Floats:
+        """Add rows (n, F); return the mean (m, F) at each step that they complete, once all blocks are there."""
+        if self.held + len(z) < self.step:
+            self.open = self.open + z.sum(axis=0)
+            self.held += len(z)
+            return z[:0]
+        head = self.step - self.held
+        whole = (len(z) - head) // self.step
+        rest = z[head + whole * self.step :]
+        first = self.open + z[:head].sum(axis=0)
+        others = z[head : head + whole * self.step].reshape(whole, self.step, z.shape[1]).sum(axis=1)
+        sums = np.concatenate([self.done, first[None], others])
+        self.open, self.held = rest.sum(axis=0), len(rest)
+        self.done = sums[max(len(sums) - self.blocks + 1, 0) :]
+        n = len(sums) - self.blocks + 1
+        if n <= 0:
+            return z[:0]
+        row, item = sums.strides
+        runs = np.ndarray((n, self.blocks, sums.shape[1]), np.float64, sums, 0, (row, row, item))
+        return np.asarray(runs.sum(axis=1) / (self.blocks * self.step))
+
 
 Weights = Mapping[str, NDArray[np.float32]]
 
@@ -24,7 +92,7 @@ _TAPS_BYTES = 2 << 20
 
 
 def softmax(logits: NDArray[np.floating[Any]]) -> Floats:
-    """Probabilities from logits over the last axis."""
+    """Return probabilities from logits over the last axis."""
     shifted = np.exp(np.asarray(logits, dtype=np.float64) - np.max(logits, axis=-1, keepdims=True))
     return np.asarray(shifted / shifted.sum(axis=-1, keepdims=True))
 
@@ -49,7 +117,7 @@ def check_weights(arch: Arch, weights: Mapping[str, NDArray[Any]]) -> None:
 
 @dataclass(frozen=True)
 class _Block:
-    """One layer ready to compute: ``matrix`` (kernel · channels, filters), taps outermost."""
+    """Layer ready to compute: ``matrix`` (kernel · channels, filters), taps outermost."""
 
     layer: ConvLayer
     matrix: Floats
@@ -71,13 +139,13 @@ class _Block:
         return cls(layer, matrix.astype(np.float64), bias, gain, shift, arch.norm == "layer")
 
     def rectified(self, taps: Floats) -> Floats:
-        """Convolution and ReLU: taps (n, kernel · channels) → (n, filters)."""
+        """Compute convolution and ReLU: taps (n, kernel · channels) → (n, filters)."""
         out = taps @ self.matrix
         out += self.bias
         return np.maximum(out, 0.0, out=out)
 
     def __call__(self, taps: Floats) -> Floats:
-        """The whole block: taps (n, kernel · channels) → (n, filters)."""
+        """Compute the whole block: taps (n, kernel · channels) → (n, filters)."""
         out = self.rectified(taps)
         if self.per_step:
             out -= out.mean(axis=-1, keepdims=True)
@@ -88,7 +156,7 @@ class _Block:
 
 
 def taps_of(x: Floats, layer: ConvLayer) -> Floats:
-    """What each position of a layer reads: (N, T, C) → (N, T − reach, kernel, C), a view."""
+    """Return a view of the samples that each position of a layer reads: (N, T, C) → (N, T − reach, kernel, C)."""
     x = np.ascontiguousarray(x)
     n, t, c = x.shape
     batch, row, item = x.strides
@@ -105,7 +173,7 @@ def _padded(x: Floats, arch: Arch, reach: int) -> Floats:
 
 
 def _through(x: Floats, block: _Block, arch: Arch) -> Floats:
-    """One block over whole windows, (N, T, C) → (N, T', filters), a few windows at a time."""
+    """Apply one block to whole windows, (N, T, C) → (N, T', filters), a few windows at a time."""
     taps = taps_of(_padded(x, arch, block.layer.reach), block.layer)
     n, t, width = len(taps), taps.shape[1], len(block.matrix)
     out = np.empty((n, t, block.layer.filters))
@@ -131,7 +199,7 @@ class Network:
         self._bias = weights["dense.bias"].astype(np.float64)
 
     def forward(self, x: NDArray[np.floating[Any]]) -> Floats:
-        """Logits (N, K) of scaled windows (N, C, T); the last ``arch.span`` samples are read.
+        """Return logits (N, K) of scaled windows (N, C, T); the last ``arch.span`` samples are read.
 
         Raises:
             BadInput: for windows of another shape, or shorter than the span.
@@ -139,7 +207,7 @@ class Network:
         return self.classify(self.features(x))
 
     def features(self, x: NDArray[np.floating[Any]]) -> Floats:
-        """What the dense layer reads of scaled windows (N, C, T): means over time (N, F).
+        """Return the inputs of the dense layer, means over time (N, F), of scaled windows (N, C, T).
 
         Raises:
             BadInput: as `forward`.
@@ -151,7 +219,10 @@ class Network:
         return np.asarray(z.mean(axis=1))
 
     def rectified(self, x: NDArray[np.floating[Any]]) -> list[Floats]:
-        """What each layer's ReLU gives, before normalisation, of scaled windows (N, C, T): [(N, T', F)]; `stream`."""
+        """Return the ReLU outputs of each layer before normalisation, [(N, T', F)], of scaled windows (N, C, T).
+
+        ``stream`` only.
+        """
         z: Floats = np.ascontiguousarray(x.transpose(0, 2, 1), dtype=np.float64)
         seen = []
         for block in self.blocks:
@@ -161,15 +232,15 @@ class Network:
         return seen
 
     def classify(self, pooled: Floats) -> Floats:
-        """The dense layer: means over time (N, F) → logits (N, K)."""
+        """Apply the dense layer: means over time (N, F) → logits (N, K)."""
         return np.asarray(pooled @ self._dense + self._bias)
 
     def probabilities(self, x: NDArray[np.floating[Any]]) -> Floats:
-        """Class probabilities (N, K) of scaled windows (N, C, T)."""
+        """Return class probabilities (N, K) of scaled windows (N, C, T)."""
         return softmax(self.forward(x))
 
     def stepper(self) -> Stepper:
-        """A reader of one stream, warming."""
+        """Return a reader of one stream, in the state ``warming``."""
         return _Streaming(self) if self.arch.padding == "stream" else _Recomputing(self)
 
 
@@ -195,7 +266,7 @@ class Stepper(ABC):
         self.reset()
 
     def step(self, sample: ArrayLike) -> Floats | None:
-        """One sample (C,): logits (K,) when a decision is due, else None."""
+        """Read one sample (C,); return logits (K,) when a decision is due, else None."""
         one = np.asarray(sample, dtype=np.float64)
         if one.shape != (self.arch.channels,):
             raise BadInput(
@@ -207,7 +278,7 @@ class Stepper(ABC):
         return due[0] if len(due) else None
 
     def push(self, samples: ArrayLike) -> list[Floats]:
-        """Samples (n, C) at once: the logits of every decision that ``step`` would have made, in order."""
+        """Read samples (n, C) at once; return the logits of every decision that ``step`` would have made, in order."""
         block = np.asarray(samples, dtype=np.float64)
         if block.ndim != 2 or block.shape[1] != self.arch.channels:
             raise BadInput(
@@ -227,7 +298,7 @@ class Stepper(ABC):
         return "ready" if self.seen >= self.arch.span else "warming"
 
     def reset(self) -> None:
-        """Forget everything: after a gap, a clock reset, a reconnection."""
+        """Forget the past: after a gap, a clock reset, a reconnection."""
         self.seen = 0
         self._clear()
 
@@ -236,7 +307,7 @@ class Stepper(ABC):
 
     @abstractmethod
     def _advance(self, chunk: Floats) -> Floats:
-        """Take at most CHUNK samples in; logits (decisions, K)."""
+        """Read at most CHUNK samples; return logits (decisions, K)."""
 
 
 class _Streaming(Stepper):
@@ -244,7 +315,7 @@ class _Streaming(Stepper):
 
     def _clear(self) -> None:
         arch = self.arch
-        self._rings = [Ring(layer, read) for layer, read in zip(arch.layers, arch.inputs, strict=True)]
+        self._rings = [SampleRing(layer, read) for layer, read in zip(arch.layers, arch.inputs, strict=True)]
         self._pool = Pool(arch.step, arch.pooled // arch.step, arch.filters[-1])
 
     def _advance(self, chunk: Floats) -> Floats:
@@ -261,7 +332,7 @@ class _Recomputing(Stepper):
     """``mirror`` and ``causal``: each decision computes the whole window again."""
 
     def _clear(self) -> None:
-        self._ring = Ring(ConvLayer(self.arch.window, 1, 1), self.arch.channels)
+        self._ring = SampleRing(ConvLayer(self.arch.window, 1, 1), self.arch.channels)
 
     def _advance(self, chunk: Floats) -> Floats:
         windows = self._ring.feed(chunk)
@@ -271,7 +342,9 @@ class _Recomputing(Stepper):
 
 
 def random_weights(arch: Arch, seed: int) -> dict[str, NDArray[np.float32]]:
-    """Weights such as training leaves: norm statistics that fit, uneven gains, logits of a few units.
+    """Return random weights with the statistics that training leaves.
+
+    Fitting norms, uneven gains, logits of a few units.
 
     For tests and for measuring; they know no gesture.
     """

@@ -1,4 +1,4 @@
-"""Taking up a session's folder: a new one is made, an interrupted one is mended and goes on where it stood."""
+"""Open a session's folder: create a new one, or repair and continue an interrupted one."""
 
 from __future__ import annotations
 
@@ -12,43 +12,51 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from plushsense.core.errors import DatasetError
+from plushsense.core.errors import DatasetError, PlushSenseError
+from plushsense.core.files import PART
 from plushsense.core.gestures import NOBODY
-from plushsense.core.recfile import STREAM_NAME, parse_name
-from plushsense.core.signal import HOST_MS, Layout
+from plushsense.core.layouts import HOST_MS, Layout
+from plushsense.core.recorder_csv import STREAM_NAME, parse_name
 from plushsense.devices.base import now_ms
-from plushsense.recording.protocol import Protocol
-from plushsense.recording.sessionfile import SESSION_HEAD, SESSION_LOG, SIDECAR, Event, SessionHead, read_events
-from plushsense.recording.writer import NEW, PART, LogFile
+from plushsense.recording.plan import Protocol
+from plushsense.recording.session_files import (
+    SESSION_HEAD,
+    SESSION_LOG,
+    SIDECAR,
+    SessionEvent,
+    SessionHead,
+    read_events,
+)
+from plushsense.recording.writer import LogFile
 
 LOCK = "session.lock"
 TORN = ".torn"
 _KEPT_BYTES = 4096
 _RESERVED = re.compile(r"(?i)con|prn|aux|nul|(com|lpt)\d")
-"""What no folder can be called on Windows."""
+"""Names that Windows reserves."""
 
 Key = tuple[str, int]
-"""A recording to be made: its gesture and its repetition."""
+"""A planned recording: its gesture and its repetition."""
 
 
 @dataclass
-class Standing:
-    """Where a session stands: the recording of each step, what was skipped, and what had to be mended.
+class SessionProgress:
+    """The state of a session: the recording of each step, the skipped steps, and repairs after a crash.
 
-    ``rows`` and ``host_ms``: rows of the stream so far, and the last one's time. ``mended``: sentences for the person.
+    ``rows``: rows of the stream; ``host_ms``: time of the last one; ``repairs``: sentences for the person.
     """
 
     takes: dict[Key, str] = field(default_factory=dict)
     skipped: set[Key] = field(default_factory=set)
-    aside: dict[Key, list[str]] = field(default_factory=dict)
+    discarded: dict[Key, list[str]] = field(default_factory=dict)
     rows: int = 0
     host_ms: int = 0
     resumed: bool = False
-    mended: list[str] = field(default_factory=list)
+    repairs: list[str] = field(default_factory=list)
 
 
 def check_subject(code: str) -> str:
-    """A person's code; refused when it looks like a name.
+    """Return a person's code; refuse one that looks like a name.
 
     Raises:
         DatasetError: for two words, a word without a digit, or more than 16 characters.
@@ -64,7 +72,7 @@ def check_subject(code: str) -> str:
 
 
 def check_session(name: str) -> str:
-    """A session's name as a folder name; DatasetError for one that cannot be."""
+    """Return a session's name if it can be a folder name, else raise DatasetError."""
     if re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,31}", name, re.ASCII) is None or _RESERVED.fullmatch(name):
         raise DatasetError(
             f"'{name}' is no name for a session: give at most 32 letters and digits, such as 1 or autumn."
@@ -73,9 +81,9 @@ def check_session(name: str) -> str:
 
 
 def session_names(person: Path) -> list[str]:
-    """The sessions in a person's folder, in the order in which they were begun.
+    """Return the sessions in a person's folder, in the order in which they were begun.
 
-    Numbers say it where all are numbers: a computer without a battery for its clock may think that it is yesterday.
+    Numeric names are sorted by number, since the clock of a computer without a clock battery may be wrong.
     """
     found = []
     for folder in sorted(person.iterdir()) if person.is_dir() else ():
@@ -88,7 +96,7 @@ def session_names(person: Path) -> list[str]:
 
 
 def is_finished(folder: Path) -> bool:
-    """Whether the session in ``folder`` came to its end."""
+    """Return whether the session in ``folder`` was completed."""
     finished = False
     for event in read_events(folder):
         finished = event.what == "finished" or (finished and event.what not in ("redo", "go"))
@@ -96,7 +104,7 @@ def is_finished(folder: Path) -> bool:
 
 
 def next_session(person: Path) -> str:
-    """The session to take up: the last one when it is unfinished, else a new number."""
+    """Return the name of the session to continue: the last one if it is unfinished, else a new number."""
     names = session_names(person)
     if names and not is_finished(person / names[-1]):
         return names[-1]
@@ -104,7 +112,7 @@ def next_session(person: Path) -> str:
 
 
 def new_session(person: Path) -> str:
-    """A number for a new session, after all that are there."""
+    """Return an unused number for a new session."""
     taken = {p.name for p in person.iterdir()} if person.is_dir() else set()
     number = 1
     while str(number) in taken:
@@ -113,16 +121,16 @@ def new_session(person: Path) -> str:
 
 
 class OpenSession:
-    """A session's folder, held by this process alone until it is closed.
+    """A session's folder, locked by this process until it is closed.
 
     Attributes:
-        folder, head, layout, protocol: the session's.
-        standing: where it stood when it was taken up.
-        log: to append events to.
+        folder, head, layout, protocol: those of the session.
+        progress: its state when it was opened.
+        log: the log to append events to.
     """
 
     def __init__(self, folder: Path, head: SessionHead | None = None) -> None:
-        """Make the session of ``head`` in ``folder``, or take up the one that is there.
+        """Create the session of ``head`` in ``folder``, or open the existing one.
 
         Raises:
             DatasetError: when another program has it, ``head`` is of another session, or the disk refuses.
@@ -148,7 +156,7 @@ class OpenSession:
             _end_torn_line(folder / SESSION_LOG)
             self.log = LogFile(folder)
             try:
-                self.standing = _mend(folder, self.layout, self.log)
+                self.progress = _repair(folder, self.layout, self.log)
             except BaseException:
                 self.log.close()
                 raise
@@ -175,7 +183,7 @@ class OpenSession:
         return self._joined(known, given)
 
     def _joined(self, known: SessionHead, given: SessionHead) -> SessionHead:
-        """The head as it stands, with what only now is said; refused where both say something else."""
+        """Return the stored head, completed by what only the new one states; refuse contradictions."""
         added: dict[str, Any] = {}
         for key, option in (
             ("subject", "--subject"),
@@ -186,12 +194,12 @@ class OpenSession:
             ("consent", "--consent"),
         ):
             old, new = getattr(known, key), getattr(given, key)
-            old_said, new_said = json.loads(json.dumps([old, new]))
-            if old_said == new_said or not new:
+            old_json, new_json = json.loads(json.dumps([old, new]))
+            if old_json == new_json or not new:
                 continue
             if old:
-                shown = [v["name"] if isinstance(v, dict) and "name" in v else v for v in (old, new)]
-                differs = f"{shown[0]!r}, not {shown[1]!r}" if shown[0] != shown[1] else "another one of that name"
+                names = [v["name"] if isinstance(v, dict) and "name" in v else v for v in (old, new)]
+                differs = f"{names[0]!r}, not {names[1]!r}" if names[0] != names[1] else "another one of that name"
                 raise DatasetError(
                     f"The session '{self.folder}' was begun with the {key.replace('_', ' ')} {differs}: "
                     f"leave {option} as it was, or begin a new session (--new)."
@@ -207,13 +215,13 @@ class OpenSession:
         return known
 
     def close(self) -> None:
-        """Let go of the folder. Closing twice is harmless."""
+        """Release the folder. Closing twice is harmless."""
         self.log.close()
         self._release()
 
     def _release(self) -> None:
         if self._lock.is_locked:
-            # Unlinked while it is held: who opened it meanwhile sees that and tries again. Windows unlinks it itself.
+            # Unlinked while locked: a process that opened it meanwhile notices and tries again. Windows unlinks it.
             if os.name == "posix":
                 with contextlib.suppress(OSError):
                     (self.folder / LOCK).unlink()
@@ -225,7 +233,7 @@ def _refused(folder: Path, cause: Exception) -> str:
 
 
 def _end_torn_line(path: Path) -> None:
-    """A log line that a crash tore is ended, so that the next one stands alone; readers pass over it."""
+    """End a log line that a crash cut off, so that the next one is separate; readers skip it."""
     if path.is_file() and path.stat().st_size:
         with path.open("rb+") as file:
             file.seek(-1, os.SEEK_END)
@@ -233,30 +241,31 @@ def _end_torn_line(path: Path) -> None:
                 file.write(b"\n")
 
 
-def _mend(folder: Path, layout: Layout, log: LogFile) -> Standing:
-    """Where the session stands, by its log and its files; what a crash left is put right, each time with an event."""
-    standing = Standing(resumed=(folder / STREAM_NAME).exists() or any(True for _ in read_events(folder)))
-    started, made = replay_log(folder, standing)
-    _mend_stream(folder / STREAM_NAME, layout, standing, log)
+def _repair(folder: Path, layout: Layout, log: LogFile) -> SessionProgress:
+    """Return the progress of a session by its log and files; repair what a crash left and log each repair."""
+    progress = SessionProgress(resumed=(folder / STREAM_NAME).exists() or any(True for _ in read_events(folder)))
+    started, made = replay_log(folder, progress)
+    _repair_stream(folder / STREAM_NAME, layout, progress, log)
     for path in sorted(folder.iterdir()):
-        if path.name.endswith((PART, NEW)):
+        # ".new" was written by earlier versions.
+        if path.name.endswith((PART, ".new")):
             log.write([_event("mended", file=path.name, bytes=path.stat().st_size, how="unfinished file removed")])
             path.unlink()
-    _mend_takes(folder, standing, log, made)
+    _repair_takes(folder, progress, log, made)
     for path in sorted(folder.glob(f"*{SIDECAR}")):
         csv = path.with_suffix(".csv")
-        # One whose recording was finished once is kept: the recording may be somewhere else, or come back.
+        # The sidecar of a recording that was finished once is kept: the recording may come back.
         if path.name != SESSION_HEAD and csv.name not in made and not csv.exists():
             log.write([_event("mended", file=path.name, how="sidecar without a recording removed")])
             path.unlink()
-    if started is not None and started not in standing.takes:
+    if started is not None and started not in progress.takes:
         log.write([_event("unfinished", gesture=started[0], repetition=started[1])])
-        standing.mended.append(f"'{started[0]}', {started[1]}, was broken off: it is to be made again")
-    return standing
+        progress.repairs.append(f"'{started[0]}', {started[1]}, was broken off: it is to be made again")
+    return progress
 
 
-def _event(what: str, **more: Any) -> Event:
-    return Event(what, now_ms(), more)
+def _event(what: str, **more: Any) -> SessionEvent:
+    return SessionEvent(what, now_ms(), more)
 
 
 def _key(more: dict[str, Any]) -> Key | None:
@@ -264,50 +273,50 @@ def _key(more: dict[str, Any]) -> Key | None:
     return (gesture, repetition) if isinstance(gesture, str) and isinstance(repetition, int) else None
 
 
-def replay_log(folder: Path, standing: Standing) -> tuple[Key | None, dict[str, Key]]:
-    """Bring ``standing`` to what the log says.
+def replay_log(folder: Path, progress: SessionProgress) -> tuple[Key | None, dict[str, Key]]:
+    """Update ``progress`` by the events of the log.
 
     Returns:
-        The recording that was begun and never ended, and every file that ever was finished with what it is of.
+        The recording that was begun and never ended, and the key of every file that was ever finished.
     """
     of: dict[str, Key] = {}
     open_key: Key | None = None
     for event in read_events(folder):
-        key, file = _key(event.more), str(event.more.get("file") or "")
+        key, file = _key(event.details), str(event.details.get("file") or "")
         if event.what == "start":
             open_key = key
         elif event.what in ("take", "abandon", "unfinished"):
             open_key = None
         if event.what == "take" and key is not None and file:
             of[file] = key
-            standing.takes[key] = file
-            standing.skipped.discard(key)
+            progress.takes[key] = file
+            progress.skipped.discard(key)
         elif event.what == "redo" and file in of:
-            standing.aside.setdefault(of[file], []).append(file)
-            if standing.takes.get(of[file]) == file:
-                del standing.takes[of[file]]
+            progress.discarded.setdefault(of[file], []).append(file)
+            if progress.takes.get(of[file]) == file:
+                del progress.takes[of[file]]
         elif event.what == "keep" and file in of:
-            if file in (aside := standing.aside.get(of[file], [])):
+            if file in (aside := progress.discarded.get(of[file], [])):
                 aside.remove(file)
-            standing.takes[of[file]] = file
+            progress.takes[of[file]] = file
         elif event.what == "skip" and key is not None:
-            standing.skipped.add(key)
+            progress.skipped.add(key)
     return open_key, of
 
 
-def _mend_stream(path: Path, layout: Layout, standing: Standing, log: LogFile) -> None:
-    """Count the stream's rows; a torn last line is kept in the log and cut off, so that the next row stands alone."""
+def _repair_stream(path: Path, layout: Layout, progress: SessionProgress, log: LogFile) -> None:
+    """Count the stream's rows; move an incomplete last line to the log, so that the next row is separate."""
     if not path.exists():
         return
     with path.open("rb+") as file:
         last = b""
         whole = size = 0
         while block := file.read(1 << 20):
-            standing.rows += block.count(b"\n")
+            progress.rows += block.count(b"\n")
             end = block.rfind(b"\n")
             if end >= 0:
                 tail = last + block[:end]
-                standing.host_ms = _host_ms(tail[tail.rfind(b"\n") + 1 :], layout) or standing.host_ms
+                progress.host_ms = _host_ms(tail[tail.rfind(b"\n") + 1 :], layout) or progress.host_ms
                 last = block[end + 1 :]
                 whole = size + end + 1
             else:
@@ -318,7 +327,7 @@ def _mend_stream(path: Path, layout: Layout, standing: Standing, log: LogFile) -
             log.write([_event("mended", file=path.name, how="torn last line cut off", bytes=size - whole, text=kept)])
             file.truncate(whole)
             os.fsync(file.fileno())
-            standing.mended.append(f"the last line of {path.name} was torn and is cut off ({size - whole} bytes)")
+            progress.repairs.append(f"the last line of {path.name} was torn and is cut off ({size - whole} bytes)")
 
 
 def _host_ms(line: bytes, layout: Layout) -> int:
@@ -329,10 +338,10 @@ def _host_ms(line: bytes, layout: Layout) -> int:
     return 0
 
 
-def _mend_takes(folder: Path, standing: Standing, log: LogFile, made: dict[str, Key]) -> None:
-    """Look at every recording: one that the log does not know is taken in, one that is not whole is set aside."""
-    known = {file: key for key, file in standing.takes.items()}
-    known |= {file: key for key, files in standing.aside.items() for file in files}
+def _repair_takes(folder: Path, progress: SessionProgress, log: LogFile, made: dict[str, Key]) -> None:
+    """Check every recording: add one that the log does not know, rename one that is incomplete."""
+    known = {file: key for key, file in progress.takes.items()}
+    known |= {file: key for key, files in progress.discarded.items() for file in files}
     for path in sorted(folder.glob("*.csv"), key=lambda p: (n.epoch_ms if (n := parse_name(p.name)) else 0, p.name)):
         name = parse_name(path.name)
         if name is None:
@@ -342,17 +351,17 @@ def _mend_takes(folder: Path, standing: Standing, log: LogFile, made: dict[str, 
         if not data.endswith(b"\n") or data.count(b"\n") != name.rows + 1:
             os.replace(path, path.with_name(path.name + TORN))
             log.write([_event("mended", file=path.name, how=f"not whole: renamed to end in {TORN}")])
-            standing.mended.append(f"'{path.name}' is not whole: it is to be made again")
-            if key is not None and standing.takes.get(key) == path.name:
-                del standing.takes[key]
+            progress.repairs.append(f"'{path.name}' is not whole: it is to be made again")
+            if key is not None and progress.takes.get(key) == path.name:
+                del progress.takes[key]
             continue
         if key is not None:
             continue
         if path.name in made:
-            # It was gone, was made again, and is back: the newer one counts.
+            # It was gone, was repeated, and is back: the newer one is used.
             key = made[path.name]
             log.write([_event("redo", file=path.name, gesture=key[0], repetition=key[1], why="made again")])
-            standing.aside.setdefault(key, []).insert(0, path.name)
+            progress.discarded.setdefault(key, []).insert(0, path.name)
             continue
         try:
             sidecar = json.loads(path.with_suffix(SIDECAR).read_text(encoding="utf-8"))
@@ -362,14 +371,57 @@ def _mend_takes(folder: Path, standing: Standing, log: LogFile, made: dict[str, 
         if key is None:
             continue
         events = [_event("take", file=path.name, gesture=key[0], repetition=key[1], rows=name.rows, found=True)]
-        if key in standing.takes:
-            events.append(_event("redo", file=standing.takes[key], gesture=key[0], repetition=key[1]))
-            standing.aside.setdefault(key, []).append(standing.takes[key])
+        if key in progress.takes:
+            events.append(_event("redo", file=progress.takes[key], gesture=key[0], repetition=key[1]))
+            progress.discarded.setdefault(key, []).append(progress.takes[key])
         log.write(events)
-        standing.takes[key] = path.name
-        standing.skipped.discard(key)
-    for key, file in list(standing.takes.items()):
+        progress.takes[key] = path.name
+        progress.skipped.discard(key)
+    for key, file in list(progress.takes.items()):
         if not (folder / file).exists():
             log.write([_event("mended", file=file, how="the recording is gone", gesture=key[0], repetition=key[1])])
-            standing.mended.append(f"'{file}' is gone: it is to be made again")
-            del standing.takes[key]
+            progress.repairs.append(f"'{file}' is gone: it is to be made again")
+            del progress.takes[key]
+
+
+@dataclass(frozen=True)
+class SessionSummary:
+    """The summary of a session on disk.
+
+    Attributes:
+        folder: the session's folder.
+        head, protocol: None where they cannot be read; ``error`` is the reason.
+        done, skipped, steps: numbers of steps by its log.
+        finished: whether it was completed.
+    """
+
+    folder: Path
+    head: SessionHead | None = None
+    protocol: Protocol | None = None
+    done: int = 0
+    skipped: int = 0
+    steps: int = 0
+    finished: bool = False
+    error: str = ""
+
+
+def list_sessions(out: Path) -> list[SessionSummary]:
+    """Return all sessions in ``out``, the newest first; unreadable ones are included with the reason."""
+    found = [summarize_session(path.parent) for path in sorted(out.glob(f"*/*/{SESSION_HEAD}"))]
+    return sorted(found, key=lambda s: -(s.head.started_ms if s.head is not None else 0))
+
+
+def summarize_session(folder: Path) -> SessionSummary:
+    """Return the summary of the session in ``folder``."""
+    try:
+        head = SessionHead.read(folder)
+        if head is None:
+            return SessionSummary(folder, error=f"'{folder}' holds no session.")
+        protocol = Protocol.from_dict(head.protocol, f"protocol in '{folder / SESSION_HEAD}'")
+        progress = SessionProgress()
+        replay_log(folder, progress)
+        finished = is_finished(folder)
+    except PlushSenseError as refusal:
+        return SessionSummary(folder, error=str(refusal))
+    steps = len(protocol.steps())
+    return SessionSummary(folder, head, protocol, len(progress.takes), len(progress.skipped), steps, finished)

@@ -1,8 +1,8 @@
-"""Recording sessions of the virtual toy's people, left on disk exactly as the authors' recorder leaves them.
+"""Simulate recording sessions with the virtual toy, with the files of the authors' recorder.
 
-One folder a person, with ``<label>_<epoch ms>_<rows>.csv`` a recording and ``fulldatastream.csv`` for all that the
-toy sent, at its end some handling that is no gesture; nobody's recordings of the toy at rest are in the folder
-``none``. A score on these says nothing about a real toy.
+One folder a person, with ``<label>_<epoch ms>_<rows>.csv`` for each recording and ``fulldatastream.csv`` for the whole
+session, which ends with some handling that is no gesture; recordings of the toy at rest are in the folder ``none``.
+A score on these says nothing about a real toy.
 """
 
 from __future__ import annotations
@@ -17,35 +17,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, DatasetError
-from plushsense.core.folders import whole_folder
+from plushsense.core.files import new_folder
 from plushsense.core.gestures import NOBODY
-from plushsense.core.recfile import (
+from plushsense.core.layouts import DEVICE_MS, Layout, load_layout
+from plushsense.core.recorder_csv import (
     SIMULATION_MARK,
     STREAM_NAME,
     Frames,
+    format_header,
     format_rows,
     recording_filename,
-    write_recording,
 )
-from plushsense.core.signal import DEVICE_MS, Layout, load_layout
 from plushsense.devices.virtual.motions import AT_REST
-from plushsense.devices.virtual.people import draw_person
-from plushsense.devices.virtual.session import GESTURES, Episode, Mark, Session
+from plushsense.devices.virtual.session import GESTURES, Episode, GestureMark, VirtualSession
 from plushsense.devices.virtual.stream import channel_columns
-from plushsense.devices.virtual.world import WORLD, World
+from plushsense.devices.virtual.world import WORLD, World, draw_person
 
 START_MS = 1_760_000_000_000
-"""The first session, milliseconds since 1970: fixed, so that the same seed writes the same files."""
+"""Time of the first session, milliseconds since 1970: fixed, so that the same seed writes the same files."""
 
 HANDLED = 6
-"""So often a person takes the toy up and puts it down when all is recorded: no gesture, in the stream alone."""
+"""Number of times a person handles the toy after the recordings, which is no gesture and in the stream only."""
 
 Progress = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True)
 class SimulationSummary:
-    """What was written."""
+    """The size of a simulated data set."""
 
     folder: str
     people: int
@@ -56,13 +55,13 @@ class SimulationSummary:
     seed: int
 
     def to_dict(self) -> dict[str, str | int]:
-        """Plain values, ready for JSON."""
+        """Return plain values, ready for JSON."""
         return dataclasses.asdict(self)
 
 
 @dataclass(frozen=True)
 class _Take:
-    """One session: all frames that the recorder took in, and which rows became which recording."""
+    """A simulated session: all received frames, and the rows of each recording."""
 
     frames: Frames
     cuts: list[tuple[str, int, int]]
@@ -72,19 +71,19 @@ class _Take:
 def _session(
     who: int | None, seed: int, gestures: Sequence[str], repetitions: int, layout: Layout, world: World
 ) -> _Take:
-    """Play a session through, lose the lines that the air loses, and stamp the host's time on the rest."""
+    """Simulate a session, drop lost lines and add the host's time to the others."""
     person = None if who is None else draw_person(who, seed, world)
-    session = Session(person, seed, 0, world)
+    session = VirtualSession(person, seed, 0, world)
     episodes = [session.idle(2.0)]
     episodes += [session.perform(label, repetitions) for label in gestures]
     episodes.append(session.idle(2.0))
-    marks: list[Mark] = [m for e in episodes for m in e.marks]
+    marks: list[GestureMark] = [m for e in episodes for m in e.marks]
     number = 0 if who is None else who + 1
     order = 40 if who is None else who
     rng = np.random.default_rng([seed, number, 0xF11E])
     frames, row_of, lost = _taken_in(episodes, START_MS + order * 86_400_000, True, layout, world, rng)
     if who is not None:
-        # At the end and by chance of its own: the recordings are what they are without it.
+        # With its own random generator, so that the recordings do not depend on it.
         handling = [e for _ in range(HANDLED) for e in (session.handle(), session.idle(2.0))]
         after = int(frames.host_ms[-1]) if frames.host_ms is not None else 0
         more, _, more_lost = _taken_in(
@@ -98,11 +97,13 @@ def _session(
 def _taken_in(
     episodes: Sequence[Episode], host_ms: int, first: bool, layout: Layout, world: World, rng: np.random.Generator
 ) -> tuple[Frames, NDArray[np.int64], int]:
-    """What the recorder takes in from ``host_ms`` on (the ``first`` of a session begins some time that day): frames,
-    the frame of each row that was sent (and of the end), and how many were lost."""
+    """Return the frames received from ``host_ms`` on, the frame of each sent row and of the end, and the number lost.
+
+    The ``first`` frames of a session begin at a random time of that day.
+    """
     values = np.concatenate([e.values for e in episodes])[:, channel_columns(layout)]
     device_ms = np.concatenate([e.device_ms for e in episodes])
-    # The recorder writes the last integer of a line as it came: of firmware without a clock, the delay.
+    # The recorder writes the last integer of a line unchanged: the delay for firmware without a clock.
     written = device_ms if DEVICE_MS in layout.wire else np.concatenate([e.delay_ms for e in episodes])
     kept = rng.random(len(values)) >= world.lost + world.garbled
     begin = host_ms + (int(rng.integers(0, 20_000_000)) if first else 10)
@@ -121,7 +122,7 @@ def _joined(one: Frames, other: Frames) -> Frames:
 
 
 def _arrival(device_ms: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
-    """Host times of frames, from 0: the host's clock runs a little differently, and frames wait 0 to 6 ms."""
+    """Return the host times of frames, from 0: with a small clock drift and delays of 0 to 6 ms."""
     passed = (device_ms - device_ms[0]) * (1.0 + 4e-5 * rng.standard_normal())
     return np.maximum.accumulate(np.rint(passed + 6.0 * rng.random(len(passed))).astype(np.int64))
 
@@ -134,14 +135,12 @@ def _write(folder: Path, take: _Take, layout: Layout) -> int:
     for label, start, stop in take.cuts:
         part = take.frames.slice(start, stop)
         saved_ms = (int(host[stop - 1]) if host is not None else 0) + 25
-        write_recording(folder / recording_filename(label, saved_ms, len(part)), part, layout)
+        text = format_header(layout) + format_rows(part, layout)
+        (folder / recording_filename(label, saved_ms, len(part))).write_text(text, encoding="utf-8", newline="\n")
         rows += len(part)
-    target = folder / STREAM_NAME
-    part_file = target.with_name(STREAM_NAME + ".part")
-    with part_file.open("w", encoding="utf-8", newline="\n") as file:
+    with (folder / STREAM_NAME).open("w", encoding="utf-8", newline="\n") as file:
         for start in range(0, len(take.frames), 20_000):
             file.write(format_rows(take.frames.slice(start, start + 20_000), layout))
-    os.replace(part_file, target)
     return rows
 
 
@@ -188,8 +187,8 @@ def simulate(
     if resting > 0:
         sessions.append((NOBODY, None))
     recordings = rows = stream_rows = lost = 0
-    # Whole or not at all: a folder half full would look like a small data set.
-    with whole_folder(folder, DatasetError) as work:
+    # Whole or not at all: an incomplete folder would look like a small data set.
+    with new_folder(folder, DatasetError) as work:
         (work / SIMULATION_MARK).write_text(
             f"Recordings of the virtual toy, seed {seed}. Nobody touched anything.\n", "utf-8"
         )

@@ -1,55 +1,56 @@
-"""What a screen shows of a session: one immutable snapshot."""
+"""Immutable snapshots of a recording session, for display."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-from plushsense.recording.protocol import Step
+from plushsense.recording.plan import Step
 
-State = Literal["idle", "countdown", "recording", "saving", "paused", "finished", "stopped"]
+RecorderState = Literal["idle", "countdown", "recording", "saving", "paused", "finished", "stopped"]
 
 
 @dataclass(frozen=True)
-class StepStanding:
-    """One recording of the plan and what came of it: the file that counts ("" when there is none yet), whether it was
-    passed over, and how many files were set aside."""
+class StepResult:
+    """The state of one planned recording.
+
+    ``file`` is the recording in use ("" when there is none yet), ``discarded`` the number of discarded files.
+    """
 
     step: Step
     file: str
     skipped: bool
-    aside: int
+    discarded: int
 
 
 @dataclass(frozen=True)
-class Status:
-    """A session at one moment.
+class RecorderStatus:
+    """A snapshot of a session.
 
     Attributes:
-        state: what it is doing; "finished": all is recorded or skipped; "stopped": nothing comes or is written
-            any more (``failed`` says why where the disk is the reason, else ``message``).
-        step: the recording that is asked for, or being made; ``following``: the next one.
-        done, skipped, steps: of all recordings; ``redone``: files that were set aside.
-        already: the file of this step where it is recorded already.
-        countdown_s: left; ``elapsed_s`` of this recording; ``left_s`` until it ends by itself.
-        rate_hz, jitter_ms, signal: of the last seconds (see `plushsense.recording.meter.SIGNAL`).
-        lost, malformed, garbage, reconnects, gaps: since this program began.
-        rows: of the session's stream.
-        file: the last recording that was finished.
-        heard: frames since this program began.
-        bad_share: of the last seconds' lines, how many were lost, spoilt or out of range, 0 to 1; ``bad_ever`` since
-            this program began.
+        state: current state; "finished": all steps are recorded or skipped; "stopped": no more data come or can be
+            written (``failed`` is the reason when the disk is the cause, else ``message``).
+        step: the current step; ``next_step``: the one after it.
+        done, skipped, steps: numbers of steps; ``redone``: number of discarded files.
+        existing: the file of this step if it is recorded already.
+        countdown_s: time left; ``elapsed_s`` of this recording; ``left_s`` until it ends automatically.
+        rate_hz, jitter_ms, signal: signal quality of the last seconds (see `plushsense.recording.takes.SIGNAL`).
+        away: whether the toy is disconnected.
+        frames, lost, malformed, garbage, reconnects, gaps: numbers since this program began.
+        rows: rows of the session's stream.
+        file: the last finished recording.
+        bad_share: share of the last seconds' lines that were lost, malformed or out of range, 0 to 1.
     """
 
-    state: State
+    state: RecorderState
     step: Step
     steps: int
     repetitions: int
-    following: Step | None
+    next_step: Step | None
     done: int
     skipped: int
     redone: int
-    already: str
+    existing: str
     countdown_s: float
     elapsed_s: float
     left_s: float
@@ -67,20 +68,20 @@ class Status:
     message: str
     failed: str
     folder: str
-    heard: int = 0
+    frames: int = 0
     bad_share: float = 0.0
 
     @property
-    def bad_ever(self) -> float:
-        """See above."""
+    def bad_share_total(self) -> float:
+        """Share of all lines since this program began that were lost, malformed or out of range, 0 to 1."""
         bad = self.lost + self.malformed + self.garbage
-        return bad / max(1, self.heard + bad)
+        return bad / max(1, self.frames + bad)
 
     @property
     def seen(self) -> str:
-        """A word for what this snapshot asks for: a command given upon it means nothing any more once it differs."""
+        """An identifier of what is displayed: a command given to another display is outdated."""
         return f"{self.state}.{self.step.number}.{self.done}.{self.skipped}.{self.redone}"
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, ready for JSON."""
+        """Return plain values, ready for JSON."""
         return asdict(self)

@@ -1,31 +1,29 @@
-"""Putting a session on disk so that a crash, a pulled plug or a full disk takes at most the last second of it.
-
-Whatever is said to be written has been handed to the disk (fsync), the folder's entry too. Every function here raises
-OSError when the disk refuses; the stream is then cut back to its last whole line.
-"""
+"""Write a session's files in the background: one thread for the stream, one for everything else."""
 
 from __future__ import annotations
 
 import contextlib
+import errno
+import functools
 import json
 import os
-from collections.abc import Iterable, Sequence
+import threading
+import time
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from plushsense.core.recfile import Frames, format_rows, recording_filename, write_recording
-from plushsense.core.signal import DELAY_MS, Layout
+from plushsense.core.files import write_file
+from plushsense.core.layouts import DELAY_MS, Layout
+from plushsense.core.recorder_csv import Frames, format_rows, recording_filename, write_recording
 from plushsense.devices.base import Frame
-from plushsense.recording.sessionfile import SESSION_LOG, SIDECAR, Event
-
-PART, NEW = ".part", ".new"
-"""How files end that are not whole yet; what a crash leaves of them is removed, their rows are in the stream."""
+from plushsense.recording.session_files import SESSION_LOG, SIDECAR, SessionEvent
 
 
 def to_frames(frames: Sequence[Frame], channels: int) -> Frames:
-    """Frames of a toy as rows: ``values`` (T, channels)."""
+    """Convert a toy's frames to rows: ``values`` (T, channels)."""
     values = np.array([f.values for f in frames], dtype=np.int64).reshape(len(frames), channels)
     return Frames(
         values,
@@ -34,18 +32,13 @@ def to_frames(frames: Sequence[Frame], channels: int) -> Frames:
     )
 
 
-def sync_folder(folder: Path) -> None:
-    """Make the names in a folder as lasting as the files; Windows does so by itself."""
-    if os.name == "posix":
-        at = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(at)
-        finally:
-            os.close(at)
+def lacks_descriptor(cause: Exception) -> bool:
+    """Return whether no file descriptor was free, in the process or the system: that passes, a full disk does not."""
+    return isinstance(cause, OSError) and cause.errno in (errno.EMFILE, errno.ENFILE)
 
 
 class AppendedFile:
-    """A file that only grows, by whole lines."""
+    """A file to which whole lines are appended."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -53,14 +46,14 @@ class AppendedFile:
         self._good = self._file.seek(0, os.SEEK_END)
 
     def append(self, data: bytes) -> None:
-        """Append lines and hand them to the disk; on OSError the file is as it was before."""
+        """Append lines and flush them to the disk; on OSError the file is as before."""
         try:
             left = memoryview(data)
             while left:
                 left = left[self._file.write(left) :]
             os.fsync(self._file.fileno())
         except OSError:
-            # A disk without room still lets go of what it had begun.
+            # Truncating works on a full disk, too.
             with contextlib.suppress(OSError):
                 os.ftruncate(self._file.fileno(), self._good)
             raise
@@ -77,12 +70,12 @@ class StreamFile(AppendedFile):
     def __init__(self, path: Path, layout: Layout) -> None:
         super().__init__(path)
         self.layout = layout
-        # Delays refer to the row before: its frame is kept, so that pieces join without a seam.
+        # Delays refer to the row before, so its frame is kept.
         self._overlap = DELAY_MS in layout.csv.columns
         self._last: Frame | None = None
 
     def write(self, frames: Sequence[Frame]) -> None:
-        """Append these frames."""
+        """Append frames."""
         if not frames:
             return
         before = [self._last] if self._overlap and self._last is not None else []
@@ -92,13 +85,13 @@ class StreamFile(AppendedFile):
 
 
 class LogFile(AppendedFile):
-    """``session.jsonl``: what happened, one event a line."""
+    """``session.jsonl``: one event a line."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder / SESSION_LOG)
 
-    def write(self, events: Iterable[Event]) -> None:
-        """Append these events."""
+    def write(self, events: Iterable[SessionEvent]) -> None:
+        """Append events."""
         if data := "".join(e.to_line() for e in events).encode():
             self.append(data)
 
@@ -108,38 +101,185 @@ def save_take(
 ) -> Path:
     """Write one recording and its sidecar, each whole or not at all; nothing is ever replaced.
 
-    The sidecar comes first: a recording is what has its CSV, so a crash between the two leaves no recording without
-    its sidecar, and a sidecar alone says nothing (it is removed when the session is opened again).
+    The sidecar is written first, so that a crash leaves no recording without its sidecar; a sidecar without a recording
+    is removed when the session is opened again.
 
     Returns:
-        The CSV, named by gesture, time of saving and rows as the authors' recorder does.
+        Path of the CSV, named by gesture, time of saving and rows as in the authors' recorder.
     """
     path = folder / recording_filename(gesture, saved_ms, len(frames))
     while path.exists():
         saved_ms += 1
         path = folder / recording_filename(gesture, saved_ms, len(frames))
-    beside, fresh = path.with_suffix(SIDECAR), path.with_name(path.name + NEW)
-    part = beside.with_name(beside.name + PART)
-    done = False
+    sidecar_path = path.with_suffix(SIDECAR)
     try:
-        text = json.dumps({"file": path.name} | sidecar, ensure_ascii=False, indent=1) + "\n"
-        part.write_text(text, encoding="utf-8", newline="\n")
-        _sync(part)
-        os.replace(part, beside)
-        write_recording(fresh, frames, layout)
-        _sync(fresh)
-        sync_folder(folder)
-        os.replace(fresh, path)
-        done = True
-        sync_folder(folder)
-    finally:
-        if not done:
-            for left in (part, beside, fresh, fresh.with_name(fresh.name + PART)):
-                with contextlib.suppress(OSError):
-                    left.unlink(missing_ok=True)
+        write_file(sidecar_path, json.dumps({"file": path.name} | sidecar, ensure_ascii=False, indent=1) + "\n")
+        write_recording(path, frames, layout)
+    except BaseException:
+        if not path.exists():
+            with contextlib.suppress(OSError):
+                sidecar_path.unlink(missing_ok=True)
+        raise
     return path
 
 
-def _sync(path: Path) -> None:
-    with path.open("rb+") as file:
-        os.fsync(file.fileno())
+FLUSH_S = 0.5
+"""Longest delay before rows are written, by the computer's clock or the toy's, whichever is first."""
+
+CLOSING_S = 10.0
+"""How long a closing writer keeps trying while no file descriptor is free."""
+
+_LOOK_S = 0.05
+_RETRY_S = 0.2
+
+Job = Callable[[], None]
+
+
+class BackgroundWriter:
+    """Queue rows, events and jobs without waiting, and write them to the disk.
+
+    Args:
+        stream, log: open files; the writer closes the stream.
+        synchronous: write every row at once, and let `wait_written` wait for it; for a toy that runs faster than real
+            time, of which otherwise more than the last second could be lost.
+        on_fail: called once, in a thread of the writer, when something cannot be written; nothing is written then.
+        on_wait: called in a thread of the writer when a write or a job is repeated because no file
+            descriptor was free.
+    """
+
+    def __init__(
+        self,
+        stream: StreamFile,
+        log: LogFile,
+        *,
+        synchronous: bool,
+        on_fail: Callable[[Exception], None],
+        on_wait: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._stream = stream
+        self._log = log
+        self._synchronous = synchronous
+        self._on_fail = on_fail
+        self._on_wait = on_wait
+        self._changed = threading.Condition()
+        self._rows: list[Frame] = []
+        self._since_s = self._since_ms = self._toy_ms = 0.0
+        self._added = self._written = 0
+        self._jobs: list[tuple[int, SessionEvent | Job]] = []
+        self._closing = self._failed = False
+        self._closing_s = 0.0
+        self._threads = [
+            threading.Thread(target=self._guarded, args=(work,), name=f"plushsense-{name}", daemon=True)
+            for name, work in (("stream", self._write_stream), ("log", self._write_events))
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def add_frames(self, frames: Sequence[Frame], toy_ms: float) -> None:
+        """Queue rows for the stream; ``toy_ms`` is the toy's running time at the last of them."""
+        with self._changed:
+            if not self._rows:
+                self._since_s, self._since_ms = time.monotonic(), self._toy_ms
+            self._rows.extend(frames)
+            self._added += len(frames)
+            self._toy_ms = toy_ms
+            self._changed.notify_all()
+
+    def submit(self, job: SessionEvent | Job) -> None:
+        """Queue an event for the log, or a job, in order; a job waits for the rows added so far.
+
+        A job that fails for want of a file descriptor is done again: it must have left nothing behind.
+        """
+        with self._changed:
+            self._jobs.append((0 if isinstance(job, SessionEvent) else self._added, job))
+            self._changed.notify_all()
+
+    def wait_written(self) -> None:
+        """Wait until all rows are on disk when ``synchronous``, else return at once."""
+        if self._synchronous:
+            with self._changed:
+                while self._written < self._added and not (self._failed or self._closing):
+                    self._changed.wait(_LOOK_S)
+
+    def close(self) -> None:
+        """Write everything and end; jobs that are queued meanwhile are done, too."""
+        with self._changed:
+            if not self._closing:
+                self._closing, self._closing_s = True, time.monotonic()
+            self._changed.notify_all()
+        for thread in self._threads:
+            if thread is not threading.current_thread():
+                thread.join()
+        self._stream.close()
+
+    def _guarded(self, work: Job) -> None:
+        try:
+            work()
+        except Exception as cause:  # noqa: BLE001, RUF100
+            with self._changed:
+                first, self._failed = not self._failed, True
+                self._changed.notify_all()
+            if first:
+                self._on_fail(cause)
+
+    def _persist(self, work: Job) -> None:
+        """Repeat ``work`` while no file descriptor is free; a closing writer gives up after `CLOSING_S`."""
+        waiting = False
+        while True:
+            try:
+                work()
+                return
+            except OSError as cause:
+                if not lacks_descriptor(cause):
+                    raise
+                with self._changed:
+                    late = self._closing and time.monotonic() - self._closing_s > CLOSING_S
+                    if self._failed or late:
+                        raise
+            if not waiting:
+                waiting = True
+                self._on_wait()
+            time.sleep(_RETRY_S)
+
+    def _due(self) -> bool:
+        if not self._rows:
+            return False
+        waited = any(after > self._written for after, _ in self._jobs)
+        old = time.monotonic() - self._since_s >= FLUSH_S or self._toy_ms - self._since_ms >= 1000.0 * FLUSH_S
+        return old or waited or self._synchronous or self._closing
+
+    def _write_stream(self) -> None:
+        while True:
+            with self._changed:
+                while not (self._due() or self._closing or self._failed):
+                    self._changed.wait(_LOOK_S)
+                if self._failed or not self._rows:
+                    return
+                rows, self._rows = self._rows, []
+            self._persist(functools.partial(self._stream.write, rows))
+            with self._changed:
+                self._written += len(rows)
+                self._changed.notify_all()
+
+    def _write_events(self) -> None:
+        while True:
+            events: list[SessionEvent] = []
+            job: Job | None = None
+            with self._changed:
+                while not (self._closing or self._failed or (self._jobs and self._jobs[0][0] <= self._written)):
+                    self._changed.wait(_LOOK_S)
+                if self._failed or (self._closing and not self._jobs):
+                    return
+                if self._jobs[0][0] > self._written:
+                    self._changed.wait(_LOOK_S)
+                    continue
+                while self._jobs and isinstance(event := self._jobs[0][1], SessionEvent):
+                    events.append(event)
+                    self._jobs.pop(0)
+                if not events:
+                    first = self._jobs.pop(0)[1]
+                    assert not isinstance(first, SessionEvent)
+                    job = first
+            self._persist(functools.partial(self._log.write, events))
+            if job is not None:
+                self._persist(job)

@@ -1,17 +1,17 @@
-"""Figures that stand alone: a confusion matrix, training curves. Each is returned, never shown."""
+"""Figures that several reports share: confusion matrix and training curves; their formats, and shades for tables."""
 
 from __future__ import annotations
 
+import base64
 import io
 import warnings
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from plushsense.core.errors import ConfigError
-from plushsense.core.extras import need
-from plushsense.reports.tables import row_shares, shade
+from plushsense.core.errors import ConfigError, need
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -21,14 +21,14 @@ _TRAIN, _VALIDATION = ("#0072b2", "-", "training"), ("#d55e00", "--", "validatio
 _CELL_IN = 0.36
 
 
-def _figure(width: float, height: float) -> Figure:
-    """A figure outside pyplot: nothing global holds it, so no window opens and no memory stays."""
-    made: Figure = need("matplotlib.figure", "reports").Figure(figsize=(width, height), layout="constrained")
-    return made
+def new_figure(width: float, height: float) -> Figure:
+    """Return an empty figure of that size in inches, outside pyplot: no window opens and no global list keeps it."""
+    figure: Figure = need("matplotlib.figure", "reports").Figure(figsize=(width, height), layout="constrained")
+    return figure
 
 
 def confusion(labels: Sequence[str], counts: Any, *, title: str = "") -> Figure:
-    """A confusion matrix as a heat map: shade = share of the truth's row, figure = count, frame = right.
+    """Draw a confusion matrix as a heat map: shade is the share of the truth's row, framed cells are right.
 
     Args:
         labels: K class names in class order.
@@ -44,7 +44,7 @@ def confusion(labels: Sequence[str], counts: Any, *, title: str = "") -> Figure:
         raise ConfigError(f"A confusion matrix of {k} labels needs {k} × {k} counts (at least 1), not {table.shape}.")
     longest = max(len(label) for label in labels) * 0.085
     side = max(k * _CELL_IN, 2.0)
-    figure = _figure(side + longest + 0.9, side + longest + 0.9)
+    figure = new_figure(side + longest + 0.9, side + longest + 0.9)
     axes = figure.add_subplot()
     shares = row_shares(table)
     patch = need("matplotlib.patches", "reports").Rectangle
@@ -80,17 +80,17 @@ def confusion(labels: Sequence[str], counts: Any, *, title: str = "") -> Figure:
 
 
 def training_curves(histories: Sequence[Sequence[Mapping[str, Any]]], *, title: str = "", of: str = "folds") -> Figure:
-    """Loss and accuracy by epoch: a thin line a fold, a thick one for the mean of the folds still training.
+    """Draw loss and accuracy by epoch: thin lines for folds, a thick one for the mean of the folds still training.
 
     Args:
-        histories: one list of epochs a fold; an epoch holds epoch, train_loss, train_accuracy,
+        histories: a list of epochs for each fold; an epoch holds epoch, train_loss, train_accuracy,
             validation_loss, validation_accuracy (any may be missing or None).
         title: written above; may be empty.
         of: what a history is one of, for the legend.
     """
-    figure = _figure(9.2, 3.4)
+    figure = new_figure(9.2, 3.4)
     left, right = figure.subplots(1, 2)
-    for axes, measure, label in (
+    for axes, measure, y_label in (
         (left, "loss", "Loss (cross-entropy, nats)"),
         (right, "accuracy", "Accuracy (share of windows)"),
     ):
@@ -100,10 +100,10 @@ def training_curves(histories: Sequence[Sequence[Mapping[str, Any]]], *, title: 
                 axes.plot(epochs, values, color=colour, linewidth=0.5, alpha=0.3)
             if lines:
                 epochs, mean = _mean(lines)
-                said = f"{name}, mean of {len(lines)} {of}" if len(lines) > 1 else name
-                axes.plot(epochs, mean, style, color=colour, linewidth=2.0, label=said)
+                label = f"{name}, mean of {len(lines)} {of}" if len(lines) > 1 else name
+                axes.plot(epochs, mean, style, color=colour, linewidth=2.0, label=label)
         axes.set_xlabel("Epoch")
-        axes.set_ylabel(label)
+        axes.set_ylabel(y_label)
         axes.grid(color="#dddddd", linewidth=0.5)
         axes.spines[["top", "right"]].set_visible(False)
         axes.xaxis.get_major_locator().set_params(integer=True)
@@ -117,14 +117,14 @@ def training_curves(histories: Sequence[Sequence[Mapping[str, Any]]], *, title: 
 
 
 def _curve(history: Sequence[Mapping[str, Any]], key: str) -> tuple[Any, Any]:
-    """Epochs and finite values of one fold."""
+    """Return epochs and finite values of one fold."""
     points = [(epoch.get("epoch", i + 1), epoch[key]) for i, epoch in enumerate(history) if epoch.get(key) is not None]
     table = np.asarray([point for point in points if np.isfinite(point[1])], dtype=float).reshape(-1, 2)
     return table[:, 0], table[:, 1]
 
 
 def _mean(lines: Sequence[tuple[Any, Any]]) -> tuple[Any, Any]:
-    """Mean over the folds, as far as at least half of them train: a mean of few survivors would mislead."""
+    """Return the mean over the folds up to where half of them still train: a mean of a few would mislead."""
     epochs = np.unique(np.concatenate([line[0] for line in lines]))
     table = np.full((len(lines), epochs.size), np.nan)
     for row, (at, values) in zip(table, lines, strict=True):
@@ -134,20 +134,63 @@ def _mean(lines: Sequence[tuple[Any, Any]]) -> tuple[Any, Any]:
 
 
 def svg(figure: Figure) -> bytes:
-    """A figure as SVG, letters as outlines: it asks for no font, and the same data give the same bytes."""
+    """Return a figure as SVG with letters as outlines, so that it needs no font; equal data give equal bytes."""
     with need("matplotlib", "reports").rc_context({"svg.fonttype": "path", "svg.hashsalt": "plushsense"}):
         return _saved(figure, format="svg", metadata={"Date": None, "Creator": None})
 
 
 def png(figure: Figure, dpi: int = 90) -> bytes:
-    """A figure as PNG; the same data give the same bytes."""
+    """Return a figure as PNG; equal data give equal bytes."""
     return _saved(figure, format="png", dpi=dpi, metadata={"Software": None})
 
 
-def _saved(figure: Figure, **how: Any) -> bytes:
+def data_uri(figure: Figure) -> str:
+    """Return a figure as the data URI of its SVG, to embed in a page."""
+    return svg_uri(svg(figure))
+
+
+def svg_uri(content: bytes) -> str:
+    """Return SVG as a data URI."""
+    return "data:image/svg+xml;base64," + base64.b64encode(content).decode("ascii")
+
+
+def _saved(figure: Figure, **options: Any) -> bytes:
     out = io.BytesIO()
     with warnings.catch_warnings():
-        # A letter that the font lacks is drawn as a box; whoever named a gesture so can do nothing about it here.
+        # A letter that the font lacks is drawn as a box; the user cannot act on the warning.
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
-        figure.savefig(out, **how)
+        figure.savefig(out, **options)
     return out.getvalue()
+
+
+# The ends of a single-hue scale (ColorBrewer "Blues"): lightness alone carries the order, so it prints in
+# grey and reads with any colour vision. The count in each cell says the same in figures.
+_LIGHT, _DARK = (247, 251, 255), (8, 64, 129)
+
+
+def shade(share: float) -> tuple[str, str]:
+    """Return background and text colour (CSS) for a share of 0 to 1; their contrast is at least 4.5 : 1."""
+    share = min(max(share, 0.0), 1.0)
+    rgb = tuple(round(a + (b - a) * share) for a, b in zip(_LIGHT, _DARK, strict=True))
+    ink = "#ffffff" if _contrast(rgb, (255, 255, 255)) > _contrast(rgb, (0, 0, 0)) else "#000000"
+    return "#{:02x}{:02x}{:02x}".format(*rgb), ink
+
+
+def _contrast(one: Sequence[int], other: Sequence[int]) -> float:
+    """Return the contrast ratio of two colours, 1 to 21 (WCAG 2.1)."""
+    low, high = sorted((_luminance(one), _luminance(other)))
+    return (high + 0.05) / (low + 0.05)
+
+
+def _luminance(rgb: Sequence[int]) -> float:
+    linear = [c / 12.92 if c <= 0.03928 else ((c + 0.055) / 1.055) ** 2.4 for c in (v / 255 for v in rgb)]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+
+def row_shares(counts: NDArray[Any]) -> NDArray[np.float64]:
+    """Return each row of a confusion matrix (K, K) as shares of its truth; a row without windows stays zero."""
+    table = np.asarray(counts, dtype=np.float64)
+    totals = table.sum(axis=1, keepdims=True)
+    shares = np.zeros_like(table)
+    np.divide(table, totals, out=shares, where=totals > 0)
+    return shares

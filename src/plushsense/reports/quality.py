@@ -5,25 +5,24 @@ from __future__ import annotations
 import base64
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.recfile import Frames
-from plushsense.core.signal import Layout
-from plushsense.dataset.quality import CHECKS
-from plushsense.dataset.quality.checking import Checked
-from plushsense.dataset.quality.examined import NEVER_STOPPED_FACTOR, seconds_of
-from plushsense.dataset.quality.finding import SEVERITIES, Finding
-from plushsense.dataset.quality.outline import outline
+from plushsense.core.layouts import Layout
+from plushsense.core.recorder_csv import Frames
+from plushsense.dataset.quality.checking import CheckReport
+from plushsense.dataset.quality.findings import SEVERITIES, Finding
+from plushsense.dataset.quality.measurements import NEVER_STOPPED_FACTOR, duration_s, summarize
+from plushsense.dataset.quality.registry import CHECKS
 from plushsense.dataset.store import Dataset, RecordingInfo
 from plushsense.reports import quality_figures as figures
-from plushsense.reports import words
 from plushsense.reports.figures import png
-from plushsense.reports.html import check_place, fill, put_page
+from plushsense.reports.page import check_page_path, render_page, write_page
+from plushsense.reports.table import count
+from plushsense.reports.wording import SIMULATED_RECORDINGS_TITLE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -47,17 +46,17 @@ _SEVERITY = {"error": "to decide", "warning": "to look at", "info": "good to kno
 
 
 def scale_of(dataset: Dataset, sample: int = 200) -> NDArray[np.float64]:
-    """What each channel does in a recording when something happens, (C,), from a sample of the recordings."""
+    """Return the usual spread of each channel within a recording, (C,), from a sample of the recordings."""
     used = dataset.used
     taken = used[:: max(1, len(used) // sample)]
-    spreads = [outline(r, frames, dataset.layout).spread for r in taken if len(frames := dataset.read(r))]
+    spreads = [summarize(r, frames, dataset.layout).spread for r in taken if len(frames := dataset.read(r))]
     high = np.percentile(spreads, 75, axis=0) if spreads else np.ones(dataset.layout.n_channels)
     scale: NDArray[np.float64] = np.where(high > 0, high, 1.0)
     return scale
 
 
-def _names_of_odd(result: Checked, gesture: str) -> dict[str, str]:
-    """The recordings that an overlay names: id and why; errors and warnings, the most urgent first."""
+def _names_of_odd(result: CheckReport, gesture: str) -> dict[str, str]:
+    """Return the recordings that an overlay names: id and reason; errors and warnings, the most urgent first."""
     odd: dict[str, list[str]] = {}
     for f in result.findings:
         if f.recording and f.gesture == gesture and f.check in _ODD and f.severity != "info" and not f.accepted:
@@ -65,8 +64,8 @@ def _names_of_odd(result: Checked, gesture: str) -> dict[str, str]:
     return {name: f"{name}: {', '.join(odd[name])}" for name in list(odd)[:NAMED]}
 
 
-def gesture_figure(result: Checked, gesture: str, scale: NDArray[np.float64] | None = None) -> Figure:
-    """All used recordings of a gesture over each other, and how long each lasts."""
+def gesture_figure(result: CheckReport, gesture: str, scale: NDArray[np.float64] | None = None) -> Figure:
+    """Draw all used recordings of a gesture over each other, and how long each lasts."""
     dataset = result.dataset
     scale = scale_of(dataset) if scale is None else scale
     odd = _names_of_odd(result, gesture)
@@ -74,7 +73,7 @@ def gesture_figure(result: Checked, gesture: str, scale: NDArray[np.float64] | N
     for r in dataset.used:
         if r.gesture == gesture and r.stop > r.start:
             frames = dataset.read(r)
-            lines.append(figures.line(frames, dataset.layout, scale, seconds_of(frames), odd.get(r.id, "")))
+            lines.append(figures.line(frames, dataset.layout, scale, duration_s(frames), odd.get(r.id, "")))
     seconds = np.array([one.lasts for one in lines]) if lines else np.ones(1)
     mean = float(seconds[seconds <= NEVER_STOPPED_FACTOR * np.median(seconds)].mean())
     return figures.overlay(gesture, lines, mean, result.limits.duration)
@@ -99,23 +98,23 @@ class _Pictures:
         return "data:image/png;base64," + base64.b64encode(data).decode("ascii")
 
 
-def write_report(path: Path, result: Checked, progress: Progress | None = None) -> Path:
+def write_report(path: Path, result: CheckReport, progress: Progress | None = None) -> Path:
     """Write the page; an older page of PlushSense is replaced in one step, another file never.
 
     Raises:
         ConfigError: when the place is taken by something else, or cannot be written.
         MissingExtraError: when jinja2 or matplotlib is not installed.
     """
-    target = check_place(path)
-    return put_page(target, render(result, progress))
+    target = check_page_path(path)
+    return write_page(target, render(result, progress))
 
 
-def render(result: Checked, progress: Progress | None = None) -> str:
-    """The page as one HTML text; every file is read again only where it is drawn."""
+def render(result: CheckReport, progress: Progress | None = None) -> str:
+    """Return the page as one HTML text; files are read again only where they are drawn."""
     dataset = result.dataset
     pictures = _Pictures(PICTURE_BYTES)
     gestures = [g.label for g in dataset.gestures.gestures if any(r.gesture == g.label for r in dataset.used)]
-    by_check = {name: result.of(name) for name in CHECKS}
+    by_check = {name: result.findings_of(name) for name in CHECKS}
     by_check = {name: found for name, found in by_check.items() if found}
     total, done = len(gestures) + len(by_check), 0
 
@@ -137,21 +136,19 @@ def render(result: Checked, progress: Progress | None = None) -> str:
         overlays.append({"label": gesture, "picture": pictures.add(gesture_figure(result, gesture, scale))})
         step()
     counts = result.counts()
-    return fill(
+    return render_page(
         "quality.html.j2",
         title=f"Check of {dataset.head.name}",
-        made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         simulated=dataset.head.simulated,
-        simulated_title=words.SIMULATED_RECORDINGS_TITLE,
-        simulated_words=words.SIMULATED_WORDS,
+        simulated_title=SIMULATED_RECORDINGS_TITLE,
         summary=[
-            ("Recordings looked at", words.count(result.recordings)),
-            ("Excluded by a mark", words.count(result.excluded)),
-            ("People", words.count(len(dataset.subjects))),
-            ("Streams", words.count(len(dataset.streams))),
+            ("Recordings looked at", count(result.recordings)),
+            ("Excluded by a mark", count(result.excluded)),
+            ("People", count(len(dataset.subjects))),
+            ("Streams", count(len(dataset.streams))),
             ("Layout", f"{dataset.layout.title}, {dataset.layout.rate_hz:g} Hz"),
-            *((f"Findings {_SEVERITY[s]}", words.count(counts["by_severity"][s])) for s in SEVERITIES),
-            ("Findings accepted", words.count(sum(counts["accepted"].values()))),
+            *((f"Findings {_SEVERITY[s]}", count(counts["by_severity"][s])) for s in SEVERITIES),
+            ("Findings accepted", count(sum(counts["accepted"].values()))),
         ],
         undecided=[_row(f) for f in result.undecided],
         sections=sections,
@@ -194,7 +191,7 @@ def _section(name: str, found: list[Finding], places: _Places, pictures: _Pictur
 
 
 def _spread(found: list[Finding]) -> Iterator[Finding]:
-    """The findings in turn over the people, so that the plots show all kinds; most urgent first, then recordings."""
+    """Yield the findings in turn over the people, so that the plots differ; the most urgent first."""
     turns: dict[tuple[int, str], int] = {}
     order = []
     for i, f in enumerate(found):
@@ -218,14 +215,14 @@ class _Places:
         return self._dataset.layout
 
     def can_draw(self, f: Finding) -> bool:
-        """Whether looking is better than reading for this finding."""
+        """Return whether a plot helps to judge this finding."""
         if f.recording:
             info = self._recordings[f.recording]
             return info.stop - info.start >= _DRAWN_ROWS and (f.check in _SIGNAL or f.check in _CLOCK)
         return bool(f.stream) and f.check in (*_CLOCK, "stuck", "flat", "drift", "garbage")
 
     def draw(self, f: Finding) -> Iterator[Figure]:
-        """One or two figures: the clock for what is about time, the channels with the place marked."""
+        """Yield one or two figures: the clock for findings about time, the channels with the place marked."""
         frames = self._frames(f)
         if not len(frames):
             return
@@ -234,7 +231,7 @@ class _Places:
         first = self._recordings[f.recording].start if f.recording else 0
         if f.check == "drift":
             info = next(s for s in self._dataset.streams if s.id == f.stream)
-            lows = outline(info, frames, self._layout).lows
+            lows = summarize(info, frames, self._layout).lows
             if lows is not None:
                 yield figures.baselines(lows, self._layout, f.channels, title=title)
             return

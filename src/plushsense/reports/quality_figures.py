@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.extras import need
-from plushsense.core.recfile import Frames
-from plushsense.core.signal import Layout
-from plushsense.dataset.quality.outline import LEVEL_KINDS
+from plushsense.core.errors import ConfigError, need
+from plushsense.core.layouts import Layout
+from plushsense.core.recorder_csv import Frames
+from plushsense.dataset.quality.measurements import LEVEL_KINDS
+from plushsense.dataset.store import Dataset
+from plushsense.dataset.trimming import Trim
+from plushsense.reports.figures import new_figure, png
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
 
 # Okabe and Ito's colours, told apart with any colour vision; grey is what is usual.
 COLOURS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
@@ -37,13 +42,8 @@ class Line:
     name: str = ""
 
 
-def _figure(width: float, height: float) -> Figure:
-    made: Figure = need("matplotlib.figure", "reports").Figure(figsize=(width, height), layout="constrained")
-    return made
-
-
 def away(frames: Frames, layout: Layout, scale: NDArray[np.float64]) -> NDArray[np.float64]:
-    """How far each channel is from its rest in the recording, (T, C), in units of ``scale``.
+    """Return how far each channel is from its rest in the recording, (T, C), in units of ``scale``.
 
     Rest is the low of channels that have a baseline, and the median of others; garbage is drawn to the valid range.
     """
@@ -55,13 +55,13 @@ def away(frames: Frames, layout: Layout, scale: NDArray[np.float64]) -> NDArray[
 
 
 def deviation(frames: Frames, layout: Layout, scale: NDArray[np.float64]) -> NDArray[np.float64]:
-    """How far all channels together are from their rest, (T,): root of the summed squares."""
+    """Return the distance of all channels together from their rest, (T,): root of the summed squares."""
     size: NDArray[np.float64] = np.sqrt(np.square(away(frames, layout, scale)).sum(axis=1))
     return size
 
 
 def line(frames: Frames, layout: Layout, scale: NDArray[np.float64], lasts: float, name: str = "") -> Line:
-    """A recording for an overlay, thinned: of each stretch its highest value."""
+    """Return a recording for an overlay, thinned to the highest value of each stretch."""
     size = deviation(frames, layout, scale)
     seconds = np.linspace(0.0, lasts, len(size))
     step = -(-len(size) // _LINE_POINTS)
@@ -72,8 +72,8 @@ def line(frames: Frames, layout: Layout, scale: NDArray[np.float64], lasts: floa
 
 
 def overlay(gesture: str, lines: Sequence[Line], mean_s: float, tolerance: float) -> Figure:
-    """All recordings of a gesture over each other, the odd ones in colour and named; below, how long each lasts."""
-    figure = _figure(9.2, 4.3)
+    """Draw all recordings of a gesture over each other, odd ones in colour and named; below, how long each lasts."""
+    figure = new_figure(9.2, 4.3)
     top, strip = figure.subplots(2, 1, height_ratios=(3.2, 1), sharex=True)
     named = [one for one in lines if one.name]
     # One that never stopped would squeeze all others to the left.
@@ -137,11 +137,11 @@ def signals(
     title: str = "",
     scale: NDArray[np.float64] | None = None,
 ) -> Figure:
-    """The channels of a recording by row, with places marked; only ``channels`` where they are named.
+    """Draw the channels of a recording by row, with places marked; only ``channels`` where they are named.
 
     Channels of several kinds are drawn from their rest, each divided by its ``scale``.
     """
-    figure = _figure(7.4, 2.2)
+    figure = new_figure(7.4, 2.2)
     axes = figure.add_subplot()
     shown = list(channels) or list(range(layout.n_channels))
     kinds = {layout.channels[c].unit for c in shown} | {layout.channels[c].kind for c in shown}
@@ -169,8 +169,8 @@ def signals(
 
 
 def clock(frames: Frames, rows: Sequence[tuple[int, int]] = (), *, first_row: int = 0, title: str = "") -> Figure:
-    """The time from each row to the next by the device clock, with places marked."""
-    figure = _figure(7.4, 2.2)
+    """Draw the time from each row to the next by the device clock, with places marked."""
+    figure = new_figure(7.4, 2.2)
     axes = figure.add_subplot()
     steps = np.diff(frames.device_ms)
     # The far ones must not be thinned away.
@@ -189,8 +189,8 @@ def clock(frames: Frames, rows: Sequence[tuple[int, int]] = (), *, first_row: in
 
 
 def baselines(lows: NDArray[np.float64], layout: Layout, channels: Sequence[int], *, title: str = "") -> Figure:
-    """The low level of channels over a session, one value for every 10 s."""
-    figure = _figure(7.4, 2.2)
+    """Draw the low level of channels over a session, one value for every 10 s."""
+    figure = new_figure(7.4, 2.2)
     axes = figure.add_subplot()
     minutes = np.arange(len(lows)) / 6
     for i, c in enumerate(channels[: len(COLOURS)]):
@@ -216,3 +216,104 @@ def _finished(figure: Figure, axes: Any, title: str) -> Figure:
     if title:
         axes.set_title(textwrap.fill(title, 105), fontsize=8, loc="left", parse_math=False)
     return figure
+
+
+PER_PAGE = 12
+_COLUMNS = 3
+_MARK, _SUGGESTION = "#d55e00", "#000000"
+
+
+def trim_page(dataset: Dataset, trims: Sequence[Trim], offset: bool = True) -> Figure:
+    """Draw one page of recordings: every channel over the device clock, with suggested and marked edges.
+
+    A dotted line stands where an edge is suggested, a solid one where it is marked; what a mark cuts off is shaded.
+
+    Channels of one kind share a lane and a scale: each is drawn off its median, in shares of the kind's largest swing.
+
+    Args:
+        trims: at most `PER_PAGE` of `plushsense.dataset.trimming.suggest_trims`.
+        offset: whether to draw the suggested end.
+    """
+    rows = max(1, -(-len(trims) // _COLUMNS))
+    figure = new_figure(5.2 * _COLUMNS, 2.5 * rows + 0.6)
+    grid = figure.subplots(rows, _COLUMNS, squeeze=False)
+    channels = dataset.layout.channels
+    kinds = list(dict.fromkeys(c.kind for c in channels))
+    colours = need("matplotlib", "reports").colormaps["tab10" if len(channels) <= 10 else "tab20"]
+    for axes, trim in zip(grid.flat, trims, strict=False):
+        info, s = trim.recording, trim.suggestion
+        frames = dataset.read(replace(info, start=0, stop=info.rows))
+        values = _off_median(frames.values, dataset.layout)
+        at = trim.seconds[: len(frames)]
+        for lane, kind in enumerate(kinds):
+            mine = [i for i, c in enumerate(channels) if c.kind == kind]
+            swing = max(1.0, float(np.nanmax(np.abs(values[:, mine]))))
+            for i in mine:
+                axes.plot(
+                    at, values[:, i] / swing - 2.1 * lane, linewidth=0.8, color=colours(i), label=channels[i].name
+                )
+        edges = [(s.start, s.onset_visible), (s.stop, s.offset_visible and offset)]
+        for edge in (row for row, visible in edges if visible):
+            axes.axvline(trim.seconds[edge], color=_SUGGESTION, linestyle=":", linewidth=1.6)
+        if trim.mark_state.trimmed:
+            start, stop = trim.current_rows()
+            for edge, whole, cut in ((start, 0, (0, start)), (stop, info.rows, (stop, info.rows))):
+                if edge != whole:
+                    axes.axvline(trim.seconds[edge], color=_MARK, linewidth=1.8)
+                    axes.axvspan(trim.seconds[cut[0]], trim.seconds[cut[1]], color=_MARK, alpha=0.12, linewidth=0)
+        said = f"{trim.state}, confidence {s.onset_confidence:.2f}" + (f"; {s.why}" if s.why else "")
+        axes.set_title(f"{info.id}\n{said}", fontsize=7.5, parse_math=False)
+        axes.set_xlim(0.0, float(trim.seconds[-1]) or 1.0)
+        axes.set_ylim(-1.08 - 2.1 * (len(kinds) - 1), 1.08)
+        axes.set_yticks([-2.1 * lane for lane in range(len(kinds))], kinds, rotation=90, va="center")
+        axes.tick_params(labelsize=7)
+    for axes in grid.flat[len(trims) :]:
+        axes.set_axis_off()
+    for axes in grid[-1, : len(trims) - (rows - 1) * _COLUMNS]:
+        axes.set_xlabel("Seconds since the first row", fontsize=8)
+    handles, labels = grid[0, 0].get_legend_handles_labels()
+    line = need("matplotlib.lines", "reports").Line2D
+    handles += [line([], [], color=_SUGGESTION, linestyle=":"), line([], [], color=_MARK)]
+    figure.legend(
+        handles, [*labels, "suggested", "marked"], loc="outside upper center", ncols=min(10, len(handles)), fontsize=8
+    )
+    return figure
+
+
+def _off_median(raw: NDArray[np.int64], layout: Layout) -> NDArray[np.float64]:
+    """Return values (T, C) less their channel's median; invalid values are NaN."""
+    valid = (raw >= layout.valid_min_int) & (raw <= layout.valid_max_int)
+    values = np.where(valid | ~valid.any(axis=0), raw, np.nan)
+    return np.asarray(values - np.nanmedian(values, axis=0))
+
+
+def check_picture_path(out: Path) -> None:
+    """Refuse a place that `save_trims` could not write to, before anything is marked.
+
+    Raises:
+        ConfigError: for a file that is no .png, or a folder that cannot be made.
+        MissingExtraError: when matplotlib is not installed.
+    """
+    need("matplotlib", "reports")
+    single = out.suffix.lower() == ".png"
+    if out.is_dir() if single else out.is_file():
+        raise ConfigError(f"'{out}' is a {'folder' if single else 'file'}: name a new .png for one page, or a folder.")
+    try:
+        (out.parent if single else out).mkdir(parents=True, exist_ok=True)
+    except OSError as cause:
+        raise ConfigError(f"'{out}' cannot be drawn to ({cause.strerror or cause}): name another place.") from None
+
+
+def save_trims(dataset: Dataset, trims: Sequence[Trim], out: Path, offset: bool = True) -> list[Path]:
+    """Draw recordings into ``out``: a file that ends in .png holds the first page, a folder all pages.
+
+    Pictures of that name are replaced.
+    """
+    single = out.suffix.lower() == ".png"
+    pages = [trims[at : at + PER_PAGE] for at in range(0, len(trims), PER_PAGE)][: 1 if single else None]
+    (out.parent if single else out).mkdir(parents=True, exist_ok=True)
+    written = []
+    for number, page in enumerate(pages, 1):
+        written.append(out if single else out / f"trim-{number:03d}.png")
+        written[-1].write_bytes(png(trim_page(dataset, page, offset), dpi=110))
+    return written

@@ -1,11 +1,11 @@
-"""Events against true intervals: what was noticed, what was said for no reason, how late, and what the errors cost.
+"""Scores of events against true intervals: detections, latency, and the cost of errors.
 
 After Ward, Lukowicz and Gellersen, *Performance metrics for activity recognition*, ACM TIST 2(1), 2011, article 6,
-event analysis. Everything is asked on one level: gestures, families or affects are labels to this room.
+event analysis. Labels are gestures, families or affects: one level at a time.
 
-*Overlap.* A truth stands from ``start_s`` to ``stop_s``. An event belongs to its time when it lasts into it, or begins
-in it or at most ``late_s`` after its end (a reaction to a blow of 0.2 s cannot come sooner), but not after the next
-truth of the same label has begun. An event stands from when its label was *said* until its end.
+*Overlap.* A truth lasts from ``start_s`` to ``stop_s``. An event belongs to it when it lasts into it, or begins in it
+or at most ``late_s`` after its end (a reaction to a blow of 0.2 s cannot come sooner), but not after the next
+truth of the same label has begun. An event lasts from when its label was *reported* until its end.
 
 Of each label by itself, with the events and truths of that label that overlap:
 
@@ -21,9 +21,9 @@ correct: none of these    correct: none of these
 ========================  =============================================================================================
 
 So every truth and every event is counted once in its column; ``hits`` are truths with an event, ``matched`` events
-with a truth. An event of a wrong label is an insertion and leaves a deletion behind, if nothing else was right. An
-insertion is ``confused`` where it overlaps a truth of another label, else ``outside``. An event without a label (a
-gate that says an affect, asked for gestures) is ``unnamed`` where there is any truth: neither right nor wrong.
+with a truth. An event of a wrong label is an insertion and leaves a deletion if nothing else was right. An insertion is
+``confused`` where it overlaps a truth of another label, else ``outside``. An event without a label (a gate, which
+reports an affect, when gestures are scored) is ``unnamed`` where there is any truth: neither right nor wrong.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ LATE_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """A truth, or an event from when its label was said; ``label`` "" says nothing on this level."""
+    """A truth, or an event from when its label was reported; ``label`` "" means none on this level."""
 
     start_s: float
     stop_s: float
@@ -52,7 +52,7 @@ class Interval:
 class Tally:
     """Counts of one label, or of several added up; ``latencies`` in seconds, one for each hit.
 
-    ``early``: hits whose event was said before the onset; their latency counts as 0.
+    ``early``: hits whose event was reported before the onset; their latency counts as 0.
     """
 
     truths: int = 0
@@ -73,7 +73,7 @@ class Tally:
     latencies: list[float] = field(default_factory=list)
 
     def add(self, other: Tally) -> None:
-        """Count another stream, person or label in."""
+        """Add the counts of another stream, person or label."""
         for f in fields(self):
             setattr(self, f.name, getattr(self, f.name) + getattr(other, f.name))
 
@@ -84,29 +84,29 @@ class Tally:
 
     @property
     def recall(self) -> float | None:
-        """Hits of the truths; None without any."""
+        """Hits divided by truths; None without truths."""
         return self.hits / self.truths if self.truths else None
 
     @property
     def precision(self) -> float | None:
-        """Matched of the events that said something; None without any."""
-        said = self.events - self.unnamed
-        return self.matched / said if said else None
+        """Matched events divided by named events; None without any."""
+        named = self.events - self.unnamed
+        return self.matched / named if named else None
 
     @property
     def f1(self) -> float | None:
-        """Harmonic mean of both: 0 when nothing was said, None without truths and events."""
+        """Harmonic mean of both: 0 without named events, None without truths and events."""
         if not self.truths and not self.events:
             return None
         recall, precision = self.recall or 0.0, self.precision or 0.0
         return 2 * recall * precision / (recall + precision) if recall + precision else 0.0
 
     def latency_s(self) -> dict[str, float | None]:
-        """Median and 90th percentile of the time from onset to the first right event."""
+        """Return median and 90th percentile of the time from onset to the first right event."""
         return latency_summary(self.latencies)
 
     def to_dict(self) -> dict[str, Any]:
-        """Counts and what follows from them, ready for JSON; not every latency."""
+        """Return counts and the scores that follow from them, ready for JSON; not every latency."""
         table = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "latencies"}
         return table | {
             "outside": self.outside,
@@ -119,7 +119,7 @@ class Tally:
         }
 
     def kept(self) -> dict[str, Any]:
-        """All of it as plain values: what a journal keeps, and `Tally(**kept)` makes again."""
+        """Return all fields as plain values: what a journal keeps, and `Tally(**kept)` restores."""
         return {f.name: getattr(self, f.name) for f in fields(self)}
 
 
@@ -127,14 +127,14 @@ Tallies = dict[str, Tally]
 
 
 def latency_summary(latencies: Sequence[float]) -> dict[str, float | None]:
-    """``{median, p90}`` in seconds; None without any."""
+    """Return ``{median, p90}`` in seconds; None without latencies."""
     if not latencies:
         return {"median": None, "p90": None}
     return {"median": float(np.median(latencies)), "p90": float(np.percentile(latencies, 90))}
 
 
 def pooled(tallies: Iterable[Tally]) -> Tally:
-    """Several tallies as one."""
+    """Add several tallies up."""
     total = Tally()
     for tally in tallies:
         total.add(tally)
@@ -142,18 +142,18 @@ def pooled(tallies: Iterable[Tally]) -> Tally:
 
 
 def overlaps(truths: Sequence[Interval], events: Sequence[Interval], late_s: float = LATE_S) -> NDArray[np.bool_]:
-    """(T, E) whether an event belongs to the time of a truth, whatever both are called."""
+    """Return (T, E) whether each event belongs to the time of each truth, whatever their labels."""
     if not truths or not events:
         return np.zeros((len(truths), len(events)), dtype=np.bool_)
     start = np.array([t.start_s for t in truths])[:, None]
     until = _until(truths, late_s)[:, None]
-    said = np.array([e.start_s for e in events])
+    start_of_event = np.array([e.start_s for e in events])
     end = np.array([e.stop_s for e in events])
-    return np.asarray((said < until) & ((end > start) | (said >= start)))
+    return np.asarray((start_of_event < until) & ((end > start) | (start_of_event >= start)))
 
 
 def _until(truths: Sequence[Interval], late_s: float) -> NDArray[np.float64]:
-    """(T,) the time up to which an event may begin that belongs to each truth."""
+    """Return (T,) the time up to which an event of each truth may begin."""
     until = np.array([t.stop_s + late_s for t in truths])
     following: dict[str, float] = {}
     for at in sorted(range(len(truths)), key=lambda i: truths[i].start_s, reverse=True):
@@ -165,7 +165,7 @@ def _until(truths: Sequence[Interval], late_s: float) -> NDArray[np.float64]:
 
 
 def tally(truths: Sequence[Interval], events: Sequence[Interval], late_s: float = LATE_S) -> Tallies:
-    """The counts of one stream by label; `pooled` adds them up.
+    """Count one stream by label; `pooled` adds the labels up.
 
     Args:
         truths, events: in any order; a truth has a label, an event may have none.
@@ -215,21 +215,25 @@ def tally(truths: Sequence[Interval], events: Sequence[Interval], late_s: float 
     return found
 
 
-def inserted(truths: Sequence[Interval], events: Sequence[Interval], late_s: float = LATE_S) -> list[Interval]:
-    """The insertions that are ``outside``: where there is no truth of any label."""
+def outside_insertions(
+    truths: Sequence[Interval], events: Sequence[Interval], late_s: float = LATE_S
+) -> list[Interval]:
+    """Return the insertions where there is no truth of any label."""
     anything = overlaps(truths, events, late_s).sum(axis=0) > 0
     return [event for event, any_truth in zip(events, anything, strict=True) if not any_truth]
 
 
 @dataclass(frozen=True)
-class Costs:
-    """What an error costs. There is no measurement behind these numbers: a family minds a hug taken for a blow more
-    than one scratch taken for another, and a toy that speaks for no reason more than one that misses something.
+class ErrorCosts:
+    """Costs of the kinds of errors.
+
+    They are not measured: a family minds a hug taken for a blow more than one scratch taken for
+    another, and a toy that reacts for no reason more than one that misses something.
 
     Every event is charged by the truth it fits best: nothing for the first event of the right gesture; ``again`` for
     every further one; ``family`` for another gesture of the family (also when it only says the right affect);
-    ``confused`` for another family of the same affect, or where no affect is told; ``affect`` for another affect;
-    ``outside`` where there is no truth. Every truth in whose time nothing was said costs ``missed``.
+    ``confused`` for another family of the same affect, or where no affect is known; ``affect`` for another affect;
+    ``outside`` where there is no truth. Every truth without any event costs ``missed``.
     """
 
     again: float = 0.5
@@ -246,17 +250,17 @@ def cost(
     affects: Sequence[str],
     families: Mapping[str, str],
     affect_of: Mapping[str, str],
-    weights: Costs | None = None,
+    weights: ErrorCosts | None = None,
     late_s: float = LATE_S,
 ) -> float:
-    """The cost of one stream's errors, 0 for none.
+    """Return the cost of one stream's errors, 0 for none.
 
     Args:
         truths, events: with gestures as labels; an event may have none.
-        affects: the affect that each event said (E,), "none" where it said none.
-        families, affect_of: of each gesture; affect "none" is one that nobody told.
+        affects: the affect of each event (E,), "none" where it has none.
+        families, affect_of: of each gesture; affect "none" is unknown.
     """
-    weights = weights or Costs()
+    weights = weights or ErrorCosts()
     over = overlaps(truths, events, late_s)
     total = float(weights.missed * (len(truths) - int(over.any(axis=1).sum() if len(events) else 0)))
     right: set[int] = set()
@@ -286,21 +290,21 @@ def cost(
     return total
 
 
-def uncovered_s(heard: Sequence[tuple[float, float]], covered: Iterable[tuple[float, float]]) -> float:
-    """How much of the stretches ``heard`` (start, stop; they do not overlap) no stretch of ``covered`` covers."""
+def uncovered_s(spans: Sequence[tuple[float, float]], covered: Iterable[tuple[float, float]]) -> float:
+    """Return how much of ``spans`` (start, stop; they do not overlap) no span of ``covered`` covers, in seconds."""
     union: list[list[float]] = []
     for start, stop in sorted(covered):
         if union and start <= union[-1][1]:
             union[-1][1] = max(union[-1][1], stop)
         else:
             union.append([start, stop])
-    total = sum(stop - start for start, stop in heard)
-    inside = sum(max(0.0, min(stop, b) - max(start, a)) for start, stop in heard for a, b in union)
+    total = sum(stop - start for start, stop in spans)
+    inside = sum(max(0.0, min(stop, b) - max(start, a)) for start, stop in spans for a, b in union)
     return total - inside
 
 
 def front(points: Sequence[tuple[float, float]]) -> list[int]:
-    """Indices of the points (recall, false events) that no other beats in both, by rising recall."""
+    """Return the indices of the points (recall, false events) on the Pareto front, by rising recall."""
     best: list[int] = []
     least = float("inf")
     for at in sorted(range(len(points)), key=lambda i: (-points[i][0], points[i][1], i)):
@@ -311,7 +315,7 @@ def front(points: Sequence[tuple[float, float]]) -> list[int]:
 
 
 def at_recall(points: Sequence[tuple[float, float]], recall: float) -> float | None:
-    """False events at a recall on the `front` of ``points``, straight between its points; None beyond its ends."""
+    """Interpolate false events at a recall on the `front` of ``points``; None beyond its ends."""
     chosen = [points[i] for i in front(points)]
     if not chosen or not chosen[0][0] <= recall <= chosen[-1][0]:
         return None

@@ -1,18 +1,104 @@
-"""Scores from truth and prediction: confusion, accuracy, macro recall, macro-F1, votes, spread over people.
+"""Scores from truth and prediction: confusion, accuracy, macro-F1, votes, risk and coverage, Pareto front.
 
-Everything but the vote is counted from a confusion matrix (K, K): rows are the truth, columns what was read.
+A confusion matrix (K, K) has the truth in rows and the prediction in columns.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from plushsense.core.errors import BadInput
+
+Floats = NDArray[np.float64]
+
+
+def confidences(logits: ArrayLike, smoothed: ArrayLike, highest: ArrayLike, sure: float) -> dict[str, Floats]:
+    """Return the confidences that are compared, (n,) each.
+
+    Args:
+        logits: (n, K) of the step itself.
+        smoothed: (n, K) smoothed probabilities; ``highest`` (n,) the smoothed highest logit.
+        sure: the conformal threshold on smoothed probabilities; an empty set is the lowest confidence.
+    """
+    z = np.asarray(logits, dtype=np.float64)
+    p, top = np.asarray(smoothed, dtype=np.float64), np.asarray(highest, dtype=np.float64)
+    peak = z.max(axis=1)
+    energy = peak + np.log(np.exp(z - peak[:, None]).sum(axis=1))
+    two = np.sort(p, axis=1)[:, -2:]
+    size = (p >= sure).sum(axis=1)
+    return {
+        "softmax": np.exp(peak - energy),
+        "softmax, smoothed": two[:, 1].copy(),
+        "margin, smoothed": two[:, 1] - two[:, 0],
+        "set size": -np.where(size == 0, p.shape[1] + 1, size).astype(np.float64),
+        "logit": peak,
+        "logit, smoothed": top.copy(),
+        "energy": energy,
+    }
+
+
+@dataclass(frozen=True)
+class RiskCoverage:
+    """Risk-coverage curve: of the most confident answers, their share ``coverage`` (n,) and error rate ``risk`` (n,).
+
+    ``area`` lies under the curve (AURC), ``oracle`` is the area of a perfect confidence, ``random`` that of chance.
+    """
+
+    coverage: Floats
+    risk: Floats
+    area: float
+    oracle: float
+    random: float
+
+    @property
+    def gain(self) -> float:
+        """Share of the oracle's gain over chance that the confidence reaches; NaN where the oracle gains nothing."""
+        return (self.random - self.area) / (self.random - self.oracle) if self.random > self.oracle else float("nan")
+
+    def coverage_at(self, risk: float) -> float:
+        """Return the largest coverage with at most this risk; 0 where there is none."""
+        fits = np.flatnonzero(self.risk <= risk + 1e-12)
+        return float(self.coverage[fits[-1]]) if len(fits) else 0.0
+
+
+def risk_coverage(confidence: ArrayLike, right: ArrayLike) -> RiskCoverage:
+    """Compute risk against coverage of answers ``right`` (n,) or not.
+
+    The area is the mean of the risk over the coverages 1/n to 1 (Geifman, Uziel and El-Yaniv 2019).
+    """
+    sure, good = np.asarray(confidence, dtype=np.float64), np.asarray(right, dtype=bool)
+    if sure.shape != good.shape or sure.ndim != 1 or not len(sure) or np.isnan(sure).any():
+        raise BadInput(f"A risk-coverage curve needs a confidence for each answer: {sure.shape} for {good.shape}.")
+    n = len(sure)
+    risk = _wrong(sure, good) / np.arange(1, n + 1)
+    best = _wrong(good.astype(np.float64), good) / np.arange(1, n + 1)
+    return RiskCoverage(np.arange(1, n + 1) / n, risk, float(risk.mean()), float(best.mean()), float((~good).mean()))
+
+
+def _wrong(sure: Floats, good: NDArray[np.bool_]) -> Floats:
+    """Return (n,) the expected number of errors among the k most confident answers, over all orders of ties."""
+    order = np.argsort(-sure, kind="stable")
+    ranked, wrong = sure[order], (~good[order]).astype(np.float64)
+    starts = np.flatnonzero(np.concatenate([[True], ranked[1:] != ranked[:-1]]))
+    sizes = np.diff(np.append(starts, len(ranked)))
+    each = np.add.reduceat(wrong, starts) / sizes
+    return np.cumsum(np.repeat(each, sizes))
+
+
+def auroc(known: ArrayLike, unknown: ArrayLike) -> float:
+    """Return the probability that a known item scores higher than an unknown one, ties half; NaN without either."""
+    a, b = np.asarray(known, dtype=np.float64), np.sort(np.asarray(unknown, dtype=np.float64))
+    if not len(a) or not len(b):
+        return float("nan")
+    below, upto = np.searchsorted(b, a, side="left"), np.searchsorted(b, a, side="right")
+    return float((below + upto).mean() / (2 * len(b)))
+
 
 Counts = NDArray[np.int64]
 
@@ -21,7 +107,11 @@ BOOTSTRAP_SEED = 20_260
 
 
 def confusion(truth: NDArray[np.int64], predicted: NDArray[np.int64], classes: int) -> Counts:
-    """Counts (classes, classes) of each truth (n,) read as each class; BadInput for an index out of range."""
+    """Count (classes, classes) how often each truth (n,) was predicted as each class.
+
+    Raises:
+        BadInput: for a class index out of range.
+    """
     for name, index in (("truth", truth), ("prediction", predicted)):
         if len(index) and (int(index.min()) < 0 or int(index.max()) >= classes):
             raise BadInput(f"A class index of the {name} is out of range: accepted are 0 to {classes - 1}.")
@@ -30,14 +120,14 @@ def confusion(truth: NDArray[np.int64], predicted: NDArray[np.int64], classes: i
 
 
 def accuracy(counts: Counts) -> float:
-    """Share of units read right; NaN without any."""
+    """Return the share of correct predictions; NaN without any."""
     total = int(counts.sum())
     return float(np.trace(counts) / total) if total else float("nan")
 
 
 @dataclass(frozen=True)
 class ClassScores:
-    """Precision, recall and F1 of each class, (K,) each; 0 where nothing was read or nothing was there."""
+    """Precision, recall and F1 of each class, (K,) each; 0 where they are undefined."""
 
     precision: NDArray[np.float64]
     recall: NDArray[np.float64]
@@ -46,7 +136,7 @@ class ClassScores:
 
 
 def class_scores(counts: Counts) -> ClassScores:
-    """Precision, recall and F1 by class."""
+    """Return precision, recall and F1 by class."""
     right = np.diag(counts).astype(np.float64)
     support, read = counts.sum(axis=1), counts.sum(axis=0)
     return ClassScores(
@@ -58,12 +148,12 @@ def class_scores(counts: Counts) -> ClassScores:
 
 
 def macro_recall(counts: Counts) -> float:
-    """Mean recall of the classes that are present in the truth; NaN without any."""
+    """Return the mean recall of the classes that are present in the truth; NaN without any."""
     return _mean(class_scores(counts).recall[counts.sum(axis=1) > 0])
 
 
 def macro_f1(counts: Counts, all_classes: bool = False) -> float:
-    """Mean F1 of the classes that are present in the truth; NaN without any.
+    """Return the mean F1 of the classes that are present in the truth; NaN without any.
 
     Args:
         all_classes: average every class, as the paper does over its 18; one that is absent counts as 0.
@@ -74,8 +164,48 @@ def macro_f1(counts: Counts, all_classes: bool = False) -> float:
     return _mean(scores.f1) if counts.sum() else float("nan")
 
 
+class Metric(NamedTuple):
+    """A score computed from a confusion matrix (K, K), and how tables name and print it.
+
+    ``percent``: sweep tables print it in percent. ``column``: narrow tables (people, trials) have a column of it;
+    without, only the full table of an evaluation has it.
+    """
+
+    function: Callable[[Counts], float]
+    name: str
+    note: str = ""
+    percent: bool = False
+    column: bool = True
+
+    @property
+    def title(self) -> str:
+        """The name as the head of a column."""
+        return self.name[0].upper() + self.name[1:]
+
+
+# A metric is a function and a line here: evaluations, reports, sweep tables and the command line read this table.
+METRICS: dict[str, Metric] = {
+    "accuracy": Metric(accuracy, "accuracy", percent=True),
+    "macro_recall": Metric(macro_recall, "macro recall", column=False),
+    "macro_f1": Metric(macro_f1, "macro-F1", note="gestures present"),
+}
+
+
+def column_metrics() -> dict[str, Metric]:
+    """Return the metrics that narrow tables have a column of, by key."""
+    return {key: metric for key, metric in METRICS.items() if metric.column}
+
+
+def scores_of(counts: Counts) -> dict[str, float]:
+    """Return every metric of a confusion matrix, by key; NaN where it is undefined."""
+    return {key: metric.function(counts) for key, metric in METRICS.items()}
+
+
 def grouped(counts: Counts, groups: Sequence[str]) -> tuple[tuple[str, ...], Counts]:
-    """The confusion of groups of classes (affects, families): their names as they appear, and counts (G, G).
+    """Sum a confusion by groups of classes (affects, families).
+
+    Returns:
+        the names of the groups in order of appearance, and counts (G, G).
 
     Args:
         groups: the group of each class, (K,).
@@ -88,7 +218,7 @@ def grouped(counts: Counts, groups: Sequence[str]) -> tuple[tuple[str, ...], Cou
 def vote(
     probabilities: NDArray[np.floating[Any]], recording: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """What each recording is read as: the class of the highest mean probability over its windows.
+    """Return the class of each recording: that of the highest mean probability over its windows.
 
     Args:
         probabilities: (N, K); recording: (N,) any integer for each recording.
@@ -104,10 +234,10 @@ def vote(
 
 
 def summary(values: Sequence[float] | NDArray[np.float64]) -> dict[str, Any]:
-    """``{mean, sd, ci95}`` of one value a person (or a fold).
+    """Return ``{mean, sd, ci95}`` of one value for each person (or fold).
 
     ``sd`` divides by n − 1. ``ci95`` is the percentile bootstrap of the mean: 10 000 resamples with a fixed seed.
-    Values that are not numbers are left out; what cannot be said of the rest is None.
+    Values that are not numbers are left out; what cannot be computed is None.
     """
     table = np.asarray(values, dtype=np.float64)
     table = table[np.isfinite(table)]
@@ -127,3 +257,23 @@ def _ratio(part: NDArray[np.float64], whole: Counts) -> NDArray[np.float64]:
 
 def _mean(values: NDArray[np.float64]) -> float:
     return float(values.mean()) if len(values) else float("nan")
+
+
+def pareto_front(rows: Sequence[tuple[float, ...]]) -> list[bool]:
+    """Tell for each row (score, cost, cost, …) whether it is on the Pareto front.
+
+    No other row is at least as good in all and better in one.
+
+    Equal rows do not beat each other: both stay.
+    """
+
+    def beats(a: tuple[float, ...], b: tuple[float, ...]) -> bool:
+        pairs = [(a[0], b[0]), *((-x, -y) for x, y in zip(a[1:], b[1:], strict=True))]
+        return all(x >= y for x, y in pairs) and any(x > y for x, y in pairs)
+
+    return [not any(beats(other, row) for other in rows) for row in rows]
+
+
+def accuracy_complexity_ratio(accuracy: float | None, parameters: int) -> float | None:
+    """Return ACR = accuracy / log10(parameters) (paper, 3.6.3); None without an accuracy or for 1 parameter."""
+    return None if accuracy is None or parameters <= 1 else accuracy / math.log10(parameters)

@@ -1,8 +1,8 @@
-"""How recordings (or, leaky, windows) are divided into training, validation and test: functions on arrays.
+"""Splits of recordings (or, leaky, windows) into training, validation and test: functions on arrays.
 
-What is divided is called a unit: a recording in every split but the one over windows. A split by subject
-keeps whole people apart: those tested, those who validate (they decide when training stops), those trained
-on. Units of nobody (subject "none": the toy at rest) have no person to keep apart: the folds share them.
+A unit is a recording, in splits over windows a window. A split by subject keeps whole people apart: those tested, those
+who validate (they decide when training stops), those trained on. Units of nobody (subject "none": the toy at rest) are
+spread over the folds.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ HOLDOUT_SHARE = 0.15
 
 @dataclass(frozen=True)
 class Fold:
-    """One division of the units: three disjoint index arrays, each in ascending order.
+    """One fold: three disjoint index arrays into the units, each in ascending order.
 
     ``subjects`` are the people tested (without nobody); where people are not kept apart they also train.
     """
@@ -39,9 +39,9 @@ class Fold:
 
 @dataclass(frozen=True)
 class Split:
-    """A split as it is asked for: ``by-subject:5`` is kind "by-subject" with k = 5.
+    """A split by its name: ``by-subject:5`` is kind "by-subject" with k = 5.
 
-    Without k, "windows" is the paper's one division (``windows:holdout``).
+    Without k, "windows" is the paper's hold-out split (``windows:holdout``).
     """
 
     kind: str
@@ -56,17 +56,17 @@ class Split:
 
     @property
     def leaky(self) -> bool:
-        """Whether windows of one recording, which overlap, stand on both sides."""
+        """True if windows of one recording, which overlap, can be on both sides."""
         return self.kind == "windows"
 
     @property
     def unit(self) -> str:
-        """What is divided: "recording" or "window"."""
+        """The unit that is split: "recording" or "window"."""
         return "window" if self.leaky else "recording"
 
     @property
     def apart(self) -> bool:
-        """Whether nobody who is tested was trained on."""
+        """True if nobody is both tested and trained on."""
         return self.kind in ("leave-one-subject-out", "by-subject")
 
 
@@ -74,7 +74,7 @@ EXAMPLES = ("leave-one-subject-out", "by-subject:5", "by-recording:5", "windows:
 
 
 def parse_split(text: str) -> Split:
-    """The split that a string names.
+    """Return the split of a name.
 
     Raises:
         ConfigError: quoting the string, with the accepted forms and the nearest of them.
@@ -94,7 +94,7 @@ def parse_split(text: str) -> Split:
 
 
 def make_folds(split: Split, subject: NDArray[np.str_], label: Index, seed: int = 0) -> list[Fold]:
-    """The folds of ``split`` over units with these people and classes, both (n,); the same for the same seed.
+    """Return the folds of ``split`` over units of these people and classes, both (n,); equal seeds give equal folds.
 
     Raises:
         BadInput: when there are too few people or units, or people whom nobody named, for the split.
@@ -113,13 +113,13 @@ def make_folds(split: Split, subject: NDArray[np.str_], label: Index, seed: int 
 
 
 def leave_one_subject_out(subject: NDArray[np.str_], seed: int = 0) -> list[Fold]:
-    """Each person tested once, in the order of their codes; 15 % of the others, at least one, validate."""
+    """Test each person once, in the order of their codes; 15 % of the others, at least one, validate."""
     people = _people(subject, "leave-one-subject-out", 3)
     return _by_people(subject, [(person,) for person in people], people, seed)
 
 
 def by_subject(subject: NDArray[np.str_], k: int, seed: int = 0) -> list[Fold]:
-    """People dealt into ``k`` groups, each tested once; 15 % of the other people, at least one, validate."""
+    """Divide the people into ``k`` groups and test each once; 15 % of the other people, at least one, validate."""
     people = _people(subject, f"by-subject:{k}", max(k, 3))
     dealt = np.random.default_rng([seed, 1]).permutation(people).tolist()
     groups = [tuple(sorted(dealt[i::k])) for i in range(k)]
@@ -129,19 +129,19 @@ def by_subject(subject: NDArray[np.str_], k: int, seed: int = 0) -> list[Fold]:
 
 
 def by_recording(subject: NDArray[np.str_], label: Index, k: int, seed: int = 0) -> list[Fold]:
-    """Recordings dealt into ``k`` groups, evenly over classes and people; 15 % of the others validate."""
+    """Divide the recordings into ``k`` groups, evenly over classes and people; 15 % of the others validate."""
     _enough(len(label), max(k, 3), f"by-recording:{k}", "recordings")
     return _stratified(subject, label, k, seed, strata=subject)
 
 
 def windows(subject: NDArray[np.str_], label: Index, k: int, seed: int = 0) -> list[Fold]:
-    """Windows dealt into ``k`` groups, evenly over classes; 15 % of the others validate. Leaky."""
+    """Divide the windows into ``k`` groups, evenly over classes; 15 % of the others validate. Leaky."""
     _enough(len(label), max(k, 3), f"windows:{k}", "windows")
     return _stratified(subject, label, k, seed, strata=np.full(len(label), ""))
 
 
 def holdout(subject: NDArray[np.str_], label: Index, seed: int = 0) -> list[Fold]:
-    """The paper's division, stratified by class: 70 % of the windows train, 15 % validate. Leaky."""
+    """Return the paper's split, stratified by class: 70 % of the windows train, 15 % validate, 15 % test. Leaky."""
     everything = np.arange(len(label), dtype=np.int64)
     _enough(len(label), 3, "windows:holdout", "windows")
     rng = np.random.default_rng([seed, 3])
@@ -154,7 +154,7 @@ def holdout(subject: NDArray[np.str_], label: Index, seed: int = 0) -> list[Fold
 def purge(
     stream: NDArray[np.str_], rows: Index, tested_stream: NDArray[np.str_], tested_rows: Index
 ) -> NDArray[np.bool_]:
-    """Which windows may be trained on, (n,): those whose stream rows touch no tested recording.
+    """Tell which windows (n,) may be trained on: those whose stream rows touch no tested recording.
 
     Args:
         stream, rows: stream id (n,) and rows (n, 2), the last exclusive, of each window; "" or −1: none.
@@ -212,7 +212,7 @@ def _by_people(subject: NDArray[np.str_], groups: list[tuple[str, ...]], people:
 
 
 def _stratified(subject: NDArray[np.str_], label: Index, k: int, seed: int, strata: NDArray[np.str_]) -> list[Fold]:
-    """Units dealt like cards, sorted by class, by ``strata``, then at random: each group has its share."""
+    """Divide units into groups by class, then by ``strata``, then at random, so that each group has its share."""
     rng = np.random.default_rng([seed, 5])
     order = np.lexsort((rng.random(len(label)), strata, label))
     group = np.empty(len(label), dtype=np.int64)
@@ -227,9 +227,9 @@ def _stratified(subject: NDArray[np.str_], label: Index, k: int, seed: int, stra
 
 
 def _stratified_share(units: Index, label: Index, share: float, rng: np.random.Generator) -> Index:
-    """About ``share`` of ``units``, at least one, evenly over classes, ascending."""
+    """Draw about ``share`` of ``units``, at least one, evenly over classes; ascending."""
     order = units[np.lexsort((rng.random(len(units)), label[units]))]
-    wanted = max(1, round(share * len(units)))
-    # Evenly spaced in class order, from a random place: each class gives its share to within one.
-    places = (np.arange(wanted) + rng.random()) * len(units) / wanted
+    count = max(1, round(share * len(units)))
+    # Evenly spaced in class order from a random offset: each class gives its share to within one.
+    places = (np.arange(count) + rng.random()) * len(units) / count
     return np.sort(order[places.astype(np.int64)])

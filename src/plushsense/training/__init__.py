@@ -1,1 +1,1 @@
-"""One network from windows: how long and how fast, and the loop that moves its weights."""
+"""Training of one network: schedule, augmentation, the training loop and its fast convolutions."""

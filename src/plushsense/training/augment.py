@@ -1,62 +1,135 @@
-"""Augmentation: training windows that could have been recorded, had the toy lain otherwise.
+"""Augmentations: changes of training windows that could have been recorded with the toy held or worn otherwise.
 
-An accelerometer's axes turn with the toy, and people hold it as they like: on the makeability recordings the mean
-direction of gravity at rest differs by up to 90° between people. Turned windows teach the network not to rely on it.
-Magnitudes do not change when their vector turns, so a layout that gives a network only magnitudes is not touched.
+A setting names them in a list, each with its strength: ``augment = ["random-rotation:45"]``.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
 
-from plushsense.core.extras import need
+from plushsense.core.errors import ConfigError, nearest
 from plushsense.windows.features import Scaler
 
-need("torch", "train")
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
 
-import torch  # noqa: E402
-from torch import Tensor  # noqa: E402
+# Returns changed copies of scaled windows (N, C, T), drawing its random numbers from the generator.
+Transform = Callable[["Tensor", "torch.Generator"], "Tensor"]
 
 
-class Turn:
-    """Turns the vectors of scaled windows (N, C, T) by a random angle about a random axis, one turn a window.
+@dataclass(frozen=True)
+class Channels:
+    """The channels of the windows, as augmentations need to know them.
 
-    The angle is normal with a standard deviation of ``degrees``; all vectors of a window (accelerometer, gyroscope)
-    turn alike, as they sit in one toy. The scaling is taken back for the turn and put on again.
+    ``vectors``: the channels of each three-axis sensor (accelerometer, gyroscope). ``scaler``: from raw to scaled.
     """
 
-    def __init__(
-        self, vectors: tuple[tuple[int, ...], ...], scaler: Scaler, degrees: float, device: torch.device
-    ) -> None:
-        self._degrees = degrees
-        self._vectors = [
-            (
-                torch.tensor(axes, device=device),
-                torch.tensor(scaler.offset[list(axes)], dtype=torch.float32, device=device)[:, None],
-                torch.tensor(scaler.scale[list(axes)], dtype=torch.float32, device=device)[:, None],
-            )
-            for axes in (vectors if degrees > 0.0 else ())
-        ]
+    vectors: tuple[tuple[int, ...], ...]
+    scaler: Scaler
+    device: torch.device
 
-    @property
-    def idle(self) -> bool:
-        """Whether nothing is turned."""
-        return not self._vectors
+    def scaling(self, channels: Sequence[int]) -> tuple[Tensor, Tensor]:
+        """Return offset and scale (n, 1) of some channels: scaled = (raw - offset) * scale."""
+        import torch
 
-    def __call__(self, x: Tensor, random: torch.Generator) -> Tensor:
-        """Turned copies of the windows ``x``."""
-        if self.idle:
-            return x
-        turns = rotations(len(x), self._degrees, random).to(x.device)
+        at = list(channels)
+        offset, scale = self.scaler.offset[at], self.scaler.scale[at]
+        return (
+            torch.tensor(offset, dtype=torch.float32, device=self.device)[:, None],
+            torch.tensor(scale, dtype=torch.float32, device=self.device)[:, None],
+        )
+
+
+def random_rotation(degrees: float, channels: Channels) -> Transform | None:
+    """Rotate the vectors of every window by a random angle about a random axis.
+
+    People hold the toy as they like: on the makeability recordings the mean direction of gravity at rest differs by
+    up to 90° between people. All vectors of a window rotate alike, as they sit in one toy. Magnitudes do not change,
+    so a layout that gives a network only magnitudes is left as it is.
+
+    Args:
+        degrees: standard deviation of the angle, which is normal.
+    """
+    import torch
+
+    if not channels.vectors:
+        return None
+    vectors = [(torch.tensor(axes, device=channels.device), *channels.scaling(axes)) for axes in channels.vectors]
+
+    def rotate(x: Tensor, random: torch.Generator) -> Tensor:
+        matrices = rotations(len(x), degrees, random).to(x.device)
         out = x.clone()
-        for axes, offset, scale in self._vectors:
+        for axes, offset, scale in vectors:
             raw = x[:, axes] / scale + offset
-            out[:, axes] = (turns @ raw - offset) * scale
+            out[:, axes] = (matrices @ raw - offset) * scale
         return out
+
+    return rotate
+
+
+class Augmentation(NamedTuple):
+    """An augmentation: ``make`` prepares it for the windows, or returns None where it would change nothing."""
+
+    make: Callable[[float, Channels], Transform | None]
+    strongest: float
+    unit: str
+
+
+# An augmentation is a function and a line here.
+AUGMENTATIONS: dict[str, Augmentation] = {
+    "random-rotation": Augmentation(random_rotation, 180.0, "degrees"),
+}
+
+
+def parse_augmentation(text: str) -> tuple[str, float]:
+    """Split ``random-rotation:45`` into the name and the strength.
+
+    Raises:
+        ConfigError: for an unknown name (with the nearest known one), or a strength out of range.
+    """
+    name, _, number = text.partition(":")
+    if name not in AUGMENTATIONS:
+        raise ConfigError(
+            f"Unknown augmentation '{name}': accepted are {', '.join(AUGMENTATIONS)}.{nearest(name, AUGMENTATIONS)}"
+        )
+    known = AUGMENTATIONS[name]
+    try:
+        strength = float(number)
+    except ValueError:
+        strength = math.nan
+    if not 0.0 <= strength <= known.strongest:
+        raise ConfigError(
+            f"Augmentation '{text}': write {name}:NUMBER with 0 (off) to {known.strongest:g} {known.unit}."
+        )
+    return name, strength
+
+
+def augmentations(names: Sequence[str], channels: Channels) -> Transform | None:
+    """Return the augmentations of a list as one, applied in their order; None where nothing would change."""
+    made = []
+    for name, strength in map(parse_augmentation, names):
+        transform = AUGMENTATIONS[name].make(strength, channels) if strength > 0.0 else None
+        if transform is not None:
+            made.append(transform)
+    if not made:
+        return None
+
+    def apply(x: Tensor, random: torch.Generator) -> Tensor:
+        for transform in made:
+            x = transform(x, random)
+        return x
+
+    return apply
 
 
 def rotations(n: int, degrees: float, random: torch.Generator) -> Tensor:
-    """Random rotation matrices (n, 3, 3): axes uniform on the sphere, angles normal (Rodrigues' formula)."""
+    """Draw rotation matrices (n, 3, 3): axes uniform on the sphere, angles normal (Rodrigues' formula)."""
+    import torch
+
     axis = torch.randn(n, 3, generator=random)
     axis = axis / axis.norm(dim=1, keepdim=True).clamp_min(1e-12)
     angle = torch.randn(n, generator=random) * math.radians(degrees)

@@ -1,59 +1,123 @@
-"""What `fit` drives: a network that takes batches, and is read. Two ways, chosen by network and device alone.
+"""Training engines: a network that `fit` can step and evaluate.
 
-`Fast` (``training/fast``) on the CPU for batch normalisation under ``mirror`` and ``stream``; `Plain`, PyTorch's own
-layers and gradients, for all else: layer normalisation, ``causal`` padding, a GPU.
+Network and device alone decide which of the two is used.
+
+`Fast` (``training/fast``) runs on the CPU, for batch normalisation with ``mirror`` or ``stream`` padding; `Plain` uses
+PyTorch's layers and gradients, for everything else: layer normalisation, ``causal`` padding, a GPU.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Protocol
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
-
-from plushsense.models.arch import Arch
-from plushsense.models.net import Net
-from plushsense.training.augment import Turn
-from plushsense.training.fast.net import FastNet, can
-from plushsense.training.fast.plan import plan_net
-from plushsense.training.spec import TrainSpec
-
-import torch  # isort: skip - after models.net, which says how to install it
 from torch import Tensor
 from torch.nn import functional as F
 
-# Windows at a time where no gradient is kept.
+from plushsense.models.arch import Arch
+from plushsense.models.net import Net
+from plushsense.training.augment import Transform
+from plushsense.training.fast.net import FastNet, can_train
+from plushsense.training.fast.plan import plan_net
+from plushsense.training.spec import TrainSpec
+
+_WEIGHT, _MEAN, _SQUARE, _KEPT, _BEST = "weight:", "mean:", "square:", "kept:", "best:"
+
+
+@dataclass(frozen=True)
+class FitState:
+    """State of a training after ``epoch``, from which it can continue.
+
+    ``means`` and ``squares`` are Adam's, of each parameter, after ``steps`` steps; ``random`` is the generator's state;
+    ``kept`` the weights after earlier epochs; ``best`` the best weights so far, with early stopping.
+    """
+
+    epoch: int
+    steps: int
+    weights: dict[str, NDArray[np.float32]]
+    means: Sequence[NDArray[np.float32]]
+    squares: Sequence[NDArray[np.float32]]
+    random: NDArray[np.uint8]
+    history: list[dict[str, Any]]
+    kept: dict[int, dict[str, NDArray[np.float32]]] = field(default_factory=dict)
+    best: dict[str, NDArray[np.float32]] = field(default_factory=dict)
+
+    def to_arrays(self) -> dict[str, Any]:
+        """Return the state as arrays and plain values by name, as a journal takes them."""
+        arrays: dict[str, Any] = {"epoch": self.epoch, "steps": self.steps, "history": self.history}
+        for prefix, weights in ((_WEIGHT, self.weights), (_BEST, self.best)):
+            arrays |= {prefix + name: values for name, values in weights.items()}
+        for prefix, several in ((_MEAN, self.means), (_SQUARE, self.squares)):
+            arrays |= {f"{prefix}{i}": values for i, values in enumerate(several)}
+        for epoch, weights in self.kept.items():
+            arrays |= {f"{_KEPT}{epoch}:{name}": values for name, values in weights.items()}
+        return arrays | {"random": self.random}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, Any]) -> FitState:
+        """Return the state from `to_arrays`; other names are ignored."""
+
+        def several(prefix: str) -> list[NDArray[np.float32]]:
+            return [arrays[f"{prefix}{i}"] for i in range(sum(name.startswith(prefix) for name in arrays))]
+
+        def named(prefix: str) -> dict[str, NDArray[np.float32]]:
+            return {name.removeprefix(prefix): v for name, v in arrays.items() if name.startswith(prefix)}
+
+        kept: dict[int, dict[str, NDArray[np.float32]]] = {}
+        for name, values in arrays.items():
+            if name.startswith(_KEPT):
+                epoch, _, weight = name.removeprefix(_KEPT).partition(":")
+                kept.setdefault(int(epoch), {})[weight] = values
+        return cls(
+            epoch=int(arrays["epoch"]),
+            steps=int(arrays["steps"]),
+            weights=named(_WEIGHT),
+            means=several(_MEAN),
+            squares=several(_SQUARE),
+            random=arrays["random"],
+            history=list(arrays["history"]),
+            kept=kept,
+            best=named(_BEST),
+        )
+
+
+# Windows at a time without gradients.
 _READ = 512
 
 
 class Engine(Protocol):
-    """A network on its device, with the optimizer's view of it."""
+    """A network on its device that can compute a training step."""
 
     @property
     def parameters(self) -> Sequence[Tensor]:
-        """What the optimizer moves."""
+        """The tensors that the optimizer updates."""
         ...
 
-    def step(self, x: Windows, batch: Tensor, y: Tensor, turn: Turn, random: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Mean loss and logits (n, K) of the windows ``batch`` with truth ``y``; the gradients are then in place."""
+    def step(
+        self, x: Windows, batch: Tensor, y: Tensor, augment: Transform | None, random: torch.Generator
+    ) -> tuple[Tensor, Tensor]:
+        """Return mean loss and logits (n, K) of the windows ``batch`` with truth ``y``, and compute the gradients."""
         ...
 
     def logits(self, x: Windows) -> Tensor:
-        """Logits (N, K), as the finished network would give them."""
+        """Return the logits (N, K) in evaluation mode."""
         ...
 
     def export_weights(self) -> dict[str, NDArray[np.float32]]:
-        """A copy of the weights, as ``models/reference`` takes them."""
+        """Return a copy of the weights, as ``models/reference`` takes them."""
         ...
 
     def close(self) -> None:
-        """Give back threads."""
+        """End the threads."""
         ...
 
 
 class Windows:
-    """Scaled windows (N, C, T), held whole where they are needed; time first where the engine wants it so."""
+    """Scaled windows (N, C, T) on the device, in the memory layout of the engine."""
 
     def __init__(self, x: NDArray[np.float32], arch: Arch, device: torch.device) -> None:
         whole = torch.from_numpy(x)
@@ -65,20 +129,20 @@ class Windows:
 
 
 def is_fast(arch: Arch, device: torch.device) -> bool:
-    """Whether a network trains the fast way on a device."""
-    return device.type == "cpu" and can(arch)
+    """Tell whether `Fast` trains a network on a device."""
+    return device.type == "cpu" and can_train(arch)
 
 
 def step_bytes(arch: Arch, spec: TrainSpec) -> int | None:
-    """What a training step holds beside the data; None where PyTorch's own layers train, which do not say.
+    """Return the memory of a training step beside the data, in bytes; None for `Plain`, where it is unknown.
 
-    ``spec.device`` is settled (see `plushsense.training.fit.placed`).
+    ``spec.device`` is not "auto" (see `plushsense.training.fit.resolve_device`).
     """
     return plan_net(arch, spec.batch).bytes if is_fast(arch, torch.device(spec.device)) else None
 
 
 def engine(arch: Arch, net: Net, device: torch.device, batch: int, threads: int) -> Engine:
-    """The engine of a network; the weights are taken from ``net``.
+    """Return the engine for a network; the weights are taken from ``net``.
 
     Args:
         batch: windows in a batch, at most.
@@ -88,7 +152,7 @@ def engine(arch: Arch, net: Net, device: torch.device, batch: int, threads: int)
 
 
 class Plain:
-    """PyTorch's own layers."""
+    """Training with PyTorch's layers and autograd."""
 
     def __init__(self, net: Net, device: torch.device) -> None:
         self._net = net.to(device)
@@ -97,9 +161,12 @@ class Plain:
     def parameters(self) -> Sequence[Tensor]:
         return list(self._net.parameters())
 
-    def step(self, x: Windows, batch: Tensor, y: Tensor, turn: Turn, random: torch.Generator) -> tuple[Tensor, Tensor]:
+    def step(
+        self, x: Windows, batch: Tensor, y: Tensor, augment: Transform | None, random: torch.Generator
+    ) -> tuple[Tensor, Tensor]:
         self._net.train()
-        logits = self._net(turn(x.whole[batch], random))
+        windows = x.whole[batch]
+        logits = self._net(windows if augment is None else augment(windows, random))
         loss = F.cross_entropy(logits, y)
         self._net.zero_grad(set_to_none=True)
         torch.autograd.backward(loss)
@@ -115,11 +182,11 @@ class Plain:
         return self._net.export_weights()
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing: there are no threads."""
 
 
 class Fast:
-    """``training/fast``."""
+    """Training with ``training/fast``."""
 
     def __init__(self, net: Net, batch: int, threads: int) -> None:
         self._net = FastNet(net, batch, threads)
@@ -128,18 +195,20 @@ class Fast:
     def parameters(self) -> Sequence[Tensor]:
         return self._net.parameters
 
-    def step(self, x: Windows, batch: Tensor, y: Tensor, turn: Turn, random: torch.Generator) -> tuple[Tensor, Tensor]:
-        if turn.idle:
+    def step(
+        self, x: Windows, batch: Tensor, y: Tensor, augment: Transform | None, random: torch.Generator
+    ) -> tuple[Tensor, Tensor]:
+        if augment is None:
             source = x.time_first
             assert source is not None
 
             def fill(out: Tensor, start: int, end: int) -> None:
                 torch.index_select(source, 1, batch[start:end], out=out)
         else:
-            turned = turn(x.whole[batch], random)
+            augmented = augment(x.whole[batch], random)
 
             def fill(out: Tensor, start: int, end: int) -> None:
-                out.copy_(turned[start:end].permute(2, 0, 1))
+                out.copy_(augmented[start:end].permute(2, 0, 1))
 
         return self._net.step(fill, y)
 
@@ -160,5 +229,5 @@ class Fast:
 
 
 def slices(n: int, size: int) -> Iterator[slice]:
-    """The parts of ``n`` things, ``size`` at a time."""
+    """Yield the slices of ``n`` items, ``size`` at a time."""
     return (slice(start, start + size) for start in range(0, n, size))

@@ -1,4 +1,4 @@
-"""Train one network: windows in, weights, scaling and the history of every epoch out."""
+"""Training of one network: from windows to weights, scaling and history."""
 
 from __future__ import annotations
 
@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from plushsense.core.errors import DivergedError, TrainingError
 from plushsense.models.arch import Arch
 from plushsense.models.net import Net
-from plushsense.training.augment import Turn
-from plushsense.training.engine import Engine, Windows, engine, is_fast, slices
+from plushsense.training.augment import Channels, Transform, augmentations
+from plushsense.training.engine import Engine, FitState, Windows, engine, is_fast, slices
 from plushsense.training.spec import TrainSpec
-from plushsense.training.state import FitState
 from plushsense.windows.cut import WindowSet
 from plushsense.windows.features import Scaler
 
@@ -30,13 +29,13 @@ Progress = Callable[[int, int, dict[str, Any]], None]
 
 
 @dataclass(frozen=True)
-class Fitted:
+class FittedNetwork:
     """A trained network.
 
     ``weights`` as ``models/reference`` takes them; ``history`` one row an epoch: epoch (from 1), train_loss,
     train_accuracy (means over the epoch's batches, as they were trained on), validation_loss, validation_accuracy
     (None without validation), learning_rate; ``best_epoch`` the one whose weights these are; ``kept`` the weights
-    after the epochs that were asked for; ``state`` where it can go on from, without early stopping.
+    after the epochs in ``keep``; ``state`` where it can go on from, without early stopping.
     """
 
     weights: dict[str, NDArray[np.float32]]
@@ -58,7 +57,7 @@ def fit(
     start: FitState | None = None,
     save: Callable[[FitState], None] | None = None,
     save_every_s: float = 60.0,
-) -> Fitted:
+) -> FittedNetwork:
     """Train ``arch`` on ``train``; ``validation`` decides when to stop. The same seed gives the same weights.
 
     ``keep``: epochs after which the weights are kept as well. At a constant rate a long training passes through the
@@ -77,8 +76,8 @@ def fit(
     device = _device(spec.device)
     scaler = Scaler.fit(train.x)
     x, y = _tensors(train, scaler, arch, device)
-    watched = None if validation is None or not len(validation) else _tensors(validation, scaler, arch, device)
-    stops = watched is not None and spec.patience is not None
+    held_out = None if validation is None or not len(validation) else _tensors(validation, scaler, arch, device)
+    stops = held_out is not None and spec.patience is not None
     if start is not None and stops and not start.best:
         raise TrainingError(
             "A training with early stopping cannot go on from a state that holds no best weights: leave patience out."
@@ -90,7 +89,7 @@ def fit(
             fresh.import_weights(start.weights)
         net = engine(arch, fresh, device, min(spec.batch, len(train)), spec.threads)
         order = torch.Generator().manual_seed(spec.seed)
-        turn = Turn(train.vectors, scaler, spec.turn_deg, device)
+        augment = augmentations(spec.augment, Channels(train.vectors, scaler, device))
         adam = torch.optim.Adam(net.parameters, lr=spec.learning_rate, fused=True)
         if start is not None:
             _restore(adam, net, start)
@@ -106,9 +105,9 @@ def fit(
                 row: dict[str, Any] = {"epoch": epoch}
                 for group in adam.param_groups:
                     group["lr"] = spec.learning_rate_at(epoch)
-                row["train_loss"], row["train_accuracy"] = _train(net, adam, x, y, spec, order, turn)
+                row["train_loss"], row["train_accuracy"] = _train(net, adam, x, y, spec, order, augment)
                 row["validation_loss"], row["validation_accuracy"] = (
-                    (None, None) if watched is None else _measure(net, *watched)
+                    (None, None) if held_out is None else _measure(net, *held_out)
                 )
                 row["learning_rate"] = spec.learning_rate_at(epoch)
                 _still_numbers(row, spec)
@@ -128,7 +127,7 @@ def fit(
             if best_epoch == 0:
                 best_epoch, best = len(history), net.export_weights()
             state = None if spec.patience is not None else _state(adam, net, order, history, kept)
-    return Fitted(best, scaler, history, best_epoch, time.perf_counter() - began, kept, state)
+    return FittedNetwork(best, scaler, history, best_epoch, time.perf_counter() - began, kept, state)
 
 
 def _state(
@@ -154,12 +153,12 @@ def _state(
 
 
 def _score(row: Mapping[str, Any], spec: TrainSpec) -> float:
-    """What early stopping goes by: more is better."""
+    """Return the score of an epoch for early stopping; higher is better."""
     return float(row["validation_accuracy"] if spec.stop_on == "accuracy" else -row["validation_loss"])
 
 
 def _best(history: list[dict[str, Any]], spec: TrainSpec) -> tuple[int, float]:
-    """The first epoch of the best score, and the score."""
+    """Return the first epoch with the best score, and the score."""
     scores = [_score(row, spec) for row in history]
     return int(np.argmax(scores)) + 1, max(scores)
 
@@ -176,7 +175,7 @@ def _restore(adam: torch.optim.Adam, net: Engine, start: FitState) -> None:
 def predict(
     arch: Arch, weights: dict[str, NDArray[np.float32]], scaler: Scaler, windows: WindowSet, device: str = "auto"
 ) -> NDArray[np.float32]:
-    """Probabilities (N, K) of each class for each window."""
+    """Return the probabilities (N, K) of the classes for each window."""
     _check(windows, arch, "read", some=False)
     place = _device(device)
     net = Net(arch)
@@ -189,19 +188,25 @@ def predict(
 
 
 def _train(
-    net: Engine, adam: torch.optim.Adam, x: Windows, y: Tensor, spec: TrainSpec, order: torch.Generator, turn: Turn
+    net: Engine,
+    adam: torch.optim.Adam,
+    x: Windows,
+    y: Tensor,
+    spec: TrainSpec,
+    order: torch.Generator,
+    augment: Transform | None,
 ) -> tuple[float, float]:
-    """One epoch; the mean loss and accuracy of what was trained on."""
-    # Summed where the data are: reading a number out of a GPU would wait for it in every batch.
+    """Train one epoch; return mean loss and accuracy over its batches."""
+    # Summed on the device: reading a number from a GPU would wait for it in every batch.
     sums, seen = torch.zeros(2, device=y.device), 0
     shuffled = torch.randperm(len(x), generator=order).to(y.device)
     for at in slices(len(x), spec.batch):
         batch = shuffled[at]
-        # A few left over would give noisy batch statistics; they come in another epoch.
+        # A few left over would give noisy batch statistics; they are used in another epoch.
         if seen and len(batch) < min(8, spec.batch):
             continue
         truth = y[batch]
-        loss, logits = net.step(x, batch, truth, turn, order)
+        loss, logits = net.step(x, batch, truth, augment, order)
         adam.step()
         sums[0] += loss * len(batch)
         sums[1] += (logits.argmax(dim=1) == truth).sum()
@@ -210,13 +215,13 @@ def _train(
 
 
 def _measure(net: Engine, x: Windows, y: Tensor) -> tuple[float, float]:
-    """Mean loss and accuracy without training."""
+    """Return mean loss and accuracy without training."""
     logits = net.logits(x)
     return float(F.cross_entropy(logits, y)), float((logits.argmax(dim=1) == y).float().mean())
 
 
 def _tensors(windows: WindowSet, scaler: Scaler, arch: Arch, device: torch.device) -> tuple[Windows, Tensor]:
-    """Scaled windows (N, C, span or window) and classes (N,), whole and where they are needed."""
+    """Return scaled windows (N, C, span or window) and classes (N,) on the device."""
     x = scaler.apply(windows.x[:, :, windows.x.shape[2] - arch.span :])
     return Windows(x, arch, device), torch.from_numpy(windows.y.astype(np.int64)).to(device)
 
@@ -246,8 +251,8 @@ def _still_numbers(row: dict[str, Any], spec: TrainSpec) -> None:
             )
 
 
-def placed(spec: TrainSpec) -> TrainSpec:
-    """The settings with the device that they mean here: what a job's id has to hold.
+def resolve_device(spec: TrainSpec) -> TrainSpec:
+    """Return the settings with "auto" replaced by the device that it means here, as a job's id needs it.
 
     Raises:
         TrainingError: when the device is not there.
@@ -264,10 +269,10 @@ def _device(name: str) -> torch.device:
 
 
 @contextmanager
-def _threads(wanted: int, arch: Arch, device: torch.device) -> Iterator[None]:
+def _threads(threads: int, arch: Arch, device: torch.device) -> Iterator[None]:
     before = torch.get_num_threads()
-    # The fast engine has threads of its own, each with one of PyTorch's.
-    torch.set_num_threads(1 if is_fast(arch, device) else wanted)
+    # The fast engine has its own threads, each with one of PyTorch's.
+    torch.set_num_threads(1 if is_fast(arch, device) else threads)
     try:
         yield
     finally:

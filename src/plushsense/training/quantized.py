@@ -1,10 +1,10 @@
-"""Quantization-aware fine-tuning: weights that still say the same once they are rounded to 8 bits.
+"""Quantization-aware fine-tuning: adapt weights to their rounding to 8 bits.
 
-The forward pass computes what ``models/integer`` computes, weights in steps of their filter's largest and activations
-in 255 steps of a fixed range, with the biases that ``deploy/quantize`` gives; only its fixed-point scales are left
-out, which move an activation by less than a hundredth of a step but where it stands on an edge. The gradient goes
-straight through every rounding. Batch normalisation is frozen. The float network teaches: what is learnt is its
-answers, not the labels anew, so that a few epochs on the training windows cannot overfit what they were fitted to.
+The forward pass computes what ``runtime/integer`` computes: weights in steps of their filter's largest, activations in
+255 steps of a fixed range, biases as in ``deploy/quantize``. Only the fixed-point scales are left out, which change an
+activation by less than a hundredth of a step unless it lies on a rounding boundary. Gradients pass straight through
+rounding. Batch normalisation is frozen. The float network is the teacher: its outputs are learned, not the labels, so
+that a few epochs on the training windows do not overfit.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import TrainingError
 from plushsense.models.arch import NORM_EPSILON, Arch
-from plushsense.models.integer import deployable
 from plushsense.models.net import Net
+from plushsense.runtime.integer import deployable
 from plushsense.training.engine import slices
 from plushsense.training.spec import TrainSpec
 from plushsense.windows.cut import WindowSet
@@ -36,9 +36,11 @@ _SLOWER = 5
 
 
 @dataclass(frozen=True)
-class Tuned:
-    """``weights`` after the last epoch; ``history`` one row an epoch: epoch (from 1), train_loss (cross-entropy
-    against the float network's answers, above their own entropy), learning_rate."""
+class FineTuned:
+    """The outcome of `fine_tune`: ``weights`` after the last epoch, and ``history``, one row an epoch.
+
+    A row holds epoch (from 1), train_loss (Kullback-Leibler divergence from the float network) and learning_rate.
+    """
 
     weights: Weights
     history: list[dict[str, Any]]
@@ -53,12 +55,12 @@ def fine_tune(
     spec: TrainSpec,
     epochs: int,
     progress: Callable[[int, int, dict[str, Any]], None] | None = None,
-) -> Tuned:
+) -> FineTuned:
     """Fine-tune trained weights for the ranges of ``calibration``, which stay those of the deployed network.
 
-    Batch, seed and threads are those of ``spec``, the rate falls evenly from a fifth of the last of its schedule to
-    nothing. Windows are not turned: on turned ones, which lie outside the ranges, it would learn to live with being
-    cut off. It runs on the CPU. The same seed gives the same weights.
+    Batch, seed and threads are those of ``spec``, the rate falls linearly from a fifth of the last of its schedule to
+    0. Windows are not augmented: rotated ones exceed the ranges and would be clipped. It runs on the CPU. The same
+    seed gives the same weights.
 
     Raises:
         TrainingError: for a network that cannot be deployed, no calibration, or fewer epochs than 1.
@@ -69,7 +71,7 @@ def fine_tune(
             "and --norm batch."
         )
     if epochs < 1:
-        raise TrainingError(f"{epochs} epochs of fine-tuning are asked for: accepted are 1 and more.")
+        raise TrainingError(f"{epochs} epochs of fine-tuning: accepted are 1 and more.")
     x = torch.from_numpy(scaler.apply(train.x[:, :, train.x.shape[2] - arch.span :]))
     highest = spec.learning_rate_at(spec.epochs) / _SLOWER
     history: list[dict[str, Any]] = []
@@ -88,8 +90,8 @@ def fine_tune(
             for at in slices(len(x), spec.batch):
                 batch = x[order[at]]
                 with torch.no_grad():
-                    wanted = F.log_softmax(teacher(batch), dim=1)
-                loss = F.kl_div(F.log_softmax(network(batch), dim=1), wanted, reduction="batchmean", log_target=True)
+                    target = F.log_softmax(teacher(batch), dim=1)
+                loss = F.kl_div(F.log_softmax(network(batch), dim=1), target, reduction="batchmean", log_target=True)
                 adam.zero_grad(set_to_none=True)
                 torch.autograd.backward(loss)
                 adam.step()
@@ -97,13 +99,13 @@ def fine_tune(
             history.append({"epoch": epoch, "train_loss": total / len(x), "learning_rate": rate})
             if progress is not None:
                 progress(epoch, epochs, history[-1] | {"what": "fine-tuning for 8 bits", "validation_accuracy": None})
-    return Tuned(network.export_weights(), history)
+    return FineTuned(network.export_weights(), history)
 
 
 @contextmanager
-def _threads(wanted: int) -> Iterator[None]:
+def _threads(threads: int) -> Iterator[None]:
     before = torch.get_num_threads()
-    torch.set_num_threads(wanted)
+    torch.set_num_threads(threads)
     try:
         yield
     finally:
@@ -111,7 +113,7 @@ def _threads(wanted: int) -> Iterator[None]:
 
 
 class Rounded:
-    """A network that computes as it will once it is deployed, and lets gradients through.
+    """A network that computes as it will when deployed, with straight-through gradients.
 
     ``parameters`` are convolutions, gains, shifts and the dense layer; ``mean`` and ``var`` stay.
     """
@@ -126,7 +128,7 @@ class Rounded:
         self._means = [torch.tensor(mean, dtype=torch.float32) for mean in calibration["means"]]
 
     def __call__(self, x: Tensor) -> Tensor:
-        """Logits (N, K) of scaled windows (N, C, span)."""
+        """Return the logits (N, K) of scaled windows (N, C, span)."""
         of, arch = self._tensors, self.arch
         unit = (self._high - self._low).clamp_min(1e-6) / 255
         start, mean = self._low, self._means[0]
@@ -142,29 +144,31 @@ class Rounded:
         return F.linear(codes.mean(dim=2), w, b)
 
     def logits(self, x: Tensor) -> Tensor:
-        """Logits (N, K) without gradients, a few windows at a time."""
+        """Return the logits (N, K) without gradients, computed in parts."""
         with torch.no_grad():
             return torch.cat([self(x[at]) for at in slices(len(x), _READ)])
 
     def export_weights(self) -> Weights:
-        """A copy of the weights, as ``models/reference`` takes them."""
+        """Return a copy of the weights, as ``models/reference`` takes them."""
         return {name: t.detach().numpy().copy() for name, t in self._tensors.items()}
 
 
 def _straight(x: Tensor, rounded: Tensor) -> Tensor:
-    """``rounded``, with the gradient of ``x``."""
+    """Return ``rounded`` with the gradient of ``x`` (straight-through estimator)."""
     return x + (rounded - x).detach()
 
 
 def _whole(x: Tensor) -> Tensor:
-    """To the numbers of 8 bits; beyond them there is no gradient."""
+    """Round to the 8-bit range; values outside it have no gradient."""
     held = x.clamp(0.0, 255.0)
     return _straight(held, torch.floor(held + 0.5))
 
 
 def _rounded(w: Tensor, b: Tensor, unit: Tensor, start: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
-    """Weights (F, C, …) for numbers in steps ``unit`` (C,) from ``start``, rounded as ``deploy/quantize`` does it, and
-    the biases, which undo what rounding does to the mean."""
+    """Return rounded weights (F, C, …) and biases for inputs in steps ``unit`` (C,) from ``start``.
+
+    Weights are rounded as in ``deploy/quantize``; the biases compensate the effect of rounding on the mean.
+    """
     each = (1, -1, *[1] * (w.ndim - 2))
     scaled = w * unit.reshape(each)
     step = (scaled.detach().abs().flatten(1).amax(dim=1) / 127).clamp_min(1e-30).reshape(-1, *[1] * (w.ndim - 1))

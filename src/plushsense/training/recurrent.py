@@ -1,7 +1,7 @@
-"""Recurrent networks to compare with: LSTM and BiLSTM, trained by the schedule and the seed of our own networks.
+"""Recurrent networks for comparison: LSTM and BiLSTM, trained with the schedule and seed of our own networks.
 
 The paper tried both (section 3.3) and gives no sizes. Here: one layer of 32 units, about as many parameters as the
-default network has; its last state (of both directions, where there are two) goes to a dense layer.
+default network; a dense layer reads the last state (of both directions in a BiLSTM).
 """
 
 from __future__ import annotations
@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save
 
-from plushsense.core.errors import TrainingError
-from plushsense.core.extras import need
+from plushsense.core.errors import TrainingError, need
 from plushsense.training.spec import TrainSpec
 from plushsense.windows.cut import WindowSet
 from plushsense.windows.features import Scaler
@@ -26,18 +25,18 @@ import torch  # noqa: E402
 from torch import Tensor, nn  # noqa: E402
 from torch.nn import functional as F  # noqa: E402
 
-from plushsense.training.augment import Turn  # noqa: E402
-from plushsense.training.fit import placed  # noqa: E402
+from plushsense.training.augment import Channels, Transform, augmentations  # noqa: E402
+from plushsense.training.fit import resolve_device  # noqa: E402
 
-# Part of every journalled training: raise it when the same settings would train differently.
+# Part of every training's id: raise it when the same settings train differently.
 RECURRENT_VERSION = 1
 UNITS = 32
-# Windows at a time where no gradient is kept, and those too few to train on after the first batch.
+# Windows at a time without gradients; batches smaller than _FEW after the first are skipped.
 _READ, _FEW = 512, 8
 
 
 class Recurrent(nn.Module):
-    """Scaled windows (N, C, T) → logits (N, K)."""
+    """LSTM from scaled windows (N, C, T) to logits (N, K)."""
 
     def __init__(self, channels: int, classes: int, units: int, both_ways: bool) -> None:
         super().__init__()
@@ -63,7 +62,7 @@ class RecurrentReader:
         return len(save({name: tensor.detach().cpu().numpy() for name, tensor in self.net.state_dict().items()}))
 
     def __call__(self, windows: WindowSet, /) -> NDArray[np.float32]:
-        """Probabilities (N, K)."""
+        """Return the probabilities (N, K) of the classes."""
         device = self.net.dense.weight.device
         x = torch.from_numpy(self.scaler.apply(windows.x[:, :, -self.samples :])).to(device)
         with torch.no_grad():
@@ -79,7 +78,7 @@ def fit_recurrent(
 ) -> RecurrentReader:
     """Train on the last ``samples`` of each window, for all epochs of ``spec``; the same seed gives the same weights.
 
-    Adam, its falling rate, batches, turned vectors and seed are those of ``spec``; ``patience`` is not used.
+    Adam, its learning rates, batches, augmentation and seed are those of ``spec``; ``patience`` is not used.
 
     Raises:
         TrainingError: without windows, or when the loss is no longer a number.
@@ -87,7 +86,7 @@ def fit_recurrent(
     if not len(train):
         raise TrainingError("There are no windows to train on: check the data set, the gestures and the split.")
     began = time.perf_counter()
-    device = torch.device(placed(spec).device)
+    device = torch.device(resolve_device(spec).device)
     scaler = Scaler.fit(train.x[:, :, -samples:])
     x = torch.from_numpy(scaler.apply(train.x[:, :, -samples:])).to(device)
     y = torch.from_numpy(train.y).to(device)
@@ -98,19 +97,26 @@ def fit_recurrent(
             torch.manual_seed(spec.seed)
             net = Recurrent(x.shape[1], len(train.labels), units, both_ways).to(device)
             order = torch.Generator().manual_seed(spec.seed)
-            turn = Turn(train.vectors, scaler, spec.turn_deg, device)
+            augment = augmentations(spec.augment, Channels(train.vectors, scaler, device))
             adam = torch.optim.Adam(net.parameters(), lr=spec.learning_rate)
             for epoch in range(1, spec.epochs + 1):
                 for group in adam.param_groups:
                     group["lr"] = spec.learning_rate_at(epoch)
-                _epoch(net, adam, x, y, spec.batch, order, turn, epoch)
+                _epoch(net, adam, x, y, spec.batch, order, augment, epoch)
     finally:
         torch.set_num_threads(before)
     return RecurrentReader(net.eval(), scaler, samples, time.perf_counter() - began)
 
 
 def _epoch(
-    net: Recurrent, adam: Any, x: Tensor, y: Tensor, size: int, order: torch.Generator, turn: Turn, epoch: int
+    net: Recurrent,
+    adam: Any,
+    x: Tensor,
+    y: Tensor,
+    size: int,
+    order: torch.Generator,
+    augment: Transform | None,
+    epoch: int,
 ) -> None:
     shuffled = torch.randperm(len(x), generator=order).to(x.device)
     total = torch.zeros((), device=x.device)
@@ -118,10 +124,11 @@ def _epoch(
         batch = shuffled[start : start + size]
         if start and len(batch) < min(_FEW, size):
             continue
-        loss = F.cross_entropy(net(turn(x[batch], order)), y[batch])
+        windows = x[batch] if augment is None else augment(x[batch], order)
+        loss = F.cross_entropy(net(windows), y[batch])
         adam.zero_grad(set_to_none=True)
         torch.autograd.backward(loss)
-        # An LSTM's gradient now and then leaps; without a bound one window in a long run ruins the weights.
+        # Gradients of an LSTM can explode: one window in a long run would ruin the weights.
         nn.utils.clip_grad_norm_(net.parameters(), 1.0)
         adam.step()
         total += loss.detach()

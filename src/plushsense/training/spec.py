@@ -1,4 +1,4 @@
-"""How a network is trained: the schedule, and the presets that the paper and this project use."""
+"""Settings of a training run, and the presets of the paper and of this project."""
 
 from __future__ import annotations
 
@@ -6,12 +6,15 @@ from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 from plushsense.core.errors import ConfigError, nearest
+from plushsense.training.augment import parse_augmentation
 
 DEVICES = ("auto", "cpu", "cuda")
 STOP_ON = ("loss", "accuracy")
 
-# Part of every journalled training: raise it when the same settings would train differently.
+# Part of every training's id: raise it when the same settings train differently.
 TRAINING_VERSION = 2
+
+_ROTATION = "random-rotation"
 
 
 def _one_of(what: str, value: str, known: tuple[str, ...]) -> None:
@@ -26,12 +29,12 @@ def _at_least(name: str, value: object, low: int) -> None:
 
 @dataclass(frozen=True)
 class TrainSpec:
-    """Adam with a stepwise falling rate, and when to stop.
+    """Settings of a training run: Adam with a stepwise falling learning rate, and when to stop.
 
-    ``halve_every`` epochs the rate is halved (None: constant). ``patience`` is the number of epochs without a better
-    validation loss (``stop_on`` "accuracy": a better accuracy) after which training ends with the best weights
-    (None: all epochs, and the last weights).
-    ``turn_deg`` turns the vectors of training windows at random (see `training.augment`).
+    The learning rate is halved every ``halve_every`` epochs (None: constant). Training ends with the best weights
+    after ``patience`` epochs without a better validation loss (``stop_on`` "accuracy": a better accuracy); None:
+    all epochs, and the last weights.
+    ``augment`` names the augmentations of the training windows (see `training.augment`).
     ``device`` "auto" takes CUDA where it is available. ``threads`` on the CPU: those of ``training/fast`` share the
     chunks of 64 windows of a batch, so that a batch of 64 keeps one busy; PyTorch's own gain little on networks as
     small as these, and on a busy machine a second one made an epoch 25 times slower. Run folds side by side.
@@ -43,7 +46,7 @@ class TrainSpec:
     halve_every: int | None = 30
     patience: int | None = 10
     stop_on: str = "loss"
-    turn_deg: float = 0.0
+    augment: tuple[str, ...] = ()
     seed: int = 0
     device: str = "auto"
     threads: int = 1
@@ -58,23 +61,49 @@ class TrainSpec:
                 _at_least(name, getattr(self, name), 1)
         if not 0.0 < self.learning_rate <= 1.0:
             raise ConfigError(f"learning_rate is {self.learning_rate}: accepted is above 0, up to 1.")
-        if not 0.0 <= self.turn_deg <= 180.0:
-            raise ConfigError(f"turn_deg is {self.turn_deg}: accepted are 0 (off) to 180 degrees.")
+        for augmentation in self.augment:
+            parse_augmentation(augmentation)
         _one_of("device to train on", self.device, DEVICES)
         _one_of("measure to stop on", self.stop_on, STOP_ON)
 
     def learning_rate_at(self, epoch: int) -> float:
-        """The rate in an epoch, counted from 1."""
+        """Return the learning rate in an epoch, counted from 1."""
         halvings = 0 if self.halve_every is None else (epoch - 1) // self.halve_every
         return self.learning_rate * 0.5**halvings
 
+    def changed(self, **changes: Any) -> TrainSpec:
+        """Return a copy with some settings changed; ``turn_deg=45`` stands for ``augment=["random-rotation:45"]``."""
+        if "turn_deg" in changes:
+            if "augment" in changes:
+                raise ConfigError(
+                    'Both augment and turn_deg are set: write turn_deg as augment = ["random-rotation:45"].'
+                )
+            degrees = changes.pop("turn_deg")
+            changes["augment"] = (f"{_ROTATION}:{degrees}",) if degrees else ()
+        if "augment" in changes:
+            changes["augment"] = tuple(changes["augment"])
+        return replace(self, **changes)
+
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, ready for JSON."""
-        return asdict(self)
+        """Return plain values, ready for JSON.
+
+        A list of at most a random rotation is written as ``turn_deg``, as earlier versions did: the identities of
+        their trainings and evaluations stay valid.
+        """
+        given = [parse_augmentation(text) for text in self.augment]
+        values: dict[str, Any] = {}
+        for key, value in asdict(self).items():
+            if key != "augment":
+                values[key] = value
+            elif [name for name, _ in given] in ([], [_ROTATION]):
+                values["turn_deg"] = given[0][1] if given else 0.0
+            else:
+                values[key] = list(value)
+        return values
 
     def key(self) -> dict[str, Any]:
-        """What the outcome depends on, to the last bit: all settings, and the code's version."""
-        return {"version": TRAINING_VERSION} | asdict(self)
+        """Return everything that the outcome depends on: all settings, and the version of the code."""
+        return {"version": TRAINING_VERSION} | self.to_dict()
 
 
 # "search": paper, section 3.6.1; "loso": paper, section 4.4; "paper" is the same schedule, for the paper's own form
@@ -84,29 +113,29 @@ class TrainSpec:
 PRESETS: dict[str, TrainSpec] = {
     "search": TrainSpec(epochs=250, learning_rate=0.001, halve_every=None, patience=None),
     "loso": TrainSpec(),
-    "people": TrainSpec(epochs=60, halve_every=15, patience=None, turn_deg=45.0),
+    "people": TrainSpec(epochs=60, halve_every=15, patience=None, augment=("random-rotation:45",)),
     "paper": TrainSpec(),
 }
 
-# The padding of the network that a preset trains unless another is asked for.
+# The padding of the network that a preset trains unless another is set.
 PADDING: dict[str, str] = {"search": "stream", "loso": "stream", "people": "stream", "paper": "mirror"}
 
-# The context of the windows that a preset trains on and is scored on unless another is asked for.
+# The context of the windows that a preset trains on and is scored on unless another is set.
 CONTEXT: dict[str, str] = {"search": "loop", "loso": "stream", "people": "stream", "paper": "loop"}
 
 
 def preset(name: str, **changes: Any) -> TrainSpec:
-    """The preset of a name, with some settings changed; a change of None for a number keeps the preset's.
+    """Return the preset of a name with some settings changed; None keeps the preset's.
 
     Raises:
         ConfigError: for an unknown preset or setting, with the nearest known one.
     """
     if name not in PRESETS:
         raise ConfigError(f"Unknown preset '{name}': accepted are {', '.join(PRESETS)}.{nearest(name, PRESETS)}")
-    known = [f.name for f in fields(TrainSpec)]
+    known = [*(f.name for f in fields(TrainSpec)), "turn_deg"]
     for key in changes:
         if key not in known:
             raise ConfigError(
                 f"Unknown training setting '{key}': accepted are {', '.join(known)}.{nearest(key, known)}"
             )
-    return replace(PRESETS[name], **{key: value for key, value in changes.items() if value is not None})
+    return PRESETS[name].changed(**{key: value for key, value in changes.items() if value is not None})

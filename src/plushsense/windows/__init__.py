@@ -1,1 +1,1 @@
-"""From recorded frames to windows: the clock rule, derived channels and scaling, the cut."""
+"""Clock rule, derived channels, scaling and cutting of windows."""

@@ -12,8 +12,8 @@ People also practise between recordings, and that must not pass for idleness: of
 the liveliest ``busy_share`` is left out, by how much the signals moved in the last second, without a look at labels.
 Of what remains as many are taken, evenly, as make idle windows ``idle_share`` of all.
 
-A recording that no stream holds (or whose stream gives no position of it) is cut as ``windows/cut`` does, and marked.
-A session with such a recording gives no idle positions: somewhere in its stream may be that gesture.
+A recording that no stream holds (or whose stream gives no position of it) is cut as `plushsense.windows.cut` does, and
+marked. A session with such a recording gives no idle positions: somewhere in its stream may be that gesture.
 """
 
 from __future__ import annotations
@@ -28,8 +28,16 @@ from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.gestures import Gesture, GestureSet
 from plushsense.dataset.store import Dataset, RecordingInfo, StreamInfo
 from plushsense.windows.clock import Segment, resample
-from plushsense.windows.cut import ANYWHERE, Cut, WindowSet, WindowSpec, assemble, from_recording, not_too_long
-from plushsense.windows.features import inputs
+from plushsense.windows.cut import (
+    ANYWHERE,
+    WindowCut,
+    WindowSet,
+    WindowSpec,
+    assemble,
+    drop_long_recordings,
+    from_recording,
+)
+from plushsense.windows.features import network_inputs
 
 IDLE_LABEL = "Idle"
 _LIVELY_S = 1.0
@@ -38,7 +46,10 @@ NOTHING, FREE = -1, -2
 
 @dataclass(frozen=True)
 class AnywhereSpec:
-    """Which positions of a stream are trained on, in seconds and shares; the room's own words state the rules."""
+    """Settings of the positions of a stream to train on, in seconds and shares.
+
+    The rules stand in the module's docstring.
+    """
 
     every_s: float = 0.4
     onset_s: float = 0.3
@@ -61,8 +72,8 @@ class AnywhereSpec:
             )
 
 
-def with_idle(gestures: GestureSet, dataset: Dataset) -> GestureSet:
-    """The classes, with one for idleness where a stream can show it and they hold none: the data set's, or a new one.
+def add_idle_gesture(gestures: GestureSet, dataset: Dataset) -> GestureSet:
+    """Return the gesture set with an idle class added, where a stream can show idleness and the set has none.
 
     Runs of labels fill their streams: nothing is unmarked there, and nothing is added.
     """
@@ -72,9 +83,9 @@ def with_idle(gestures: GestureSet, dataset: Dataset) -> GestureSet:
         return gestures
     own = [g for g in dataset.gestures.gestures if g.idle]
     if own:
-        wanted = {*gestures.labels, own[0].label}
-        return dataset.gestures.subset([label for label in dataset.gestures.labels if label in wanted])
-    affect = "neutral" if gestures.tells_affect else "none"
+        known = {*gestures.labels, own[0].label}
+        return dataset.gestures.subset([label for label in dataset.gestures.labels if label in known])
+    affect = "neutral" if gestures.has_affect else "none"
     idle = Gesture(IDLE_LABEL, affect, nobody=True, idle=True, description="Nothing happens to the toy")
     if gestures.find(IDLE_LABEL) is not None:
         raise DatasetError(
@@ -86,21 +97,21 @@ def with_idle(gestures: GestureSet, dataset: Dataset) -> GestureSet:
 
 @dataclass(frozen=True, eq=False)
 class _Place:
-    """A position: the samples of ``segment`` (``x`` as a network reads them) up to ``at`` are heard."""
+    """A position: the samples of ``segment`` (``x`` as a network reads them) up to ``at``."""
 
     x: NDArray[np.int64]
     segment: Segment
     at: int
 
-    def cut(self, reach: int) -> Cut:
-        """Its window."""
+    def cut(self, reach: int) -> WindowCut:
+        """Return the window that ends at the position."""
         rows = (int(self.segment.row_of[self.at - reach]), int(self.segment.row_of[self.at - 1]) + 1)
-        return Cut(self.x[self.at - reach : self.at], ANYWHERE, rows)
+        return WindowCut(self.x[self.at - reach : self.at], ANYWHERE, rows)
 
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """What a stream gave: positions in recordings, with the recording; unmarked ones that may pass for idle."""
+    """Positions of a stream: those in recordings, with the recording, and unmarked ones that may pass for idle."""
 
     held: list[tuple[RecordingInfo, _Place]]
     free: list[_Place]
@@ -113,7 +124,7 @@ def cut_anywhere(
     anywhere: AnywhereSpec | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> WindowSet:
-    """Windows at positions along the streams of ``dataset``, for training.
+    """Cut windows at positions along the streams of ``dataset``, for training.
 
     Args:
         gestures: the classes (see `with_idle`). Without an idle one, no position outside a recording is taken.
@@ -129,7 +140,7 @@ def cut_anywhere(
     anywhere = anywhere or AnywhereSpec()
     layout = dataset.layout
     reach = max(layout.samples(spec.window_s), layout.samples(spec.span_s) if spec.span_s else 0)
-    used, left_out = not_too_long([r for r in dataset.used if r.gesture in gestures.labels], spec)
+    used, left_out = drop_long_recordings([r for r in dataset.used if r.gesture in gestures.labels], spec)
     idle = next((g for g in gestures.gestures if g.idle), None)
     adrift = {(r.subject, r.session) for r in dataset.recordings if r.stream_row < 0}
     moving, resting = list[tuple[RecordingInfo, _Place]](), list[tuple[RecordingInfo, _Place]]()
@@ -144,16 +155,16 @@ def cut_anywhere(
         if progress is not None:
             progress(done + 1, len(dataset.streams))
     reached = {r.id for r, _ in (*moving, *resting)}
-    cuts: list[tuple[RecordingInfo, Cut]] = []
+    cuts: list[tuple[RecordingInfo, WindowCut]] = []
     for recording in (r for r in used if r.id not in reached):
         instead = from_recording(resample(dataset.read(recording), layout), dataset, reach, layout.samples(spec.step_s))
         if not instead:
             left_out.append(f"{recording.id}: no valid sample")
         cuts += [(recording, c) for c in instead]
     gesturing = len(moving) + sum(not gestures.get(r.gesture).idle for r, _ in cuts)
-    wanted = round(gesturing * anywhere.idle_share / (1.0 - anywhere.idle_share))
-    quiet = _evenly(resting, max(wanted // 2, wanted - len(free)))
-    quiet += _evenly(free, wanted - len(quiet))
+    n_idle = round(gesturing * anywhere.idle_share / (1.0 - anywhere.idle_share))
+    quiet = _evenly(resting, max(n_idle // 2, n_idle - len(free)))
+    quiet += _evenly(free, n_idle - len(quiet))
     cuts += [(recording, place.cut(reach)) for recording, place in (*moving, *quiet)]
     if not cuts:
         raise DatasetError(
@@ -163,14 +174,14 @@ def cut_anywhere(
 
 
 def _evenly(places: Sequence[tuple[RecordingInfo, _Place]], most: int) -> list[tuple[RecordingInfo, _Place]]:
-    """At most so many, from beginning to end in even distances: every stream gives its share."""
+    """Return at most ``most`` places, at even distances from the first to the last."""
     if len(places) <= most:
         return list(places)
     return [places[at] for at in (np.arange(max(0, most)) * len(places) // max(1, most)).tolist()]
 
 
 def _unmarked(stream: StreamInfo, idle: Gesture) -> RecordingInfo:
-    """The unmarked positions of a stream as one recording of nothing; its rows are none, so that it bars none."""
+    """Return the unmarked positions of a stream as one idle recording without rows, so that it excludes none."""
     name, file = f"{stream.id} (unmarked)", stream.file
     return RecordingInfo(
         name, stream.subject, stream.session, idle.label, file, 0, 0, 0, 0, stream.id, 0, 0, 0, 0.0, False, (), ""
@@ -180,7 +191,7 @@ def _unmarked(stream: StreamInfo, idle: Gesture) -> RecordingInfo:
 def _positions(
     dataset: Dataset, stream: StreamInfo, used: Sequence[RecordingInfo], reach: int, spec: AnywhereSpec
 ) -> _Found:
-    """The positions of one stream and what they are called."""
+    """Return the positions of one stream with their labels."""
     mine = [r for r in used if r.stream == stream.id and r.stream_row >= 0]
     chosen = {r.id for r in mine}
     barred = [r for r in dataset.recordings if r.stream == stream.id and r.stream_row >= 0 and r.id not in chosen]
@@ -188,37 +199,37 @@ def _positions(
     free: list[_Place] = []
     lively: list[float] = []
     segments = resample(dataset.read_stream(stream.id), dataset.layout)
-    whole = [inputs(segment.data, dataset.layout) for segment in segments]
+    whole = [network_inputs(segment.data, dataset.layout) for segment in segments]
     spread = np.std(np.concatenate(whole), axis=0) if whole else np.zeros(0)
     for segment, x in zip(segments, whole, strict=True):
         if len(segment) < reach:
             continue
-        said = called(segment, mine, barred, dataset.layout.rate_hz, spec)
+        labels = position_labels(segment, mine, barred, dataset.layout.rate_hz, spec)
         moved = _moved(x, dataset.layout.samples(_LIVELY_S), spread)
         for at in range(reach, len(x) + 1, dataset.layout.samples(spec.every_s)):
-            if said[at] >= 0:
-                held.append((mine[said[at]], _Place(x, segment, at)))
-            elif said[at] == FREE:
+            if labels[at] >= 0:
+                held.append((mine[labels[at]], _Place(x, segment, at)))
+            elif labels[at] == FREE:
                 free.append(_Place(x, segment, at))
                 lively.append(float(moved[at - 1]))
     kept = np.sort(np.argsort(lively, kind="stable")[: len(free) - round(spec.busy_share * len(free))])
     return _Found(held, [free[at] for at in kept.tolist()])
 
 
-def called(
+def position_labels(
     segment: Segment,
     used: Sequence[RecordingInfo],
     barred: Sequence[RecordingInfo],
     rate_hz: float,
     spec: AnywhereSpec,
 ) -> NDArray[np.int64]:
-    """What each position of a stretch is called, (n + 1,): an index into ``used``, `FREE` or `NOTHING`.
+    """Return the label of each position of a segment, (n + 1,): an index into ``used``, `FREE` or `NOTHING`.
 
     Args:
         used: recordings of the stream whose gesture is a class; their rows after trimming count.
         barred: the stream's other recordings, all their rows.
     """
-    said = np.full(len(segment) + 1, FREE, dtype=np.int64)
+    labels = np.full(len(segment) + 1, FREE, dtype=np.int64)
     onset, after, settle = (round(s * rate_hz) for s in (spec.onset_s, spec.after_s, spec.settle_s))
 
     def samples(first: int, last: int) -> tuple[int, int]:
@@ -230,29 +241,29 @@ def called(
 
     spans = [(number, *samples(*rows(r))) for number, r in enumerate(used)]
     spans = [(number, begin, end) for number, begin, end in spans if end > begin]
-    # A position counts the samples heard: at ``begin`` none of the recording, at ``end`` all of it.
+    # A position counts the samples read: at ``begin`` none of the recording, at ``end`` all of it.
     for _, _, end in spans:
-        said[end + 1 : end + settle + 1] = NOTHING
+        labels[end + 1 : end + settle + 1] = NOTHING
     for number, _, end in spans:
-        said[end + 1 : end + after + 1] = number
+        labels[end + 1 : end + after + 1] = number
     for number, begin, end in spans:
-        inside = said[begin + 1 : end + 1]
+        inside = labels[begin + 1 : end + 1]
         claimed = np.zeros(len(inside), dtype=bool)
         for other, first, last in spans:
             if other != number:
                 claimed[max(0, first - begin) : max(0, last - begin)] = True
         inside[:] = np.where(claimed, NOTHING, number)
     for _, begin, _ in spans:
-        said[begin + 1 : begin + onset] = NOTHING
+        labels[begin + 1 : begin + onset] = NOTHING
     for r in barred:
         begin, end = samples(r.stream_row, r.stream_row + r.rows)
         if end > begin:
-            said[begin + 1 : end + settle + 1] = NOTHING
-    return said
+            labels[begin + 1 : end + settle + 1] = NOTHING
+    return labels
 
 
 def _moved(x: NDArray[np.int64], samples: int, usual: NDArray[np.float64]) -> NDArray[np.float64]:
-    """How much the channels moved in the last ``samples`` of each (T,): their spreads over ``usual`` (F,), averaged."""
+    """Return the movement (T,) over the last ``samples``: spreads of the channels over ``usual`` (F,), averaged."""
     values = x - x.mean(axis=0)
     sums = np.vstack([np.zeros(values.shape[1]), np.cumsum(values, axis=0)])
     squares = np.vstack([np.zeros(values.shape[1]), np.cumsum(values**2, axis=0)])

@@ -21,8 +21,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.recfile import Frames
-from plushsense.core.signal import Layout
+from plushsense.core.layouts import Layout
+from plushsense.core.recorder_csv import Frames
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Segment:
         return len(self.data)
 
 
-class Clock:
+class SampleClock:
     """The clock rule for a live stream: frames in, even samples out."""
 
     def __init__(self, layout: Layout) -> None:
@@ -61,12 +61,12 @@ class Clock:
         self._forget()
 
     def forget(self) -> None:
-        """The next frame begins a new segment, as the first one did."""
+        """Begin a new segment with the next frame."""
         self._seen_us = None
         self._forget()
 
     def breaks(self, device_ms: int) -> bool:
-        """Whether a frame of this time would begin a new segment after a gap or a clock reset."""
+        """Return whether a frame at this time would begin a new segment after a gap or a clock reset."""
         time, seen = int(device_ms) * 1000, self._seen_us
         return seen is not None and (time < seen or time - seen > self._gap)
 
@@ -82,7 +82,7 @@ class Clock:
         return None if self._made == 0 else self._start + (self._made - 1) * self._period
 
     def push(self, device_ms: int, values: Sequence[int]) -> list[NDArray[np.int64]]:
-        """The samples, each (C,) int64, that this frame completes.
+        """Return the samples, each (C,) int64, that this frame completes.
 
         ``restarted`` then says whether the frame began a new segment: what remembers the past must be reset before it
         reads these samples.
@@ -90,7 +90,7 @@ class Clock:
         return [np.array(row, dtype=np.int64) for row in self.rows(device_ms, values)]
 
     def rows(self, device_ms: int, values: Sequence[int]) -> list[list[int]]:
-        """`push` in plain integers: a live stream cannot afford array set-up a sample."""
+        """Return what `push` does, in plain integers: faster for a live stream."""
         time = int(device_ms) * 1000
         self.restarted = self.breaks(device_ms)
         self._seen_us = time
@@ -128,7 +128,7 @@ class Clock:
 
 
 def resample(frames: Frames, layout: Layout) -> list[Segment]:
-    """The clock rule for a whole recording: the segments that a `Clock` would make of the same frames."""
+    """Return the segments that a `SampleClock` would make of a whole recording."""
     time = frames.device_ms.astype(np.int64) * 1000
     if len(time) == 0:
         return []
@@ -144,7 +144,7 @@ def resample(frames: Frames, layout: Layout) -> list[Segment]:
 
 
 def hold_valid(values: NDArray[np.int64], layout: Layout) -> tuple[NDArray[np.int64], int, int]:
-    """Rule 2 on the rows of one segment: (values, first usable row, how many values were invalid)."""
+    """Apply rule 2 to the rows of one segment; return (values, first usable row, number of invalid values)."""
     good = (values >= layout.valid_min_int) & (values <= layout.valid_max_int)
     if good.all():
         return values, 0, 0

@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, DatasetError, nearest
 from plushsense.core.gestures import GestureSet
-from plushsense.dataset.quality import NEVER_STOPPED_FACTOR
+from plushsense.dataset.quality.measurements import NEVER_STOPPED_FACTOR
 from plushsense.dataset.store import RECORDINGS, Dataset, RecordingInfo
 from plushsense.windows.clock import Segment, resample
-from plushsense.windows.features import inputs
+from plushsense.windows.features import network_inputs
 
 CONTEXTS = ("stream", "loop")
 ANYWHERE = "anywhere"
@@ -36,7 +36,7 @@ TRAIN_CONTEXTS = (*CONTEXTS, ANYWHERE)
 
 @dataclass(frozen=True)
 class WindowSpec:
-    """How windows are cut, in seconds.
+    """Settings of the cutting of windows, in seconds.
 
     ``span_s`` asks for more past than the window, for networks that need it. Recordings longer than
     ``longest_factor`` times the median of their gesture are left out (0: none are).
@@ -63,8 +63,10 @@ class WindowSpec:
 
 
 def whole_gestures(windowing: Mapping[str, Any]) -> WindowSpec:
-    """How a bundle's windows were cut (its ``windowing``); where it was trained anywhere, or on arrays, whole
-    gestures with their real past."""
+    """Return the window settings of a bundle (its ``windowing``).
+
+    Where it was trained anywhere, or on arrays, those of whole gestures with their real past.
+    """
     given = {field.name: windowing[field.name] for field in fields(WindowSpec) if field.name in windowing}
     if given.get("context") not in CONTEXTS:
         given["context"] = "stream"
@@ -104,7 +106,7 @@ class WindowSet:
         return len(self.y)
 
     def take(self, index: NDArray[np.int64]) -> WindowSet:
-        """The windows at ``index``; recordings keep their numbers."""
+        """Return the windows at ``index``; recordings keep their numbers."""
         per_window = ("x", "y", "recording", "subject", "context", "stream", "window_rows", "recording_rows")
         return replace(self, **{name: getattr(self, name)[index] for name in per_window})
 
@@ -118,8 +120,8 @@ class WindowSet:
 
 
 @dataclass
-class Cut:
-    """One window on its way into the set."""
+class WindowCut:
+    """One window before it is assembled into a set."""
 
     x: NDArray[np.int64]
     context: str
@@ -130,28 +132,28 @@ def _starts(samples: int, window: int, step: int) -> range:
     return range(0, samples - window + 1, step)
 
 
-def from_recording(segments: list[Segment], dataset: Dataset, window: int, step: int) -> list[Cut]:
-    """Full windows of every stretch; if none is long enough, the longest stretch looped."""
+def from_recording(segments: list[Segment], dataset: Dataset, window: int, step: int) -> list[WindowCut]:
+    """Cut full windows from every segment; if none is long enough, loop the longest segment."""
     cuts = []
     for segment in segments:
         if len(segment) >= window:
-            x = inputs(segment.data, dataset.layout)
-            cuts += [Cut(x[s : s + window], "inside", (-1, -1)) for s in _starts(len(x), window, step)]
+            x = network_inputs(segment.data, dataset.layout)
+            cuts += [WindowCut(x[s : s + window], "inside", (-1, -1)) for s in _starts(len(x), window, step)]
     if not cuts and segments:
-        x = inputs(max(segments, key=len).data, dataset.layout)
+        x = network_inputs(max(segments, key=len).data, dataset.layout)
         repeated = np.tile(x, (-(-window // len(x)), 1))[:window]
-        cuts.append(Cut(repeated, "loop", (-1, -1)))
+        cuts.append(WindowCut(repeated, "loop", (-1, -1)))
     return cuts
 
 
 def _from_stream(
     segments: list[Segment], first: int, last: int, window: int, reach: int, step: int, dataset: Dataset
-) -> list[Cut]:
-    """Rows ``first`` to ``last`` of a stream with their real past; nothing where the past is too short.
+) -> list[WindowCut]:
+    """Cut rows ``first`` to ``last`` of a stream with their real past; return nothing where the past is too short.
 
     Where a gap or a clock reset divides the recording, its end is cut as usual, and full windows of the parts before.
     """
-    cuts: list[Cut] = []
+    cuts: list[WindowCut] = []
     for segment in (s for s in segments if s.first_row < last and first < s.last_row):
         begin = int(np.searchsorted(segment.row_of, first, side="left"))
         end = int(np.searchsorted(segment.row_of, last, side="left"))
@@ -160,11 +162,11 @@ def _from_stream(
             ends = [end]
         if not ends or ends[0] < reach:
             continue
-        x = inputs(segment.data[ends[0] - reach : ends[-1]], dataset.layout)
+        x = network_inputs(segment.data[ends[0] - reach : ends[-1]], dataset.layout)
         for e in ends:
             stop = e - (ends[0] - reach)
             rows = (int(segment.row_of[e - reach]), int(segment.row_of[e - 1]) + 1)
-            cuts.append(Cut(x[stop - reach : stop], "inside" if e - reach >= begin else "stream", rows))
+            cuts.append(WindowCut(x[stop - reach : stop], "inside" if e - reach >= begin else "stream", rows))
     return cuts
 
 
@@ -192,12 +194,12 @@ def cut_windows(
     layout = dataset.layout
     window, step = layout.samples(spec.window_s), layout.samples(spec.step_s)
     reach = max(window, layout.samples(spec.span_s) if spec.span_s else 0)
-    wanted, left_out = not_too_long([r for r in dataset.used if r.gesture in gestures.labels], spec)
-    wanted.sort(key=lambda r: (r.stream, r.id))
-    cuts: list[tuple[RecordingInfo, Cut]] = []
+    recordings, left_out = drop_long_recordings([r for r in dataset.used if r.gesture in gestures.labels], spec)
+    recordings.sort(key=lambda r: (r.stream, r.id))
+    cuts: list[tuple[RecordingInfo, WindowCut]] = []
     stream_id, segments = "", list[Segment]()
-    for done, recording in enumerate(wanted):
-        mine: list[Cut] = []
+    for done, recording in enumerate(recordings):
+        mine: list[WindowCut] = []
         if spec.context == "stream" and recording.stream_row >= 0:
             if recording.stream != stream_id:
                 stream_id = recording.stream
@@ -211,23 +213,23 @@ def cut_windows(
             left_out.append(f"{recording.id}: no valid sample")
         cuts += [(recording, c) for c in mine]
         if progress is not None:
-            progress(done + 1, len(wanted))
+            progress(done + 1, len(recordings))
     if not cuts:
         raise DatasetError(
-            f"Data set '{dataset.head.name}' gives no window: {len(wanted)} recordings of "
+            f"Data set '{dataset.head.name}' gives no window: {len(recordings)} recordings of "
             f"{len(gestures)} gestures ({', '.join(gestures.labels[:6])}…)."
         )
     return replace(assemble(cuts, gestures, dataset), left_out=tuple(left_out))
 
 
-def not_too_long(wanted: list[RecordingInfo], spec: WindowSpec) -> tuple[list[RecordingInfo], list[str]]:
-    """The recordings to cut, and those that nobody stopped. Runs of labels in a stream are as long as they are."""
+def drop_long_recordings(recordings: list[RecordingInfo], spec: WindowSpec) -> tuple[list[RecordingInfo], list[str]]:
+    """Split recordings into those to cut and descriptions of those that were not stopped in time."""
     durations: dict[str, list[int]] = {}
-    for r in wanted:
+    for r in recordings:
         durations.setdefault(r.gesture, []).append(r.stop - r.start)
     usual = {gesture: float(np.median(rows)) for gesture, rows in durations.items()}
     kept, left_out = [], []
-    for r in wanted:
+    for r in recordings:
         own_file = r.file.startswith(f"{RECORDINGS}/")
         if spec.longest_factor and own_file and r.stop - r.start > spec.longest_factor * usual[r.gesture]:
             left_out.append(f"{r.id}: {r.stop - r.start} rows where {r.gesture} usually has {usual[r.gesture]:.0f}")
@@ -236,12 +238,12 @@ def not_too_long(wanted: list[RecordingInfo], spec: WindowSpec) -> tuple[list[Re
     return kept, left_out
 
 
-def recordings_in_time(wanted: list[RecordingInfo], spec: WindowSpec | None = None) -> list[RecordingInfo]:
-    """Those that somebody stopped in time, by the rule of `WindowSpec.longest_factor`."""
-    return not_too_long(wanted, spec or WindowSpec())[0]
+def recordings_in_time(recordings: list[RecordingInfo], spec: WindowSpec | None = None) -> list[RecordingInfo]:
+    """Return the recordings that were stopped in time, by the rule of `WindowSpec.longest_factor`."""
+    return drop_long_recordings(recordings, spec or WindowSpec())[0]
 
 
-def assemble(cuts: list[tuple[RecordingInfo, Cut]], gestures: GestureSet, dataset: Dataset) -> WindowSet:
+def assemble(cuts: list[tuple[RecordingInfo, WindowCut]], gestures: GestureSet, dataset: Dataset) -> WindowSet:
     ids = tuple(sorted({r.id for r, _ in cuts}))
     number = {identity: i for i, identity in enumerate(ids)}
     # Layouts see to it that every input fits 32 bits.
@@ -278,7 +280,8 @@ def assemble(cuts: list[tuple[RecordingInfo, Cut]], gestures: GestureSet, datase
 
 
 def shared_gestures(dataset: Dataset, share: float = 0.9) -> tuple[GestureSet, dict[str, str]]:
-    """The gestures that at least ``share`` of the people made and that are not free choice, and why each other is not.
+    """Return the gestures that at least ``share`` of the people made and that are not free choice, and why each
+    other is not.
 
     Gestures that are recorded without a person stay in.
     """

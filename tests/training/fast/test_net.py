@@ -8,9 +8,9 @@ import pytest
 from plushsense.models.arch import Arch
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed (extra train)")
-from plushsense.models.net import Net  # noqa: E402
-from plushsense.training.fast import plan  # noqa: E402
-from plushsense.training.fast.net import FastNet, can  # noqa: E402
+from plushsense.models.net import Net
+from plushsense.training.fast import plan
+from plushsense.training.fast.net import FastNet, can_train
 
 
 def pair(symbol: str, filters: str, padding: str, batch: int, window: int = 250, threads: int = 1, **more: int):  # type: ignore[no-untyped-def]
@@ -136,6 +136,6 @@ def test_memory_that_is_used_again_keeps_nothing_of_the_last_batch() -> None:
 
 
 def test_what_it_can_train() -> None:
-    assert can(Arch.parse("3", "4", padding="stream")) and can(Arch.parse("3", "4", padding="mirror"))
-    assert not can(Arch.parse("3", "4", padding="causal"))
-    assert not can(Arch.parse("3", "4", padding="stream", norm="layer"))
+    assert can_train(Arch.parse("3", "4", padding="stream")) and can_train(Arch.parse("3", "4", padding="mirror"))
+    assert not can_train(Arch.parse("3", "4", padding="causal"))
+    assert not can_train(Arch.parse("3", "4", padding="stream", norm="layer"))

@@ -1389,39 +1389,41 @@ static void forget(plush_toy *toy)
 
 /* ---- What others call ------------------------------------------------------------------------------------------ */
 
-uint32_t plush_memory_bytes(const uint8_t *model, uint32_t model_bytes)
-{
-    plush_toy toy;
-
-    return check(model, model_bytes) == PLUSH_OK && read_model(&toy, model) ? share_out(&toy, NULL) : 0;
-}
-
 struct plush_aligned {
     uint8_t byte;
     uint32_t word;
 };
 
-plush_status plush_begin(plush_toy *toy, const uint8_t *model, uint32_t model_bytes, void *memory,
-                         uint32_t memory_bytes)
+/* A toy with this model and memory. Nothing is written to the memory; a toy of which this does not say PLUSH_OK is of no
+ * use. */
+PLUSH_APART
+static plush_status prepare(plush_toy *toy, const uint8_t *model, uint32_t model_bytes, void *memory,
+                            uint32_t memory_bytes)
 {
     plush_status status = check(model, model_bytes);
 
     memset(toy, 0, sizeof *toy);
-    if (status == PLUSH_OK && !read_model(toy, model))
-        status = PLUSH_DAMAGED;
-    if (status == PLUSH_OK && (memory == NULL || (uintptr_t)memory % offsetof(struct plush_aligned, word) != 0 ||
-                               share_out(toy, NULL) > memory_bytes))
-        status = PLUSH_MEMORY_TOO_SMALL;
-    if (status != PLUSH_OK) {
-        memset(toy, 0, sizeof *toy);
+    if (status != PLUSH_OK)
         return status;
-    }
+    if (!read_model(toy, model))
+        return PLUSH_DAMAGED;
+    if (memory == NULL || (uintptr_t)memory % offsetof(struct plush_aligned, word) != 0 ||
+        share_out(toy, NULL) > memory_bytes)
+        return PLUSH_MEMORY_TOO_SMALL;
     toy->memory = memory;
     share_out(toy, (uint8_t *)memory);
-    plush_restart(toy);
     return PLUSH_OK;
 }
 
+uint32_t plush_memory_bytes(const uint8_t *model, uint32_t model_bytes)
+{
+    plush_toy toy;
+
+    /* Without memory, only that can be wrong with a good model. */
+    return prepare(&toy, model, model_bytes, NULL, 0) == PLUSH_MEMORY_TOO_SMALL ? share_out(&toy, NULL) : 0;
+}
+
+PLUSH_APART
 void plush_restart(plush_toy *toy)
 {
     if (toy->memory == NULL) /* plush_begin() has not said PLUSH_OK */
@@ -1429,6 +1431,34 @@ void plush_restart(plush_toy *toy)
     lose(toy, toy->seen_ms);
     forget_health(toy);
     forget(toy);
+}
+
+plush_status plush_begin(plush_toy *toy, const uint8_t *model, uint32_t model_bytes, void *memory,
+                         uint32_t memory_bytes)
+{
+    plush_status status = prepare(toy, model, model_bytes, memory, memory_bytes);
+
+    if (status != PLUSH_OK)
+        memset(toy, 0, sizeof *toy);
+    plush_restart(toy);
+    return status;
+}
+
+plush_status plush_swap(plush_toy *toy, const uint8_t *model, uint32_t model_bytes, void *memory,
+                        uint32_t memory_bytes)
+{
+    plush_toy next;
+    plush_status status = prepare(&next, model, model_bytes, memory, memory_bytes);
+
+    if (status != PLUSH_OK)
+        return status;
+    if (toy->memory == NULL || toy->layout != next.layout || toy->channels != next.channels)
+        return PLUSH_OTHER_LAYOUT;
+    lose(toy, toy->seen_ms); /* while the old model can still be read */
+    memcpy(&next, toy, offsetof(plush_toy, layers)); /* answers, events, counts, callbacks */
+    *toy = next;
+    plush_restart(toy);
+    return PLUSH_OK;
 }
 
 void plush_silence(plush_toy *toy)

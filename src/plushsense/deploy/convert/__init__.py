@@ -1,13 +1,11 @@
-"""The network for other runtimes: optional converters, each beside the tool that it needs.
+"""Optional converters of the network to formats of other runtimes.
 
-They recompute a whole window a decision; the C of the export computes each sample once. The clock, the derived
-channels, the validity rule and the smoothing stay with the caller.
+They compute a whole window for each decision; the C of the export computes each sample once. The caller provides the
+clock, the derived channels, the validity rule and the smoothing.
 """
 
 from __future__ import annotations
 
-import contextlib
-import uuid
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -17,10 +15,11 @@ from typing import Any
 from numpy.typing import NDArray
 
 from plushsense.core.errors import BadInput, ConfigError, nearest
-from plushsense.deploy.convert.as_espdl import to_espdl
-from plushsense.deploy.convert.as_onnx import to_integer_onnx, to_onnx
-from plushsense.deploy.convert.as_tflite import to_integer_tflite, to_tflite
-from plushsense.deploy.convert.facts import Converted, Job, Made
+from plushsense.core.files import write_file
+from plushsense.deploy.convert.espdl import to_espdl
+from plushsense.deploy.convert.facts import Conversion, ConversionJob, Converted
+from plushsense.deploy.convert.onnx import to_integer_onnx, to_onnx
+from plushsense.deploy.convert.tflite import to_integer_tflite, to_tflite
 from plushsense.models.bundle import Bundle
 
 __all__ = ["CONVERTERS", "Converted", "Format", "check_format", "convert"]
@@ -28,11 +27,11 @@ __all__ = ["CONVERTERS", "Converted", "Format", "check_format", "convert"]
 
 @dataclass(frozen=True)
 class Format:
-    """A format: the file it is written to, what it holds, the function that writes it."""
+    """A format: its file name, a description of the contents, and the converter."""
 
     file_name: str
     holds: str
-    write: Callable[[Job], Made]
+    write: Callable[[ConversionJob], Conversion]
 
 
 CONVERTERS: dict[str, Format] = {
@@ -49,7 +48,7 @@ CONVERTERS: dict[str, Format] = {
 
 
 def check_format(name: str) -> None:
-    """Refuse a format that there is not: ConfigError with those that there are."""
+    """Raise ConfigError for an unknown format."""
     if name not in CONVERTERS:
         raise ConfigError(f"Unknown format '{name}': accepted are {', '.join(CONVERTERS)}.{nearest(name, CONVERTERS)}")
 
@@ -73,16 +72,11 @@ def convert(
         BundleError: when the result does not give the network's answers; for int8, a bundle without calibration.
     """
     check_format(format_name)
-    made = CONVERTERS[format_name].write(Job.of(bundle, windows))
+    result = CONVERTERS[format_name].write(ConversionJob.of(bundle, windows))
     path = Path(path)
-    part = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_bytes(made.data)
-        part.replace(path)
+        write_file(path, result.data)
     except OSError as cause:
-        raise BadInput(f"'{path}' cannot be written ({cause}): choose another place.") from None
-    finally:
-        with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
-    return Converted(path, len(made.data), made.largest_difference, made.notes)
+        raise BadInput(f"'{path}' cannot be written ({cause}): choose another path.") from None
+    return Converted(path, len(result.data), result.largest_difference, result.notes)

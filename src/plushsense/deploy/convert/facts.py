@@ -1,4 +1,4 @@
-"""What every converter says, and how its result is tried: facts to write into the file, windows, the comparison."""
+"""Metadata, test windows and the comparison of logits that all converters share."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import BundleError
 from plushsense.models.bundle import Bundle
-from plushsense.models.fixed import LOGIT_LIMIT
-from plushsense.models.integer import IntegerNetwork
 from plushsense.models.reference import check_windows
+from plushsense.runtime.fixed import LOGIT_LIMIT
+from plushsense.runtime.integer import IntegerNetwork
 from plushsense.windows.features import Scaler
 
 Floats = NDArray[np.float32]
@@ -48,8 +48,8 @@ class Converted:
 
 
 @dataclass(frozen=True)
-class Made:
-    """What a converter gives: the file's bytes, and as in `Converted`."""
+class Conversion:
+    """Result of a converter: the bytes of the file; the other fields as in `Converted`."""
 
     data: bytes
     largest_difference: float | None
@@ -57,17 +57,19 @@ class Made:
 
 
 @dataclass(frozen=True)
-class Job:
-    """What a converter is given: the bundle, and raw windows (N, C, T) to try and to calibrate with: ``given`` ones
-    first, then made-up ones."""
+class ConversionJob:
+    """Input of a converter: the bundle and raw windows (N, C, T), of which the first ``given`` came from the caller.
+
+    The windows serve to calibrate and to compare; the others are generated.
+    """
 
     bundle: Bundle
     windows: Windows
     given: int
 
     @classmethod
-    def of(cls, bundle: Bundle, windows: NDArray[Any] | None) -> Job:
-        """With made-up windows beside the given ones.
+    def of(cls, bundle: Bundle, windows: NDArray[Any] | None) -> ConversionJob:
+        """Return the job with generated windows after the given ones.
 
         Raises:
             BadInput: for windows of another shape.
@@ -79,24 +81,24 @@ class Job:
             tried = np.concatenate([given, tried])
         return cls(bundle, tried, 0 if windows is None else len(windows))
 
-    def thinned(self, most: int) -> Job:
-        """At most ``most`` of the given windows, evenly taken, and the made-up ones."""
+    def thinned(self, most: int) -> ConversionJob:
+        """Return the job with at most ``most`` of the given windows, evenly spaced, and all generated ones."""
         given = self.windows[: self.given][:: max(1, -(-self.given // most))]
         return replace(self, windows=np.concatenate([given, self.windows[self.given :]]), given=len(given))
 
     @property
     def tried(self) -> str:
-        """The windows, in words."""
+        """Number of windows as text."""
         made = len(self.windows) - self.given
         return f"{made} made-up windows" if not self.given else f"{self.given} given and {made} made-up windows"
 
     def reference(self) -> NDArray[np.float64]:
-        """Logits (N, K) of the float network."""
+        """Return the logits (N, K) of the float network."""
         return self.bundle.network().forward(self.bundle.scaler.apply(self.windows))
 
 
 def made_up_windows(bundle: Bundle, n: int = 24) -> Windows:
-    """Raw windows (n, C, span) that nobody recorded: walks and noise about the middle of each channel."""
+    """Generate raw windows (n, C, span): random walks and noise around the mean of each channel."""
     rng = np.random.default_rng(20)
     shape = (n, bundle.arch.channels, bundle.arch.span)
     walk = np.cumsum(rng.normal(size=shape), axis=2) / np.sqrt(shape[2] / 4) + rng.normal(size=(*shape[:2], 1))
@@ -111,16 +113,20 @@ def made_up_windows(bundle: Bundle, n: int = 24) -> Windows:
 
 
 def scaling(scaler: Scaler) -> tuple[Floats, Floats, Floats]:
-    """(whole, scale, rest), each (C,): ``(raw - whole) * scale + rest`` in float32 is the scaler without its losing
-    the last digits of a large offset."""
+    """Return (whole, scale, rest), each (C,), with which ``(raw - whole) * scale + rest`` is the scaler in float32.
+
+    Subtracting a whole number first keeps the last digits of a large offset.
+    """
     whole = np.rint(scaler.offset)
     rest = (whole - scaler.offset) * scaler.scale
     return whole.astype(np.float32), scaler.scale.astype(np.float32), rest.astype(np.float32)
 
 
 def input_codes(network: IntegerNetwork) -> tuple[Floats, Floats, Floats]:
-    """(offset, gain, start), each (C,): ``(raw - offset) * gain + start``, rounded and held in 0 to 255, is what the
-    first layer reads; it may differ from `InputScale` by 1 where that rounds the other way."""
+    """Return (offset, gain, start), each (C,): ``(raw - offset) * gain + start``, rounded and clipped to 0…255.
+
+    This is the input of the first layer; it may differ from `InputScale` by 1 where that rounds the other way.
+    """
     scale = network.inputs
     unit = np.ldexp(1.0, -scale.after)
     gain = scale.multiplier * unit * np.ldexp(1.0, -scale.before)
@@ -128,12 +134,12 @@ def input_codes(network: IntegerNetwork) -> tuple[Floats, Floats, Floats]:
 
 
 def sum_scales(multiplier: NDArray[Any], before: NDArray[Any], after: NDArray[Any]) -> NDArray[np.float64]:
-    """What a sum is multiplied by; never 0, which runtimes refuse: 2^-32 of any sum is less than half."""
+    """Return the factors of a layer's sums; at least 2^-32, because runtimes refuse 0."""
     return np.asarray(np.maximum(multiplier * np.ldexp(1.0, -(before + after)), 2.0**-32))
 
 
 def describe(bundle: Bundle) -> dict[str, str]:
-    """What a file must say of itself, as texts: `metadata_props` of ONNX, the metadata of a .tflite."""
+    """Return the metadata to write into a file, as texts (`metadata_props` of ONNX, metadata of a .tflite)."""
     arch, layout = bundle.arch, bundle.layout
     provenance = bundle.provenance
     facts: dict[str, Any] = {
@@ -158,20 +164,26 @@ def describe(bundle: Bundle) -> dict[str, str]:
 
 
 def compare(
-    found: NDArray[Any], job: Job, title: str, expected: NDArray[np.float64] | None = None, exact: bool = True
+    logits: NDArray[Any],
+    job: ConversionJob,
+    title: str,
+    expected: NDArray[np.float64] | None = None,
+    exact: bool = True,
 ) -> tuple[float, str]:
-    """(largest difference, a sentence) between logits (N, K); ``exact`` refuses what is no rounding.
+    """Compare logits (N, K) with the expected ones: return the largest difference and a sentence about it.
+
+    With ``exact`` a difference beyond rounding is refused.
 
     Raises:
         BundleError: when a float file does not give the network's answers.
     """
     expected = job.reference() if expected is None else expected
-    largest = float(np.abs(found - expected).max())
-    same = int((found.argmax(axis=1) == expected.argmax(axis=1)).sum())
+    largest = float(np.abs(logits - expected).max())
+    same = int((logits.argmax(axis=1) == expected.argmax(axis=1)).sum())
     if exact and not largest <= TOLERANCE * max(1.0, float(np.abs(expected).max())):
         raise BundleError(
             f"The {title} file answers otherwise than the bundle (logits differ by up to {largest:.3g}) and is not "
             "written: please report this with the bundle."
         )
-    said = f"On {job.tried}: logits differ by at most {largest:.2g}, the same gesture in {same} of {len(expected)}."
-    return largest, said
+    sentence = f"On {job.tried}: logits differ by at most {largest:.2g}, the same gesture in {same} of {len(expected)}."
+    return largest, sentence

@@ -1,4 +1,4 @@
-"""The virtual toy: people, their hands on a simulated plush companion, and what its sensors then send.
+"""The virtual toy: simulated people who touch a simulated plush companion, and its sensor signals.
 
-Its scores say nothing about a real toy: it is for demos, tests and fault drills.
+Its scores say nothing about a real toy: it is for demos and tests.
 """

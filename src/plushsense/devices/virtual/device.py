@@ -1,4 +1,4 @@
-"""``virtual://``: the virtual toy in this process, through the same bytes and the same parser as a real one."""
+"""The virtual toy in this process (``virtual://``), with the same bytes and the same parser as a real one."""
 
 from __future__ import annotations
 
@@ -6,18 +6,17 @@ import time
 from collections.abc import Callable
 
 from plushsense.core.errors import ConfigError
-from plushsense.core.signal import Layout
+from plushsense.core.layouts import Layout
 from plushsense.devices.base import Device, Frame, Pacer, now_ms
-from plushsense.devices.opening import Address
-from plushsense.devices.virtual.cues import Cue, Cues
-from plushsense.devices.virtual.stream import Line, Performed, ToySpec, ToyStream
+from plushsense.devices.opening import DeviceAddress
+from plushsense.devices.virtual.stream import PerformedGesture, Prompt, Prompts, ToyLine, ToySpec, ToyStream
 from plushsense.devices.wire import LineParser
 
 _BLOCK = 200
 
 
 class VirtualDevice(Device):
-    """A virtual toy. ``on_performed`` may be set to hear what its person does; ``performed`` lists it all.
+    """A virtual toy. ``performed`` lists the gestures that its person made; ``on_performed`` is called with each.
 
     Args:
         speed: 1 real time, 0 as fast as frames are taken.
@@ -27,52 +26,52 @@ class VirtualDevice(Device):
     def __init__(self, url: str, layout: Layout, spec: ToySpec, speed: float = 1.0, seconds: float = 0.0) -> None:
         super().__init__(url, layout)
         self.spec = spec
-        self.performed: list[Performed] = []
-        self.on_performed: Callable[[Performed], None] | None = None
+        self.performed: list[PerformedGesture] = []
+        self.on_performed: Callable[[PerformedGesture], None] | None = None
         self._stream = ToyStream(spec, layout)
         self._lines = iter(self._stream)
-        self._cue: Cue | None = None
+        self._prompt: Prompt | None = None
         self._parser = LineParser(layout, self.counters)
         self._pacer = Pacer(speed)
         self._seconds = seconds
         self._first_ms: int | None = None
-        self._next: Line | None = None
+        self._next: ToyLine | None = None
         self._due = 0.0
 
     @property
     def first_ms(self) -> int | None:
-        """The device clock at the first line, the zero of a live run's times; None before it."""
+        """The device clock at the first line, from which a live run counts its times; None before it."""
         return self._first_ms
 
     def play_ahead(self) -> None:
-        """Work out all its lines now; then reading costs only what reading a real toy does. It needs ``seconds``.
+        """Compute all lines now, so that reading is as fast as with a real toy. It needs ``seconds``.
 
         Raises:
             ConfigError: for a toy without an end.
         """
         if not self._seconds:
             raise ConfigError(f"'{self.url}' has no end to play ahead to: give it seconds=.")
-        lines: list[Line] = []
+        lines: list[ToyLine] = []
         for line in self._lines:
             lines.append(line)
             if line.device_ms - lines[0].device_ms >= self._seconds * 1000.0:
                 break
         self._lines = iter(lines)
 
-    def follow(self, cues: Cues | None = None) -> None:
-        """From now on the person only does what ``cues`` or `perform` say; call it before the first `read`."""
-        self._stream.cues = cues or self._next_cue
+    def follow(self, prompts: Prompts | None = None) -> None:
+        """Make the person do only what ``prompts`` or `perform` ask for; call it before the first `read`."""
+        self._stream.prompts = prompts or self._next_prompt
 
     def perform(self, label: str, begin_ms: int | None = None) -> None:
-        """Have the person make a gesture, so that the hand comes when the toy's clock is ``begin_ms``."""
-        self._cue = Cue(label, begin_ms)
+        """Make the person perform a gesture that begins when the toy's clock is ``begin_ms``."""
+        self._prompt = Prompt(label, begin_ms)
 
-    def _next_cue(self) -> Cue | None:
-        cue, self._cue = self._cue, None
-        return cue
+    def _next_prompt(self) -> Prompt | None:
+        prompt, self._prompt = self._prompt, None
+        return prompt
 
     def read(self) -> list[Frame] | None:
-        """The frames that are due, waiting at most about ``wait_s``; None after ``seconds``."""
+        """Return the frames that are due, waiting at most about ``wait_s``; return None after ``seconds``."""
         until = time.monotonic() + self.wait_s
         data = bytearray()
         count = 0
@@ -109,7 +108,7 @@ class VirtualDevice(Device):
         return [Frame(host, p.device_ms, p.values) for p in self._parser.feed(bytes(data))]
 
 
-def open_url(address: Address, layout: Layout) -> VirtualDevice:
+def open_virtual(address: DeviceAddress, layout: Layout) -> VirtualDevice:
     """Open ``virtual://?person=7&seed=1&speed=1``; also session, lost, garbled, glitch, seconds,
     gestures (with commas).
     """

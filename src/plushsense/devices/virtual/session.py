@@ -1,7 +1,7 @@
-"""A person and the toy over time: waiting, picking it up, gestures, putting it down; what the sensors send meanwhile.
+"""Simulate a person's session with the toy: waiting, picking it up, gestures, putting it down, and the sensor signals.
 
-A session is made of episodes. Each begins and ends with the toy on the table and no hand near, so that episodes can
-be joined without an end; the samples, the device clock and the room's drift go on from one to the next.
+A session consists of episodes. Each begins and ends with the toy on the table and no hand near, so that any number of
+them can be joined; samples, device clock and humidity drift continue from one to the next.
 """
 
 from __future__ import annotations
@@ -14,11 +14,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, nearest
-from plushsense.devices.virtual.canvas import RATE_HZ, Canvas, Climate, Floats, sense
-from plushsense.devices.virtual.holding import APPROACH_S, PICK_S, PUT_S, Hands, Plan, samples
-from plushsense.devices.virtual.motions import AT_REST, DURATIONS, MOTIONS, Trial, split_label
-from plushsense.devices.virtual.people import Person, draw_person
-from plushsense.devices.virtual.world import WORLD, Pair, World
+from plushsense.devices.virtual.motions import (
+    APPROACH_S,
+    AT_REST,
+    DURATIONS,
+    MOTIONS,
+    PICK_S,
+    PUT_S,
+    RATE_HZ,
+    Canvas,
+    Climate,
+    Floats,
+    Hands,
+    Performance,
+    RepetitionPlan,
+    samples,
+    sense,
+    split_label,
+)
+from plushsense.devices.virtual.world import WORLD, Pair, Person, World, draw_person
 
 GESTURES = (
     "Back stroke 1", "Back stroke 2", "Ear scratch 1", "Ear scratch 2", "Head stroke 1", "Head stroke 2",
@@ -31,10 +45,12 @@ _POSTURES = np.array([(0, 0, 1.0), (0, 0, -1.0), (0, 1.0, 0.1), (0, -1.0, 0.1), 
 
 
 @dataclass(frozen=True)
-class Mark:
-    """One performed gesture, in samples of the session: the hand works from ``start`` to ``stop``; a recorder that
-    somebody starts and stops by hand would hold ``record_start`` to ``record_stop``. ``struck`` is when a rough
-    gesture's blow or jerk comes, after the hand has reached out; None for any other."""
+class GestureMark:
+    """A performed gesture, in samples of the session.
+
+    The hand works from ``start`` to ``stop``; a recorder started and stopped by hand holds ``record_start`` to
+    ``record_stop``. ``struck`` is the time of a rough gesture's impact or jerk; None for any other gesture.
+    """
 
     label: str
     record_start: int
@@ -46,22 +62,25 @@ class Mark:
 
 @dataclass(frozen=True)
 class Episode:
-    """A piece of a session: ``first`` sample number, raw ``values`` (n, 13) in the order of `CHANNELS`,
-    ``device_ms`` (n,), ``delay_ms`` (n,), and the gestures performed in it."""
+    """A section of a session.
+
+    ``first`` is its first sample number; ``values`` (n, 13) are raw, in the order of `CHANNELS`; ``device_ms`` (n,);
+    ``delay_ms`` (n,); ``marks`` are the gestures performed in it.
+    """
 
     first: int
     values: NDArray[np.int64]
     device_ms: NDArray[np.int64]
     delay_ms: NDArray[np.int64]
-    marks: tuple[Mark, ...] = ()
+    marks: tuple[GestureMark, ...] = ()
 
     def __len__(self) -> int:
         return len(self.device_ms)
 
 
 @dataclass
-class Session:
-    """One person's time with the toy. The same person, seed and number give the same session.
+class VirtualSession:
+    """A person's session with the toy. The same person, seed and number give the same session.
 
     Args:
         person: who; None for recordings of nobody (somebody turns the toy over and goes away).
@@ -88,10 +107,10 @@ class Session:
         self._down: Floats = self._hands.upright()
         self.clock_ms = int(self._rng.integers(5_000, 60_000))
 
-    # What happens ---------------------------------------------------------------------------------------------
+    # Episodes -------------------------------------------------------------------------------------------------
 
     def perform(self, label: str, repetitions: int = 1) -> Episode:
-        """A gesture of plush-18, made some times; "At rest" turns the toy over and leaves it alone."""
+        """Perform a gesture of plush-18 a number of times; "At rest" turns the toy over and leaves it alone."""
         if label == AT_REST:
             return self._rest(repetitions)
         family, in_hands = split_label(label)
@@ -118,7 +137,7 @@ class Session:
             share = world.grip_tail if family.startswith("Tail") else 1.0
             self._down = self._hands.hold(canvas, first_pick, put, plans, share)
         for plan in plans:
-            trial = Trial(
+            trial = Performance(
                 person=who,
                 family=family,
                 in_hands=in_hands,
@@ -139,15 +158,15 @@ class Session:
         marks = []
         for p in plans:
             blow = next((at + s for s in canvas.struck if p.at <= s < p.at + p.n), None)
-            marks.append(Mark(label, at + p.record_start, at + p.at, at + p.at + p.n, at + p.record_stop, blow))
+            marks.append(GestureMark(label, at + p.record_start, at + p.at, at + p.at + p.n, at + p.record_stop, blow))
         return self._sense(canvas, tuple(marks))
 
     def idle(self, seconds: float) -> Episode:
-        """The toy stands on the table and nobody touches it."""
+        """Leave the toy untouched on the table."""
         return self._sense(Canvas(max(1, samples(seconds)), self._down), ())
 
     def handle(self) -> Episode:
-        """Somebody takes the toy up, turns it and puts it down: no gesture."""
+        """Lift the toy, turn it and put it down, which is no gesture."""
         n_hold = samples(0.6 + 1.2 * self._rng.random())
         start = samples(0.4)
         put = start + samples(PICK_S) + n_hold
@@ -156,7 +175,7 @@ class Session:
         return self._sense(canvas, ())
 
     def play(self, gestures: Iterable[str] | None = None) -> Iterator[Episode]:
-        """Episodes without end: idle, now and then handling, and gestures at random, or those given, over and over."""
+        """Yield episodes without end: idle, sometimes handling, and random gestures, or ``gestures`` in turn."""
         script = tuple(gestures or ())
         turn = 0
         while True:
@@ -167,13 +186,13 @@ class Session:
             turn += 1
             yield self.perform(label)
 
-    # How it happens -------------------------------------------------------------------------------------------
+    # Simulation -----------------------------------------------------------------------------------------------
 
     def _wait(self) -> int:
         low, high = self.wait_s or (self.world.countdown_s + 0.5, self.world.countdown_s + 2.0)
         return samples(low + (high - low) * self._rng.random())
 
-    def _plan(self, family: str, record_start: int) -> Plan:
+    def _plan(self, family: str, record_start: int) -> RepetitionPlan:
         rng, who, world = self._rng, self._who, self.world
         median, spread = getattr(world, DURATIONS[family])
         latency = max(0.1, who.latency_s + 0.5 * world.latency_s[1] * rng.standard_normal())
@@ -185,10 +204,10 @@ class Session:
         blur = world.blur_tail if family.startswith("Tail") else blur
         blur = world.blur_hit if family == "Tail hit" else blur
         lap, steadied = rng.random() < blur * who.lap, rng.random() < blur * who.steadies
-        return Plan(record_start, at, n, at + n + samples(stop), lap, steadied, self._hands.light())
+        return RepetitionPlan(record_start, at, n, at + n + samples(stop), lap, steadied, self._hands.light())
 
     def _rest(self, repetitions: int) -> Episode:
-        """Somebody lays the toy down in another way each time, and leaves."""
+        """Lay the toy down in another way each time, and leave it."""
         rng, world = self._rng, self.world
         pieces, marks = [], []
         for _ in range(repetitions):
@@ -197,7 +216,7 @@ class Session:
             seconds = max(3.0, world.rest_s[0] * math.exp(world.rest_s[1] * rng.standard_normal()))
             start = self.samples
             pieces.append(self.idle(seconds))
-            marks.append(Mark(AT_REST, start, start, self.samples, self.samples))
+            marks.append(GestureMark(AT_REST, start, start, self.samples, self.samples))
         return Episode(
             pieces[0].first,
             np.concatenate([p.values for p in pieces]),
@@ -207,7 +226,7 @@ class Session:
         )
 
     def _lay(self, posture: Floats) -> Episode:
-        """Somebody takes the toy up and lays it down with gravity along ``posture``."""
+        """Lift the toy and lay it down with gravity along ``posture``."""
         start = samples(0.3)
         put = start + samples(1.4)
         canvas = Canvas(put + samples(PUT_S + 0.6), self._down)
@@ -216,7 +235,7 @@ class Session:
         canvas.turn(put, samples(PUT_S), self._down)
         return self._sense(canvas, ())
 
-    def _sense(self, canvas: Canvas, marks: tuple[Mark, ...]) -> Episode:
+    def _sense(self, canvas: Canvas, marks: tuple[GestureMark, ...]) -> Episode:
         rng, world, n = self._rng, self.world, len(canvas)
         first = self.samples
         values = sense(canvas, first, self._climate, self._who.coupling, rng, world)

@@ -1,21 +1,73 @@
-"""The virtual toy as a byte stream: lines in the wire format, some lost, some garbled, and what is being performed."""
+"""The byte stream of the virtual toy: lines in the wire format, some of them lost or corrupted."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+import json
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from plushsense.core.errors import ConfigError, nearest
-from plushsense.core.signal import DELAY_MS, DEVICE_MS, Layout
-from plushsense.devices.virtual.cues import Cues
-from plushsense.devices.virtual.holding import PICK_S
-from plushsense.devices.virtual.motions import AT_REST, split_label
-from plushsense.devices.virtual.people import draw_person
-from plushsense.devices.virtual.session import GESTURES, Episode, Session
-from plushsense.devices.virtual.world import CHANNELS, WORLD, World
+from plushsense.core.layouts import DELAY_MS, DEVICE_MS, Layout
+from plushsense.devices.virtual.motions import AT_REST, PICK_S, split_label
+from plushsense.devices.virtual.session import GESTURES, Episode, VirtualSession
+from plushsense.devices.virtual.world import CHANNELS, WORLD, World, draw_person
+
+
+@dataclass(frozen=True)
+class Prompt:
+    """A gesture to perform, and when its recording begins on the toy's clock (ms); None: as soon as possible."""
+
+    label: str
+    begin_ms: int | None = None
+
+
+Prompts = Callable[[], Prompt | None]
+"""A function, called repeatedly, that returns the newest prompt since the last call, or None."""
+
+
+class LogPrompts:
+    """Read prompts from a session's log (``session.jsonl``) while a recorder writes it, from now on.
+
+    Nothing is sent to the toy itself, since a real one would not know the bytes. The file need not exist yet.
+    A prompt is a ``countdown`` event with ``gesture``, ``device_ms`` and ``countdown_s``.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self._path = Path(path)
+        try:
+            self._at = self._path.stat().st_size
+        except OSError:
+            self._at = 0
+        self._rest = b""
+
+    def __call__(self) -> Prompt | None:
+        """Return the newest prompt since the last call; None when there is none."""
+        try:
+            if self._path.stat().st_size <= self._at:
+                return None
+            with self._path.open("rb") as file:
+                file.seek(self._at)
+                data = file.read()
+        except OSError:
+            return None
+        self._at += len(data)
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        prompt = None
+        for line in lines:
+            try:
+                event = json.loads(line)
+                if event["what"] == "countdown":
+                    at = event.get("device_ms")
+                    begin = None if at is None else int(at) + round(1000.0 * float(event.get("countdown_s", 0.0)))
+                    prompt = Prompt(str(event["gesture"]), begin)
+            except (ValueError, KeyError, TypeError):
+                continue
+        return prompt
+
 
 _ALIASES = {"x": "acc_x", "y": "acc_y", "z": "acc_z"}
 _NOISE = bytes(range(128, 256)) + b"#?~\x00\x7f"
@@ -26,30 +78,30 @@ _LEAD_S = 0.6
 
 
 @dataclass(frozen=True)
-class Performed:
-    """The truth about one gesture: its label, and from when to when on the device clock the hand works."""
+class PerformedGesture:
+    """A performed gesture: its label, and begin and end on the device clock."""
 
     label: str
     start_ms: int
     end_ms: int
 
     def to_dict(self) -> dict[str, str | int]:
-        """Plain values, ready for a JSON line."""
+        """Return plain values, ready for JSON."""
         return dataclasses.asdict(self)
 
 
 @dataclass(frozen=True)
-class Line:
-    """One line as it leaves the toy: its bytes (empty when lost), its time, and the gesture that begins with it."""
+class ToyLine:
+    """A line as the toy sends it: its bytes (empty when lost), its time, and the gesture that begins with it."""
 
     data: bytes
     device_ms: int
-    begins: Performed | None = None
+    begins: PerformedGesture | None = None
 
 
 @dataclass(frozen=True)
 class ToySpec:
-    """Which virtual toy: its person and what it performs.
+    """Settings of a virtual toy: its person and what it performs.
 
     Attributes:
         person, seed, session: the same numbers give the same bytes.
@@ -84,7 +136,7 @@ class ToySpec:
 
 
 def channel_columns(layout: Layout) -> list[int]:
-    """Where each channel of the layout stands in what the virtual toy measures.
+    """Return the index of each channel of the layout among the channels of the virtual toy.
 
     Raises:
         ConfigError: for a layout with other sensors than the plush toy's.
@@ -102,7 +154,7 @@ def channel_columns(layout: Layout) -> list[int]:
 
 
 def _garble(line: bytes, rng: np.random.Generator) -> bytes:
-    """A line spoilt on the way, so that it is no frame any more: cut, noisy, or glued to the next."""
+    """Corrupt a line so that it is no valid frame: cut it, add noise, or join it to the next."""
     at = int(rng.integers(1, max(2, len(line) - 1)))
     kind = int(rng.integers(3))
     if kind == 0:
@@ -114,43 +166,43 @@ def _garble(line: bytes, rng: np.random.Generator) -> bytes:
 
 
 class ToyStream:
-    """The lines of a virtual toy without end: iterate over it.
+    """Iterate over the endless lines of a virtual toy.
 
-    With ``cues`` its person waits to be told what to do (set it before the first line); else it plays by itself.
+    With ``prompts`` (set before the first line) its person performs what they ask for; else random gestures.
     """
 
-    def __init__(self, spec: ToySpec, layout: Layout, cues: Cues | None = None) -> None:
+    def __init__(self, spec: ToySpec, layout: Layout, prompts: Prompts | None = None) -> None:
         self.spec = spec
         self.layout = layout
-        self.cues = cues
+        self.prompts = prompts
         self._columns = channel_columns(layout)
         person = draw_person(spec.person, spec.seed, spec.world)
         world = spec.world if spec.glitch is None else dataclasses.replace(spec.world, glitch=spec.glitch)
-        self._session = Session(person, spec.seed, spec.session, world, wait_s=_LIVE_WAIT_S)
+        self._session = VirtualSession(person, spec.seed, spec.session, world, wait_s=_LIVE_WAIT_S)
         self._rng = np.random.default_rng([spec.seed, spec.person, spec.session, 0x10])
 
-    def __iter__(self) -> Iterator[Line]:
-        # Asked only now: a recorder may set the cues after it has opened the toy.
-        episodes = self._session.play(self.spec.gestures) if self.cues is None else self._told(self.cues)
+    def __iter__(self) -> Iterator[ToyLine]:
+        # Checked here since a recorder may set the prompts after it has opened the toy.
+        episodes = self._session.play(self.spec.gestures) if self.prompts is None else self._prompted(self.prompts)
         for episode in episodes:
             yield from self._lines(episode)
 
-    def _told(self, cues: Cues) -> Iterator[Episode]:
-        """Nothing until a cue comes, then its gesture, so that the hand comes when the recording begins."""
+    def _prompted(self, prompts: Prompts) -> Iterator[Episode]:
+        """Yield idle episodes until a prompt comes, then its gesture, timed to the beginning of the recording."""
         session = self._session
         while True:
-            cue = cues()
-            if cue is None or cue.label not in GESTURES:  # nobody touches a toy at rest
+            prompt = prompts()
+            if prompt is None or prompt.label not in GESTURES:  # nobody touches a toy at rest
                 yield session.idle(_LISTEN_S)
                 continue
-            family, in_hands = split_label(cue.label)
+            family, in_hands = split_label(prompt.label)
             lead = _LEAD_S + (PICK_S if in_hands and family != "Hold in hands" else 0.0)
-            wait = 0.0 if cue.begin_ms is None else (cue.begin_ms - session.clock_ms) / 1000.0 - lead
+            wait = 0.0 if prompt.begin_ms is None else (prompt.begin_ms - session.clock_ms) / 1000.0 - lead
             wait = min(max(0.0, wait), _LONGEST_WAIT_S)
             session.wait_s = (wait, wait)
-            yield session.perform(cue.label)
+            yield session.perform(prompt.label)
 
-    def _lines(self, episode: Episode) -> Iterator[Line]:
+    def _lines(self, episode: Episode) -> Iterator[ToyLine]:
         world, n = self.spec.world, len(episode)
         lost = world.lost if self.spec.lost is None else self.spec.lost
         garbled = world.garbled if self.spec.garbled is None else self.spec.garbled
@@ -159,7 +211,7 @@ class ToyStream:
         begins = {}
         for mark in episode.marks:
             start, stop = mark.start - episode.first, mark.stop - episode.first - 1
-            begins[start] = Performed(mark.label, int(episode.device_ms[start]), int(episode.device_ms[stop]))
+            begins[start] = PerformedGesture(mark.label, int(episode.device_ms[start]), int(episode.device_ms[stop]))
         order: Sequence[int] = [
             -1 if name == DEVICE_MS else -2 if name == DELAY_MS else self._columns[self.layout.index(name)]
             for name in self.layout.wire
@@ -171,4 +223,4 @@ class ToyStream:
             data = b"" if is_lost[i] else (" ".join(map(str, row)) + "\n").encode("ascii")
             if data and is_garbled[i]:
                 data = _garble(data, self._rng)
-            yield Line(data, clock[i], begins.get(i))
+            yield ToyLine(data, clock[i], begins.get(i))

@@ -1,4 +1,4 @@
-"""Every number that sets how hard the virtual toy is: the toy, its room, its people, how they touch.
+"""The constants that set the difficulty of the virtual toy: toy, environment, people and gestures.
 
 Frozen: `tests/devices/test_virtual_frozen.py` holds a hash of these numbers, so that scores on the
 virtual toy stay comparable. A score on it says nothing about a real toy.
@@ -12,13 +12,16 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 from dataclasses import dataclass
+
+import numpy as np
 
 ZONES = ("cap_extremities", "ears", "head", "neck", "proximity", "nose", "tail", "back", "belly")
 """The capacitive electrodes, in the order of Table 1 of the paper; `cap_all` is summed from them."""
 
 CHANNELS = ("cap_all", *ZONES, "acc_x", "acc_y", "acc_z")
-"""All that the virtual toy measures, in wire order."""
+"""All channels of the virtual toy, in wire order."""
 
 Pair = tuple[float, float]
 Nine = tuple[float, float, float, float, float, float, float, float, float]
@@ -42,7 +45,7 @@ class World:
     acc_noise_counts: float = 70.0
     acc_axis_error: float = 0.008  # gain error of an axis, by toy
 
-    # The room.
+    # The environment.
     humidity_session: float = 0.16  # baseline, relative, from session to session
     humidity_drift: float = 0.05  # within a session, over minutes
     humidity_electrode: float = 0.08  # each electrode's own share
@@ -121,9 +124,109 @@ class World:
     glitch: float = 0.00002  # share of the frames in which an electrode reads nonsense
 
     def fingerprint(self) -> str:
-        """SHA-256 of all the numbers, in a fixed writing."""
+        """Return the SHA-256 of all the numbers."""
         text = json.dumps(dataclasses.asdict(self), sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
 
 WORLD = World()
+
+
+PLACES = (
+    *("Back stroke", "Head stroke", "Ear scratch", "Neck scratch"),
+    *("Tail scratch", "Tail tap", "Tail hit", "Tail pull"),
+)
+GROUPS = ("child", "teen", "adult")
+# 8 kindergarten children, 9 teenagers, 8 adults of 25 (section 3.2 of the paper).
+GROUP_SHARE = (8 / 25, 17 / 25)
+
+
+@dataclass(frozen=True)
+class Person:
+    """A simulated person. Sizes and forces are relative to an average adult; rates in hertz.
+
+    Attributes:
+        place: where this person puts each of `PLACES`, as an offset along the toy's back.
+        scratch_lift, tap_dwell: style; a lifted scratch and a dwelling tap look alike.
+        lap, steadies: chance that "in hands" is on the lap, that a toy on the table is steadied.
+        grip_belly, grip_limbs, grip_back, grip_neck: where the holding hand lies.
+    """
+
+    number: int
+    group: str
+    hand: float
+    force: float
+    coupling: float
+    tempo: float
+    pace: float
+    place: tuple[float, ...]
+    stroke_period_s: float
+    stroke_lift: float
+    scratch_hz: float
+    scratch_lift: float
+    tap_hz: float
+    tap_dwell: float
+    hit: float
+    hug: float
+    grip: float
+    grip_belly: float
+    grip_limbs: float
+    grip_back: float
+    grip_neck: float
+    lap: float
+    steadies: float
+    sway_g: float
+    latency_s: float
+
+    def offset(self, family: str) -> float:
+        """Return this person's offset along the back for a gesture family; 0 for one without a place."""
+        return self.place[PLACES.index(family)] if family in PLACES else 0.0
+
+
+def draw_person(number: int, seed: int = 1, world: World = WORLD) -> Person:
+    """Draw the person with this number from the population of this seed; always the same person."""
+    rng = np.random.default_rng([abs(int(seed)), abs(int(number)), 0x5EED])
+    share = rng.random()
+    group = GROUPS[0] if share < GROUP_SHARE[0] else GROUPS[1] if share < GROUP_SHARE[1] else GROUPS[2]
+    hands = {"child": world.hand_child, "teen": world.hand_teen, "adult": world.hand_adult}
+    hand_mean, hand_sd = hands[group]
+    hand = max(0.5, hand_mean + hand_sd * rng.standard_normal())
+
+    def log(spread: float) -> float:
+        return math.exp(spread * rng.standard_normal())
+
+    def between(pair: Pair) -> float:
+        return pair[0] + (pair[1] - pair[0]) * rng.random()
+
+    def around(pair: Pair) -> float:
+        return pair[0] + pair[1] * rng.standard_normal()
+
+    force = hand**0.5 * log(world.force_log)
+    tempo = log(world.tempo_log)
+    return Person(
+        number=number,
+        group=group,
+        hand=hand,
+        force=force,
+        coupling=log(world.coupling_log),
+        tempo=tempo,
+        pace=log(world.person_pace_log),
+        place=tuple(float(world.place_person * rng.standard_normal()) for _ in PLACES),
+        stroke_period_s=max(0.6, around(world.stroke_period_s)) / tempo,
+        stroke_lift=rng.random(),
+        scratch_hz=max(1.2, around(world.scratch_hz)) * tempo,
+        scratch_lift=between(world.scratch_lift),
+        tap_hz=max(1.0, around(world.tap_hz)) * tempo,
+        tap_dwell=between(world.tap_dwell),
+        hit=force**0.5 * log(world.hit_shake_g[1]),
+        hug=world.hug[0] * log(world.hug[1]),
+        grip=world.grip[0] * log(world.grip[1]),
+        grip_belly=between((0.5, 1.2)),
+        grip_limbs=between((0.2, 1.0)),
+        grip_back=between((0.05, 0.45)),
+        grip_neck=between((0.0, 0.30)),
+        lap=between(world.lap),
+        steadies=between(world.steady),
+        sway_g=world.sway_g[0] * log(world.sway_g[1]),
+        latency_s=max(0.15, around(world.latency_s)),
+    )

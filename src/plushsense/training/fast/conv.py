@@ -1,7 +1,7 @@
-"""The three ways of a convolution on a chunk of windows, forward and backward, into memory that is used again.
+"""Three methods of convolving a chunk of windows, forward and backward, in reused memory.
 
-Rows are (T, N, C). Weights are (taps, channels read, filters). A way prepares its weights once a step; then each chunk
-goes forward, and backward, where the gradient of the weights is added up over chunks.
+Rows are (T, N, C). Weights are (taps, channels read, filters). A method prepares its weights once in
+a step; then each chunk is passed forward and backward, and the gradients of the weights are summed over the chunks.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from plushsense.training.fast.plan import LayerPlan
 from plushsense.training.fast.transform import matrices
 
 
-class Space:
-    """Memory by name, used again: a fresh allocation of megabytes costs more than the work done in it."""
+class BufferPool:
+    """Buffers by name, reused: allocating megabytes anew costs more than the computation in them."""
 
     def __init__(self) -> None:
         self._held: dict[object, Tensor] = {}
 
     def take(self, name: object, *shape: int) -> Tensor:
-        """A tensor of ``shape`` with whatever the last user of ``name`` left in it."""
+        """Return a tensor of ``shape`` that still holds what the last user of ``name`` left in it."""
         size = 1
         for n in shape:
             size *= n
@@ -33,24 +33,24 @@ class Space:
 
 
 class Way(Protocol):
-    """How a layer is computed. ``spectrum`` names the memory that forward leaves for backward."""
+    """A method of computing a layer. ``spectrum`` is memory that the forward pass leaves for the backward pass."""
 
     plan: LayerPlan
 
-    def weights(self, w: Tensor, space: Space, name: object) -> Tensor:
-        """The weights (taps, C, F) as this way uses them."""
+    def weights(self, w: Tensor, space: BufferPool, name: object) -> Tensor:
+        """Return the weights (taps, C, F) in the form that this method uses."""
         ...
 
-    def forward(self, x: Tensor, w: Tensor, bias: Tensor, out: Tensor, scratch: Space, spectrum: Tensor) -> None:
-        """``out`` (writes, N, F) from ``x`` (needs or more, N, C)."""
+    def forward(self, x: Tensor, w: Tensor, bias: Tensor, out: Tensor, scratch: BufferPool, spectrum: Tensor) -> None:
+        """Compute ``out`` (writes, N, F) from ``x`` (needs or more, N, C)."""
         ...
 
     def spectrum_shape(self, windows: int) -> tuple[int, ...]:
-        """The shape of the memory that forward leaves."""
+        """Return the shape of the memory that the forward pass leaves."""
         ...
 
-    def spectrum(self, x: Tensor, scratch: Space, out: Tensor) -> None:
-        """Fill that memory again, where it was not kept."""
+    def spectrum(self, x: Tensor, scratch: BufferPool, out: Tensor) -> None:
+        """Compute that memory again where it was not kept."""
         ...
 
     def backward(
@@ -61,34 +61,37 @@ class Way(Protocol):
         total: Tensor,
         fresh: bool,
         dx: Tensor | None,
-        scratch: Space,
+        scratch: BufferPool,
         spectrum: Tensor,
     ) -> Tensor:
-        """From ``dz`` (writes, N, F), zero beyond ``after``: the gradient of the weights into ``total`` (as `weights`
-        made them; ``fresh``: the first chunk), of the input rows into ``dx`` (needs, N, C), and of the bias (F,)."""
+        """Compute the gradients from ``dz`` (writes, N, F), which is zero beyond ``after``.
+
+        The gradient of the weights is added to ``total`` (in the form of `weights`; ``fresh``: overwrites it), that of
+        the input rows is written to ``dx`` (needs, N, C); returns that of the bias (F,).
+        """
         ...
 
     def gradient(self, total: Tensor) -> Tensor:
-        """The gradient of the weights (taps, C, F) from ``total``."""
+        """Return the gradient of the weights (taps, C, F) from ``total``."""
         ...
 
 
 class Pointwise:
-    """One tap: a matrix product of all rows."""
+    """A convolution with one tap: a matrix product of all rows."""
 
     def __init__(self, plan: LayerPlan) -> None:
         self.plan = plan
 
-    def weights(self, w: Tensor, space: Space, name: object) -> Tensor:
+    def weights(self, w: Tensor, space: BufferPool, name: object) -> Tensor:
         return w[0]
 
     def spectrum_shape(self, windows: int) -> tuple[int, ...]:
         return (0,)
 
-    def spectrum(self, x: Tensor, scratch: Space, out: Tensor) -> None:
-        """Nothing: the input itself is all that backward needs."""
+    def spectrum(self, x: Tensor, scratch: BufferPool, out: Tensor) -> None:
+        """Do nothing: backward needs only the input."""
 
-    def forward(self, x: Tensor, w: Tensor, bias: Tensor, out: Tensor, scratch: Space, spectrum: Tensor) -> None:
+    def forward(self, x: Tensor, w: Tensor, bias: Tensor, out: Tensor, scratch: BufferPool, spectrum: Tensor) -> None:
         p = self.plan
         torch.addmm(bias, x[: p.before].view(-1, p.reads), w, out=out.view(-1, p.filters))
 
@@ -100,7 +103,7 @@ class Pointwise:
         total: Tensor,
         fresh: bool,
         dx: Tensor | None,
-        scratch: Space,
+        scratch: BufferPool,
         spectrum: Tensor,
     ) -> Tensor:
         p = self.plan
@@ -115,25 +118,25 @@ class Pointwise:
 
 
 class Direct:
-    """A few taps: one matrix product each, on rows that are shifted views."""
+    """A convolution with few taps: one matrix product for each, on shifted views of the rows."""
 
     def __init__(self, plan: LayerPlan) -> None:
         self.plan = plan
 
-    def weights(self, w: Tensor, space: Space, name: object) -> Tensor:
+    def weights(self, w: Tensor, space: BufferPool, name: object) -> Tensor:
         return w
 
     def spectrum_shape(self, windows: int) -> tuple[int, ...]:
         return (0,)
 
-    def spectrum(self, x: Tensor, scratch: Space, out: Tensor) -> None:
-        """Nothing: the input itself is all that backward needs."""
+    def spectrum(self, x: Tensor, scratch: BufferPool, out: Tensor) -> None:
+        """Do nothing: backward needs only the input."""
 
     def _rows(self, x: Tensor, tap: int) -> Tensor:
         start = tap * self.plan.dilation
         return x[start : start + self.plan.after].view(-1, self.plan.reads)
 
-    def forward(self, x: Tensor, w: Tensor, bias: Tensor, out: Tensor, scratch: Space, spectrum: Tensor) -> None:
+    def forward(self, x: Tensor, w: Tensor, bias: Tensor, out: Tensor, scratch: BufferPool, spectrum: Tensor) -> None:
         rows = out.view(-1, self.plan.filters)
         torch.addmm(bias, self._rows(x, 0), w[0], out=rows)
         for tap in range(1, self.plan.taps):
@@ -147,7 +150,7 @@ class Direct:
         total: Tensor,
         fresh: bool,
         dx: Tensor | None,
-        scratch: Space,
+        scratch: BufferPool,
         spectrum: Tensor,
     ) -> Tensor:
         rows = dz.view(-1, self.plan.filters)
@@ -164,7 +167,7 @@ class Direct:
 
 
 class Spectral:
-    """Many taps: transforms, one product for each plane, and back."""
+    """A convolution with many taps: transform, one product for each plane, inverse transform."""
 
     def __init__(self, plan: LayerPlan) -> None:
         assert plan.lengths is not None
@@ -174,7 +177,7 @@ class Spectral:
             torch.from_numpy(m) for m in (found.d1, found.d2, found.g, found.a2, found.a1)
         )
 
-    def weights(self, w: Tensor, space: Space, name: object) -> Tensor:
+    def weights(self, w: Tensor, space: BufferPool, name: object) -> Tensor:
         p = self.plan
         out = space.take(name, self.lengths.planes, p.reads * p.filters)
         return torch.mm(self.g, w.reshape(p.taps, -1), out=out).view(-1, p.reads, p.filters)
@@ -182,7 +185,7 @@ class Spectral:
     def spectrum_shape(self, windows: int) -> tuple[int, ...]:
         return (self.lengths.planes, self.plan.dilation * windows, self.plan.reads)
 
-    def spectrum(self, x: Tensor, scratch: Space, out: Tensor) -> None:
+    def spectrum(self, x: Tensor, scratch: BufferPool, out: Tensor) -> None:
         n, (pairs, short, long) = self.lengths, (self.lengths.pairs, self.lengths.short, self.lengths.long)
         wide = out.shape[1] * out.shape[2]
         half = torch.mm(
@@ -190,7 +193,7 @@ class Spectral:
         )
         torch.bmm(self.d2, half.view(pairs, 2 * short, wide), out=out.view(pairs, n.planes // pairs, wide))
 
-    def forward(self, x: Tensor, w: Tensor, bias: Tensor, out: Tensor, scratch: Space, spectrum: Tensor) -> None:
+    def forward(self, x: Tensor, w: Tensor, bias: Tensor, out: Tensor, scratch: BufferPool, spectrum: Tensor) -> None:
         p, (pairs, short, long) = self.plan, (self.lengths.pairs, self.lengths.short, self.lengths.long)
         self.spectrum(x, scratch, spectrum)
         side = spectrum.shape[1]
@@ -198,7 +201,7 @@ class Spectral:
         product = torch.bmm(spectrum, w, out=scratch.take("product", self.lengths.planes, side, p.filters))
         half = scratch.take("half", long + 1, short * wide)
         torch.bmm(self.a2, product.view(pairs, 3 * short, wide), out=half[:long].view(pairs, 2 * short, wide))
-        # The bias rides along as one more row of the last product.
+        # The bias is one more row of the last product.
         half[long].view(short * side, p.filters).copy_(bias)
         torch.mm(self.a1, half, out=out.view(p.rows, short * wide))
 
@@ -210,7 +213,7 @@ class Spectral:
         total: Tensor,
         fresh: bool,
         dx: Tensor | None,
-        scratch: Space,
+        scratch: BufferPool,
         spectrum: Tensor,
     ) -> Tensor:
         p, (pairs, short, long) = self.plan, (self.lengths.pairs, self.lengths.short, self.lengths.long)
@@ -228,7 +231,7 @@ class Spectral:
         else:
             total.baddbmm_(spectrum.transpose(1, 2), product)
         if dx is not None:
-            # The spectrum is not needed any more: its gradient takes its place.
+            # The spectrum is no longer needed: its gradient replaces it.
             torch.bmm(product, w.transpose(1, 2), out=spectrum)
             wide = side * p.reads
             half = scratch.take("half", long, short * wide)
@@ -244,7 +247,7 @@ class Spectral:
 
 
 def way(plan: LayerPlan) -> Way:
-    """The way that a plan chose."""
+    """Return the method that a plan chose."""
     made: dict[str, type[Pointwise] | type[Direct] | type[Spectral]] = {
         "pointwise": Pointwise,
         "direct": Direct,

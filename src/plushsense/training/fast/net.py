@@ -1,8 +1,8 @@
-"""A network whose training step is written out: forward, backward, and a normalisation that costs no pass of its own.
+"""A network with an explicit training step: forward and backward pass, without a separate normalisation pass.
 
-Batch normalisation is an affine map a·r + b of each channel. Where nothing but mirrored or real samples goes into the
-next convolution, the map is folded into that layer's weights, and the network stores only r = ReLU(z): of its gradient,
-the parts through a and b follow from the gradient of the folded weights. Large batches go in chunks.
+Batch normalisation is an affine map a·r + b of each channel. Without zero padding the map can be folded into the
+weights of the next convolution, so that only r = ReLU(z) is stored; the gradients of a and b follow from the gradient
+of the folded weights. Large batches are processed in chunks.
 """
 
 from __future__ import annotations
@@ -18,24 +18,24 @@ from torch.nn import functional as F
 
 from plushsense.models.arch import NORM_EPSILON, Arch, reflected
 from plushsense.models.net import Net
-from plushsense.training.fast.conv import Space, Way, way
-from plushsense.training.fast.crew import LANES, Crew
+from plushsense.training.fast.conv import BufferPool, Way, way
 from plushsense.training.fast.plan import CHUNK, plan_net
+from plushsense.training.fast.threads import LANES, ThreadPool
 
 MOMENTUM = 0.1
 
-# Fills (rows, windows, channels) with the input of the windows from, to of the batch.
+# Writes the input of the windows [start, end) of the batch into a tensor (rows, windows, channels).
 Fill = Callable[[Tensor, int, int], None]
 
 
-def can(arch: Arch) -> bool:
-    """Whether a network can be trained this way: batch normalisation, and no zeros among what a layer reads."""
+def can_train(arch: Arch) -> bool:
+    """Tell whether `FastNet` can train a network: batch normalisation, and no zero padding."""
     return arch.norm == "batch" and arch.padding in ("mirror", "stream")
 
 
 @dataclass
 class _Layer:
-    """One block: its way, its parameters (``w`` (taps, C, F)), running statistics, and the rows mirrored before it."""
+    """One block: its method, parameters (``w`` (taps, C, F)), running statistics, and indices of the mirrored rows."""
 
     way: Way
     w: Tensor
@@ -50,7 +50,7 @@ class _Layer:
 
 @dataclass
 class _Pass:
-    """What the forward pass of a layer leaves for the backward pass."""
+    """What the forward pass of a layer keeps for the backward pass."""
 
     w: Tensor
     mean: Tensor
@@ -60,12 +60,12 @@ class _Pass:
 
 
 class FastNet:
-    """The trainable network. ``parameters`` have their gradients after `step`; gradients are not tracked otherwise.
+    """A trainable network; after `step` the ``parameters`` have gradients, which autograd does not track.
 
     Args:
-        net: where the weights come from: a `Net` of the same architecture.
+        net: a `Net` with the initial weights.
         batch: windows in a batch, at most.
-        threads: threads that share the chunks of a batch; the outcome is the same for any number.
+        threads: for the chunks of a batch; the result does not depend on it.
     """
 
     def __init__(self, net: Net, batch: int, threads: int = 1) -> None:
@@ -73,8 +73,8 @@ class FastNet:
         self.arch, self.plan = arch, plan_net(arch, batch)
         self._layers = [self._layer(net, i) for i in range(len(arch.layers))]
         self._dense, self._dense_bias = net.dense.weight.detach().clone(), net.dense.bias.detach().clone()
-        self._crew, self._shared = Crew(threads), Space()
-        self._scratch = [Space() for _ in range(self._crew.threads)]
+        self._threads, self._shared = ThreadPool(threads), BufferPool()
+        self._scratch = [BufferPool() for _ in range(self._threads.threads)]
         self._ones = torch.ones(1, arch.span)
         self._edges: list[tuple[int, int]] = []
         self.parameters = [t for one in self._layers for t in (one.w, one.bias, one.gain, one.shift)]
@@ -101,7 +101,7 @@ class FastNet:
 
     @torch.no_grad()
     def step(self, fill: Fill, y: Tensor) -> tuple[Tensor, Tensor]:
-        """The mean loss of a batch and its logits (N, K); the gradients are then in ``grad`` of the parameters."""
+        """Return mean loss and logits (N, K) of a batch; the gradients are then in ``grad`` of the parameters."""
         self._cut(len(y))
         passes, pooled = self._forward(fill)
         last = passes[-1]
@@ -118,7 +118,7 @@ class FastNet:
 
     @torch.no_grad()
     def logits(self, fill: Fill, windows: int) -> Tensor:
-        """Logits (N, K) with the running statistics, as a finished network gives them."""
+        """Return the logits (N, K) with the running statistics."""
         if not windows:
             return torch.zeros(0, self.arch.classes)
         self._cut(windows)
@@ -139,12 +139,12 @@ class FastNet:
                 x = out
             return self._rows(len(self._layers) - 1, x).mean(0)
 
-        pooled = torch.cat(self._crew.each(read, len(self._edges)))
+        pooled = torch.cat(self._threads.each(read, len(self._edges)))
         a, b = folded[-1]
         return torch.addmm(self._dense_bias, pooled * a + b, self._dense.t())
 
     def export_weights(self) -> dict[str, NDArray[np.float32]]:
-        """A copy of the weights, as ``models/reference`` and the bundle take them."""
+        """Return a copy of the weights, as ``models/reference`` and the bundle take them."""
         named: dict[str, Tensor] = {"dense.weight": self._dense, "dense.bias": self._dense_bias}
         for i, layer in enumerate(self._layers):
             named |= {f"conv{i}.weight": layer.w.permute(2, 1, 0), f"conv{i}.bias": layer.bias}
@@ -156,17 +156,17 @@ class FastNet:
 
     def close(self) -> None:
         """End the threads."""
-        self._crew.close()
+        self._threads.close()
 
     def _cut(self, windows: int) -> None:
-        """Windows into chunks, [from, to)."""
+        """Divide the windows into chunks [start, end)."""
         self._edges = [(at, min(at + CHUNK, windows)) for at in range(0, windows, CHUNK)]
 
     def _size(self, i: int) -> int:
         return self._edges[i][1] - self._edges[i][0]
 
     def _folded(self, at: int, a: Tensor | None, b: Tensor | None) -> tuple[Tensor, Tensor]:
-        """A layer's weights with the normalisation before it folded in, as its way uses them, and the bias."""
+        """Return weights with the preceding normalisation folded in, in the form that the layer uses, and the bias."""
         layer = self._layers[at]
         w = layer.w if a is None else layer.w * a[None, :, None]
         bias = layer.bias if b is None else layer.bias + b @ layer.w.sum(0)
@@ -180,27 +180,27 @@ class FastNet:
         return x
 
     def _mirror(self, at: int, x: Tensor) -> None:
-        """The rows before the input of layer ``at``."""
+        """Fill the mirrored rows before the input of layer ``at``."""
         mirror, front = self._layers[at].mirror, self._layers[at].way.plan.front
         if mirror is not None:
             torch.index_select(x[front:], 0, mirror, out=x[:front])
 
     def _front(self, at: int) -> int:
-        """Rows before the output of layer ``at`` in its buffer: those that the next layer mirrors."""
+        """Return how many rows the next layer mirrors before the output of layer ``at``."""
         return self._layers[at + 1].way.plan.front if at + 1 < len(self._layers) else 0
 
     def _place(self, at: int, out: Tensor) -> Tensor:
-        """Where layer ``at`` writes in its output's buffer."""
+        """Return the part of the output buffer that layer ``at`` writes."""
         front = self._front(at)
         return out[front : front + self._layers[at].way.plan.writes]
 
     def _rows(self, at: int, out: Tensor) -> Tensor:
-        """The true output rows of layer ``at`` in its buffer."""
+        """Return the valid output rows of layer ``at`` in its buffer."""
         front = self._front(at)
         return out[front : front + self._layers[at].way.plan.after]
 
     def _finish(self, at: int, out: Tensor) -> Tensor:
-        """ReLU, zeros behind, mirrored rows before; the true rows."""
+        """Apply ReLU, clear the rows behind, fill the mirrored rows before; return the valid rows."""
         rows = self._rows(at, out)
         rows.relu_()
         out[self._front(at) + len(rows) :].zero_()
@@ -209,7 +209,7 @@ class FastNet:
         return rows
 
     def _held(self, at: int, i: int) -> Tensor:
-        """The input buffer of layer ``at`` for a chunk (one beyond the last layer: its output)."""
+        """Return the input buffer of layer ``at`` for a chunk; one beyond the last layer: its output."""
         width = self.arch.channels if at == 0 else self._layers[at - 1].way.plan.filters
         return self._shared.take(("x", at, i), self.plan.buffers[at], self._size(i), width)
 
@@ -223,9 +223,9 @@ class FastNet:
         )
 
     def _forward(self, fill: Fill) -> tuple[list[_Pass], Tensor]:
-        """The passes of all layers, and the mean over time of the last one's output (N, F)."""
+        """Return what each layer keeps, and the mean over time of the last layer's output (N, F)."""
         chunks, windows = len(self._edges), self._edges[-1][1]
-        self._crew.each(lambda i, lane, thread: self._input(fill, i, self._held(0, i)), chunks)
+        self._threads.each(lambda i, lane, thread: self._input(fill, i, self._held(0, i)), chunks)
         passes: list[_Pass] = []
         pooled: list[Tensor] = []
         for at, layer in enumerate(self._layers):
@@ -252,7 +252,7 @@ class FastNet:
                 rows = self._finish(at, out)
                 return self._sums(rows, self._scratch[thread])
 
-            sums = self._crew.each(work, chunks)
+            sums = self._threads.each(work, chunks)
             count = windows * layer.way.plan.after
             mean = _added([s.sum(0) for s, _ in sums]) / count
             var = (_added([q for _, q in sums]) / count - mean * mean).clamp_min_(0.0)
@@ -263,15 +263,15 @@ class FastNet:
             pooled = [s / layer.way.plan.after for s, _ in sums]
         return passes, torch.cat(pooled)
 
-    def _sums(self, rows: Tensor, space: Space) -> tuple[Tensor, Tensor]:
-        """Sums over time (N, F), and sums of squares over time and windows (F,)."""
+    def _sums(self, rows: Tensor, space: BufferPool) -> tuple[Tensor, Tensor]:
+        """Return sums over time (N, F), and sums of squares over time and windows (F,)."""
         after, windows, width = rows.shape
         flat, ones = rows.view(after, windows * width), self._ones[:, :after]
         squares = torch.mul(flat, flat, out=space.take("squares", after, windows * width))
         return (ones @ flat).view(windows, width), (ones @ squares).view(windows, width).sum(0)
 
     def _backward(self, passes: list[_Pass], pooled: Tensor, slope: Tensor) -> None:
-        """Gradients of all layers from ``slope`` (N, F), that of the last features."""
+        """Compute the gradients of all layers from ``slope`` (N, F), that of the last features."""
         chunks, windows = len(self._edges), self._edges[-1][1]
         da, db = (slope * pooled).sum(0), slope.sum(0)
         flat = slope * passes[-1].a / self._layers[-1].way.plan.after
@@ -281,7 +281,7 @@ class FastNet:
             inverse = (here.var + NORM_EPSILON).rsqrt()
             straight = da - here.mean * db
             layer.gain.grad, layer.shift.grad = straight * inverse, db.clone()
-            # dL/dr = (what comes down) + alpha + beta · r: the way through the batch's own mean and variance.
+            # dL/dr = (gradient from above) + alpha + beta · r: the part through the batch's mean and variance.
             beta = straight * layer.gain * inverse.pow(3) / -count
             alpha = -here.a * db / count - beta * here.mean
             totals: dict[int, Tensor] = {}
@@ -323,7 +323,7 @@ class FastNet:
                     dx[planned.front :].index_add_(0, layer.mirror, dx[: planned.front])
                 return bias
 
-            bias = _added(self._crew.each(work, chunks))
+            bias = _added(self._threads.each(work, chunks))
             total = totals[0]
             for lane in range(1, min(LANES, chunks)):
                 total += totals[lane]
@@ -337,12 +337,12 @@ class FastNet:
                 layer.w.grad = dw.clone()
 
     def _slope(self, at: int, i: int) -> Tensor:
-        """The gradient of the input rows of layer ``at`` (needs, N, C): one memory a chunk, for all layers."""
+        """Return the gradient buffer of the input rows of layer ``at`` (needs, N, C); all layers share one a chunk."""
         planned = self._layers[at].way.plan
         return self._shared.take(("slope", i), planned.needs, self._size(i), planned.reads)
 
     def _gradient(self, at: int, i: int) -> Tensor:
-        """The part of `_slope` that belongs to the rows the layer before wrote."""
+        """Return the part of `_slope` for the rows that the preceding layer wrote."""
         planned = self._layers[at].way.plan
         return self._slope(at, i)[planned.front : planned.front + planned.before]
 

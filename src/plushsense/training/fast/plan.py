@@ -1,7 +1,7 @@
-"""Which way each layer of a network is computed: a pure function of its shape, the same on every machine.
+"""The method by which each layer is computed: a function of its shape alone, the same on every machine.
 
-Inside, activations are (T, N, C): time first. Dilation is then a view: row q · d + p is row q of phase p, and the
-phases stand beside the windows.
+Activations are (T, N, C), time first. Dilation is then a view: row q · d + p is row q of phase p, and the phases are
+an extra window dimension.
 """
 
 from __future__ import annotations
@@ -17,21 +17,20 @@ Way = Literal["pointwise", "direct", "spectral"]
 # Windows computed at a time: large enough for full matrix products, small enough for the caches.
 CHUNK = 64
 
-# Spectra kept from the forward to the backward pass, at most; what does not fit is computed again.
+# At most so many bytes of spectra are kept for the backward pass; the others are computed again.
 SPECTRA_BYTES = 1 << 30
 
 _FLOAT_BYTES = 4
 
-# A product over few channels is no faster than one over this many.
+# A matrix product over fewer channels than this is no faster.
 _NARROW = 16
 
 
 @dataclass(frozen=True)
 class LayerPlan:
-    """One layer: ``front`` mirrored rows before its ``before`` input rows, ``after`` output rows.
+    """Plan of a layer: ``front`` mirrored rows, ``before`` input rows, ``after`` output rows.
 
-    ``needs`` rows of input are read (those beyond the input are zeros), ``writes`` rows written (those beyond
-    ``after`` are of no meaning).
+    ``needs`` input rows are read (zeros beyond the input) and ``writes`` rows written (undefined beyond ``after``).
     """
 
     way: Way
@@ -72,7 +71,7 @@ class LayerPlan:
 
     @property
     def macs(self) -> int:
-        """Multiplications of the forward pass of one window, in the way chosen."""
+        """Multiplications of the forward pass of one window with the chosen method."""
         if self.lengths is None:
             return self.taps * self.after * self.reads * self.filters
         return _spectral_macs(self.lengths, self.dilation, self.reads, self.filters)
@@ -111,7 +110,7 @@ class NetPlan:
 
 
 def plan_layer(taps: int, dilation: int, reads: int, filters: int, front: int, before: int) -> LayerPlan:
-    """The way of one layer; ``front`` mirrored rows are put before its ``before`` input rows."""
+    """Choose the method of one layer with ``front`` mirrored rows before its ``before`` input rows."""
     reach = (taps - 1) * dilation
     after = before + front - reach
     if taps == 1:
@@ -124,7 +123,7 @@ def plan_layer(taps: int, dilation: int, reads: int, filters: int, front: int, b
 
 
 def plan_net(arch: Arch, batch: int) -> NetPlan:
-    """The ways of all layers for batches of at most ``batch`` windows."""
+    """Choose the methods of all layers for batches of at most ``batch`` windows."""
     layers, before = [], arch.span
     for layer, reads in zip(arch.layers, arch.inputs, strict=True):
         front = layer.reach if arch.padding == "mirror" else 0

@@ -1,9 +1,9 @@
-"""A correlation as three matrices and one product: y = A ((G w) · (D x)), all real, so that everything is a GEMM.
+"""A correlation as three real matrices and one product: y = A ((G w) · (D x)), all computed as matrix products.
 
 D x is the discrete Fourier transform of ``x`` at the L/2 frequencies k + ½ (the odd roots of z^L = −1: none of them is
 real, so that no product is wasted), in two stages (L = short · long, Cooley and Tukey 1965), each complex number as the
 three real ones that its product needs (Gauss; Karatsuba and Ofman 1962). G w is the conjugate transform of the
-kernel, A the inverse. What wraps around, with its sign changed, falls on outputs that are not asked for.
+kernel, A the inverse. What wraps around, with its sign changed, affects only outputs that are not computed.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Matrix = NDArray[np.float32]
 # Real products a complex one takes.
 PLANES = 3
 
-# What a sample of transform length costs beside the multiplications: memory moved. Fitted to steps on two cores.
+# Cost of a sample of transform length beside the multiplications (memory traffic), fitted to steps on two cores.
 _LENGTH_COST = 40
 _SHORT = range(1, 41)
 
@@ -54,7 +54,7 @@ class Lengths:
 
 @cache
 def lengths_for(samples: int) -> Lengths:
-    """The cheapest transform that holds ``samples``; the same everywhere."""
+    """Return the cheapest transform that holds ``samples``; the same on every machine."""
     candidates = []
     for short in _SHORT:
         long = -(-samples // short)
@@ -80,15 +80,15 @@ class Matrices:
 
 @lru_cache(maxsize=64)
 def matrices(lengths: Lengths, taps: int, rows: int) -> Matrices:
-    """The matrices of a correlation with ``taps`` taps; computed in float64."""
+    """Return the matrices of a correlation with ``taps`` taps, computed in float64."""
     short, long, pairs = lengths.short, lengths.long, lengths.pairs
     coarse = 2.0 * np.pi * (np.arange(pairs) + 0.5)[:, None] / long * np.arange(long)
     first = np.stack([np.cos(coarse), -np.sin(coarse)], axis=1).reshape(long, long)
     # The frequencies that a first-stage frequency fans out into, (pairs, short), as angles a sample.
     fan = np.arange(pairs)[:, None] + long * np.arange(short)
     angle = 2.0 * np.pi * (fan + 0.5) / lengths.samples
-    turn = angle[:, :, None] * np.arange(short)
-    cos, sin = np.cos(turn), np.sin(turn)
+    phase = angle[:, :, None] * np.arange(short)
+    cos, sin = np.cos(phase), np.sin(phase)
     real, imag = np.concatenate([cos, sin], axis=2), np.concatenate([-sin, cos], axis=2)
     second = np.concatenate([real + imag, real, imag], axis=1)
     kernel = angle[:, :, None] * np.arange(taps)

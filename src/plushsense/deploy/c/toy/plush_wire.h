@@ -1,7 +1,7 @@
 /*
  * The toy's lines, as `plushsense record` and `plushsense live` read them. A frame is a line of numbers:
  *
-@fields_shown@
+@fields@
  *
  * device_ms is the sender's clock in ms (here it wraps at 2^32), delay_ms the time since the frame before.
 @if decimal@

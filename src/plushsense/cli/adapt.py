@@ -1,0 +1,163 @@
+"""``plushsense adapt BUNDLE RECORDINGS --out BUNDLE``."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from plushsense.cli.evaluate import figure, spread
+from plushsense.cli.output import emit, say, table
+from plushsense.cli.settings import add_settings, marks, settings, warn
+from plushsense.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from plushsense.experiments.adaptation import Adapted
+
+_WAYS = """
+  plushsense adapt model.plush RECORDINGS --out mine.plush      a person's folder as the recorder left it, or a data set
+  plushsense adapt model.plush DS --subject S07 --use 2 --out mine.plush
+  plushsense adapt mine.plush --undo --out model.plush          the bundle as it was, byte for byte
+  plushsense adapt --evaluate DS                                how much it helps people left out (needs PyTorch)
+
+A bundle that own recordings do not show to become better stays as it is: nothing is written, exit status 1.
+"""
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = _WAYS
+    parser.add_argument("bundle", metavar="BUNDLE", nargs="?", help="the bundle to adapt; it is never changed")
+    parser.add_argument("recordings", metavar="RECORDINGS", nargs="?", help="a data set, or a recorder's folder")
+    parser.add_argument("--out", metavar="BUNDLE", help="the bundle to write")
+    parser.add_argument("--force", action="store_true", help="replace another bundle that is already there")
+    parser.add_argument(
+        "--subject", metavar="CODE", help="whose recordings (may be left out where there is one person)"
+    )
+    parser.add_argument(
+        "--use",
+        type=int,
+        metavar="N",
+        help="only the first N recordings of each gesture adapt, and the rest are scored before and after (default: "
+        "all adapt, and each is scored by a bundle adapted without it; with --evaluate: 2)",
+    )
+    parser.add_argument("--undo", action="store_true", help="write the bundle as it was before it was adapted")
+    parser.add_argument("--evaluate", metavar="DATASET", help="train networks and adapt them to people left out")
+    parser.add_argument("--split", metavar="SPLIT", help="of --evaluate: leave-one-subject-out (default), by-subject:K")
+    parser.add_argument("--choices", type=int, metavar="N", help="of --evaluate: so many random choices more (0)")
+    parser.add_argument("--int8", action="store_true", help="of --evaluate: the deployed networks too")
+    add_settings(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    if args.evaluate is not None:
+        return _evaluate(args)
+    if args.bundle is None or (args.recordings is None) != args.undo:
+        raise ConfigError("Give BUNDLE and RECORDINGS, or BUNDLE --undo, or --evaluate DATASET.")
+    if args.out is None:
+        raise ConfigError(
+            "--out is missing: say where the bundle is to be written; the one that is given never changes."
+        )
+    out = Path(args.out)
+    if out.exists() and Path(args.bundle).exists() and out.samefile(args.bundle):
+        raise ConfigError(f"'{out}' is the bundle that is adapted, which is never changed: choose another --out.")
+    if out.exists() and not args.force:
+        raise ConfigError(f"'{out}' is already there: choose another --out, or --force to replace it.")
+    if args.undo:
+        return _undo(args, out)
+    from plushsense.experiments.adaptation import adapt
+
+    done = adapt(args.bundle, args.recordings, subject=args.subject, use=args.use, warn=warn)
+    if done.personal.accepted:
+        done.save(out)
+    written = str(out) if done.personal.accepted else None
+    emit(args, {"bundle": written, **done.to_dict()}, _lines(done, out))
+    return 0 if done.personal.accepted else 1
+
+
+def _undo(args: argparse.Namespace, out: Path) -> int:
+    from plushsense.live.adaptation import restore_original
+    from plushsense.models.bundle import Bundle
+
+    bundle = Bundle.load(args.bundle)
+    subject = bundle.adapted_to
+    restore_original(bundle).save(out)
+    emit(
+        args, {"bundle": str(out), "undone": True, "subject": subject}, f"{out}: as before it was adapted to {subject}"
+    )
+    return 0
+
+
+def _lines(done: Adapted, out: Path) -> list[str]:
+    personal = done.personal
+    mark = "  [SIMULATION]" if done.simulated else ""
+    head = (
+        f"{out}: adapted to {done.subject}{mark}" if personal.accepted else "nothing written: the bundle stays as it is"
+    )
+    text = [head, f"{personal.reason}." if personal.accepted else f"why: {personal.reason}."]
+    if done.tested is not None:
+        one, other = done.tested
+        text.append(
+            f"on {one.recordings} recordings that did not adapt it: {other.right} right, before {one.right}; log loss "
+            f"{other.log_loss:.3f}, before {one.log_loss:.3f}."
+        )
+    return text
+
+
+def _evaluate(args: argparse.Namespace) -> int:
+    from plushsense.experiments.adaptation import evaluate_adapting
+
+    given = {"BUNDLE": args.bundle, "--out": args.out, "--subject": args.subject, "--undo": args.undo or None}
+    for name, value in given.items():
+        if value is not None:
+            raise ConfigError(f"--evaluate trains its own networks for everybody: leave {name} out.")
+    result = evaluate_adapting(
+        args.evaluate,
+        settings(args),
+        split=args.split or "leave-one-subject-out",
+        use=2 if args.use is None else args.use,
+        random=args.choices or 0,
+        int8=args.int8,
+        progress=say,
+        warn=warn,
+    )
+    emit(args, result, _evaluation_lines(result))
+    return 0
+
+
+def _evaluation_lines(e: dict[str, Any]) -> list[str]:
+    out = marks({**e, "leaky": False})
+    out.append(
+        f"split {e['split']}, context {e['context']}; {e['use']} recordings of each gesture adapt, the rest test; "
+        f"{e['choices']} choices, {100 * e['refused']:.1f} % left the bundle as it is\n"
+    )
+    for engine, found in e["engines"].items():
+        rows = [
+            (
+                row["subject"],
+                f"{row['recordings']:.0f}",
+                *(figure(row[f"{s}_{w}"]) for s in ("accuracy", "macro_f1") for w in ("before", "after")),
+                f"{row['right_change']:.1f}",
+                row["right_change_worst"],
+            )
+            for row in found["people"]
+        ]
+        head = ("subject", "tested", "accuracy", "after", "macro-F1", "after", "more right", "worst choice")
+        out += [f"{engine}\n", table(head, rows), ""]
+        for score, name in (("accuracy", "accuracy"), ("macro_f1", "macro-F1")):
+            for when in ("before", "after", "gain", "first"):
+                said = "gain, first ones adapt" if when == "first" else when
+                out.append(f"{name} {said:<24}{spread(found[score][when])}")
+        right = found["right"]
+        out.append(
+            f"recordings right, after less before: mean {right['mean']:.1f}; the person who gains least "
+            f"{right['worst_mean']:.1f}, the worst single choice {right['worst']}; people worse by more than one: "
+            f"{right['worse_people']}, choices: {100 * right['worse_choices']:.1f} %\n"
+        )
+    if e["agreement"]:
+        same = e["agreement"]
+        out.append(
+            f"float and int8 say the same on {100 * same['before']:.1f} % of the windows, after adapting "
+            f"{100 * same['after']:.1f} %"
+        )
+    return [*out, "Where a person recorded all in one session, what lasts until another day is not shown."]

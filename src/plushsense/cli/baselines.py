@@ -1,0 +1,101 @@
+"""``plushsense baselines DATASET --split leave-one-subject-out,windows:5``."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from plushsense.cli.output import emit, say
+from plushsense.cli.settings import add_settings, add_work, listed, settings, warn
+from plushsense.jobs.progress import ProgressReporter
+
+if TYPE_CHECKING:
+    from plushsense.experiments.baselines.score import CompareProgress
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("dataset", metavar="DATASET", help="data set folder")
+    parser.add_argument(
+        "--split",
+        default="leave-one-subject-out,windows:5",
+        metavar="SPLIT,...",
+        help="splits side by side (default: leave-one-subject-out,windows:5, the second leaky); as for evaluate",
+    )
+    parser.add_argument(
+        "--models",
+        default="all",
+        metavar="NAME,...",
+        help="all (default), classical, quick, or names: forest, extra-trees, knn, subspace-knn, cubic-svm, rbf-svm, "
+        "tree, boosting, mlp, lstm, bilstm, network (ours, see --arch), minirocket, multirocket-hydra (extra rocket)",
+    )
+    parser.add_argument(
+        "--features",
+        default="statistics,flattened",
+        metavar="NAME,...",
+        help="what classical models read: statistics, 8 a channel, flattened, all samples, or both (default)",
+    )
+    parser.add_argument("--pca", default="both", help="for classical models: both (default), no or yes")
+    add_work(parser, "folds")
+    parser.add_argument(
+        "--out",
+        metavar="DIR",
+        help="folder for baselines.json, .csv, .html and .png (default: one in DATASET/evaluations/ for each settings)",
+    )
+    parser.add_argument("--force", action="store_true", help="replace a comparison of other settings or data in --out")
+    add_settings(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    from plushsense.dataset.index import open_dataset
+    from plushsense.experiments.baselines.run import PAGE, baselines, comparison_id
+
+    config = settings(args, workers=args.workers)
+    dataset = open_dataset(args.dataset)
+    asked: dict[str, Any] = {"splits": listed(args.split), "models": listed(args.models)}
+    asked |= {"features": listed(args.features), "pca": args.pca}
+    name = f"baselines_{comparison_id(dataset, config, **asked)[:8]}"
+    out = Path(args.out) if args.out else dataset.path / "evaluations" / name
+    result = baselines(
+        dataset,
+        config,
+        **asked,
+        out=out,
+        overwrite=args.force,
+        cluster=args.cluster,
+        progress=_report_fits(),
+        warn=warn,
+    )
+    result |= {"out": str(out), "report": str(out / PAGE)}
+    say(f"written: {out}")
+    emit(args, result, lines(result))
+    return 0
+
+
+def lines(result: dict[str, Any]) -> list[str]:
+    """Format the table as text, one line a program, with an explanation."""
+    from plushsense.experiments.baselines.report import (
+        COUNTS,
+        LEAKY,
+        SIMULATION,
+        describe_costs,
+        describe_data,
+        program_table,
+    )
+
+    out = [SIMULATION, ""] if result["simulated"] else []
+    out += [describe_data(result), "", program_table(result).text(), "", describe_costs(result)]
+    if any(split["leaky"] for split in result["splits"]):
+        out += ["", COUNTS if result["gaps"] else LEAKY]
+    return out
+
+
+def _report_fits() -> Callable[[CompareProgress], None]:
+    """Return a callback that reports the fits of a comparison."""
+    reporter = ProgressReporter("comparing", "fits", keep=True)
+
+    def report(at: CompareProgress) -> None:
+        reporter(at.done, at.jobs, detail=at.what, resumed=at.resumed)
+
+    return report

@@ -1,0 +1,137 @@
+"""``plushsense live --device URL --model BUNDLE``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from plushsense.cli.output import say
+
+if TYPE_CHECKING:
+    from plushsense.live.reactions import Reaction
+    from plushsense.runtime.classifier import Decision, GestureEvent, State
+
+STATES = {
+    "warming": "getting to know what goes on",
+    "tracking": "reading",
+    "no signal": "no signal",
+    "sensor fault": "sensor fault: what the sensors say cannot be believed",
+}
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--device",
+        required=True,
+        metavar="URL",
+        help="the toy: serial:///dev/ttyUSB0, ble://name:PlushName, tcp://host:port, lsl://NAME, "
+        "replay:///path/stream.csv?speed=0, virtual://?person=7 (plushsense devices lists what is there)",
+    )
+    parser.add_argument("--model", required=True, metavar="BUNDLE", help="a .plush bundle")
+    parser.add_argument(
+        "--engine",
+        default="float",
+        choices=("float", "int8", "both"),
+        help="float (default); int8: whole numbers, bit for bit what the toy's C answers; both: decides as int8, and "
+        "the summary says how often float agreed",
+    )
+    parser.add_argument(
+        "--seconds",
+        type=float,
+        metavar="S",
+        help="stop after so many seconds of the toy's clock (default: when it ends)",
+    )
+    parser.add_argument(
+        "--smoothing",
+        type=float,
+        metavar="S",
+        help="time constant of the smoothing, seconds; 0: off (default: the bundle's)",
+    )
+    shown = parser.add_mutually_exclusive_group()
+    shown.add_argument(
+        "--events",
+        action="store_true",
+        help="only the lines with an event, no signal, a fault, or that all is well again",
+    )
+    shown.add_argument("--text", action="store_true", help="the same as sentences for people, not JSON")
+    parser.add_argument(
+        "--reconnect", action="store_true", help="wait for a toy that goes away, and go on when it is back"
+    )
+    parser.add_argument(
+        "--reactions",
+        metavar="NAME|FILE",
+        help="say what the toy does about it, too: standard, gentle (roughness is never answered with a show), or a "
+        "TOML file of your own",
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    from plushsense.devices.opening import open_device
+    from plushsense.live.loop import run_live as run_loop
+    from plushsense.live.reactions import Reactor, load_reactions
+    from plushsense.models.bundle import Bundle
+    from plushsense.runtime.classifier import BothEngines
+    from plushsense.runtime.decisions import DecideSpec
+    from plushsense.workflow.export import classifier_of
+
+    bundle = Bundle.load(args.model)
+    reactor = Reactor(load_reactions(args.reactions, bundle.gestures)) if args.reactions else None
+    decide = DecideSpec.from_dict(bundle.decision)
+    if args.smoothing is not None:
+        decide = replace(decide, smoothing_s=args.smoothing)
+    classifier = classifier_of(bundle, decide, args.engine)
+    with open_device(args.device, bundle.layout, reconnect=args.reconnect) as device:
+        say(
+            f"reading {args.device}; {bundle.arch.symbol}, a decision every "
+            f"{classifier.step_s * 1000:.0f} ms; Ctrl-C ends"
+        )
+        live = run_loop(device, classifier, seconds=args.seconds)
+        try:
+            state: State | None = None
+            for decision in live:
+                reactions = reactor.push(decision) if reactor else []
+                if args.text or args.events:
+                    news, state = decision.state != state, decision.state
+                    if not (news or decision.events or reactions):
+                        continue
+                if args.text:
+                    lines = format_update(decision, news, reactions)
+                else:
+                    more = {"reactions": [r.to_dict() for r in reactions]} if reactor else {}
+                    lines = [json.dumps(decision.to_dict() | more, ensure_ascii=False)]
+                sys.stdout.write("".join(f"{line}\n" for line in lines))
+                sys.stdout.flush()
+        except KeyboardInterrupt:
+            pass
+        finally:
+            both = {"agreement": classifier.agreement()} if isinstance(classifier, BothEngines) else {}
+            say(json.dumps(live.summary().to_dict() | both))
+    return 0
+
+
+def format_update(decision: Decision, news: bool, reactions: Sequence[Reaction] = ()) -> list[str]:
+    """Format lines for people: changes of events, reactions, and each new state."""
+    lines = [f"{event.t_s:9.2f} s  {_event(event)}" for event in decision.events]
+    lines += [f"{reaction.t_s:9.2f} s    {_reaction(reaction)}" for reaction in reactions]
+    if news:
+        lines.append(f"{decision.t_s:9.2f} s  {STATES[decision.state]}")
+    return lines
+
+
+def _event(event: GestureEvent) -> str:
+    affect = "" if event.affect == "none" else event.affect
+    what = ": ".join(part for part in (affect, event.gesture) if part) or "something"
+    if event.what == "ended":
+        return f"  end of {event.number}, {what}"
+    by = " (gate)" if event.source == "gate" and event.what == "begun" else ""
+    return f"{event.number} {what}{by}" if event.what == "begun" else f"{event.number} it is {what}"
+
+
+def _reaction(reaction: Reaction) -> str:
+    shown = [f"eyes {reaction.eyes}", *([reaction.sound] if reaction.sound else [])]
+    lasting = f" for {reaction.seconds:g} s" if reaction.seconds else ""
+    return f"the toy: {', '.join(shown)}{lasting}"

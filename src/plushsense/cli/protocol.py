@@ -1,0 +1,85 @@
+"""``plushsense protocol --model BUNDLE [--people 5] [--out DIR]``, or with ``--dataset DS`` or ``--session DIR``."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from plushsense.cli.output import emit
+from plushsense.core.errors import ConfigError
+from plushsense.jobs.progress import ProgressReporter
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--model", required=True, metavar="BUNDLE", help="a .plush bundle")
+    parser.add_argument("--people", type=int, metavar="N", help="virtual people (5, as in the paper)")
+    parser.add_argument(
+        "--first",
+        type=int,
+        metavar="N",
+        help="number of the first virtual person (1001: nobody met them)",
+    )
+    parser.add_argument("--seed", type=int, metavar="N", help="of the virtual population (1)")
+    parser.add_argument("--repetitions", type=int, metavar="N", help="of each gesture by each person (3)")
+    parser.add_argument("--dataset", metavar="DS", help="recorded sessions instead: a data set with session streams")
+    parser.add_argument(
+        "--session",
+        metavar="DIR",
+        help="recorded sessions instead: a folder as a recorder leaves it, stream and recordings",
+    )
+    parser.add_argument(
+        "--subjects", metavar="NAME,...", help="people of DS or DIR (default: all that the network never met)"
+    )
+    parser.add_argument(
+        "--engine",
+        default="float",
+        choices=("float", "int8"),
+        help="float (default), or int8: the toy's own arithmetic",
+    )
+    parser.add_argument(
+        "--no-rules", action="store_true", help="leave out the old heuristic, which has to be tuned first"
+    )
+    parser.add_argument(
+        "--out", metavar="DIR", help="folder for protocol.html, table.csv, trials.csv and protocol.json"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    from plushsense.cli.settings import listed
+    from plushsense.experiments.protocol.run import protocol
+
+    virtual = {name: getattr(args, name) for name in ("people", "first", "seed", "repetitions")}
+    virtual = {name: value for name, value in virtual.items() if value is not None}
+    if virtual and (args.dataset or args.session):
+        raise ConfigError(f"--{next(iter(virtual))} is for virtual people: leave it out, or --dataset and --session.")
+    result = protocol(
+        args.model,
+        **virtual,
+        dataset=args.dataset,
+        session=args.session,
+        subjects=listed(args.subjects) if args.subjects else None,
+        engine=args.engine,
+        rules=not args.no_rules,
+        out=args.out,
+        progress=ProgressReporter("people"),
+    )
+    emit(args, result, lines(result))
+    return 0
+
+
+def lines(result: dict[str, Any]) -> list[str]:
+    """Format the table, the aims and the notes as text."""
+    from plushsense.experiments.protocol.report import SIMULATION, aim_table, between_table, group_table
+
+    out = [result["heading"], *([SIMULATION] if result["simulated"] else [])]
+    out += [f"{name}: {value}" for name, value in result["about"]]
+    out += ["", group_table(result).text(), ""]
+    out += [
+        f"{row['system']}, {row['minutes']} minutes between the gestures: {row['positive']} positive and "
+        f"{row['negative']} negative events, {row['none']} without affect: {row['reactions']} an hour"
+        for row in between_table(result).rows
+    ]
+    if result["aims"]:
+        out += ["", *(f"{row['met']}: {row['aim']}: {row['measured']}" for row in aim_table(result).rows)]
+    out += ["", *result["said"]]
+    return [*out, f"written: {result['files'][0]}"] if "files" in result else out

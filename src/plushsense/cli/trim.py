@@ -1,0 +1,141 @@
+"""``plushsense trim DATASET [--only GLOB] [--accept GLOB | --accept-above 0.8] [--set ID FROM:TO] [--undo GLOB]``."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from plushsense.cli.output import emit, say, table
+from plushsense.jobs.progress import ProgressReporter
+
+if TYPE_CHECKING:
+    from plushsense.dataset.trimming import TrimResult
+
+LINES = 20
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("dataset", metavar="DATASET", help="data set folder")
+    parser.add_argument(
+        "--only", metavar="GLOB", default="*", help="recordings to show, draw and accept, as 'P01/*' (default: all)"
+    )
+    parser.add_argument(
+        "--accept", action="append", default=[], metavar="ID|GLOB", help="mark what is suggested for these; repeatable"
+    )
+    parser.add_argument(
+        "--accept-above", type=float, metavar="C", help="mark every suggestion of at least this confidence, 0 to 1"
+    )
+    parser.add_argument(
+        "--set",
+        nargs=2,
+        action="append",
+        default=[],
+        metavar=("ID", "FROM:TO"),
+        help="keep these seconds of one recording, as 0.35:2.1, 0.35: or :2.1; repeatable",
+    )
+    parser.add_argument(
+        "--undo", action="append", default=[], metavar="ID|GLOB", help="take these marks back; repeatable"
+    )
+    parser.add_argument(
+        "--offset",
+        action=argparse.BooleanOptionalAction,
+        default=False,
+        help="accept the suggested end too (default: the start alone, as in the paper)",
+    )
+    parser.add_argument("--who", metavar="NAME", help="who decides, kept in the mark (default: the login name)")
+    parser.add_argument("--why", default="", metavar="TEXT", help="why, kept in the mark (default: nothing)")
+    parser.add_argument(
+        "--plot", metavar="FILE.png|DIR", help="draw recordings, the least sure first: one page, or all into a folder"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    from plushsense.dataset.trimming import decide_trims
+
+    if args.plot:
+        from plushsense.reports.quality_figures import check_picture_path
+
+        check_picture_path(Path(args.plot))
+    result = decide_trims(
+        args.dataset,
+        only=args.only,
+        accept=args.accept,
+        above=args.accept_above,
+        keep=[(identity, *_seconds(text)) for identity, text in args.set],
+        undo=args.undo,
+        offset=args.offset,
+        who=args.who,
+        why=args.why,
+        progress=ProgressReporter("reading"),
+    )
+    drawn: list[Path] = []
+    if args.plot:
+        from plushsense.reports.quality_figures import save_trims
+
+        least_sure_first = sorted(result.trims, key=lambda t: t.suggestion.onset_confidence)
+        drawn = save_trims(result.dataset, least_sure_first, Path(args.plot), args.offset)
+    _tell(args, result, drawn)
+    return 0
+
+
+def _decides(args: argparse.Namespace) -> bool:
+    """Return whether the options ask for marks rather than a look."""
+    return bool(args.accept or args.set or args.undo) or args.accept_above is not None
+
+
+def _seconds(text: str) -> tuple[float | None, float | None]:
+    from plushsense.core.errors import ConfigError
+
+    start, colon, stop = text.partition(":")
+    try:
+        if not colon:
+            raise ValueError
+        return (float(start) if start.strip() else None, float(stop) if stop.strip() else None)
+    except ValueError:
+        raise ConfigError(f"--set was given '{text}': seconds as FROM:TO are accepted, such as 0.35:2.1.") from None
+
+
+def _tell(args: argparse.Namespace, done: TrimResult, drawn: list[Path]) -> None:
+    accepted, states = done.accepted, done.states
+    result: dict[str, Any] = {
+        "recordings": [t.to_dict(args.offset) for t in done.trims],
+        "states": states,
+        "accepted": list(accepted.marked),
+        "already": len(accepted.already),
+        "not_visible": len(accepted.not_visible),
+        "kept_by_hand": list(accepted.kept_by_hand),
+        "adjusted": list(done.adjusted),
+        "undone": list(done.undone),
+        "plots": [str(path) for path in drawn],
+    }
+    # After a decision, what it changed; the rest was shown when it was made.
+    decided = _decides(args)
+    rows = [
+        (
+            r["recording"],
+            r["rows"],
+            f"{r['start_s']:.2f}",
+            f"{r['stop_s']:.2f}",
+            f"{r['confidence']:.2f}",
+            r["state"],
+            r["note"],
+        )
+        for r in result["recordings"]
+        if not decided or r["recording"] in done.changed
+    ]
+    if not args.json and (args.accept or args.accept_above is not None):
+        less_sure = " or not sure enough" if args.accept_above else ""
+        say(
+            f"accepted {len(accepted.marked)}, already so {len(accepted.already)}, "
+            f"no visible onset{less_sure} {len(accepted.not_visible)}, "
+            f"kept as set by hand {len(accepted.kept_by_hand)}"
+        )
+    if not args.json and args.set:
+        say(f"adjusted {len(done.adjusted)}, already so {len(args.set) - len(done.adjusted)}")
+    if not args.json and args.undo:
+        say(f"undone {len(done.undone)}")
+    counts = ", ".join(f"{n} {state}" for state, n in sorted(states.items()))
+    head = ("recording", "rows", "start s", "stop s", "confidence", "state", "note")
+    shown = [] if decided and not 0 < len(rows) <= LINES else [table(head, rows), ""]
+    emit(args, result, [*shown, f"{len(done.trims)} recordings{': ' if counts else ''}{counts}", *map(str, drawn)])

@@ -1,0 +1,235 @@
+"""Sensor layouts: the channels of a toy and their order on the wire, in files and in a network's input."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import LayoutError, nearest
+from plushsense.core.toml import builtin_names, load_table, read_named
+
+DEVICE_MS = "device_ms"
+DELAY_MS = "delay_ms"
+HOST_MS = "host_ms"
+MAGNITUDE_FRACTION_BITS = 4
+_INT32 = (-2147483648.0, 2147483647.0)
+
+
+def magnitude_limit(n: int) -> int:
+    """Return the largest component of n whose magnitude, with its fraction bits, stays below 2³¹: 2²⁷ / √n."""
+    return math.isqrt((2 ** (62 - 2 * MAGNITUDE_FRACTION_BITS) - 1) // n)
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A measured quantity.
+
+    A raw value is the one that the toy sends. ``physical = (raw - offset) * scale`` in ``unit``; all later computations
+    use the integer ``round(raw / step)``. Raw values outside ``[valid_min, valid_max]`` are invalid.
+    """
+
+    name: str
+    unit: str
+    kind: str
+    offset: float = 0.0
+    scale: float = 1.0
+    valid_min: float = _INT32[0]
+    valid_max: float = _INT32[1]
+    step: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.step <= 0:
+            raise LayoutError(f"Channel '{self.name}': step is {self.step}; it must be above 0.")
+        # The default range is that of the integers.
+        if self.valid_min == _INT32[0]:
+            object.__setattr__(self, "valid_min", _INT32[0] * self.step)
+        if self.valid_max == _INT32[1]:
+            object.__setattr__(self, "valid_max", _INT32[1] * self.step)
+        low, high = self.valid_min / self.step, self.valid_max / self.step
+        if not _INT32[0] - 0.5 <= low <= high <= _INT32[1] + 0.5:
+            raise LayoutError(
+                f"Channel '{self.name}': valid_min {self.valid_min:g} to valid_max {self.valid_max:g} in steps of "
+                f"{self.step:g} must rise and fit 32-bit integers: narrow the range or take a larger step."
+            )
+
+
+@dataclass(frozen=True)
+class Derived:
+    """A channel computed from others; ``magnitude`` is √(Σ v²) in integers with 4 fraction bits."""
+
+    name: str
+    kind: str
+    of: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class CsvFormat:
+    """The layout's CSV format in the authors' recorder: column keys in file order, header texts, separator."""
+
+    columns: tuple[str, ...]
+    header: tuple[str, ...]
+    separator: str
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The channels of a toy, their order on the wire and in files, and the inputs of a network.
+
+    ``vectors`` names triples of channels that are the axes of one vector (an accelerometer), which turn with the toy.
+    ``wire`` names channels plus ``device_ms`` (the device clock) and ``delay_ms`` (since the frame before).
+    """
+
+    name: str
+    title: str
+    rate_hz: float
+    channels: tuple[Channel, ...]
+    wire: tuple[str, ...]
+    derived: tuple[Derived, ...]
+    inputs: tuple[str, ...]
+    csv: CsvFormat
+    gap_ms: int = 100
+    vectors: tuple[tuple[str, ...], ...] = ()
+
+    def __post_init__(self) -> None:  # noqa: C901
+        names = [c.name for c in self.channels] + [d.name for d in self.derived]
+        if len(set(names)) != len(names):
+            raise LayoutError(f"Layout '{self.name}' names a channel twice: {', '.join(names)}.")
+        if len(self.csv.header) != len(self.csv.columns):
+            raise LayoutError(
+                f"Layout '{self.name}': csv.header has {len(self.csv.header)} texts for {len(self.csv.columns)} "
+                "columns: give one for each."
+            )
+        for where, used, extra in (
+            ("wire", self.wire, (DEVICE_MS, DELAY_MS)),
+            ("inputs", self.inputs, tuple(d.name for d in self.derived)),
+            ("csv.columns", self.csv.columns, (DEVICE_MS, DELAY_MS, HOST_MS, "label")),
+        ):
+            known = tuple(c.name for c in self.channels) + extra
+            for name in used:
+                if name not in known:
+                    raise LayoutError(
+                        f"Layout '{self.name}': {where} names '{name}'; known are {', '.join(known)}."
+                        f"{nearest(name, known)}"
+                    )
+        missing = [c.name for c in self.channels if c.name not in self.wire]
+        if missing:
+            raise LayoutError(f"Layout '{self.name}': wire does not carry {', '.join(missing)}.")
+        if DEVICE_MS not in self.wire and DELAY_MS not in self.wire:
+            raise LayoutError(f"Layout '{self.name}': wire carries no clock; add {DEVICE_MS} or {DELAY_MS}.")
+        if not self.inputs:
+            raise LayoutError(f"Layout '{self.name}' has no inputs for a network: fill in inputs.")
+        if not 1.0 <= self.rate_hz <= 10_000.0:
+            raise LayoutError(f"Layout '{self.name}': rate_hz is {self.rate_hz}; accepted are 1 to 10000.")
+        for derived in self.derived:
+            if derived.kind != "magnitude":
+                raise LayoutError(
+                    f"Layout '{self.name}': derived channel '{derived.name}' is of kind '{derived.kind}'; "
+                    "accepted is magnitude."
+                )
+            if not derived.of:
+                raise LayoutError(
+                    f"Layout '{self.name}': derived channel '{derived.name}' is of no channel: fill in of."
+                )
+            limit = magnitude_limit(len(derived.of))
+            for name in derived.of:
+                at = self.index(name)
+                if max(-self.valid_min_int[at], self.valid_max_int[at]) > limit:
+                    raise LayoutError(
+                        f"Layout '{self.name}': channel '{name}' feeds '{derived.name}' but is valid from "
+                        f"{self.valid_min_int[at]} to {self.valid_max_int[at]} steps: give it valid_min and valid_max "
+                        f"within ±{limit} steps, so that the magnitude fits 32 bits."
+                    )
+        for vector in self.vectors:
+            if len(vector) != 3:
+                raise LayoutError(f"Layout '{self.name}': a vector has three axes, not {len(vector)}.")
+            for name in vector:
+                self.index(name)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Channel names in order."""
+        return tuple(c.name for c in self.channels)
+
+    @property
+    def is_labelled(self) -> bool:
+        """Return whether every row of a file carries its gesture, so that recordings are sections of streams."""
+        return "label" in self.csv.columns
+
+    @property
+    def n_channels(self) -> int:
+        """Number of measured channels, C."""
+        return len(self.channels)
+
+    @property
+    def n_inputs(self) -> int:
+        """Number of a network's input channels, F."""
+        return len(self.inputs)
+
+    @property
+    def period_us(self) -> int:
+        """Sampling period in whole microseconds."""
+        return round(1_000_000 / self.rate_hz)
+
+    @property
+    def valid_min_int(self) -> NDArray[np.int64]:
+        """Smallest valid integer of each channel, (C,)."""
+        return np.array([max(_INT32[0], np.ceil(c.valid_min / c.step)) for c in self.channels], dtype=np.int64)
+
+    @property
+    def valid_max_int(self) -> NDArray[np.int64]:
+        """Largest valid integer of each channel, (C,)."""
+        return np.array([min(_INT32[1], np.floor(c.valid_max / c.step)) for c in self.channels], dtype=np.int64)
+
+    def index(self, name: str) -> int:
+        """Return the index of a channel; raise LayoutError with the nearest known name for an unknown one."""
+        if name not in self.names:
+            raise LayoutError(
+                f"Layout '{self.name}' has no channel '{name}'; it has {', '.join(self.names)}."
+                f"{nearest(name, self.names)}"
+            )
+        return self.names.index(name)
+
+    def samples(self, seconds: float) -> int:
+        """Return the number of samples in a duration, at least one."""
+        return max(1, round(seconds * self.rate_hz))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, table: dict[str, Any], where: str = "layout") -> Layout:
+        """Return the layout that plain values describe (a TOML file, a bundle).
+
+        Raises:
+            LayoutError: for an unknown or missing key, or a value that does not fit.
+        """
+        given = table.get("channels")
+        # What is wrong with the channels is reported by `load_table`.
+        names = [c.get("name") for c in given if isinstance(c, dict)] if isinstance(given, list | tuple) else []
+        csv = table.get("csv", {})
+        if isinstance(csv, dict):
+            columns = csv.get("columns", [HOST_MS, DEVICE_MS, *names])
+            csv = {"columns": columns, "header": columns, "separator": ", "} | csv
+        defaults = {"title": table.get("name"), "derived": [], "inputs": names}
+        return load_table({**defaults, **table, "csv": csv}, cls, where, LayoutError)
+
+
+def layout_names() -> tuple[str, ...]:
+    """Return the names of the built-in layouts."""
+    return builtin_names("layouts")
+
+
+def load_layout(name_or_path: str | Path) -> Layout:
+    """Load a built-in layout by name, or one of the user's own by the path of its TOML file.
+
+    Raises:
+        LayoutError: for an unknown name or an unusable file.
+    """
+    table, source = read_named(name_or_path, "layouts", "layout", LayoutError)
+    return Layout.from_dict(table, f"layout '{source}'")

@@ -1,0 +1,410 @@
+"""Read and write the CSV files of the authors' recorder: single recordings and session streams.
+
+Recordings are ``<label>_<epoch ms>_<rows>.csv`` with a header line; after the authors' trimming step the header is
+gone and the separator is ``;``. A stream (``fulldatastream.csv``) has the same columns and no header.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import FileFormatError
+from plushsense.core.files import write_file
+from plushsense.core.layouts import DELAY_MS, DEVICE_MS, HOST_MS, Layout, layout_names, load_layout
+
+LIMIT = 2.0**53
+LONGEST_LINE = 1_000_000
+LONGEST_LABEL = 200
+_FULL_LINE = re.compile(rb"\S[^\n]*")
+_BLOCK = 1000
+
+
+def separator_of(line: bytes) -> str | None:
+    """Return the separator of a line: ``;`` or ``,``, else None for white space."""
+    return ";" if b";" in line else "," if b"," in line else None
+
+
+def _cells(line: bytes, separator: str | None, width: int) -> list[bytes]:
+    """Split a line into its fields, ignoring extra separators at its end; return none for one that is too long."""
+    if len(line) > LONGEST_LINE:
+        return []
+    if separator is None:
+        return line.split()
+    cells = [c.strip() for c in line.split(separator.encode())]
+    while len(cells) > width and not cells[-1]:
+        cells.pop()
+    return cells
+
+
+def _parse_slowly(
+    lines: list[bytes], separator: str | None, width: int, label_at: int | None
+) -> tuple[list[list[float]], list[str], int]:
+    """Parse lines that the fast reader refuses; return rows, labels and the number of malformed lines."""
+    rows, labels, malformed = [], [], 0
+    for line in lines:
+        if not line.strip():
+            continue
+        cells = _cells(line, separator, width)
+        try:
+            if len(cells) != width:
+                raise ValueError
+            text = cells.pop(label_at).decode("utf-8", "replace") if label_at is not None else ""
+            # float() accepts 1_000.
+            row = [float(c) if b"_" not in c else np.nan for c in cells]
+            if not all(abs(v) < LIMIT for v in row) or len(text) > LONGEST_LABEL:
+                raise ValueError
+        except ValueError:
+            malformed += 1
+            continue
+        rows.append(row)
+        labels.append(text)
+    return rows, labels, malformed
+
+
+def _parse_fast(data: bytes, separator: str | None, skip: int, width: int) -> NDArray[Any] | None:
+    """Parse numbers (T, width), int64 where all are whole, else float; return None when any line does not fit."""
+    begin = data.find(b"\n") + 1 if skip else 0
+    # Integers are read faster; some versions of NumPy truncate fractions silently.
+    whole = not any(data.find(sign, begin) >= 0 for sign in (b".", b"e", b"E"))
+    for dtype in (np.int64, np.float64) if whole else (np.float64,):
+        try:
+            table = np.loadtxt(
+                io.BytesIO(data), dtype=dtype, delimiter=separator, skiprows=skip, ndmin=2, comments=None
+            )
+        except ValueError:
+            continue
+        # NaN compares as false; abs() of the smallest int64 overflows.
+        fits = table.shape[1] == width and bool(np.all((table > -LIMIT) & (table < LIMIT)))
+        return table if fits else None
+    return None
+
+
+def _parse_in_blocks(lines: list[bytes], separator: str | None, width: int) -> tuple[list[NDArray[Any]], int]:
+    """Parse lines in blocks, so that a malformed line slows down its own block only, and count the malformed ones."""
+    blocks, malformed = [], 0
+    for at in range(0, len(lines), _BLOCK):
+        block = lines[at : at + _BLOCK]
+        if not any(line.strip() for line in block):
+            continue
+        table = _parse_fast(b"\n".join(block), separator, 0, width)
+        if table is None:
+            rows, _, bad = _parse_slowly(block, separator, width, None)
+            malformed += bad
+            table = np.array(rows).reshape(-1, width)
+        blocks.append(table)
+    return blocks, malformed
+
+
+def parse_table(
+    data: bytes, keys: list[str], skip: int, path: Path
+) -> tuple[NDArray[Any], NDArray[np.str_] | None, int]:
+    """Return all numeric columns (T, columns), the labels if there are any, and the number of malformed lines."""
+    label_at = keys.index("label") if "label" in keys else None
+    row = _FULL_LINE.search(data, data.find(b"\n") + 1 if skip else 0)
+    separator = separator_of(row[0]) if row else None
+    malformed = 0
+    if label_at is None:
+        table = _parse_fast(data, separator, skip, len(keys))
+        if table is not None:
+            return table, None, 0
+        blocks, malformed = _parse_in_blocks(data.split(b"\n")[skip:], separator, len(keys))
+        table = np.concatenate(blocks) if blocks else np.empty((0, len(keys)))
+        if len(table):
+            return table, None, malformed
+    else:
+        lines = data.split(b"\n")[skip:]
+        if label_at == len(keys) - 1 and separator:
+            parts = [line.rsplit(separator.encode(), 1) for line in lines if line.strip()]
+            try:
+                texts = [p[1].strip().decode() for p in parts]
+                table = _parse_fast(b"\n".join(p[0] for p in parts), separator, 0, len(keys) - 1)
+                if table is not None and len(table) == len(texts) and max(map(len, texts)) <= LONGEST_LABEL:
+                    return table, np.array(texts), 0
+            except (ValueError, IndexError):
+                pass
+        rows, labels, malformed = _parse_slowly(lines, separator, len(keys), label_at)
+        if rows:
+            return np.array(rows), np.array(labels), malformed
+    raise FileFormatError(f"'{path.name}' has no usable row: each must hold {len(keys)} numbers ({', '.join(keys)}).")
+
+
+STREAM_NAME = "fulldatastream.csv"
+# Marks a folder of simulated recordings, so that a score on them cannot pass for a result.
+SIMULATION_MARK = "SIMULATION.txt"
+_NAME = re.compile(r"^(?P<label>.+)_(?P<epoch>\d{1,18})_(?P<rows>\d{1,12})\.csv$", re.IGNORECASE)
+# Layouts have at least 1 frame a second: a longer column value is no delay.
+_SLOWEST_MS = 2000
+_PAUSE_MS = 60_000
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Rows of one recording or stream.
+
+    ``values`` (T, C) int64, in integer steps, layout order; ``device_ms`` and ``host_ms`` (T,) int64 (``host_ms`` None
+    where the file has no such column); ``labels`` (T,) where every row carries one.
+    """
+
+    values: NDArray[np.int64]
+    device_ms: NDArray[np.int64]
+    host_ms: NDArray[np.int64] | None = None
+    labels: NDArray[np.str_] | None = None
+
+    def __len__(self) -> int:
+        return len(self.device_ms)
+
+    def slice(self, start: int, stop: int) -> Frames:
+        """Return rows ``start`` to ``stop`` without copying them."""
+        part = slice(start, stop)
+        return Frames(
+            self.values[part],
+            self.device_ms[part],
+            None if self.host_ms is None else self.host_ms[part],
+            None if self.labels is None else self.labels[part],
+        )
+
+
+@dataclass(frozen=True)
+class RecordingName:
+    """The parts of a recording's file name."""
+
+    label: str
+    epoch_ms: int
+    rows: int
+
+
+@dataclass(frozen=True)
+class ReadResult:
+    """Frames read from a file, with warnings; ``malformed`` lines were left out.
+
+    ``integrated``: the file held delays, so ``device_ms`` is their sum and begins at 0 in every file.
+    ``cut``: the last line had no end and was left out; it counts as malformed.
+    """
+
+    frames: Frames
+    warnings: list[str] = field(default_factory=list)
+    malformed: int = 0
+    had_header: bool = False
+    integrated: bool = False
+    cut: bool = False
+
+
+def parse_name(filename: str) -> RecordingName | None:
+    """Split a recording's file name from the right into label, time and rows; return None for another name."""
+    match = _NAME.match(Path(filename).name)
+    if match is None:
+        return None
+    return RecordingName(match["label"], int(match["epoch"]), int(match["rows"]))
+
+
+def recording_filename(label: str, epoch_ms: int, rows: int) -> str:
+    """Return the file name of a recording, with ``_`` for characters that file systems refuse."""
+    safe = re.sub(r'[\\/:*?"<>|()\x00-\x1f]', "_", label).strip(" .") or "_"
+    return f"{safe}_{epoch_ms}_{rows}.csv"
+
+
+def _is_number(text: bytes) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _suggest_layout(columns: int, layout: Layout) -> str:
+    fitting = [n for n in layout_names() if n != layout.name and len(load_layout(n).csv.columns) == columns]
+    return f" Layouts with {columns} columns: {', '.join(fitting)}." if fitting else ""
+
+
+def column_keys(first: bytes, layout: Layout, path: Path) -> tuple[list[str], bool]:
+    """Return the column keys in file order, and whether the first line is a header."""
+    separator = separator_of(first)
+    cells = [c.strip() for c in (first.split(separator.encode()) if separator else first.split())]
+    columns = list(layout.csv.columns)
+    # An empty last field is an extra separator, or a missing label.
+    while cells and not cells[-1] and not (columns[-1] == "label" and len(cells) == len(columns)):
+        cells.pop()
+    header = bool(cells) and not any(_is_number(c) for c in cells)
+    if header:
+        texts = [c.decode("utf-8", "replace").strip().casefold() for c in cells]
+        known = {h.casefold(): k for h, k in zip(layout.csv.header, columns, strict=True)}
+        known |= {k.casefold(): k for k in columns}
+        known.setdefault("arduino delay (ms)", DELAY_MS)
+        if all(t in known for t in texts) and len(texts) >= layout.n_channels + 1:
+            return [known[t] for t in texts], True
+    if len(cells) == len(columns):
+        return columns, header
+    if len(cells) == len(columns) - 1 and columns[-1] == "label":
+        return columns[:-1], header
+    raise FileFormatError(
+        f"'{path.name}' has {len(cells)} columns, but a file of layout '{layout.name}' has {len(columns)} "
+        f"({', '.join(columns)}): choose another --layout.{_suggest_layout(len(cells), layout)}"
+    )
+
+
+def _looks_like_delay(column: NDArray[np.int64], host_ms: NDArray[np.int64] | None) -> bool:
+    """Return whether the clock column holds delays, as in recordings of the 14-integer firmware.
+
+    Delays are small, fall as often as they rise (a clock falls only where it was reset, even one that starts at 0 and
+    stamps its rows in pairs), and add up to the time that passed on the host; pauses apart, since a stream that was
+    appended to on another day has one.
+    """
+    if len(column) < 3 or column.min() < 0 or np.median(column) > _SLOWEST_MS:
+        return False
+    steps = np.diff(column)
+    if np.mean(steps <= 0) < 0.3 or np.sum(steps < 0) < 0.3 * np.sum(steps > 0):
+        return False
+    if host_ms is None:
+        return True
+    passed = np.diff(host_ms)
+    together = (passed <= _PAUSE_MS) & (column[1:] <= _PAUSE_MS)
+    on_host = float(passed[together].sum())
+    return abs(float(column[1:][together].sum()) - on_host) <= max(200.0, 0.5 * on_host)
+
+
+def read_bytes(path: Path) -> bytes:
+    """Read a file.
+
+    Raises:
+        FileFormatError: when the system refuses.
+    """
+    try:
+        return path.read_bytes()
+    except OSError as cause:
+        raise FileFormatError(f"'{path}' cannot be read: {cause.strerror or cause}.") from None
+
+
+def _read(path: Path, layout: Layout, data: bytes | None, *, whole_lines: bool = False) -> ReadResult:  # noqa: C901
+    if data is None:
+        data = read_bytes(path)
+    data = data.removeprefix(b"\xef\xbb\xbf")
+    if b"\r" in data:
+        data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    if b"\x00" in data[:4096]:
+        raise FileFormatError(f"'{path.name}' is not a text file: a recording is CSV in UTF-8.")
+    data = data.lstrip()
+    cut = whole_lines and b"\n" in data and not data.endswith(b"\n")
+    if cut:
+        data = data[: data.rfind(b"\n") + 1]
+    if not data:
+        raise FileFormatError(f"'{path.name}' is empty: a recording has one row a sample.")
+    end = data.find(b"\n")
+    first = data if end < 0 else data[:end]
+    if len(first) > LONGEST_LINE:
+        raise FileFormatError(f"'{path.name}' begins with a line of {len(first)} characters: that is no recording.")
+    keys, header = column_keys(first, layout, path)
+    if header and (end < 0 or not data[end:].strip()):
+        raise FileFormatError(f"'{path.name}' holds a header and no row.")
+    table, labels, malformed = parse_table(data, keys, 1 if header else 0, path)
+    numeric = [k for k in keys if k != "label"]
+    warnings: list[str] = ["the last line is cut off: left out"] if cut else []
+    if malformed:
+        warnings.append(f"{malformed} malformed line{'s' if malformed > 1 else ''} left out")
+
+    def as_whole(numbers: NDArray[Any]) -> NDArray[np.int64]:
+        # Values beyond the integers are clipped; they are outside every valid range in any case.
+        if numbers.dtype != np.int64:
+            numbers = np.clip(np.round(numbers), -LIMIT, LIMIT)
+        return np.ascontiguousarray(numbers, dtype=np.int64)
+
+    def column(name: str) -> NDArray[np.int64] | None:
+        return as_whole(table[:, numeric.index(name)]) if name in numeric else None
+
+    steps = np.array([c.step for c in layout.channels])
+    missing = [n for n in layout.names if n not in numeric]
+    if missing:
+        raise FileFormatError(f"'{path.name}' has no column for {', '.join(missing)} of layout '{layout.name}'.")
+    values = table[:, [numeric.index(n) for n in layout.names]]
+    host = column(HOST_MS)
+    clock = column(DEVICE_MS)
+    delay = column(DELAY_MS)
+    if clock is not None and (delay is None) and _looks_like_delay(clock, host):
+        delay, clock = clock, None
+        warnings.append("the clock column holds delays (14-integer firmware): integrated")
+    integrated = clock is None and delay is not None
+    if clock is None:
+        if delay is not None:
+            clock = np.cumsum(delay) - delay[0]
+        elif host is not None:
+            clock = host
+            warnings.append("no device clock: the host's time is used")
+        else:
+            raise FileFormatError(f"'{path.name}' has no clock column: {DEVICE_MS}, {DELAY_MS} or {HOST_MS}.")
+    frames = Frames(as_whole(values if np.all(steps == 1.0) else values / steps), clock, host, labels)
+    return ReadResult(frames, warnings, malformed + cut, header, integrated, cut)
+
+
+def read_recording(path: str | os.PathLike[str], layout: Layout, data: bytes | None = None) -> ReadResult:
+    """Read one recording: ``,`` or ``;``, with or without header, any line ends.
+
+    ``data`` is the file's content if it was read before.
+
+    Malformed lines are left out and counted. The clock column of the 14-integer firmware holds delays; that is
+    detected and integrated.
+
+    Raises:
+        FileFormatError: for a file that is empty, not text, or of another width than the layout's.
+    """
+    return _read(Path(path), layout, data)
+
+
+def read_stream(path: str | os.PathLike[str], layout: Layout, data: bytes | None = None) -> ReadResult:
+    """Read a session's stream: as `read_recording`, but a last line without its end was cut off and is left out.
+
+    A cut line can still have the right number of fields, with a digit of the last one missing.
+    """
+    return _read(Path(path), layout, data, whole_lines=True)
+
+
+def _columns(frames: Frames, layout: Layout) -> Iterator[list[str]]:
+    host = frames.device_ms if frames.host_ms is None else frames.host_ms
+    for key in layout.csv.columns:
+        if key == HOST_MS:
+            yield [str(v) for v in host.tolist()]
+        elif key == DEVICE_MS:
+            yield [str(v) for v in frames.device_ms.tolist()]
+        elif key == DELAY_MS:
+            yield [str(v) for v in np.diff(frames.device_ms, prepend=frames.device_ms[:1]).tolist()]
+        elif key == "label":
+            yield [""] * len(frames) if frames.labels is None else [str(v) for v in frames.labels]
+        else:
+            at = layout.index(key)
+            step = layout.channels[at].step
+            column = frames.values[:, at]
+            if step == 1.0:
+                yield [str(v) for v in column.tolist()]
+            else:
+                digits = max(0, -int(np.floor(np.log10(step))))
+                yield [f"{v * step:.{digits}f}" for v in column.tolist()]
+
+
+def format_rows(frames: Frames, layout: Layout) -> str:
+    """Format rows as the recorder writes them, without header, each ended by a newline."""
+    join = layout.csv.separator.join
+    return "".join(join(cells) + "\n" for cells in zip(*_columns(frames, layout), strict=True))
+
+
+def format_header(layout: Layout) -> str:
+    """Return the recorder's header line."""
+    return layout.csv.separator.join(layout.csv.header) + "\n"
+
+
+def write_recording(path: str | os.PathLike[str], frames: Frames, layout: Layout) -> None:
+    """Write one recording with its header; the file appears whole or not at all, and never replaces another.
+
+    Raises:
+        FileFormatError: when a file of that name is already there.
+    """
+    target = Path(path)
+    if target.exists():
+        raise FileFormatError(f"'{target}' is already there: a recording is never overwritten.")
+    write_file(target, format_header(layout) + format_rows(frames, layout))

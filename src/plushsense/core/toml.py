@@ -1,0 +1,262 @@
+"""Read TOML files and turn their tables into dataclasses, strictly: unknown keys and values of other types are refused.
+
+The types of a dataclass's fields say what its keys accept. `cattrs` does the conversion; this module decides what fits
+(nothing is coerced, except that a whole number is a number) and writes the messages.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import numbers
+import re
+import tomllib
+import types
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import is_dataclass
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from plushsense.core.errors import BadInput, nearest
+
+if TYPE_CHECKING:
+    from cattrs import Converter
+
+T = TypeVar("T")
+Steps = tuple[str | int, ...]
+"""Keys and indices from a table to a value in it."""
+
+
+def builtin_names(folder: str) -> tuple[str, ...]:
+    """Return the names of the TOML files in ``core/data/<folder>``."""
+    root = resources.files("plushsense.core") / "data" / folder
+    return tuple(sorted(p.name.removesuffix(".toml") for p in root.iterdir() if p.name.endswith(".toml")))
+
+
+def read_named(name_or_path: str | Path, folder: str, what: str, error: type[BadInput]) -> tuple[dict[str, Any], str]:
+    """Return the table of a built-in name or of a TOML file by path, and the name to quote in messages.
+
+    Raises:
+        error: for an unknown name, a missing file, or a file that is not TOML.
+    """
+    text = str(name_or_path)
+    if text in builtin_names(folder):
+        source = resources.files("plushsense.core") / "data" / folder / f"{text}.toml"
+        return tomllib.loads(source.read_text(encoding="utf-8")), text
+    path = Path(text)
+    if path.suffix != ".toml" and not path.is_file():
+        known = builtin_names(folder)
+        raise error(
+            f"Unknown {what} '{text}': the built-in ones are {', '.join(known)}; "
+            f"or give the path of a TOML file.{nearest(text, known)}"
+        )
+    return read_toml(path, what, error), text
+
+
+def read_toml(path: Path, what: str, error: type[BadInput]) -> dict[str, Any]:
+    """Read the TOML file at ``path``; ``what`` names its purpose in messages."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except FileNotFoundError:
+        raise error(f"There is no {what} file '{path}': check the path.") from None
+    except (OSError, UnicodeDecodeError) as cause:
+        raise error(f"The {what} file '{path}' cannot be read ({cause}): give a UTF-8 TOML file.") from None
+    except (tomllib.TOMLDecodeError, RecursionError) as cause:
+        raise error(f"The {what} file '{path}' is not valid TOML: {cause}.") from None
+
+
+def load_table(table: object, kind: type[T], where: str, error: type[BadInput]) -> T:
+    """Return the instance of the dataclass ``kind`` that a table describes.
+
+    Args:
+        table: keys are the fields of ``kind``; tables in it become the dataclasses of their fields, lists tuples.
+        where: to quote in messages, such as "layout 'plush-15'".
+
+    Raises:
+        error: for the first key that is unknown or missing, or value that does not fit; the message has its path.
+    """
+    try:
+        made: T = _converter().structure(table, kind)
+    except Exception as cause:  # noqa: BLE001
+        steps, leaf, expected = next(_leaves(cause, (), kind))
+        raise error(_message(table, steps, leaf, expected, where)) from None
+    return made
+
+
+def check_table(table: Mapping[str, Any], kind: type[Any], where: str) -> tuple[dict[str, Any], list[str]]:
+    """Return the values of a table that fit the fields of the dataclass ``kind``, and a message for each that does not.
+
+    Keys may be missing: for settings that go over others. Of a list, the items that fit are kept.
+    """
+    known = get_type_hints(kind)
+    values: dict[str, Any] = {}
+    problems = []
+    for key, value in table.items():
+        if key not in known:
+            problems.append(unknown_key(key, known, where))
+            continue
+        try:
+            values[key] = _converter().structure(value, known[key])
+        except Exception as cause:  # noqa: BLE001
+            leaves = list(_leaves(cause, (key,), known[key]))
+            problems += [_message(table, steps, leaf, expected, where) for steps, leaf, expected in leaves]
+            wrong = {steps[1] for steps, _, _ in leaves if len(steps) > 1}
+            if wrong and get_origin(known[key]) is tuple and len(wrong) < len(value):
+                fitting = [item for index, item in enumerate(value) if index not in wrong]
+                values[key] = _converter().structure(fitting, known[key])
+    return values, problems
+
+
+def unknown_key(key: str, known: Iterable[str], where: str) -> str:
+    """Return the message for an unknown key, with the nearest known one."""
+    known = tuple(known)
+    return f"Unknown key '{key}' in {where}: accepted are {', '.join(known)}.{nearest(key, known)}"
+
+
+def refuse_unknown(table: Mapping[str, Any], known: Iterable[str], where: str, error: type[BadInput]) -> None:
+    """Raise ``error`` for the first key of a table that is not among the known ones."""
+    known = tuple(known)
+    for key in table:
+        if key not in known:
+            raise error(unknown_key(key, known, where))
+
+
+def accepted(kind: Any) -> str:
+    """Return a type in words, as "a list of whole numbers"."""
+    return _in_words(kind, "{}")
+
+
+_BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
+_UNIONS = (Union, types.UnionType)
+_ONE = {int: "a whole number", float: "a number", str: "text", bool: "true or false", type(None): ""}
+_MANY = {int: "whole numbers", float: "numbers", str: "texts", bool: "true and false"}
+
+
+def _in_words(kind: Any, form: str, many: bool = False) -> str:
+    origin = get_origin(kind)
+    if origin in _UNIONS:
+        return " or ".join(filter(None, (_in_words(one, form, many) for one in get_args(kind))))
+    if origin is Literal:
+        return " or ".join(f"'{value}'" for value in get_args(kind))
+    if origin is tuple:
+        return f"{'lists' if many else 'a list'} of {_in_words(get_args(kind)[0], form, many=True)}"
+    return (_MANY if many else _ONE).get(kind, "tables" if many else "a table")
+
+
+def _message(table: object, steps: Steps, cause: Exception, expected: Any, where: str) -> str:
+    from cattrs.errors import ForbiddenExtraKeysError
+
+    path = "".join(
+        f"[{step}]" if isinstance(step, int) else f".{step}" if _BARE_KEY.fullmatch(step) else f'."{step}"'
+        for step in steps
+    ).removeprefix(".")
+    inner = f"{where}, {path}" if path else where
+    if isinstance(cause, ForbiddenExtraKeysError):
+        key = next(key for key in _value(table, steps) if key in cause.extra_fields)
+        return unknown_key(key, get_type_hints(cause.cl), inner)
+    if isinstance(cause, BadInput | ValueError):
+        return f"In {inner}: {cause}"
+    try:
+        value = _value(table, steps)
+    except LookupError:
+        return f"In {where}, the key {path} is missing: add it."
+    subject = path or "what was given"
+    return f"In {where}, {subject} is {value!r}: accepted is {accepted(expected)}."
+
+
+def _value(table: object, steps: Steps) -> Any:
+    for step in steps:
+        table = table[step]  # type: ignore[index]
+    return table
+
+
+def _leaves(cause: Exception, steps: Steps, expected: Any) -> Iterator[tuple[Steps, Exception, Any]]:
+    """Yield every fault in an exception of cattrs: where it is, the exception, and the type that was expected there."""
+    from cattrs.errors import ClassValidationError, IterableValidationError
+
+    if isinstance(cause, ClassValidationError):
+        named, others = cause.group_exceptions()
+        faults = [(inner, (*steps, note.name), note.type) for inner, note in named]
+    elif isinstance(cause, IterableValidationError):
+        indexed, others = cause.group_exceptions()
+        faults = [(inner, (*steps, note.index), note.type) for inner, note in indexed]
+    else:
+        yield steps, cause, expected
+        return
+    for inner, at, kind in [*((one, steps, expected) for one in others), *faults]:
+        yield from _leaves(inner, at, kind)
+
+
+@functools.cache
+def _converter() -> Converter:  # noqa: C901
+    """Return a converter that coerces nothing; imported when it is first needed, since cattrs takes a while."""
+    from cattrs import Converter
+    from cattrs.gen import make_dict_structure_fn
+
+    converter = Converter()
+
+    def structure_number(value: Any, kind: type[Any]) -> Any:
+        if isinstance(value, bool) or not isinstance(value, numbers.Integral if kind is int else numbers.Real):
+            raise TypeError(kind)
+        number = kind(value)
+        if not math.isfinite(number):
+            raise TypeError(kind)
+        return number
+
+    def structure_exact(value: Any, kind: type[T]) -> T:
+        if not isinstance(value, kind):
+            raise TypeError(kind)
+        return value
+
+    def is_tuple(kind: Any) -> bool:
+        return get_origin(kind) is tuple
+
+    def is_union(kind: Any) -> bool:
+        return get_origin(kind) in _UNIONS
+
+    def tuples_of(kind: Any) -> Any:
+        listed: Any = list[get_args(kind)[0]]  # type: ignore[misc]
+        structure = converter.get_structure_hook(listed)
+
+        def structure_tuple(value: Any, _: Any) -> tuple[Any, ...]:
+            if not isinstance(value, Iterable) or isinstance(value, str | bytes | Mapping):
+                raise TypeError(kind)
+            return tuple(structure(value, listed))
+
+        return structure_tuple
+
+    def one_of(kind: Any) -> Any:
+        options = [(one, converter.get_structure_hook(one)) for one in get_args(kind) if one is not type(None)]
+
+        def structure_union(value: Any, _: Any) -> Any:
+            if value is None and type(None) in get_args(kind):
+                return None
+            for one, structure in options:
+                try:
+                    return structure(value, one)
+                except Exception as cause:  # noqa: BLE001
+                    failed = cause
+            # With several options it is unknown which one was meant.
+            raise failed if len(options) == 1 else TypeError(kind)
+
+        return structure_union
+
+    def tables_of(kind: Any) -> Any:
+        structure = make_dict_structure_fn(kind, converter, _cattrs_forbid_extra_keys=True)
+
+        def structure_table(value: Any, _: Any) -> Any:
+            if not isinstance(value, Mapping):
+                raise TypeError(kind)
+            return structure(value, kind)
+
+        return structure_table
+
+    converter.register_structure_hook(int, structure_number)
+    converter.register_structure_hook(float, structure_number)
+    converter.register_structure_hook(str, structure_exact)
+    converter.register_structure_hook(bool, structure_exact)
+    converter.register_structure_hook_factory(is_tuple, tuples_of)
+    converter.register_structure_hook_factory(is_union, one_of)
+    converter.register_structure_hook_factory(is_dataclass, tables_of)
+    return converter

@@ -1,0 +1,173 @@
+"""The files of a data set folder: their kind and owner, and the stamp that says whether the index is up to date."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from plushsense.core.files import PART, write_file
+from plushsense.dataset.marks import MARKS
+from plushsense.dataset.people import PEOPLE
+from plushsense.dataset.store import HEAD, RECORDINGS, STREAMS
+
+RECORDINGS_INDEX = "recordings.csv"
+STREAMS_INDEX = "streams.csv"
+STAMP = "index.json"
+STAMP_VERSION = 2
+
+
+def raw_files(folder: Path) -> list[tuple[str, Path]]:
+    """Return every raw file of a data set with its kind, streams or recordings; the suffix may be in any case."""
+    files = []
+    for kind in (STREAMS, RECORDINGS):
+        found = [
+            Path(place) / name
+            for place, _, names in os.walk(folder / kind)
+            for name in names
+            if name.lower().endswith(".csv")
+        ]
+        files += [(kind, path) for path in sorted(found)]
+    return files
+
+
+def sha256_of(path: Path) -> str:
+    """Return the SHA-256 of a file in hexadecimal; "" when there is none."""
+    if not path.is_file():
+        return ""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def current_stamp(folder: Path) -> dict[str, Any]:
+    """Return what an index is made from: raw files (name, size, time in ns), and hashes of the marks and the head."""
+    files = []
+    for _, path in raw_files(folder):
+        now = path.stat()
+        files.append([path.relative_to(folder).as_posix(), now.st_size, now.st_mtime_ns])
+    return {
+        "format": STAMP_VERSION,
+        "files": files,
+        "marks": sha256_of(folder / MARKS),
+        "head": sha256_of(folder / HEAD),
+    }
+
+
+def _index_hashes(folder: Path) -> dict[str, str]:
+    return {name: sha256_of(folder / name) for name in (RECORDINGS_INDEX, STREAMS_INDEX)}
+
+
+def write_stamp(folder: Path, stamp: dict[str, Any]) -> None:
+    """Record what the index in ``folder`` was made from; call it after the index files were written."""
+    write_file(folder / STAMP, json.dumps(stamp | {"index": _index_hashes(folder)}) + "\n")
+
+
+def is_index_fresh(folder: Path) -> bool:
+    """Return whether the index in ``folder`` is complete and made from the present files."""
+    try:
+        stamp = json.loads((folder / STAMP).read_text(encoding="utf-8"))
+    except (FileNotFoundError, ValueError, RecursionError):
+        return False
+    return bool(stamp == current_stamp(folder) | {"index": _index_hashes(folder)})
+
+
+def is_same_raw_data(folder: Path, now: dict[str, Any]) -> bool:
+    """Return whether the index is complete and, except for the marks, was made from the files of the stamp ``now``."""
+    try:
+        stamp = json.loads((folder / STAMP).read_text(encoding="utf-8"))
+        return bool(stamp | {"marks": now["marks"]} == now | {"index": _index_hashes(folder)})
+    except (FileNotFoundError, ValueError, RecursionError, TypeError):
+        return False
+
+
+def missing_files(folder: Path) -> list[str]:
+    """Return the raw files of the last index that no longer exist; none when there is no stamp."""
+    try:
+        listed = json.loads((folder / STAMP).read_text(encoding="utf-8"))["files"]
+        return [str(entry[0]) for entry in listed if not (folder / str(entry[0])).is_file()]
+    except (FileNotFoundError, ValueError, RecursionError, KeyError, TypeError, IndexError):
+        return []
+
+
+CACHE = "cache"
+EVALUATIONS = "evaluations"
+INDEX = (RECORDINGS_INDEX, STREAMS_INDEX, STAMP)
+
+# What the files with a fixed name are. A file of a person's that is neither raw nor JSON is "other".
+_KNOWN = {HEAD: "head", MARKS: "marks", PEOPLE: "people", **dict.fromkeys(INDEX, "index")}
+
+
+@dataclass(frozen=True)
+class DatasetFile:
+    """A file of a data set: its path in the folder, its kind and, in a person's folder, the person.
+
+    Kinds: head, marks, people, index, raw (recordings and streams), words (JSON beside these: session files), cache,
+    evaluation, working (locks, unfinished parts), other; and link for everything that is not a regular file.
+    """
+
+    path: PurePosixPath
+    kind: str
+    person: str = ""
+
+
+def _kind(path: PurePosixPath) -> str:
+    top = path.parts[0]
+    if path.name.endswith((PART, ".lock")):
+        return "working"
+    if len(path.parts) == 1:
+        return _KNOWN.get(path.name, "other")
+    if top in (CACHE, EVALUATIONS):
+        return "cache" if top == CACHE else "evaluation"
+    suffix = path.suffix.lower()
+    if top in (RECORDINGS, STREAMS) and suffix == ".csv":
+        return "raw"
+    return "words" if len(path.parts) > 2 and suffix in (".json", ".jsonl") else "other"
+
+
+def list_files(folder: Path) -> list[DatasetFile]:
+    """List every file below ``folder`` in the order of the paths; links to folders are listed and not followed.
+
+    Whatever lies in ``<any folder>/<person>/`` belongs to the person, if ``recordings/`` or ``streams/`` has a folder
+    of that name.
+
+    Raises:
+        OSError: when a folder cannot be listed.
+    """
+
+    def refuse(cause: OSError) -> None:
+        raise cause
+
+    found: list[tuple[PurePosixPath, bool]] = []
+    for place, folders, names in os.walk(folder, onerror=refuse, followlinks=False):
+        here = Path(place)
+        links = [f for f in folders if (here / f).is_symlink()]
+        for name in names + links:
+            path = PurePosixPath((here / name).relative_to(folder).as_posix())
+            found.append((path, name not in links and (here / name).is_file()))
+    known = set(person_folders(folder))
+    out = []
+    for path, plain in sorted(found):
+        own = len(path.parts) > 2 and path.parts[0] not in (CACHE, EVALUATIONS) and path.parts[1] in known
+        out.append(DatasetFile(path, _kind(path) if plain else "link", path.parts[1] if own else ""))
+    return out
+
+
+def person_folders(folder: Path) -> list[str]:
+    """Return the names of the folders below ``recordings/`` and ``streams/``: codes of people, and of nobody."""
+    there = [place for kind in (RECORDINGS, STREAMS) if (place := folder / kind).is_dir()]
+    return sorted({entry.name for place in there for entry in place.iterdir() if entry.is_dir()})
+
+
+def normalize_code(word: str) -> str:
+    """Return a code without case, blanks and punctuation: ``P_01`` and ``p 01`` are equal."""
+    return "".join(c for c in word.casefold() if c.isalnum())
+
+
+def match_code(word: str, codes: Iterable[str]) -> str:
+    """Return the element of ``codes`` that is ``word`` in another spelling; "" when there is none."""
+    key = normalize_code(word)
+    return next((code for code in codes if normalize_code(code) == key), "")

@@ -1,0 +1,181 @@
+"""Zip archives: unpacking foreign ones safely, and entries of our own that do not depend on the disk.
+
+Every member is unpacked or refused with a reason. Refused are links, devices, paths that leave the folder, names that
+are ambiguous or reserved on some file system, encrypted or damaged members, and those with an extreme expansion ratio.
+"""
+
+from __future__ import annotations
+
+import re
+import stat
+import struct
+import unicodedata
+import zipfile
+import zlib
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from plushsense.core.errors import ConfigError, DatasetError
+from plushsense.dataset.importing.build import DEVICE_NAME
+
+_CHUNK = 1 << 20
+# The earliest time that a zip can say.
+_WHEN = (1980, 1, 1, 0, 0, 0)
+_DEEPEST = 30
+_LONGEST_NAME = 200
+_LONGEST_PATH = 800
+# Small files are exempt from the ratio: a recording of zeros packs well.
+_SMALL_BYTES = 4_000_000
+_FORBIDDEN = re.compile(r'[\x00-\x1f\x7f:*?"<>|]')
+DAMAGED: tuple[type[Exception], ...] = (
+    zipfile.BadZipFile,
+    zipfile.LargeZipFile,
+    zlib.error,
+    EOFError,
+    NotImplementedError,
+    OverflowError,
+    RuntimeError,
+    struct.error,
+    ValueError,
+)
+"""What the reader of zips raises on bytes that are no zip, or a damaged one."""
+try:
+    import lzma
+
+    DAMAGED = (*DAMAGED, lzma.LZMAError)
+except ImportError:  # A Python that was built without it refuses such members by itself.
+    pass
+
+
+@dataclass(frozen=True)
+class UnpackLimits:
+    """Limits of unpacking: bytes in total, files, and expansion ratio (for members over 4 MB)."""
+
+    total_bytes: int = 8_000_000_000
+    files: int = 200_000
+    ratio: float = 150.0
+
+    def __post_init__(self) -> None:
+        for key in ("total_bytes", "files", "ratio"):
+            if not 0 < getattr(self, key) < 2**60:
+                raise ConfigError(f"The archive limit {key} is {getattr(self, key)}; it must be above 0.")
+
+
+def zip_entry(name: str) -> zipfile.ZipInfo:
+    """Return a zip entry without times and modes of the disk, so that the same files give the same bytes."""
+    entry = zipfile.ZipInfo(name, _WHEN)
+    entry.compress_type = zipfile.ZIP_DEFLATED
+    entry.create_system = 3
+    entry.external_attr = (stat.S_IFREG | 0o644) << 16
+    return entry
+
+
+def _target(name: str) -> PurePosixPath | str:
+    """Return the path of a member below the target folder, or the reason why it is refused."""
+    plain = name.replace("\\", "/")
+    if plain.startswith("/") or re.match(r"^[A-Za-z]:", plain):
+        return "its path is absolute: it would be written outside the target"
+    parts = [p for p in plain.split("/") if p not in ("", ".")]
+    if ".." in parts:
+        return "its path holds '..': it would be written outside the target"
+    if not parts or len(parts) > _DEEPEST or len(plain) > _LONGEST_PATH:
+        return "its path is empty, too deep or too long"
+    for part in parts:
+        if _FORBIDDEN.search(part) or part != part.rstrip(" .") or len(part.encode("utf-8", "replace")) > _LONGEST_NAME:
+            return "its name is not one that every file system can hold"
+        if DEVICE_NAME.match(part):
+            return f"'{part[:20]}' is the name of a device on Windows"
+    try:
+        plain.encode("utf-8")
+    except UnicodeEncodeError:
+        return "its name is not UTF-8"
+    return PurePosixPath(*parts)
+
+
+def refusal(info: zipfile.ZipInfo, limits: UnpackLimits) -> str:
+    """Return why a member is refused by its directory entry; "" if it may be unpacked."""
+    kind = stat.S_IFMT(info.external_attr >> 16)
+    if kind == stat.S_IFLNK:
+        return "a symbolic link is not followed"
+    if kind not in (0, stat.S_IFREG, stat.S_IFDIR):
+        return "not a regular file"
+    if info.flag_bits & 0x41:
+        return "it is encrypted: unpack the archive with its password and import the folder"
+    if info.file_size > _SMALL_BYTES and info.file_size > limits.ratio * max(1, info.compress_size):
+        return (
+            f"it would swell {info.file_size / max(1, info.compress_size):.0f} times, more than the {limits.ratio:g} "
+            "that are allowed"
+        )
+    return ""
+
+
+def unpack_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, target: Path, limit: int) -> int:
+    """Write one member to the new file ``target`` and return its size.
+
+    A member that holds more than its declared size, or than ``limit`` bytes, counts as damaged and is removed again.
+    """
+    target.parent.mkdir(parents=True, exist_ok=True)
+    written = 0
+    try:
+        with archive.open(info) as member, target.open("xb") as out:
+            while chunk := member.read(_CHUNK):
+                written += len(chunk)
+                if written > min(info.file_size, limit):
+                    raise zipfile.BadZipFile("it holds more than its size says")
+                out.write(chunk)
+    except BaseException as cause:
+        target.unlink(missing_ok=True)
+        # The unpacker of bzip2 says so of damaged bytes; what the disk refuses has a number.
+        if isinstance(cause, OSError) and cause.errno is None:
+            raise zipfile.BadZipFile(str(cause)) from None
+        raise
+    return written
+
+
+def unpack(path: Path, folder: Path, limits: UnpackLimits | None = None) -> list[tuple[str, str]]:
+    """Unpack the zip ``path`` into the empty ``folder``; returns the refused members with the reason.
+
+    Raises:
+        DatasetError: for a file that is no zip, or one that holds more files or bytes than ``limits`` allow.
+        OSError: when the disk refuses.
+    """
+    limits = limits or UnpackLimits()
+    refused: list[tuple[str, str]] = []
+    try:
+        archive = zipfile.ZipFile(path)
+    except DAMAGED as cause:
+        raise DatasetError(f"'{path}' is no zip, or a damaged one ({_message(cause)}): get it once more.") from None
+    with archive:
+        members = [m for m in archive.infolist() if not m.filename.endswith("/")]
+        total = sum(m.file_size for m in members)
+        if len(members) > limits.files or total > limits.total_bytes:
+            raise DatasetError(
+                f"'{path}' would unpack to {len(members)} files and {total / 1e9:.1f} GB; {limits.files} files and "
+                f"{limits.total_bytes / 1e9:g} GB are allowed: if you trust it, allow more (--max-gb) or unpack it "
+                "yourself."
+            )
+        seen: set[str] = set()
+        room = limits.total_bytes
+        for info in members:
+            name = info.filename.encode("utf-8", "backslashreplace").decode()
+            target = _target(info.orig_filename if "\x00" in info.orig_filename else info.filename)
+            reason = target if isinstance(target, str) else refusal(info, limits)
+            if isinstance(target, str) or reason:
+                refused.append((name, reason))
+                continue
+            key = unicodedata.normalize("NFC", str(target)).casefold()
+            if key in seen:
+                refused.append((name, "another member has the same name, but for case or accents"))
+                continue
+            seen.add(key)
+            try:
+                room -= unpack_member(archive, info, folder / target, room)
+            except (FileExistsError, NotADirectoryError, IsADirectoryError):
+                refused.append((name, "another member stands where its folder would be"))
+            except DAMAGED as cause:
+                refused.append((name, f"it is damaged: {_message(cause)}"))
+    return refused
+
+
+def _message(cause: BaseException) -> str:
+    return " ".join(str(cause).split())[:120] or type(cause).__name__

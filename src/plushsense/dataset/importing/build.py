@@ -1,0 +1,417 @@
+"""From a search to a data set: copying files, reading them, people, marks, and where each file went."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from plushsense.core.errors import DatasetError
+from plushsense.core.files import new_folder
+from plushsense.core.gestures import NOBODY, GestureSet
+from plushsense.core.recorder_csv import STREAM_NAME, parse_name
+from plushsense.dataset.importing.sources import COMPANIONS, LEFT_OUT, SourceFile, SourceScan
+from plushsense.dataset.index import DUPLICATE_FOLDER, IndexBuild, Progress, apply_marks, build_index, write_index_files
+from plushsense.dataset.marks import Mark, append_marks, read_marks
+from plushsense.dataset.people import PersonInfo, write_people
+from plushsense.dataset.store import HEAD, RECORDINGS, STREAMS, UNKNOWN_SUBJECT, Dataset, DatasetHead
+from plushsense.recording.session_files import SESSION_LOG
+
+TWICE = "the same file was already imported"
+ORPHAN = "belongs to '{}', which was not imported"
+# Files that the recorder only appends to.
+APPENDED = (STREAM_NAME, SESSION_LOG)
+_LONGEST = 120
+# Names that Windows keeps for devices, with any suffix.
+DEVICE_NAME = re.compile(r"^(con|prn|aux|nul|com[0-9¹²³]|lpt[0-9¹²³]|conin\$|conout\$)\s*(\.|$)", re.IGNORECASE)
+
+
+def folder_name(code: str, otherwise: str = UNKNOWN_SUBJECT) -> str:
+    """Return a code as a folder name that is valid on any system and cannot leave the data set."""
+    kept = "".join(c if c.isalnum() or c in "-_. " else "_" for c in code).strip(" .")
+    return f"{kept}_" if DEVICE_NAME.match(kept) else kept or otherwise
+
+
+def session_folder(session: str) -> str:
+    """Return a session as a folder name, distinct from those that keep files of one name apart."""
+    name = folder_name(session, "1")
+    return f"session-{name}" if name.startswith(DUPLICATE_FOLDER) else name
+
+
+def refuse_merged(found: Iterable[SourceFile], there: Iterable[str] = ()) -> None:
+    """Refuse codes of people or sessions that would share a folder name.
+
+    ``there`` are the folders of people that a data set has already.
+    """
+    codes = {(folder.casefold(), ""): folder for folder in there}
+    not_met = set(codes)
+    folders = [(f, "people", f.subject, folder_name(f.subject), "") for f in found]
+    folders += [
+        (f, "sessions", f.session, session_folder(f.session), folder_name(f.subject)) for f, *_ in folders if f.session
+    ]
+    for _, what, code, folder, within in folders:
+        if len(folder.encode("utf-8")) > _LONGEST:
+            raise DatasetError(f"The code '{code[:40]}…' is too long: codes of {what} have {_LONGEST} bytes at most.")
+        key = (folder.casefold(), within)
+        first = codes.setdefault(key, code)
+        if key in not_met and first == folder:
+            # The code from which an existing folder was named is unknown.
+            not_met.discard(key)
+            codes[key] = code
+        elif first != code:
+            raise DatasetError(
+                f"The {what} '{first}' and '{code}' would share the folder '{folder}': rename one of them."
+            )
+
+
+class Copier:
+    """Copies files below ``work``, which is or becomes (a part of) a data set.
+
+    ``taken`` maps paths below the data set (case-folded; raw files without suffix, since these are ids) to SHA-256.
+    ``contents`` are the existing raw files by kind and SHA-256, which are not copied again. ``there`` is the folder of
+    the existing data set: a stream or log in it that has grown since is replaced by the longer one.
+    """
+
+    def __init__(
+        self,
+        work: Path,
+        taken: Mapping[str, str] | None = None,
+        contents: Mapping[tuple[str, str], str] | None = None,
+        there: Path | None = None,
+    ):
+        self.work = work
+        self.there = there
+        self.grown: set[str] = set()
+        """Paths below the data set of files that are there, shorter."""
+        self.taken = dict(taken or {})
+        self.contents = dict(contents or {})
+        self.copied: dict[Path, str] = {}
+        """New path below the data set of each source that was copied."""
+        self.already: dict[Path, str] = {}
+        """Path below the data set of each source that is there already."""
+        self.companions: dict[str, list[Path]] = {}
+        """Sources of the companions of each copied file."""
+
+    def copy(self, found: SourceFile) -> str:
+        """Copy one file and return "", or why it was not copied; companions come after the file that they belong to."""
+        try:
+            raw = found.source.read_bytes()
+        except OSError as cause:
+            return f"cannot be read: {cause.strerror or cause}"
+        content = hashlib.sha256(raw).hexdigest()
+        there = self.contents.get((found.kind, content))
+        if there is not None:
+            self.already[found.source] = there
+            return ""
+        folder = self._folder(found)
+        if folder is None:
+            return ORPHAN.format(found.beside.name if found.beside else "")
+        companion = found.kind == COMPANIONS
+        name = found.source.name
+        place, again = folder, 1
+        while (key := _key(f"{place}/{name}", companion)) in self.taken:
+            if self.taken[key] == content:
+                if companion or self.contents:
+                    self.already[found.source] = f"{place}/{name}"
+                    return ""
+                return TWICE
+            if (longer := self._goes_on(f"{place}/{name}", raw)) is not None:
+                if not longer:
+                    self.already[found.source] = f"{place}/{name}"
+                    return ""
+                self.grown.add(f"{place}/{name}")
+                break
+            again += 1
+            place = f"{folder}/{DUPLICATE_FOLDER}{again}"
+        self.taken[key] = content
+        target = self.work / place / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(raw)
+        self.copied[found.source] = f"{place}/{name}"
+        if companion and found.beside is not None:
+            self.companions.setdefault(self.copied.get(found.beside, ""), []).append(found.source)
+        return ""
+
+    def _goes_on(self, file: str, raw: bytes) -> bool | None:
+        """Return True if ``raw`` continues an append-only file that exists, False if the existing one is longer.
+
+        None if neither begins with the other. An incomplete last line is ignored, since the recorder completes it.
+        """
+        if self.there is None or file.rpartition("/")[2] not in APPENDED or file in self.grown:
+            return None
+        try:
+            old = (self.there / file).read_bytes()
+        except OSError:
+            return None
+        shorter, longer = sorted((old, raw), key=len)
+        begins = shorter[: shorter.rfind(b"\n") + 1]
+        return longer is raw if begins and longer.startswith(begins) else None
+
+    def _folder(self, found: SourceFile) -> str | None:
+        """Return the folder of the data set that a file goes to; None for a companion whose file was not copied."""
+        if found.beside is not None:
+            main = self.copied.get(found.beside) or self.already.get(found.beside)
+            return None if main is None else main.rpartition("/")[0]
+        kind = STREAMS if found.kind == COMPANIONS else found.kind
+        folder = f"{kind}/{folder_name(found.subject)}"
+        return f"{folder}/{session_folder(found.session)}" if found.session else folder
+
+
+def _key(path: str, companion: bool) -> str:
+    folder, _, name = path.casefold().rpartition("/")
+    return f"{folder}/{name}/" if companion else f"{folder}/{name.rpartition('.')[0]}"
+
+
+def key_of(path: str, *, companion: bool) -> str:
+    """Return the key in `Copier.taken` of a file by its path below the data set."""
+    return _key(path, companion)
+
+
+RECORDER = "recorder"
+SIMULATED = "these recordings are of the virtual toy: scores on them say nothing about a real one"
+NO_PEOPLE = (
+    "the folders are gestures, so the people are not known: splits by subject are not possible; "
+    "import again with --subjects map.csv (columns file,subject) if a mapping exists"
+)
+
+
+@dataclass
+class ImportSummary:
+    """Result of an import; ``rejected``, ``left_out`` and ``warnings`` name each file.
+
+    ``recordings``, ``subjects``, ``gestures`` and ``streams`` describe the data set after the import; ``added`` counts
+    new recordings and streams, ``already_there`` files that were not copied again. ``companions`` counts sidecars,
+    session heads and logs.
+    """
+
+    dataset: Dataset
+    recordings: int
+    subjects: int
+    gestures: list[str]
+    streams: int
+    rejected: list[dict[str, str]]
+    warnings: list[str]
+    seconds: float
+    notes: list[str] = field(default_factory=list)
+    left_out: list[dict[str, str]] = field(default_factory=list)
+    companions: int = 0
+    excluded: int = 0
+    added: dict[str, int] = field(default_factory=dict)
+    already_there: int = 0
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON."""
+        return {
+            "recordings": self.recordings,
+            "subjects": self.subjects,
+            "gestures": self.gestures,
+            "streams": self.streams,
+            "rejected": self.rejected,
+            "left_out": self.left_out,
+            "companions": self.companions,
+            "excluded": self.excluded,
+            "added": self.added,
+            "already_there": self.already_there,
+            "warnings": self.notes + self.warnings,
+            "seconds": round(self.seconds, 2),
+            "hash": self.dataset.hash,
+        }
+
+
+class ImportedFiles:
+    """The files of a search, copied into the copier's work folder, and what happened to each."""
+
+    def __init__(self, search: SourceScan, copier: Copier):
+        self.search = search
+        self.copier = copier
+        self.rejected: list[dict[str, str]] = []
+        self.left_out: list[dict[str, str]] = []
+        self._origin: dict[str, SourceFile] = {}
+        refuse_merged(
+            [f for f in search.found if f.kind in (RECORDINGS, STREAMS)], people_in_paths(copier.contents.values())
+        )
+        # A companion goes where its file went.
+        for found in sorted(search.found, key=lambda f: f.kind == COMPANIONS):
+            if found.kind == LEFT_OUT:
+                self.left_out.append({"file": found.origin, "reason": found.reason})
+            elif not found.kind:
+                self.reject(found, found.reason)
+            elif reason := copier.copy(found):
+                self.reject(found, reason)
+            elif found.source in copier.copied:
+                self._origin[copier.copied[found.source]] = found
+
+    def reject(self, found: SourceFile, reason: str) -> None:
+        self.rejected.append({"file": found.origin, "reason": reason})
+
+    def drop(self, unreadable: Mapping[str, str]) -> None:
+        """Remove unreadable files and their companions from the work folder."""
+        for file, reason in unreadable.items():
+            self.reject(self._origin[file], reason)
+            self._remove(file)
+            for source in self.copier.companions.pop(file, ()):
+                companion = self.copier.copied.get(source)
+                if companion is not None:
+                    self.reject(self._origin[companion], ORPHAN.format(Path(file).name))
+                    self._remove(companion)
+
+    def _remove(self, file: str) -> None:
+        (self.copier.work / file).unlink()
+        del self.copier.copied[self._origin.pop(file).source]
+
+    @property
+    def kept(self) -> dict[str, SourceFile]:
+        """Files that were copied, by their path below the data set."""
+        return dict(self._origin)
+
+    def count(self, kind: str) -> int:
+        """Count the copied files of a kind."""
+        return sum(f.kind == kind for f in self._origin.values())
+
+    def check(self) -> None:
+        """Assert that every file of the search is accounted for."""
+        accounted = len(self._origin) + len(self.copier.already) + len(self.rejected) + len(self.left_out)
+        assert accounted == len(self.search.found), "every source file is imported, left out or rejected"
+
+    def set_aside_reasons(self) -> dict[str, str]:
+        """Return by recording id why the recorder set it aside ("" if it did not), also for those already present."""
+        places = self.copier.copied | self.copier.already
+        mine = (f for f in self.search.found if f.kind == RECORDINGS and f.source in places)
+        return {recording_id(places[f.source]): f.set_aside for f in mine}
+
+
+def recording_id(file: str) -> str:
+    """Return the id of a recording from its path below the data set."""
+    return file.removeprefix(f"{RECORDINGS}/").rpartition(".")[0]
+
+
+def people_in_paths(files: Iterable[str]) -> set[str]:
+    """Return the folders of people in the paths of raw files below the data set."""
+    return {parts[1] for path in files if len(parts := path.split("/")) > 2 and parts[0] in (RECORDINGS, STREAMS)}
+
+
+def extend_gestures(given: GestureSet | None, dataset: Dataset) -> GestureSet:
+    """Return the given set with every label that it lacks, or infer the set from the recordings."""
+    if given is None:
+        return GestureSet.infer(r.gesture for r in dataset.recordings)
+    unknown = sorted(r.gesture for r in dataset.recordings if given.find(r.gesture) is None)
+    if not unknown:
+        return given
+    return GestureSet(given.name, given.gestures + GestureSet.infer(unknown).gestures, given.inferred)
+
+
+def merge_people(
+    there: Mapping[str, PersonInfo], sessions: Iterable[PersonInfo], file: Mapping[str, PersonInfo], subjects: set[str]
+) -> tuple[list[PersonInfo], list[str]]:
+    """Merge the people's table of the data set with the sessions (fill gaps) and the user's file (override)."""
+    people, notes = dict(there), []
+    for info in sessions:
+        code = folder_name(info.subject)
+        was = people.get(code)
+        if code == NOBODY:
+            continue
+        if was is None:
+            people[code] = replace(info, subject=code)
+            continue
+        for key in ("age_group", "gender", "consent"):
+            now, then = getattr(info, key), getattr(was, key)
+            if now and then and now != then:
+                notes.append(f"the {key.replace('_', ' ')} of '{code}' is kept as '{then}'; a session says '{now}'")
+            elif now and not then:
+                was = replace(was, **{key: now})
+        people[code] = was
+    strangers = []
+    for code, info in file.items():
+        if folder_name(code) not in subjects:
+            strangers.append(code)
+            continue
+        was = people.get(folder_name(code), PersonInfo(folder_name(code)))
+        own = {key: getattr(info, key) or getattr(was, key) for key in ("age_group", "gender", "consent")}
+        people[folder_name(code)] = PersonInfo(folder_name(code), **own, more=was.more | info.more)
+    if strangers:
+        notes.append(
+            f"people of the people's file who are not in the data set were left out ({len(strangers)}): "
+            + ", ".join(f"'{s}'" for s in strangers[:5])
+            + (", …" if len(strangers) > 5 else "")
+        )
+    return list(people.values()), notes
+
+
+def create_dataset(
+    source: Path,
+    dest: Path,
+    search: SourceScan,
+    head: DatasetHead,
+    people: Mapping[str, PersonInfo],
+    progress: Progress | None,
+) -> ImportSummary:
+    """Create the data set ``dest`` from a search, completely or not at all.
+
+    Raises:
+        DatasetError: when nothing can be read, or ``dest`` holds something already.
+    """
+    with new_folder(dest, DatasetError, last=HEAD) as work:
+        account = ImportedFiles(search, Copier(work))
+        if search.gestures is None:
+            names = (parse_name(Path(file).name) for file in account.kept)
+            head = replace(head, gestures=GestureSet.infer(n.label for n in names if n is not None))
+        built = read_copied(account, head, progress)
+        if not built.dataset.recordings:
+            reasons = [*built.unreadable.values(), *(r["reason"] for r in account.rejected), *search.notes[-1:]]
+            if not reasons:
+                raise DatasetError(f"'{source}' holds no finished recording yet, only a stream: record some first.")
+            raise DatasetError(
+                f"'{source}' holds no recording that layout '{head.layout.name}' can read. The first: {reasons[0]}"
+            )
+        head = replace(head, gestures=extend_gestures(search.gestures, built.dataset))
+        if {r.gesture for r in built.dataset.recordings} - set(head.gestures.labels):
+            # Spellings were merged: label the recordings again by the complete set.
+            built = build_index(work, head)
+        listed, notes = merge_people({}, search.people, people, {r.subject for r in built.dataset.recordings})
+        if listed:
+            write_people(work, listed)
+        if marks := [Mark(i, "exclude", RECORDER, why) for i, why in account.set_aside_reasons().items() if why]:
+            append_marks(work, marks)
+        (work / HEAD).write_text(head.to_toml(), encoding="utf-8")
+        infos = apply_marks(built.dataset.recordings, read_marks(work))
+        write_index_files(Dataset(work, head, infos, built.dataset.streams))
+        account.check()
+    dataset = Dataset(dest, head, infos, built.dataset.streams)
+    return summarize_import(dataset, account, search.notes + notes, set(account.kept))
+
+
+def read_copied(account: ImportedFiles, head: DatasetHead, progress: Progress | None) -> IndexBuild:
+    """Read what was copied and remove what cannot be read."""
+    built = build_index(account.copier.work, head, progress)
+    account.drop(built.unreadable)
+    return built
+
+
+def summarize_import(dataset: Dataset, account: ImportedFiles, notes: list[str], new: set[str]) -> ImportSummary:
+    """Return the summary of an import that added the files ``new``."""
+    notes_of_import = [SIMULATED] if dataset.head.simulated else []
+    notes_of_import += notes
+    if any(r.subject == UNKNOWN_SUBJECT for r in dataset.recordings):
+        notes_of_import.append(NO_PEOPLE)
+    flagged = [(s.id, s.flags) for s in dataset.streams if s.file in new]
+    flagged += [(r.id, r.flags) for r in dataset.recordings if r.file in new]
+    mine = [r for r in dataset.recordings if r.file in new]
+    return ImportSummary(
+        dataset,
+        len(dataset.recordings),
+        len(dataset.subjects),
+        sorted({r.gesture for r in dataset.recordings}),
+        len(dataset.streams),
+        account.rejected,
+        [f"{recording_id}: {flag}" for recording_id, flags in flagged for flag in flags],
+        0.0,
+        notes_of_import,
+        left_out=account.left_out,
+        companions=account.count(COMPANIONS),
+        excluded=sum(r.excluded for r in mine),
+        added={"recordings": len(mine), "streams": account.count(STREAMS)},
+        already_there=len(account.copier.already),
+    )

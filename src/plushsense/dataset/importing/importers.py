@@ -1,0 +1,532 @@
+"""Importing recordings into a new or existing data set: raw files are copied unchanged, each is accounted for.
+
+A file format is one function that scans a file and one line in ``FORMATS``; a folder layout is one function in
+`importing.sources`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from plushsense.core.errors import ConfigError, DatasetError, FileFormatError
+from plushsense.core.files import write_file
+from plushsense.core.gestures import GestureSet, load_gestures
+from plushsense.core.layouts import Layout, layout_names, load_layout
+from plushsense.core.recorder_csv import SIMULATION_MARK, parse_name
+from plushsense.dataset.files import sha256_of
+from plushsense.dataset.importing.archives import UnpackLimits, unpack
+from plushsense.dataset.importing.build import (
+    RECORDER,
+    Copier,
+    ImportedFiles,
+    ImportSummary,
+    create_dataset,
+    extend_gestures,
+    folder_name,
+    key_of,
+    merge_people,
+    read_copied,
+    summarize_import,
+)
+from plushsense.dataset.importing.sources import (
+    SourceFile,
+    SourceScan,
+    classify_files,
+    classify_session_files,
+    common_layout,
+    is_simulation,
+    people_of,
+    printable_path,
+    read_mapping,
+    read_sessions,
+    session_of,
+    source_files,
+    split_regular_files,
+)
+from plushsense.dataset.importing.tables import STREAM_ROLE, check_roles, read_table
+from plushsense.dataset.importing.xdf import person_and_session, read_xdf
+from plushsense.dataset.index import Progress, open_dataset, rebuild_index
+from plushsense.dataset.marks import MARKS, Mark, append_marks
+from plushsense.dataset.people import PersonInfo, read_people, write_people
+from plushsense.dataset.privacy.forget import read_removals
+from plushsense.dataset.store import HEAD, RECORDINGS, STREAMS, Dataset, DatasetHead
+
+CACHE = "cache"
+
+
+@contextmanager
+def _workplace(dest: Path) -> Iterator[Path]:
+    """Create a work folder on the data set's disk, locked for one import; leftovers of a killed import are removed."""
+    cache = dest / CACHE
+    cache.mkdir(exist_ok=True)
+    try:
+        with FileLock(cache / "adding.lock", timeout=0):
+            for left in cache.glob("adding-*"):
+                shutil.rmtree(left, ignore_errors=True)
+            work = Path(tempfile.mkdtemp(prefix="adding-", dir=cache))
+            try:
+                yield work
+            finally:
+                shutil.rmtree(work, ignore_errors=True)
+    except Timeout:
+        raise DatasetError(f"Another import is adding to '{dest}' just now: wait for it to end.") from None
+
+
+def _copier(dataset: Dataset, work: Path) -> Copier:
+    """Create a copier into ``work`` that knows the files of the data set."""
+    taken: dict[str, str] = {}
+    contents: dict[tuple[str, str], str] = {}
+    for kind, infos in ((RECORDINGS, dataset.recordings), (STREAMS, dataset.streams)):
+        for info in infos:
+            # Recordings that are rows of a stream are no files of their own.
+            if info.file.startswith(f"{kind}/"):
+                taken[key_of(info.file, companion=False)] = info.sha256
+                contents[(kind, info.sha256)] = info.file
+    for kind in (RECORDINGS, STREAMS):
+        for place, _, names in os.walk(dataset.path / kind):
+            for name in names:
+                path = Path(place) / name
+                file = path.relative_to(dataset.path).as_posix()
+                if not name.lower().endswith(".csv"):
+                    taken[key_of(file, companion=True)] = sha256_of(path)
+    return Copier(work, taken, contents, dataset.path)
+
+
+def _last_use_marks(folder: Path) -> dict[str, tuple[str, str]]:
+    """Return the last exclude or include mark of each recording, and who made it."""
+    decided: dict[str, tuple[str, str]] = {}
+    try:
+        lines = (folder / MARKS).read_bytes().split(b"\n")
+    except FileNotFoundError:
+        return decided
+    for line in lines:
+        try:
+            mark = json.loads(line)
+            if mark["action"] in ("exclude", "include"):
+                decided[str(mark["recording"])] = (mark["action"], mark["who"])
+        except (ValueError, TypeError, KeyError, RecursionError):
+            continue
+    return decided
+
+
+def _new_marks(aside: Mapping[str, str], decided: Mapping[str, tuple[str, str]]) -> list[Mark]:
+    """Return marks for what the recorder decided since; decisions of people stay."""
+    marks = []
+    for recording, why in aside.items():
+        action, who = decided.get(recording, ("include", RECORDER))
+        new_action = "exclude" if why else "include"
+        if who == RECORDER and action != new_action:
+            marks.append(Mark(recording, new_action, RECORDER, why or "kept after all"))
+    return marks
+
+
+def refuse_mixture(dataset: Dataset, search: SourceScan) -> None:
+    """Refuse to mix recordings of the virtual toy with real ones."""
+    if dataset.head.simulated != search.simulated:
+        mine, theirs = ("real", "virtual") if search.simulated else ("virtual", "real")
+        raise DatasetError(
+            f"'{dataset.path}' holds recordings of a {mine} toy and the source those of a {theirs} one: "
+            "keep them apart."
+        )
+
+
+def add_to_dataset(
+    dest: Path,
+    search: SourceScan,
+    gestures: GestureSet | None,
+    people: Mapping[str, PersonInfo],
+    progress: Progress | None,
+) -> ImportSummary:
+    """Add the files of a search to the data set ``dest``; ``gestures`` may describe gestures that are new to it.
+
+    Raises:
+        DatasetError: when the data set cannot be opened or written, or another import is at work.
+    """
+    with _workplace(dest) as work:
+        dataset = open_dataset(dest)
+        refuse_mixture(dataset, search)
+        copier = _copier(dataset, work)
+        account = ImportedFiles(search, copier)
+        head = replace(dataset.head, gestures=_with_described(dataset.head.gestures, gestures))
+        built = read_copied(account, head, progress)
+        if account.rejected and not account.kept and not copier.already:
+            file, reason = account.rejected[0].values()
+            raise DatasetError(
+                f"Nothing of the source fits '{dest}', whose layout is '{head.layout.name}': all "
+                f"{len(account.rejected)} files are rejected. The first: '{file}': {reason.rstrip('.')}."
+            )
+        head = replace(head, gestures=extend_gestures(head.gestures, built.dataset))
+        subjects = {r.subject for r in (*dataset.recordings, *built.dataset.recordings)}
+        there = read_people(dest)
+        listed, notes = merge_people(there, search.people, people, subjects)
+        account.check()
+        # The people's table is written as a whole, which would restore a person who was removed meanwhile.
+        dataset.generation.check()
+        new = set(account.kept)
+        if head.gestures != dataset.head.gestures:
+            write_file(dest / HEAD, head.to_toml())
+        marks = _new_marks(account.set_aside_reasons(), _last_use_marks(dest))
+        if marks:
+            append_marks(dest, marks)
+        if {p.subject: p for p in listed} != there:
+            write_people(dest, listed)
+        # Companions first, so that an existing recording always has its sidecar.
+        for file in sorted(new, key=lambda f: (f.lower().endswith(".csv"), f)):
+            target = dest / file
+            target.parent.mkdir(parents=True, exist_ok=True)
+            if target.exists() and file not in copier.grown:
+                raise DatasetError(f"'{target}' appeared while adding: nothing is overwritten, so run it once more.")
+            os.replace(work / file, target)
+        rebuilt = rebuild_index(dest, head).dataset if new or marks else open_dataset(dest)
+    come = sorted(set(rebuilt.subjects) - set(dataset.subjects))
+    return summarize_import(rebuilt, account, search.notes + notes + _returning_people_warning(dest, come), new)
+
+
+def _returning_people_warning(dest: Path, come: list[str]) -> list[str]:
+    """Return a warning if people are added to a data set from which people were removed: it may be the same person."""
+    gone = read_removals(dest)
+    if not come or not gone:
+        return []
+    days = ", ".join(dict.fromkeys(g.day for g in gone))
+    return [
+        f"people were forgotten here ({len(gone)}; {days}), and {', '.join(come[:5])} just came in"
+        f"{f' with {len(come) - 5} more' if len(come) > 5 else ''}: whoever should not be here, take out again with  "
+        f"plushsense forget {dest} CODE"
+    ]
+
+
+def _with_described(mine: GestureSet, more: GestureSet | None) -> GestureSet:
+    """Return the data set's gestures in their order, followed by those that only ``more`` describes."""
+    new = tuple(g for g in (more.gestures if more is not None else ()) if mine.find(g.label) is None)
+    return GestureSet(mine.name, mine.gestures + new, mine.inferred and not new) if new else mine
+
+
+FOLDER = "folder"
+SHOWN = 5
+
+
+@dataclass(frozen=True)
+class ImportOptions:
+    """Options of an import; ``layout``, ``gestures`` and ``mapping`` (file to person) may be unknown.
+
+    ``layout_origin`` names the source of the layout in messages; ``columns`` maps roles to column names; ``new_folder``
+    makes a new folder for what has to be unpacked or converted.
+    """
+
+    layout: Layout | None
+    gestures: GestureSet | None
+    mapping: Mapping[str, str] | None
+    new_folder: Callable[[str], Path]
+    layout_origin: str = "the layout that was asked for"
+    columns: Mapping[str, str] = field(default_factory=dict)
+    limits: UnpackLimits = field(default_factory=UnpackLimits)
+
+    def known_layout(self, found: Layout | None = None) -> Layout:
+        """Return the layout that was requested or found.
+
+        Raises:
+            ConfigError: when there is none.
+        """
+        if (layout := found or self.layout) is None:
+            raise ConfigError(
+                f"--layout is needed, for only sessions of plushsense record say what theirs is: accepted are "
+                f"{', '.join(layout_names())}, or a TOML file of your own."
+            )
+        return layout
+
+    def known_gestures(self, layout: Layout) -> GestureSet | None:
+        """Return the gesture set; None if it is to be inferred from the labels."""
+        if self.gestures is None and layout.name.startswith("plush"):
+            return load_gestures("plush-18")
+        return self.gestures
+
+
+def scan_folder(source: Path, options: ImportOptions, *, around: Path | None = None) -> SourceScan:
+    """Search a folder: sessions of our recorder, XDF files, and recordings by the shape of the folders.
+
+    ``around`` is the folder in which to search for the mark of a simulation, by default ``source``.
+    """
+    files = source_files(source)
+    simulated = is_simulation(around or source, files)
+    files, refused = split_regular_files(f for f in files if f.name != SIMULATION_MARK)
+    sessions = read_sessions(files)
+    layout = options.known_layout(common_layout(sessions, options.layout, options.layout_origin))
+    gestures = options.known_gestures(layout)
+    in_session = [f for f in files if sessions and session_of(f, sessions) is not None]
+    rest = sorted(set(files) - set(in_session)) if in_session else files
+    convertible = [f for f in rest if f.suffix.lower() == ".xdf"]
+    plain = [f for f in rest if f.suffix.lower() != ".xdf"]
+    mapping = None if options.mapping is None else dict(options.mapping)
+    shape = "labelled-rows" if layout.is_labelled else "gesture-recorder"
+    found = (
+        refused
+        + list(classify_session_files(sessions, in_session))
+        + classify_files(shape, source, plain, mapping, gestures)
+    )
+    found = [replace(f, origin=printable_path(f.source.relative_to(source))) for f in found]
+    people, notes = people_of(sessions)
+    search = SourceScan(layout, gestures, shape if rest else "sessions", found, people, notes=notes)
+    for file in convertible:
+        name = printable_path(file.relative_to(source))
+        person = None if file.parent == around else file.parent.resolve().name
+        if mapping is not None:
+            person = mapping.get(name, mapping.get(file.name))
+        try:
+            _xdf(file, name, person, layout, gestures, options, search)
+        except FileFormatError as cause:
+            search.found.append(SourceFile(file, "", origin=name, reason=str(cause)))
+    if mapping is not None:
+        search.notes += _unused(mapping, source, rest)
+    search.simulated = simulated or any(not isinstance(h, str) and h.simulated for h in sessions.values())
+    return search
+
+
+def scan_zip(path: Path, options: ImportOptions) -> SourceScan:
+    """Search a zip, unpacked beside the new data set."""
+    # Recordings at the top belong to the person named by the folder, as if the user had unpacked the zip.
+    folder = options.new_folder("unpacked") / folder_name(path.stem)
+    folder.mkdir()
+    refused = unpack(path, folder, options.limits)
+    if any(folder.rglob(HEAD)):
+        raise DatasetError(f"'{path}' holds a data set: unpack it and open the folder, it needs no import.")
+    search = scan_folder(folder, options, around=path.resolve().parent)
+    search.found += [SourceFile(path, "", origin=printable_path(Path(name)), reason=reason) for name, reason in refused]
+    return search
+
+
+def scan_xdf(path: Path, options: ImportOptions) -> SourceScan:
+    """Search one XDF file."""
+    layout = options.known_layout()
+    gestures = options.known_gestures(layout)
+    search = SourceScan(layout, gestures, "xdf", [], simulated=is_simulation(path.resolve().parent, []))
+    _xdf(path, path.name, (options.mapping or {}).get(path.name), layout, gestures, options, search)
+    return search
+
+
+def _xdf(
+    path: Path,
+    name: str,
+    person: str | None,
+    layout: Layout,
+    gestures: GestureSet | None,
+    options: ImportOptions,
+    search: SourceScan,
+) -> None:
+    subject, session = person_and_session(path, person)
+    if options.mapping is not None:
+        subject = person
+    if subject is None:
+        raise FileFormatError(
+            f"whose '{name}' is, is not said: name the person with --subjects map.csv (file,subject), or call the file "
+            "sub-<code>_ses-<session>.xdf as LabRecorder does"
+        )
+    folder = options.new_folder("converted") / "xdf"
+    _take(
+        read_xdf(path, name, folder, subject, session, layout, gestures, options.columns.get(STREAM_ROLE, "")), search
+    )
+
+
+def scan_table(path: Path, options: ImportOptions) -> SourceScan:
+    """Search one table with a row per sample."""
+    if parse_name(path.name) is not None:
+        raise DatasetError(f"'{path}' is one recording: give the folder that holds the people's folders.")
+    layout = options.known_layout()
+    check_roles(options.columns, layout)
+    search = SourceScan(
+        layout, options.known_gestures(layout), "table", [], simulated=is_simulation(path.resolve().parent, [])
+    )
+    person = (options.mapping or {}).get(path.name)
+    _take(read_table(path, path.name, options.new_folder("converted"), person, layout, options.columns), search)
+    return search
+
+
+def _take(laid_out: Iterable[SourceFile | str], search: SourceScan) -> None:
+    for entry in laid_out:
+        if isinstance(entry, str):
+            search.notes.append(entry)
+        else:
+            search.found.append(entry)
+
+
+FORMATS: dict[str, Callable[[Path, ImportOptions], SourceScan]] = {
+    ".zip": scan_zip,
+    ".xdf": scan_xdf,
+    ".parquet": scan_table,
+    ".csv": scan_table,
+}
+
+
+def _unused(mapping: dict[str, str], source: Path, files: Iterable[Path]) -> list[str]:
+    """Return a warning if the mapping names files that do not exist."""
+    there = {name for f in files for name in (f.name, f.relative_to(source).as_posix())}
+    missing = [name for name in mapping if name not in there]
+    if not missing:
+        return []
+    listed = ", ".join(f"'{m}'" for m in missing[:SHOWN]) + (", …" if len(missing) > SHOWN else "")
+    return [f"files that the mapping names are not there ({len(missing)}): {listed}"]
+
+
+@contextmanager
+def _workplaces(dest: Path) -> Iterator[Callable[[str], Path]]:
+    """Yield a function that creates folders for unpacked and converted files; all are removed at the end."""
+    made: list[Path] = []
+
+    def make_one(what: str) -> Path:
+        real = dest.resolve()
+        place = next(p for p in real.parents if p.is_dir())
+        made.append(Path(tempfile.mkdtemp(prefix=f".{real.name}-{what}-", dir=place)))
+        return made[-1]
+
+    try:
+        yield make_one
+    finally:
+        for folder in made:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def scan_source(source: Path, options: ImportOptions) -> SourceScan:
+    """Search ``source``: a folder, or a file of one of the ``FORMATS``.
+
+    Raises:
+        DatasetError: when it is neither, cannot be read, or holds nothing to import.
+    """
+    try:
+        if source.is_dir():
+            if strange := sorted(set(options.columns) - {STREAM_ROLE}):
+                raise ConfigError(f"--column {strange[0]}=… is for a table; '{source}' is a folder.")
+            search = scan_folder(source, options)
+        elif source.is_file():
+            if source.suffix.lower() not in FORMATS:
+                raise DatasetError(
+                    f"'{source}' is of no kind that can be imported: give a folder, or a file that ends in "
+                    f"{', '.join(FORMATS)}."
+                )
+            search = FORMATS[source.suffix.lower()](source, options)
+        else:
+            raise DatasetError(
+                f"There is no folder '{source}', nor such a file: give what the recorder wrote, or a file that ends in "
+                f"{', '.join(FORMATS)}."
+            )
+    except OSError as cause:
+        raise DatasetError(f"'{source}' cannot be read: {cause.strerror or cause} ({cause.filename}).") from None
+    except FileFormatError as cause:
+        raise FileFormatError(f"'{source}': {cause}.") from None
+    if not any(f.kind in ("recordings", "streams") for f in search.found):
+        first = next((f" The first: '{f.origin}': {f.reason.rstrip('.')}." for f in search.found if f.reason), "")
+        raise DatasetError(
+            f"'{source}' holds no recording: expected <label>_<epoch ms>_<rows>.csv in a folder a person"
+            f"{' (or CSVs with a label column)' if search.shape == 'labelled-rows' else ''}; "
+            f"found {len(search.found)} others.{first}"
+        )
+    return search
+
+
+def import_recordings(
+    source: str | Path,
+    dest: str | Path,
+    *,
+    layout: Layout | str | Path | None = None,
+    gestures: GestureSet | str | Path | None = None,
+    subjects: str | Path = FOLDER,
+    name: str | None = None,
+    licence: str = "",
+    consent: str = "",
+    simulated: bool = False,
+    progress: Progress | None = None,
+    add_to: bool = False,
+    people: str | Path | None = None,
+    columns: Mapping[str, str] | None = None,
+    limits: UnpackLimits | None = None,
+) -> ImportSummary:
+    """Create a data set at ``dest`` from recordings, or add them to an existing one.
+
+    Args:
+        source: a folder as a recorder left it (sessions, a folder a person, a folder a label), a zip of one, an XDF
+            file, or one table (.csv, .parquet).
+        dest: the new data set; it must not exist yet, or be empty. With ``add_to`` the data set to add to.
+        layout: the sensor layout, by name, path or as it is; sessions of our recorder and ``add_to`` need none.
+        gestures: the gesture set; by default ``plush-18`` for plush layouts, else inferred from the labels.
+        subjects: "folder" (the folder is the person) or the path of a mapping file ``file,subject``.
+        simulated: these are recordings of the virtual toy; found out by itself where `plushsense simulate` wrote them.
+        progress: called with (files done, files in all).
+        people: the path of a people's table, see `dataset.people`.
+        columns: which column of a table is what (``{"label": "activity"}``), or which ``stream`` of an XDF file.
+        limits: how much a zip may unpack to.
+
+    Returns:
+        The summary; every source file is imported, imported with a warning, left out or rejected with a reason.
+
+    Raises:
+        DatasetError: when there is nothing to import, or ``dest`` holds something already.
+    """
+    began = time.perf_counter()
+    source, dest = Path(source), Path(dest)
+    given = layout if isinstance(layout, Layout) or layout is None else load_layout(layout)
+    if gestures is not None and not isinstance(gestures, GestureSet):
+        gestures = load_gestures(gestures)
+    mapping = None if str(subjects) == FOLDER else read_mapping(Path(subjects))
+    if people is not None and not Path(people).exists():
+        raise DatasetError(f"There is no people's file '{people}': check the path.")
+    people_info = {} if people is None else read_people(Path(people))
+    if source.is_dir() and dest.resolve() != source.resolve() and dest.resolve().is_relative_to(source.resolve()):
+        raise ConfigError(f"'{dest}' lies in '{source}', which is only read: give a place outside it for the data set.")
+    head = None
+    if add_to:
+        head = DatasetHead.read(dest)
+        if given is not None and given.to_dict() != head.layout.to_dict():
+            raise DatasetError(
+                f"'{dest}' has the layout '{head.layout.name}', and '{given.name}' was asked for: a data set has one "
+                "layout, so leave --layout out or make another data set."
+            )
+        if name or licence or consent:
+            raise ConfigError("--add keeps the name, licence and consent statement of the data set: leave them out.")
+    # An inferred set does not tell which markers of an XDF file are gestures.
+    known = gestures if head is None or head.gestures.inferred else head.gestures
+    with _workplaces(dest) as workplace:
+        options = ImportOptions(
+            given if head is None else head.layout,
+            known,
+            mapping,
+            workplace,
+            "the layout that was asked for" if head is None else "that of the data set",
+            columns or {},
+            limits or UnpackLimits(),
+        )
+        search = scan_source(source, options)
+        search.simulated = search.simulated or simulated
+        if head is None:
+            done = create_dataset(
+                source, dest, search, _new_head(source, search, name, licence, consent), people_info, progress
+            )
+        else:
+            try:
+                done = add_to_dataset(dest, search, gestures, people_info, progress)
+            except OSError as cause:
+                raise DatasetError(
+                    f"'{dest}' cannot be added to ({cause.strerror or cause}, {cause.filename}): it is as valid as "
+                    "before; check the disk and run it once more."
+                ) from None
+    done.seconds = time.perf_counter() - began
+    return done
+
+
+def _new_head(source: Path, search: SourceScan, name: str | None, licence: str, consent: str) -> DatasetHead:
+    return DatasetHead(
+        name=name or (source.resolve().name if source.is_dir() else source.stem),
+        layout=search.layout,
+        gestures=search.gestures or GestureSet("inferred", (), inferred=True),
+        licence=licence,
+        consent=consent,
+        source=search.shape,
+        simulated=search.simulated,
+    )

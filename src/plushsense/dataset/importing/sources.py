@@ -1,0 +1,434 @@
+"""Finding recordings in a source folder: the kind of each file, its person and session.
+
+Three folder layouts are read: sessions of our own recorder, folders of the GestureRecorder (by person, or by label
+after the authors' anonymising step), and folders of CSVs with a label on every row. Outside a session, the nearest
+folder names the person.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from plushsense.core.errors import BadInput, DatasetError
+from plushsense.core.gestures import NOBODY, GestureSet, plain_label
+from plushsense.core.layouts import Layout
+from plushsense.core.recorder_csv import SIMULATION_MARK, STREAM_NAME, parse_name
+from plushsense.core.toml import read_toml
+from plushsense.dataset.people import PersonInfo
+from plushsense.dataset.store import HEAD, RECORDINGS, STREAMS, UNKNOWN_SUBJECT
+from plushsense.recording.session_files import SESSION_HEAD, SESSION_LOG, SIDECAR, SessionHead, discarded_recordings
+
+COMPANIONS = "companions"
+LEFT_OUT = "left out"
+
+_ASK = (
+    "import from the folder that holds one folder a person, or name the people with --subjects map.csv (file,subject)"
+)
+
+
+@dataclass(frozen=True)
+class SourceFile:
+    """A source file and where it goes.
+
+    ``kind`` is recordings, streams, companions (copied beside another file, never read), left out (not needed), or ""
+    for a refused file with its ``reason``. ``origin`` is its name in messages, by default the path below the source.
+    ``beside`` is the file that a companion belongs to; without one it goes to its session's stream. ``set_aside`` is
+    why the recorder excluded the recording.
+    """
+
+    source: Path
+    kind: str
+    subject: str = ""
+    reason: str = ""
+    session: str = ""
+    origin: str = ""
+    beside: Path | None = None
+    set_aside: str = ""
+
+
+@dataclass
+class SourceScan:
+    """Result of searching a source: every file once, and what its sessions state."""
+
+    layout: Layout
+    gestures: GestureSet | None
+    shape: str
+    found: list[SourceFile]
+    people: list[PersonInfo] = field(default_factory=list)
+    simulated: bool = False
+    notes: list[str] = field(default_factory=list)
+
+
+def printable_path(path: Path) -> str:
+    """Return a path as printable text; characters that are not, or that would act on a terminal, are escaped."""
+    text = os.fsencode(path).decode("utf-8", "backslashreplace").replace(os.sep, "/")
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def source_files(source: Path) -> list[Path]:
+    """Return every file below ``source`` in name order, and every link to a folder.
+
+    Raises:
+        DatasetError: when a data set is in there, which would be taken in again.
+        OSError: when a folder cannot be listed.
+    """
+
+    def refuse(cause: OSError) -> None:
+        raise cause
+
+    files = []
+    for place, folders, names in os.walk(source, onerror=refuse, followlinks=False):
+        folders.sort()
+        here = Path(place)
+        if HEAD in names:
+            what = (
+                f"'{source}' is a data set already: open it as it is, with  plushsense info {source}"
+                if here == source
+                else f"'{here}' in '{source}' is a data set already: give the recorder's folder, or move it away first"
+            )
+            raise DatasetError(f"{what}; importing it again would mix its own copies with its people.")
+        files += [here / name for name in sorted(names + [f for f in folders if (here / f).is_symlink()])]
+    return files
+
+
+def is_simulation(source: Path, files: Iterable[Path]) -> bool:
+    """Return whether the virtual toy made ``files``: its mark, or a simulated data set, is there or above."""
+    if any(f.name == SIMULATION_MARK for f in files):
+        return True
+    for place in (source.resolve(), *source.resolve().parents):
+        if (place / SIMULATION_MARK).is_file():
+            return True
+        try:
+            if (place / HEAD).is_file() and read_toml(place / HEAD, "data set", DatasetError).get("simulated") is True:
+                return True
+        except BadInput:
+            continue
+    return False
+
+
+def _not_a_file(path: Path) -> SourceFile | None:
+    if path.is_symlink():
+        return SourceFile(path, "", reason="a symbolic link is not followed")
+    if not path.is_file():
+        return SourceFile(path, "", reason="not a regular file")
+    if path.name.startswith("._"):
+        return SourceFile(path, "", reason="what macOS leaves beside a file, no recording")
+    try:
+        path.name.encode("utf-8")
+    except UnicodeEncodeError:
+        return SourceFile(path, "", reason="its name is not UTF-8: rename it")
+    if any(c < " " or c == "\x7f" for c in path.name):
+        return SourceFile(path, "", reason="its name holds a control character: rename it")
+    return None
+
+
+def split_regular_files(files: Iterable[Path]) -> tuple[list[Path], list[SourceFile]]:
+    """Split files into those that can be read and those refused: links, devices, names that are not text."""
+    good, refused = [], []
+    for path in files:
+        odd = _not_a_file(path)
+        if odd is None:
+            good.append(path)
+        else:
+            refused.append(odd)
+    return good, refused
+
+
+def _is_by_label(source: Path, files: Iterable[Path]) -> bool:
+    """Return whether folders are gestures, not people: every recording's label is its folder's name."""
+    named = [(path, name) for path in files if (name := parse_name(path.name)) is not None]
+    inside = [(path, name) for path, name in named if path.parent != source] or named
+    return bool(inside) and all(plain_label(n.label) == plain_label(p.parent.resolve().name) for p, n in inside)
+
+
+def _nobodys_folders(files: Iterable[Path], gestures: GestureSet | None) -> set[Path]:
+    """Return the folders in which every recording is of a gesture that nobody makes (the toy at rest)."""
+    by_folder: dict[Path, bool] = {}
+    for path in files:
+        name = parse_name(path.name)
+        if name is not None and gestures is not None:
+            gesture = gestures.find(name.label)
+            nobody = gesture is not None and gesture.nobody
+            by_folder[path.parent] = by_folder.get(path.parent, True) and nobody
+    return {folder for folder, nobody in by_folder.items() if nobody}
+
+
+def _refuse_unclear_people(source: Path, found: Iterable[SourceFile], *, nested: bool) -> None:
+    """Refuse folders that leave open who the person is, so that people are neither merged nor split.
+
+    With ``nested`` a folder of recordings inside another one is unclear too.
+    """
+    folders: dict[str, Path] = {}
+    for f in found:
+        if not f.kind or f.subject in (NOBODY, UNKNOWN_SUBJECT):
+            continue
+        other = folders.setdefault(f.subject.casefold(), f.source.parent)
+        if other != f.source.parent:
+            a, b = (p.relative_to(source).as_posix() for p in (other, f.source.parent))
+            raise DatasetError(
+                f"Who the person is is not clear: '{a}' and '{b}' in '{source}' have the same name: {_ASK}."
+            )
+    places = set(folders.values())
+    for place in sorted(places) if nested else ():
+        above = next((p for p in place.parents if p in places), None)
+        if above is not None:
+            raise DatasetError(
+                f"Who the person is is not clear: '{place}' lies in '{above}', both hold recordings: {_ASK}."
+            )
+
+
+def _mapped(path: Path, source: Path, subjects: dict[str, str]) -> str | None:
+    """Return the person of a file by the mapping, from its path below ``source`` or its name."""
+    return subjects.get(path.relative_to(source).as_posix(), subjects.get(path.name))
+
+
+def classify_gesture_recorder(
+    source: Path, files: list[Path], subjects: dict[str, str] | None, gestures: GestureSet | None
+) -> Iterator[SourceFile]:
+    """Yield recordings and streams in the folders of the GestureRecorder.
+
+    ``subjects`` maps file names (or paths below ``source``) to people; without it the nearest folder is the person,
+    or nobody if it holds only gestures that nobody makes.
+    """
+    by_label = subjects is None and _is_by_label(source, files)
+    nobodys = _nobodys_folders(files, gestures)
+    for path in files:
+        if subjects is not None:
+            # A mapping need not list recordings of the untouched toy.
+            subject = _mapped(path, source, subjects) or (NOBODY if path.parent in nobodys else None)
+        elif path.parent in nobodys:
+            subject = NOBODY
+        elif by_label:
+            subject = UNKNOWN_SUBJECT
+        else:
+            subject = path.parent.resolve().name
+        if path.name.casefold() == STREAM_NAME.casefold():
+            if by_label or subject is None:
+                yield SourceFile(path, "", reason="a session stream whose person is not known")
+            else:
+                yield SourceFile(path, STREAMS, subject)
+        elif parse_name(path.name) is None:
+            yield SourceFile(path, "", reason="not a recording: its name is not <label>_<epoch ms>_<rows>.csv")
+        elif subject is None:
+            yield SourceFile(path, "", reason="not named in the mapping file of --subjects")
+        else:
+            yield SourceFile(path, RECORDINGS, subject)
+
+
+def classify_labelled_rows(
+    source: Path, files: list[Path], subjects: dict[str, str] | None, gestures: GestureSet | None
+) -> Iterator[SourceFile]:
+    """Yield CSVs with a label on every row: each file is a stream, runs of equal labels are recordings."""
+    one_person = all(path.parent == source for path in files)
+    for path in files:
+        if subjects is not None:
+            subject = _mapped(path, source, subjects)
+        else:
+            subject = path.parent.resolve().name if one_person or path.parent != source else None
+        if path.suffix.lower() != ".csv":
+            yield SourceFile(path, "", reason="not a CSV file")
+        elif subject is None:
+            reason = (
+                "not in the folder of a person" if subjects is None else "not named in the mapping file of --subjects"
+            )
+            yield SourceFile(path, "", reason=reason)
+        else:
+            yield SourceFile(path, STREAMS, subject)
+
+
+Classifier = Callable[[Path, list[Path], dict[str, str] | None, GestureSet | None], Iterator[SourceFile]]
+
+CLASSIFIERS: dict[str, Classifier] = {
+    "gesture-recorder": classify_gesture_recorder,
+    "labelled-rows": classify_labelled_rows,
+}
+
+
+def classify_files(
+    shape: str, source: Path, files: list[Path], subjects: dict[str, str] | None, gestures: GestureSet | None
+) -> list[SourceFile]:
+    """Classify ``files`` (regular ones); each is returned once.
+
+    Raises:
+        DatasetError: when the folders leave open who the person is.
+    """
+    found = list(CLASSIFIERS[shape](source, files, subjects, gestures))
+    if subjects is None:
+        _refuse_unclear_people(source, found, nested=shape == "gesture-recorder")
+    return found
+
+
+def read_mapping(path: Path) -> dict[str, str]:
+    """Read a mapping from file name to person, a CSV with the columns ``file`` and ``subject``."""
+    mapping: dict[str, str] = {}
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            sample = file.readline()
+            file.seek(0)
+            reader = csv.DictReader(file, delimiter=";" if ";" in sample else ",")
+            columns = [c.strip().casefold() for c in reader.fieldnames or ()]
+            if columns[:2] != ["file", "subject"]:
+                raise DatasetError(
+                    f"The mapping file '{path}' begins with the columns {', '.join(columns) or 'nothing'}; "
+                    "it needs  file,subject"
+                )
+            reader.fieldnames = columns
+            for row in reader:
+                name = (row["file"] or "").strip().replace("\\", "/")
+                subject = (row["subject"] or "").strip()
+                if not name or not subject:
+                    raise DatasetError(
+                        f"The mapping file '{path}' line {reader.line_num} names no {'subject' if name else 'file'}: "
+                        "each line is  file,subject"
+                    )
+                if mapping.setdefault(name, subject) != subject:
+                    raise DatasetError(
+                        f"The mapping file '{path}' gives '{name}' to '{mapping[name]}' and '{subject}'."
+                    )
+    except (OSError, UnicodeDecodeError, csv.Error) as cause:
+        raise DatasetError(f"The mapping file '{path}' cannot be read: {cause}.") from None
+    return mapping
+
+
+# Files that the recorder leaves when it is killed, or is still running.
+LEFT_OVER = {
+    ".part": "not finished when the recorder stopped; its rows are in the session's stream",
+    ".new": "not finished when the recorder stopped; its rows are in the session's stream",
+    ".torn": "damaged by a crash and set aside by the recorder; its rows are in the session's stream",
+    ".lock": "a lock of the recorder",
+}
+
+Sessions = dict[Path, SessionHead | str]
+
+
+def read_sessions(files: Iterable[Path]) -> Sessions:
+    """Read the head of every session folder among ``files``, or the reason why it is unreadable."""
+    sessions: Sessions = {}
+    for path in files:
+        if path.name != SESSION_HEAD:
+            continue
+        try:
+            head = SessionHead.read(path.parent)
+            if head is not None and head.subject.strip():
+                Layout.from_dict(head.layout, "layout")
+        except (BadInput, RecursionError) as cause:
+            sessions[path.parent] = f"its {SESSION_HEAD} cannot be used: {cause}"
+            continue
+        if head is not None:
+            sessions[path.parent] = head if head.subject.strip() else f"its {SESSION_HEAD} names no subject"
+    return sessions
+
+
+def session_of(path: Path, sessions: Mapping[Path, object]) -> Path | None:
+    """Return the nearest session folder that contains a file; None if there is none."""
+    return next((place for place in path.parents if place in sessions), None)
+
+
+def common_layout(sessions: Sessions, given: Layout | None, of: str) -> Layout | None:
+    """Return the layout that all sessions and the given one share; ``of`` names the source of the given one.
+
+    Raises:
+        DatasetError: when two sessions, or a session and the given layout, do not agree.
+    """
+    agreed = given
+    for place, head in sessions.items():
+        if isinstance(head, str):
+            continue
+        own = Layout.from_dict(head.layout, f"layout of the session '{place.name}'")
+        if agreed is None:
+            agreed, of = own, f"session '{place.name}'"
+        elif own.to_dict() != agreed.to_dict():
+            what = f"'{own.name}'" if own.name != agreed.name else f"another '{own.name}'"
+            raise DatasetError(
+                f"Session '{place.name}' was recorded with the layout {what}, but {of} is '{agreed.name}': "
+                "a data set has one layout, so import them apart."
+            )
+    if agreed is not None and agreed.is_labelled and any(isinstance(h, SessionHead) for h in sessions.values()):
+        raise DatasetError(
+            f"Layout '{agreed.name}' has a label on every row, which recordings of a session do not carry: "
+            "take 'label' out of its csv.columns."
+        )
+    return agreed
+
+
+def classify_session_files(sessions: Sessions, files: Iterable[Path]) -> Iterator[SourceFile]:
+    """Classify ``files`` that are in session folders."""
+    by_session: dict[Path, list[Path]] = {}
+    for path in files:
+        place = session_of(path, sessions)
+        if place is not None:
+            by_session.setdefault(place, []).append(path)
+    for place, mine in by_session.items():
+        head = sessions[place]
+        if isinstance(head, str):
+            yield from (SourceFile(path, "", reason=head) for path in mine)
+        else:
+            yield from _find(place, head, mine)
+
+
+def _find(place: Path, head: SessionHead, files: list[Path]) -> Iterator[SourceFile]:
+    try:
+        aside = discarded_recordings(place)
+    except (BadInput, OverflowError, RecursionError) as cause:
+        # Only the log states which takes were repeated.
+        yield from (SourceFile(path, "", reason=f"its {SESSION_LOG} cannot be used: {cause}") for path in files)
+        return
+    stream = place / STREAM_NAME
+    mains = {p.with_suffix("").as_posix(): p for p in files if p == stream or parse_name(p.name) is not None}
+    for path in files:
+
+        def found(
+            kind: str, reason: str = "", beside: Path | None = None, why: str = "", path: Path = path
+        ) -> SourceFile:
+            return SourceFile(
+                path, kind, head.subject, reason, head.session or place.name, beside=beside, set_aside=why
+            )
+
+        name = path.name
+        if path == stream:
+            yield found(STREAMS)
+        elif parse_name(name) is not None:
+            yield found(RECORDINGS, why=aside.get(name, ""))
+        elif path.parent == place and name in (SESSION_HEAD, SESSION_LOG):
+            yield found(COMPANIONS, beside=stream if stream in files else None)
+        elif path.suffix in LEFT_OVER:
+            yield found(LEFT_OUT, LEFT_OVER[path.suffix])
+        elif name.endswith(SIDECAR):
+            main = mains.get(path.with_suffix("").as_posix())
+            if main is None:
+                yield found(LEFT_OUT, "the sidecar of a recording that is not there")
+            else:
+                yield found(COMPANIONS, beside=main)
+        else:
+            yield found("", "no file of a session: expected are recordings, their sidecars, the stream and the log")
+
+
+def people_of(sessions: Sessions) -> tuple[list[PersonInfo], list[str]]:
+    """Return the people of the sessions, the latest session first, and a note for each value that changed."""
+    people: dict[str, PersonInfo] = {}
+    notes = []
+    heads = sorted((h for h in sessions.values() if isinstance(h, SessionHead)), key=lambda h: h.started_ms)
+    for head in heads:
+        values = {key: _plain(getattr(head, key)) for key in ("age_group", "gender", "consent")}
+        before = people.get(head.subject)
+        if before is not None:
+            for key, value in values.items():
+                was = getattr(before, key)
+                if was and value and was != value:
+                    notes.append(
+                        f"the sessions of '{head.subject}' differ in {key.replace('_', ' ')} ('{was}', '{value}'): "
+                        "the latest is kept"
+                    )
+                values[key] = value or was
+        people[head.subject] = PersonInfo(head.subject, values["age_group"], values["gender"], values["consent"])
+    return list(people.values()), notes
+
+
+def _plain(text: str) -> str:
+    """Return a text as one printable line."""
+    text = text.encode("utf-8", "replace").decode("utf-8")
+    return " ".join("".join(c if c.isprintable() else " " for c in text).split())

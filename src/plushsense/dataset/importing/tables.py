@@ -1,0 +1,411 @@
+"""Import of one table with a row per sample: ``subject, [session], [recording], label, time`` and the channels.
+
+Rows are taken person by person and session by session, in the order of the file. A recording is a run of rows with one
+label (and one ``recording``, where there is such a column); without that column it also ends where the time runs back
+or pauses for more than a second. Rows without a label belong to no recording; a session
+with such rows is also kept as a stream.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import itertools
+import json
+from array import array
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import ConfigError, FileFormatError, nearest, need
+from plushsense.core.gestures import plain_label
+from plushsense.core.layouts import DEVICE_MS, HOST_MS, Layout
+from plushsense.core.recorder_csv import (
+    LONGEST_LABEL,
+    STREAM_NAME,
+    Frames,
+    format_header,
+    format_rows,
+    recording_filename,
+    write_recording,
+)
+from plushsense.dataset.importing.sources import COMPANIONS, SourceFile
+from plushsense.dataset.store import RECORDINGS, STREAMS
+
+ORIGIN = "origin.json"
+LARGEST = 2.0**53
+# A channel with values between few steps of its layout has another scale.
+_FEW_STEPS = 10.0
+_BETWEEN = 0.05
+
+
+@dataclass(frozen=True)
+class LabelledSegment:
+    """One recording: rows ``start`` to ``stop`` of the session's frames."""
+
+    label: str
+    start: int
+    stop: int
+
+
+@dataclass(frozen=True)
+class ConvertedSource:
+    """The file that recordings were converted from, and what ``origin.json`` states of it."""
+
+    path: Path
+    display_name: str
+    more: dict[str, Any]
+
+    @cached_property
+    def sha256(self) -> str:
+        """SHA-256 of the file."""
+        with self.path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+
+    def to_json(self) -> str:
+        """Return the text of ``origin.json``."""
+        table = {"source": self.display_name, "sha256": self.sha256} | self.more
+        return json.dumps(table, ensure_ascii=False, indent=1) + "\n"
+
+
+def whole_steps(values: NDArray[np.float64], layout: Layout) -> tuple[NDArray[np.int64], str]:
+    """Round values (T, C) to integer steps of the layout; also returns a warning if the steps are too coarse."""
+    steps = np.array([c.step for c in layout.channels])
+    scaled = values / steps
+    rounded = np.round(scaled)
+    if not len(values):
+        return rounded.astype(np.int64), ""
+    between = np.mean(np.abs(scaled - rounded) > _BETWEEN, axis=0) > 0.1
+    coarse = between & (np.std(scaled, axis=0) < _FEW_STEPS)
+    odd = [f"'{n}'" for n, is_odd in zip(layout.names, coarse, strict=True) if is_odd]
+    warning = (
+        f"{', '.join(odd)}: the values are small fractions of what layout '{layout.name}' counts in and were rounded "
+        "to it: give a layout with a smaller step"
+        if odd
+        else ""
+    )
+    return np.clip(rounded, -LARGEST, LARGEST).astype(np.int64), warning
+
+
+def usable_rows(*columns: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return rows (T,) in which every value of every column is a number that a file can hold."""
+    good = np.ones(len(columns[0]), dtype=bool)
+    for column in columns:
+        # NaN compares as false.
+        fits = np.abs(column) < LARGEST
+        good &= fits.all(axis=1) if fits.ndim == 2 else fits
+    return good
+
+
+def write_session(
+    folder: Path,
+    subject: str,
+    session: str,
+    frames: Frames,
+    cuts: Sequence[LabelledSegment],
+    layout: Layout,
+    original: ConvertedSource,
+    *,
+    with_stream: bool,
+) -> Iterator[SourceFile]:
+    """Write one session into the new ``folder``: recordings, the stream if requested, and ``origin.json``.
+
+    With a layout that has a label on every row, one stream with labels is written instead of recordings.
+    """
+    folder.mkdir(parents=True)
+    where = f"{original.display_name}: {subject}{f', session {session}' if session else ''}"
+    main: Path | None = None
+    if layout.is_labelled:
+        apart = layout.csv.separator.strip() or " "
+        written = [" ".join(cut.label.replace(apart, "_").split()) for cut in cuts]
+        labels = np.full(len(frames), "", dtype=f"<U{max(map(len, written), default=1)}")
+        for cut, label in zip(cuts, written, strict=True):
+            labels[cut.start : cut.stop] = label
+        frames = Frames(frames.values, frames.device_ms, frames.host_ms, labels)
+        with_stream, cuts = True, ()
+    if with_stream:
+        main = folder / STREAM_NAME
+        with main.open("w", encoding="utf-8", newline="\n") as file:
+            if frames.labels is not None:
+                file.write(format_header(layout))
+            for start in range(0, len(frames), 20_000):
+                file.write(format_rows(frames.slice(start, start + 20_000), layout))
+        yield SourceFile(main, STREAMS, subject, session=session, origin=f"{where}, the whole stream")
+    written_paths: set[Path] = set()
+    clock = frames.device_ms if frames.host_ms is None or HOST_MS not in layout.csv.columns else frames.host_ms
+    for cut in cuts:
+        name = f"{where}, rows {cut.start + 1} to {cut.stop} ('{cut.label[:40]}')"
+        at_ms = abs(int(clock[cut.start]))
+        # Recordings of one label and length whose clocks all begin at 0 would share a name.
+        while (path := folder / recording_filename(cut.label, at_ms, cut.stop - cut.start)) in written_paths:
+            at_ms += 1
+        written_paths.add(path)
+        if len(path.name.encode("utf-8")) > LONGEST_LABEL:
+            yield SourceFile(path, "", origin=name, reason="its label is too long for a file name")
+            continue
+        write_recording(path, frames.slice(cut.start, cut.stop), layout)
+        yield SourceFile(path, RECORDINGS, subject, session=session, origin=name)
+    about = folder / ORIGIN
+    about.write_text(original.to_json(), encoding="utf-8", newline="\n")
+    yield SourceFile(about, COMPANIONS, subject, session=session, origin=f"{where}, {ORIGIN}", beside=main)
+
+
+PAUSE_MS = 1000.0
+STREAM_ROLE = "stream"
+# Accepted column names by role.
+ROLES: dict[str, tuple[str, ...]] = {
+    "subject": ("subject", "participant", "person", "subject_id", "participant_id"),
+    "session": ("session", "session_id"),
+    "recording": ("recording", "recording_id", "trial"),
+    "label": ("label", "gesture", "activity"),
+    "time": (DEVICE_MS, "time", "timestamp", "time_ms", "time_s", "timestamp_ms", "timestamp_s", "t"),
+    HOST_MS: (HOST_MS,),
+}
+_TEXTS = ("subject", "session", "recording", "label")
+_UNITS = {"ns": 1e-6, "us": 1e-3, "µs": 1e-3, "ms": 1.0, "s": 1000.0}
+
+
+@dataclass(frozen=True)
+class ImportedColumns:
+    """The columns that are used, by role or channel: texts as lists, numbers (T,) with NaN where there is none."""
+
+    names: dict[str, str]
+    texts: dict[str, list[str]]
+    numbers: dict[str, NDArray[np.float64]]
+    malformed: int = 0
+    in_ms: bool = False
+    """The time is of a type that knows its unit, already in milliseconds."""
+
+
+def check_roles(columns: Mapping[str, str], layout: Layout) -> None:
+    """Refuse a ``--column`` with an unknown role."""
+    known = (*ROLES, STREAM_ROLE, *layout.names)
+    for role in columns:
+        if role not in known:
+            raise ConfigError(f"--column {role}=…: accepted are {', '.join(known)}.{nearest(role, known)}")
+
+
+def choose_columns(there: list[str], layout: Layout, given: Mapping[str, str], display_name: str) -> dict[str, str]:
+    """Assign columns of ``there`` to roles and channels.
+
+    Raises:
+        FileFormatError: for a column that is missing, or there twice.
+    """
+    plain = [name.strip().casefold() for name in there]
+    candidates: dict[str, tuple[str, ...]] = dict(ROLES)
+    headers = dict(zip(layout.csv.columns, layout.csv.header, strict=True))
+    candidates |= {n: (n, headers.get(n, n)) for n in layout.names}
+    for key, role in ((DEVICE_MS, "time"), (HOST_MS, HOST_MS)):
+        candidates[role] = (*candidates[role], headers.get(key, key))
+    chosen = {}
+    for role, names in candidates.items():
+        if role in given:
+            names = (given[role],)
+        found = next((n.strip().casefold() for n in names if n.strip().casefold() in plain), None)
+        if found is not None and plain.count(found) > 1:
+            raise FileFormatError(f"'{display_name}' has two columns '{found}': rename one of them")
+        if found is not None:
+            chosen[role] = there[plain.index(found)]
+        elif role in given or role in ("label", "time") or role in layout.names:
+            if not any(plain):
+                raise FileFormatError(f"'{display_name}' begins with no line of column names: a table needs a header")
+            listed = ", ".join(t[:30] for t in there[:20]) + (", …" if len(there) > 20 else "")
+            raise FileFormatError(
+                f"'{display_name}' has no column '{names[0]}'; it has {listed}: name the right one with "
+                f"--column {role}=NAME"
+            )
+    return chosen
+
+
+def read_csv(path: Path, display_name: str, layout: Layout, given: Mapping[str, str]) -> ImportedColumns:
+    """Read a CSV table: ``,``, ``;`` or tab, a header, UTF-8; lines of another width are skipped."""
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            first = file.readline()
+            separator = max(",;\t", key=first.count)
+            there = next(csv.reader([first], delimiter=separator), [])
+            names = choose_columns(there, layout, given, display_name)
+            at = {role: there.index(name) for role, name in names.items()}
+            texts: dict[str, list[str]] = {role: [] for role in names if role in _TEXTS}
+            numbers = {role: array("d") for role in names if role not in _TEXTS}
+            text_at = [(values.append, at[role]) for role, values in texts.items()]
+            number_at = [(values.append, at[role]) for role, values in numbers.items()]
+            same: dict[str, str] = {}
+            malformed = 0
+            for row in csv.reader(file, delimiter=separator):
+                if len(row) != len(there):
+                    malformed += bool(row)
+                    continue
+                for append, index in text_at:
+                    text = row[index].strip()
+                    append(same.setdefault(text, text))
+                for push, index in number_at:
+                    push(_number(row[index]))
+    except UnicodeDecodeError:
+        raise FileFormatError(f"'{display_name}' is not UTF-8: save it as UTF-8") from None
+    except csv.Error as cause:
+        raise FileFormatError(f"'{display_name}' is no CSV table: {cause}") from None
+    return ImportedColumns(
+        names, texts, {role: np.array(v, dtype=np.float64) for role, v in numbers.items()}, malformed
+    )
+
+
+def _number(text: str) -> float:
+    try:
+        # Python alone takes 1_000 for a number.
+        return float(text) if "_" not in text else float("nan")
+    except ValueError:
+        return float("nan")
+
+
+def read_parquet(path: Path, display_name: str, layout: Layout, given: Mapping[str, str]) -> ImportedColumns:
+    """Read a Parquet table with polars."""
+    with path.open("rb") as file:
+        if file.read(4) != b"PAR1":
+            raise FileFormatError(f"'{display_name}' is no Parquet file: it does not begin with PAR1")
+    pl = need("polars", extra="tables")
+    try:
+        with path.open("rb") as file:
+            there = list(pl.read_parquet_schema(file))
+        names = choose_columns(there, layout, given, display_name)
+        with path.open("rb") as file:
+            table = pl.read_parquet(file, columns=list(dict.fromkeys(names.values())))
+        nested = next((n for n in table.columns if table[n].dtype.is_nested()), None)
+        if nested is not None:
+            raise FileFormatError(f"'{display_name}' has more than one value in a cell of column '{nested}'")
+        texts = {r: _parquet_texts(pl, table[n]) for r, n in names.items() if r in _TEXTS}
+        numbers = {r: _parquet_numbers(pl, table[n]) for r, n in names.items() if r not in _TEXTS}
+        in_ms = table[names["time"]].dtype.is_temporal()
+    except FileFormatError:
+        raise
+    except BaseException as cause:
+        # A panic of polars on damaged bytes is a BaseException.
+        if not isinstance(cause, Exception) and type(cause).__name__ != "PanicException":
+            raise
+        message = " ".join(str(cause).split())[:120] or type(cause).__name__
+        raise FileFormatError(f"'{display_name}' cannot be read as Parquet: {message}") from None
+    return ImportedColumns(names, texts, numbers, in_ms=in_ms)
+
+
+def _parquet_texts(pl: Any, column: Any) -> list[str]:
+    return [text.strip() for text in column.cast(pl.String).fill_null("").to_list()]
+
+
+def _parquet_numbers(pl: Any, column: Any) -> NDArray[np.float64]:
+    if column.dtype.is_temporal():
+        microseconds = column.dt.total_microseconds() if column.dtype == pl.Duration else column.dt.epoch("us")
+        column = microseconds.cast(pl.Float64) / 1000.0
+    numbers: NDArray[np.float64] = column.cast(pl.Float64, strict=False).fill_null(float("nan")).to_numpy()
+    return numbers
+
+
+def milliseconds(name: str, times: NDArray[np.float64], rate_hz: float) -> tuple[float, str]:
+    """Return milliseconds per unit of the time column, and a note if its name does not state the unit.
+
+    The unit is then the one that matches the layout's rate best; units differ by a factor of a thousand.
+    """
+    plain = name.strip().casefold().rstrip(")")
+    for unit, factor in _UNITS.items():
+        if plain.endswith((f"_{unit}", f"({unit}", f"[{unit}]")):
+            return factor, ""
+    steps = np.diff(times[:100_000])
+    forward = steps[np.isfinite(steps) & (steps > 0)]
+    if not len(forward):
+        return 1.0, f"column '{name}' is taken for milliseconds"
+    step = float(np.median(forward))
+    unit = min(_UNITS, key=lambda u: abs(np.log(step * _UNITS[u] * rate_hz / 1000.0)))
+    return _UNITS[unit], f"column '{name}' is taken for {unit}, as the rate of {rate_hz:g} Hz suggests"
+
+
+def _codes(texts: Iterable[str]) -> tuple[NDArray[np.int64], list[str]]:
+    """Return texts as numbers by first appearance, and the texts."""
+    known: dict[str, int] = {}
+    numbers = [known.setdefault(text, len(known)) for text in texts]
+    return np.array(numbers, dtype=np.int64), list(known)
+
+
+READERS = {".csv": read_csv, ".parquet": read_parquet}
+
+
+def read_table(
+    path: Path, display_name: str, folder: Path, subject: str | None, layout: Layout, given: Mapping[str, str]
+) -> Iterator[SourceFile | str]:
+    """Write a table's recordings into the new ``folder``; yields the files, and warnings.
+
+    ``subject`` is the person if the table has no such column.
+
+    Raises:
+        FileFormatError: for a table that cannot be read, or lacks a column.
+        MissingExtraError: for Parquet without polars.
+    """
+    columns = READERS[path.suffix.lower()](path, display_name, layout, given)
+    if "subject" not in columns.names and subject is None:
+        raise FileFormatError(
+            f"'{display_name}' has no column 'subject': name the right one with --column subject=NAME, or the person "
+            "with --subjects map.csv (file,subject)"
+        )
+    raw = np.column_stack([columns.numbers[n] for n in layout.names])
+    times = columns.numbers["time"]
+    factor, note = (1.0, "") if columns.in_ms else milliseconds(columns.names["time"], times, layout.rate_hz)
+    device = times * factor
+    host = columns.numbers.get(HOST_MS, device)
+    rows = len(device)
+    people, codes = _codes(columns.texts.get("subject", itertools.repeat(subject or "", rows)))
+    sessions, session_names = _codes(columns.texts.get("session", itertools.repeat("", rows)))
+    labels, label_names = _codes(columns.texts["label"])
+    takes, _ = _codes(columns.texts.get("recording", itertools.repeat("", rows)))
+    known = np.array([bool(c) for c in codes], dtype=bool)[people] if rows else np.empty(0, bool)
+    good = usable_rows(raw, device, host)
+    if note:
+        yield f"{display_name}: {note}"
+    for count, what in (
+        (columns.malformed, "of another width than the header"),
+        (int(np.sum(~good)), "without a number in every column"),
+        (int(np.sum(good & ~known)), "without a subject"),
+    ):
+        if count:
+            yield f"{display_name}: {count} row{'s' if count > 1 else ''} {what} left out"
+    good &= known
+    if not good.any():
+        raise FileFormatError(
+            f"'{display_name}' has no usable row: each needs a subject, a time and {layout.n_channels} numbers"
+        )
+    values, note = whole_steps(raw[good], layout)
+    if note:
+        yield f"{display_name}: {note}"
+    whole = Frames(values, np.round(device[good]).astype(np.int64), np.round(host[good]).astype(np.int64))
+    people, sessions, labels, takes = people[good], sessions[good], labels[good], takes[good]
+    named = np.array([bool(plain_label(n)) and len(n) <= LONGEST_LABEL for n in label_names], dtype=bool)
+    group = people * len(session_names) + sessions
+    order = np.argsort(group, kind="stable")
+    edges = [0, *(np.flatnonzero(np.diff(group[order])) + 1).tolist(), len(order)]
+    original = ConvertedSource(path, display_name, {"columns": columns.names})
+    for number, (first, last) in enumerate(itertools.pairwise(edges)):
+        mine = order[first:last]
+        frames = Frames(whole.values[mine], whole.device_ms[mine], host_ms=_rows(whole.host_ms, mine))
+        new = (np.diff(labels[mine]) != 0) | (np.diff(takes[mine]) != 0)
+        if "recording" not in columns.names:
+            steps = np.diff(frames.device_ms)
+            new |= (steps < 0) | (steps > PAUSE_MS)
+        runs = [0, *(np.flatnonzero(new) + 1).tolist(), len(mine)]
+        labelled = named[labels[mine]]
+        cuts = [LabelledSegment(label_names[labels[mine[a]]], a, b) for a, b in itertools.pairwise(runs) if labelled[a]]
+        yield from write_session(
+            folder / str(number),
+            codes[people[mine[0]]],
+            session_names[sessions[mine[0]]],
+            frames,
+            cuts,
+            layout,
+            original,
+            with_stream=not labelled.all(),
+        )
+
+
+def _rows(column: NDArray[np.int64] | None, rows: NDArray[np.int64]) -> NDArray[np.int64] | None:
+    return None if column is None else column[rows]

@@ -1,0 +1,321 @@
+"""Import of XDF files (LabRecorder): the stream that fits the layout, cut into recordings by markers.
+
+A marker that names a gesture begins a recording; the next marker, whatever it says, ends it (``end`` and ``stop`` do
+only that), and so does the end of the stream. ``start Tail pull``, ``Tail pull/begin``, ``end Tail pull`` and the like
+are understood. Without a gesture set every marker but ``end`` and ``stop`` is a gesture.
+"""
+
+from __future__ import annotations
+
+import io
+import logging
+import os
+import re
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import FileFormatError, need
+from plushsense.core.gestures import GestureSet
+from plushsense.core.layouts import DEVICE_MS, Layout
+from plushsense.core.recorder_csv import LONGEST_LABEL, Frames
+from plushsense.dataset.importing.sources import LEFT_OUT, SourceFile
+from plushsense.dataset.importing.tables import (
+    ConvertedSource,
+    LabelledSegment,
+    usable_rows,
+    whole_steps,
+    write_session,
+)
+
+_MAGIC = b"XDF:"
+_HEADER, _SAMPLES = 2, 3
+# Clock synchronisation leaves differences of this size between equal times.
+_SAME_S = 1e-6
+_SIZES = {"string": 1, "int8": 1, "int16": 2, "int32": 4, "float32": 4, "int64": 8, "double64": 8}
+_BEGIN = re.compile(r"^(?:start|begin)[\s_:/-]+(?P<a>.+)$|^(?P<b>.+)[\s_:/-]+(?:start|begin)$", re.IGNORECASE)
+_END = re.compile(r"^(?:end|stop)(?:[\s_:/-].*)?$|^.*[\s_:/-](?:end|stop)$", re.IGNORECASE | re.DOTALL)
+_BIDS = re.compile(r"(?:^|_)(sub|ses|run)-([^_]+)")
+
+
+@dataclass(frozen=True)
+class Marker:
+    """A marker and its time in seconds."""
+
+    time_s: float
+    text: str
+
+
+def person_and_session(path: Path, folder: str | None) -> tuple[str | None, str]:
+    """Return person and session from LabRecorder's names (``sub-P001_ses-S001_task-x_run-001_eeg.xdf``).
+
+    Otherwise the person is ``folder`` (None if unknown) and the session is the file's name.
+    """
+    entities = dict(_BIDS.findall(path.stem))
+    session = "-".join(entities[key] for key in ("ses", "run") if key in entities) or path.stem
+    return entities.get("sub", folder), session
+
+
+def segments_of(
+    markers: list[Marker], times_s: NDArray[np.float64], gestures: GestureSet | None
+) -> tuple[list[LabelledSegment], list[str]]:
+    """Cut recordings by the markers, as rows of ``times_s`` (T,); also returns markers that name no gesture."""
+    rising = np.maximum.accumulate(times_s)
+    cuts: list[LabelledSegment] = []
+    unknown: list[str] = []
+    label, start = "", 0
+    for marker in sorted(markers, key=lambda m: m.time_s):
+        row = int(np.searchsorted(rising, marker.time_s - _SAME_S, side="left"))
+        if label and row > start:
+            cuts.append(LabelledSegment(label, start, row))
+        label, start = _named(marker.text, gestures), row
+        if not label and not _END.match(marker.text.strip()):
+            unknown.append(marker.text)
+    if label and len(times_s) > start:
+        cuts.append(LabelledSegment(label, start, len(times_s)))
+    return cuts, unknown
+
+
+def _named(text: str, gestures: GestureSet | None) -> str:
+    """Return the gesture that a marker begins, "" if it begins none."""
+    text = " ".join(text.split())
+    begin = _BEGIN.match(text)
+    named = (begin["a"] or begin["b"]) if begin else text
+    if gestures is not None:
+        found = gestures.find(text) or gestures.find(named)
+        return found.label if found else ""
+    return "" if _END.match(named) or len(named) > LONGEST_LABEL // 2 else named
+
+
+def _varlen(file: BinaryIO) -> int:
+    size = file.read(1)
+    wide = {b"\x01": 1, b"\x04": 4, b"\x08": 8}.get(size)
+    if wide is None:
+        raise FileFormatError("a length is damaged" if size else "the end")
+    raw = file.read(wide)
+    if len(raw) < wide:
+        raise FileFormatError("the end")
+    return int.from_bytes(raw, "little")
+
+
+def complete_chunks(path: Path) -> tuple[int, int]:
+    """Return how many bytes of the file are complete, plausible chunks, and the size of the file.
+
+    pyxdf trusts the sample count of a chunk; here it is compared with the available bytes.
+
+    Raises:
+        FileFormatError: for a file that is no XDF.
+    """
+    size = path.stat().st_size
+    widths: dict[int, int] = {}
+    with path.open("rb") as file:
+        if file.read(4) != _MAGIC:
+            raise FileFormatError(f"'{path.name}' is no XDF file: it does not begin with {_MAGIC.decode()}")
+        good = 4
+        while good < size:
+            try:
+                length = _varlen(file)
+                body = file.tell()
+                if length < 2 or body + length > size:
+                    break
+                (tag,) = struct.unpack("<H", file.read(2))
+                if tag == _HEADER and length >= 6:
+                    (stream,) = struct.unpack("<I", file.read(4))
+                    widths[stream] = _sample_bytes(file.read(length - 6))
+                elif tag == _SAMPLES:
+                    if length < 7:
+                        break
+                    (stream,) = struct.unpack("<I", file.read(4))
+                    samples = _varlen(file)
+                    if stream not in widths or samples * widths[stream] > length:
+                        break
+            except (FileFormatError, struct.error):
+                break
+            good = body + length
+            file.seek(good)
+    return good, size
+
+
+def _sample_bytes(header: bytes) -> int:
+    """Return the least bytes of a sample of a stream by its header: time stamp flag and values."""
+    count = re.search(rb"<channel_count>\s*(\d{1,6})\s*</", header)
+    kind = re.search(rb"<channel_format>\s*(\w+)\s*</", header)
+    size = _SIZES.get(kind[1].decode("ascii", "replace")) if kind else None
+    if count is None or size is None:
+        raise FileFormatError("a stream's header says no channels")
+    return 1 + int(count[1]) * size
+
+
+class _FirstBytes(io.RawIOBase):
+    """The first bytes of a file, as if it ended there."""
+
+    def __init__(self, path: Path, length: int):
+        self._file = path.open("rb", buffering=0)
+        self._left = length
+        self._length = length
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def tell(self) -> int:
+        return self._file.tell()
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        if whence == os.SEEK_END:
+            offset, whence = offset + self._length, os.SEEK_SET
+        return self._file.seek(offset, whence)
+
+    def readinto(self, buffer: Any) -> int:
+        left = max(0, self._length - self._file.tell())
+        return self._file.readinto(memoryview(buffer)[:left])
+
+    def close(self) -> None:
+        self._file.close()
+        super().close()
+
+
+def _load(path: Path, length: int) -> list[dict[str, Any]]:
+    pyxdf = need("pyxdf", extra="lsl")
+    logging.getLogger("pyxdf").addHandler(logging.NullHandler())
+    with io.BufferedReader(_FirstBytes(path, length)) as file, np.errstate(all="ignore"):
+        try:
+            # Original time stamps, since dejittering would hide jitter and loss.
+            streams, _ = pyxdf.load_xdf(file, dejitter_timestamps=False)
+        except Exception as cause:  # noqa: BLE001, RUF100
+            message = " ".join(str(cause).split())[:120] or type(cause).__name__
+            raise FileFormatError(f"'{path.name}' cannot be read as XDF: {message}") from None
+    return list(streams)
+
+
+def _text(stream: dict[str, Any], *keys: str) -> str:
+    """Return a text of a stream's header; "" if there is none."""
+    at: Any = stream["info"]
+    for key in keys:
+        at = (at.get(key) or [None])[0] if isinstance(at, dict) else None
+    return at if isinstance(at, str) else ""
+
+
+def _labels(stream: dict[str, Any]) -> list[str]:
+    desc = (stream["info"].get("desc") or [None])[0]
+    channels = (desc.get("channels") or [None])[0] if isinstance(desc, dict) else None
+    listed = channels.get("channel") or [] if isinstance(channels, dict) else []
+    return [str((c.get("label") or [""])[0] or "") if isinstance(c, dict) else "" for c in listed]
+
+
+def match_columns(layout: Layout, labels: list[str], width: int) -> tuple[list[int], int | None] | str:
+    """Return the positions of the channels and of the device clock in a sample, or why they do not match.
+
+    Channels match by label (or the header text of the layout's CSV) in any order, or by position if no label matches
+    and the stream has as many channels as the layout or its wire format.
+    """
+    texts = dict(zip((h.casefold() for h in layout.csv.header), layout.csv.columns, strict=True))
+    texts |= {n.casefold(): n for n in (*layout.names, DEVICE_MS)}
+    keys = [texts.get(label.strip().casefold(), "") for label in labels] if len(labels) == width else []
+    if set(keys) & set(layout.names):
+        missing = [n for n in layout.names if keys.count(n) != 1]
+        if missing:
+            return f"its labels name {', '.join(missing)} not once"
+        return [keys.index(n) for n in layout.names], keys.index(DEVICE_MS) if DEVICE_MS in keys else None
+    if width == layout.n_channels:
+        return list(range(width)), None
+    if width == len(layout.wire):
+        clock = layout.wire.index(DEVICE_MS) if DEVICE_MS in layout.wire else None
+        return [layout.wire.index(n) for n in layout.names], clock
+    return f"it has {width} channels, and layout '{layout.name}' needs {layout.n_channels}"
+
+
+def _markers(streams: list[dict[str, Any]]) -> list[Marker]:
+    return [
+        Marker(float(time), str(sample[0]))
+        for stream in streams
+        for time, sample in zip(stream["time_stamps"], stream["time_series"], strict=True)
+        if np.isfinite(time) and sample and sample[0]
+    ]
+
+
+def _frames(
+    stream: dict[str, Any], layout: Layout, channels: list[int], clock: int | None
+) -> tuple[Frames, NDArray[np.float64], list[str]]:
+    """Return the frames of a stream, the time of each in seconds, and warnings."""
+    series = np.asarray(stream["time_series"], dtype=np.float64).reshape(len(stream["time_stamps"]), -1)
+    times = np.asarray(stream["time_stamps"], dtype=np.float64)
+    device = times * 1000.0 if clock is None else series[:, clock]
+    good = usable_rows(series[:, channels], times * 1000.0, device)
+    notes = [] if good.all() else [f"{int(np.sum(~good))} samples without a number in every channel left out"]
+    values, warning = whole_steps(series[good][:, channels], layout)
+    host_ms = np.round(times[good] * 1000.0).astype(np.int64)
+    device_ms = np.round(device[good]).astype(np.int64)
+    return Frames(values, device_ms, host_ms), times[good], notes + ([warning] if warning else [])
+
+
+def read_xdf(
+    path: Path,
+    display_name: str,
+    folder: Path,
+    subject: str,
+    session: str,
+    layout: Layout,
+    gestures: GestureSet | None,
+    stream_name: str = "",
+) -> Iterator[SourceFile | str]:
+    """Write the recordings of an XDF file into the new ``folder``; yields the files, and warnings.
+
+    ``stream_name`` selects one of several streams that fit the layout.
+
+    Raises:
+        FileFormatError: for a file that is damaged, or in which no stream, or more than one, fits.
+        MissingExtraError: without pyxdf.
+    """
+    good, size = complete_chunks(path)
+    streams = _load(path, good)
+    if good < size:
+        yield f"{display_name}: cut off or damaged from byte {good} of {size} on; what was before is taken"
+    texts = [s for s in streams if _text(s, "channel_format") == "string"]
+    fitting, others = [], []
+    for stream in streams:
+        name = _text(stream, "name")
+        if _text(stream, "channel_format") == "string":
+            continue
+        columns = match_columns(layout, _labels(stream), np.shape(stream["time_series"])[-1])
+        if isinstance(columns, str):
+            others.append((name, columns))
+        elif not len(stream["time_stamps"]):
+            others.append((name, "it is empty"))
+        elif stream_name and name != stream_name:
+            others.append((name, f"the stream '{stream_name}' was asked for"))
+        else:
+            fitting.append((stream, name, *columns))
+    if len(fitting) != 1:
+        names = ", ".join(f"'{name}'" for _, name, *_ in fitting)
+        why = (
+            f"{len(fitting)} streams fit layout '{layout.name}' ({names}): name one with --column stream=NAME"
+            if fitting
+            else f"no stream fits layout '{layout.name}': "
+            + ("; ".join(f"'{n}': {r}" for n, r in others[:5]) or f"there are {len(texts)} of texts and no other")
+        )
+        raise FileFormatError(why)
+    stream, name, channels, clock = fitting[0]
+    frames, times, notes = _frames(stream, layout, channels, clock)
+    cuts, unknown = segments_of(_markers(texts), times, gestures) if len(times) else ([], [])
+    if unknown:
+        listed = ", ".join(f"'{u[:40]}'" for u in dict.fromkeys(unknown[:20]))
+        notes.append(f"{len(unknown)} markers name no gesture and begin no recording: {listed}")
+    if not cuts:
+        notes.append("no marker names a gesture: only the stream is taken")
+    yield from (f"{display_name}: {note}" for note in notes)
+    if not len(frames):
+        raise FileFormatError(f"the stream '{name}' has no sample with a number in every channel")
+    about = {"stream": name, "type": _text(stream, "type"), "nominal_rate_hz": _text(stream, "nominal_srate")}
+    yield from write_session(
+        folder, subject, session, frames, cuts, layout, ConvertedSource(path, display_name, about), with_stream=True
+    )
+    for other, reason in others:
+        yield SourceFile(path, LEFT_OUT, origin=f"{display_name}: stream '{other}'", reason=reason)

@@ -1,0 +1,299 @@
+"""Redaction of texts: names, codes, dates, logins and addresses in session files, marks, people and the head.
+
+Codes and names are replaced, dates shifted, logins become roles, and addresses of toys and computers are dropped.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import unicodedata
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+
+from plushsense.core.errors import DatasetError
+from plushsense.core.toml import read_toml
+from plushsense.dataset.files import normalize_code
+from plushsense.dataset.people import PersonInfo
+from plushsense.dataset.privacy.pseudonyms import FIRST_MS, shifted_number, shifted_text
+from plushsense.dataset.store import HEAD
+
+_BEFORE, _AFTER = r"(?<![^\W_])", r"(?![^\W_])"
+_PIECES = re.compile(r"[^\W\d_]+|\d+")
+
+# Identifiers of one computer or toy: addresses, ports, home folders.
+_ADDRESSES = re.compile(
+    r"(?P<scheme>\b(?:serial|ble|tcp|lsl|replay|file)://)[^\s\"']*"
+    r"|\b[0-9A-Fa-f]{2}(?:[:-][0-9A-Fa-f]{2}){5}\b"
+    r"|\b[0-9A-Fa-f]{8}-(?:[0-9A-Fa-f]{4}-){3}[0-9A-Fa-f]{12}\b"
+    r"|\bCOM\d+\b"
+    r"|(?<![\w/.:])/(?:dev|home|Users|tmp|media|mnt|root|var|private)/[^\s\"']*"
+    r"|\b[A-Za-z]:\\[^\s\"']*"
+)
+NO_ADDRESS = "[address]"
+
+
+def is_searchable(word: str) -> bool:
+    """Return whether a word is long enough to be searched in a text: ``P1`` is, ``7`` and ``a`` are not."""
+    key = normalize_code(word)
+    return len(key) >= (5 if key.isdigit() else 2)
+
+
+def _pattern(word: str) -> str:
+    pieces = _PIECES.findall(unicodedata.normalize("NFC", word))
+    if any(len(p) == 1 and p.isalpha() for p in pieces):
+        # A single letter is easily part of something else: "it's 1 o'clock" is not S1.
+        return "(?<!['’])" + r"[\s_-]?".join(map(re.escape, pieces))
+    return r"[\s_.'-]*".join(map(re.escape, pieces))
+
+
+class NamePatterns:
+    """Words to search for and their replacements: whole words, in any case, with ``_``, ``-`` or blanks inside.
+
+    Words that are too short to be looked for (`searchable`) are in ``too_short``.
+    """
+
+    def __init__(self, instead: Mapping[str, str]) -> None:
+        self.too_short = sorted(word for word in instead if not is_searchable(word))
+        words = sorted((w for w in instead if is_searchable(w)), key=len, reverse=True)
+        self._instead = {normalize_code(unicodedata.normalize("NFC", word)): instead[word] for word in reversed(words)}
+        alternatives = "|".join(_pattern(word) for word in words)
+        self._any = re.compile(f"{_BEFORE}(?:{alternatives}){_AFTER}", re.IGNORECASE) if words else None
+
+    def replace(self, text: str) -> tuple[str, list[str]]:
+        """Return the text with the words replaced, and the replacements in order."""
+        if self._any is None:
+            return text, []
+        put: list[str] = []
+
+        def one(match: re.Match[str]) -> str:
+            put.append(self._instead.get(normalize_code(match.group()), "[name]"))
+            return put[-1]
+
+        plain = unicodedata.normalize("NFC", text)
+        changed = self._any.sub(one, plain)
+        return (changed, put) if put else (text, put)
+
+    def find_in(self, text: str) -> list[str]:
+        """Return the words as they occur in a text."""
+        if self._any is None:
+            return []
+        return [m.group() for m in self._any.finditer(unicodedata.normalize("NFC", text))]
+
+
+def without_addresses(text: str) -> str:
+    """Remove ports, radio addresses, unique ids and home folders from a text; the scheme of a device URL stays."""
+    return _ADDRESSES.sub(lambda m: m["scheme"] or NO_ADDRESS, text)
+
+
+ON_FILE = "on file"
+ORIGIN = "origin.json"
+"""What the importer writes of a file that it converted: the name that somebody gave it, and its hash."""
+_MENDED = "mended"
+LOGINS = frozenset({"who", "by", "user", "author", "leader", "operator", "recorded_by"})
+_SUBJECT, _CONSENT = "subject", "consent"
+_PLACES = frozenset({"device", "port", "address", "url", "mac", "hostname", "computer", "serial_number"})
+PROSE = frozenset({"why", "text", "note", "notes", "comment", "comments", "said", "description"})
+_SECONDS = ("_s", "timestamp", "epoch")
+# Programs sign marks with their own name, which identifies nobody.
+_PROGRAMS = re.compile(r"plushsense.*|recorder", re.IGNORECASE | re.DOTALL)
+_FILE = re.compile(r"^(?P<label>.+)_(?P<epoch>\d{1,18})_(?P<rows>\d{1,12}(?:\.\w+)?(?:#.*)?)$", re.DOTALL)
+
+
+@dataclass
+class ReviewNotes:
+    """Notes for a person to review: file (its new path), line (0: the whole file) and a sentence."""
+
+    found: list[dict[str, Any]] = field(default_factory=list)
+    prose: int = 0
+
+    def add(self, file: str, message: str, line: int = 0) -> None:
+        """Add a note."""
+        self.found.append({"file": file, "line": line, "message": message})
+
+    def merged(self) -> list[dict[str, Any]]:
+        """Return all notes, equal ones merged."""
+        times = Counter((f["file"], f["line"], f["message"]) for f in self.found)
+        return [
+            {"file": file, "line": line, "message": message if n == 1 else f"{n} times: {message}"}
+            for (file, line, message), n in times.items()
+        ]
+
+
+@dataclass(frozen=True)
+class Redactor:
+    """Rewrites texts of one person (or nobody). ``roles`` gives a login's role by its folded form."""
+
+    names: NamePatterns
+    roles: dict[str, str]
+    code: str
+    shift_ms: int
+    findings: ReviewNotes
+    drop_notes: bool = False
+
+    def text(self, text: str, where: tuple[str, int] | None = None) -> str:
+        """Replace names, addresses and dates in a text; a replaced name is noted for ``where``."""
+        new, put = self.names.replace(shifted_text(without_addresses(text), self.shift_ms))
+        if put and where is not None:
+            for word, times in Counter(put).items():
+                self.findings.add(
+                    where[0], f"a name or code in the text was replaced by '{word}' ({times}×): read it", where[1]
+                )
+        return new
+
+    def name(self, name: str) -> str:
+        """Shift the time in a file's name, or in the last part of an id; its label stays."""
+        match = _FILE.match(name)
+        if match is None:
+            return self.text(name)
+        return f"{match['label']}_{shifted_number(int(match['epoch']), self.shift_ms)}_{match['rows']}"
+
+    def role(self, login: str) -> str:
+        """Return ``person-1`` in place of a login; the name of a program stays."""
+        if not login or _PROGRAMS.fullmatch(login):
+            return login
+        return self.roles.setdefault(login.casefold(), f"person-{len(self.roles) + 1}")
+
+    def value(self, value: Any, key: str = "", where: tuple[str, int] = ("", 0)) -> Any:
+        """Redact a value of JSON or TOML recursively."""
+        if isinstance(value, dict):
+            # The text cut off a torn line can be a fragment of a date.
+            torn = value.get("what") == _MENDED
+            kept = {k: v for k, v in value.items() if not (torn and k == "text")}
+            return {self.text(str(k)): self.value(v, str(k), where) for k, v in kept.items()}
+        if isinstance(value, list):
+            return [self.value(v, key, where) for v in value]
+        if isinstance(value, str):
+            return self._string(value, key.casefold(), where)
+        if isinstance(value, bool) or value is None:
+            return value
+        if isinstance(value, int | float):
+            return self._number(value, key.casefold())
+        return value
+
+    def _string(self, value: str, key: str, where: tuple[str, int]) -> str:
+        if key in LOGINS:
+            return self.role(value)
+        if key == _SUBJECT:
+            return self.code if value else value
+        if key == _CONSENT:
+            return ON_FILE if value else value
+        if key in _PLACES:
+            return without_addresses(value) if "://" in value else ""
+        if key in PROSE and value:
+            if self.drop_notes:
+                return ""
+            self.findings.prose += 1
+        return self.text(value, where)
+
+    def _number(self, value: float, key: str) -> float:
+        if key.endswith(_SECONDS) and FIRST_MS / 1000 <= value < FIRST_MS / 60:
+            return value + self.shift_ms // 1000
+        if isinstance(value, int):
+            return shifted_number(value, self.shift_ms)
+        return value + (shifted_number(int(value), self.shift_ms) - int(value)) if abs(value) < 2.0**53 else value
+
+
+def logins_in(value: Any, key: str = "") -> Iterator[str]:
+    """Yield every login in a value of JSON."""
+    if isinstance(value, dict):
+        for k, v in value.items():
+            yield from logins_in(v, str(k).casefold())
+    elif isinstance(value, list):
+        for v in value:
+            yield from logins_in(v, key)
+    elif isinstance(value, str) and key in LOGINS and value and not _PROGRAMS.fullmatch(value):
+        yield value
+
+
+def subjects_in(value: Any) -> Iterator[str]:
+    """Yield the name of the person in a session's head."""
+    if isinstance(value, dict) and isinstance(value.get(_SUBJECT), str) and value[_SUBJECT]:
+        yield value[_SUBJECT]
+
+
+def read_lines(path: Path) -> Iterator[tuple[int, Any]]:
+    """Yield the values of a JSON file (one, line 1) or JSON-lines file with their lines; None for invalid JSON."""
+    data = path.read_bytes()
+    pieces = data.split(b"\n") if path.suffix.lower() == ".jsonl" else [data]
+    for number, piece in enumerate(pieces, 1):
+        if not piece.strip():
+            continue
+        try:
+            yield number, json.loads(piece.decode("utf-8-sig"))
+        except (ValueError, RecursionError):
+            yield number, None
+
+
+def redact_json(path: Path, new: str, words: Redactor) -> str | None:
+    """Return a session file's redacted text; None if nothing of it can be read.
+
+    A line that is not JSON was torn by a crash; it is left out and reported.
+    """
+    lines = path.suffix.lower() == ".jsonl"
+    out = []
+    for number, value in read_lines(path):
+        if value is None:
+            words.findings.add(new, "left out: this is no JSON (torn by a crash?)", number if lines else 0)
+            continue
+        changed = words.value(value, where=(new, number if lines else 0))
+        out.append(json.dumps(changed, ensure_ascii=False, indent=None if lines else 1) + "\n")
+    return "".join(out) if out or lines else None
+
+
+def redact_marks(
+    path: Path, words_of: Callable[[str], Redactor | None], renamed: Callable[[str], str], findings: ReviewNotes
+) -> str:
+    """Return the marks with new ids, sorted by new id, since the old order would tell who is who.
+
+    ``words_of`` returns the redactor for a mark's recording, None if its person is unknown; ``renamed`` its new id.
+    """
+    out: list[tuple[str, str]] = []
+    for number, table in read_lines(path):
+        identity = table.get("recording") if isinstance(table, dict) else None
+        words = words_of(identity) if isinstance(identity, str) else None
+        if words is None or not isinstance(identity, str):
+            findings.add(path.name, "a mark was left out: it is torn, or nobody is known by its recording", number)
+            continue
+        new = renamed(identity)
+        rest = {k: v for k, v in table.items() if k != "recording"}
+        line = {"recording": new} | words.value(rest, where=(path.name, 0))
+        out.append((new, json.dumps(line, ensure_ascii=False) + "\n"))
+    return "".join(line for _, line in sorted(out, key=lambda pair: pair[0]))
+
+
+def redact_people(people: Iterable[PersonInfo], words_of: Callable[[str], Redactor], file: str) -> Iterator[PersonInfo]:
+    """Yield the people's table with codes; a consent reference becomes "on file", since it leads to a signed name."""
+    for person in people:
+        words = words_of(person.subject)
+        more = {key: words.text(value, (file, 0)) for key, value in person.more.items()}
+        yield replace(
+            person,
+            subject=words.code,
+            age_group=words.text(person.age_group, (file, 0)),
+            gender=words.text(person.gender, (file, 0)),
+            consent=ON_FILE if person.consent else "",
+            more=more,
+        )
+
+
+def redact_head(folder: Path, words: Redactor) -> str:
+    """Return the redacted ``dataset.toml``; layout and gesture set stay as they are."""
+    table = read_toml(folder / HEAD, "data set", DatasetError)
+    kept = ("layout", "gesture_set", "format")
+    out = {key: value if key in kept else _texts(value, words) for key, value in table.items()}
+    return tomli_w.dumps(out)
+
+
+def _texts(value: Any, words: Redactor) -> Any:
+    """Redact a value of the head: its authors are meant to be named, so only people's codes and dates change."""
+    if isinstance(value, dict):
+        return {key: _texts(v, words) for key, v in value.items()}
+    if isinstance(value, list):
+        return [_texts(v, words) for v in value]
+    return words.text(value, (HEAD, 0)) if isinstance(value, str) else value

@@ -1,0 +1,448 @@
+"""Validation of a package: every validator reads every file, without network access.
+
+checksums    every file is there, unchanged, and no other
+data         the recordings are readable, the tables agree with them, and nothing private is included
+times        no unshifted time is left
+metadata     title, version, licence and day are the same in every metadata file
+croissant    mlcroissant accepts the metadata and loads back, bit for bit, what the files hold
+frictionless frictionless accepts the descriptor and every cell has the type that its schema says
+ro-crate     rocrate opens the crate, and it lists every file as it is
+datacite     the metadata fit DataCite's own schema
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import re
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path, PurePosixPath
+from typing import Any
+from urllib.parse import unquote
+
+from plushsense.core.errors import MissingExtraError, PlushSenseError, need
+from plushsense.core.recorder_csv import SIMULATION_MARK, parse_name, read_stream
+from plushsense.dataset.files import sha256_of
+from plushsense.dataset.index import IndexBuild, build_index
+from plushsense.dataset.marks import MARKS
+from plushsense.dataset.people import PEOPLE, read_people
+from plushsense.dataset.publishing.contents import LATEST_MS, WALL_CLOCK_MS, PackageContents
+from plushsense.dataset.publishing.croissant import (
+    CROISSANT_CONFORMS_TO,
+    CROISSANT_FILE,
+    ReportProblem,
+    compare_records,
+)
+from plushsense.dataset.publishing.description import CHECKSUMS, DATA, Description, find_licence
+from plushsense.dataset.publishing.metadata import CRATE_FILE, DATACITE_FILE, DATACITE_XML_FILE, DATAPACKAGE_FILE
+from plushsense.dataset.publishing.tables import build_tables, list_package_files, open_package, read_checksums
+from plushsense.dataset.store import Dataset, DatasetHead
+
+# The wording of findings may differ between versions.
+_NOT_COMPARED = ("flags",)
+
+
+def compare_tables(root: Path, dataset: Dataset, report: ReportProblem) -> None:
+    """Compare every cell of the tables with the data folder."""
+    contents = PackageContents(dataset, read_people(dataset.path), {}, ())
+    for table, expected in build_tables(contents):
+        with (root / table.file).open(encoding="utf-8", newline="") as file:
+            have = _keyed(file, table.key)
+        want = _keyed(io.StringIO(expected), table.key)
+        for key in want.keys() - have.keys():
+            report(table.file, f"'{key}' is in the data but not in the table")
+        for key, row in have.items():
+            if key not in want:
+                report(table.file, f"'{key}' is in the table but not in the data")
+                continue
+            for column in [*want[key], *(c for c in row if c not in want[key])]:
+                value, due = row.get(column), want[key].get(column)
+                if value != due and column not in _NOT_COMPARED:
+                    report(table.file, f"'{key}' has {column} {value!r}; the data say {due!r}")
+
+
+def _keyed(file: Any, key: str) -> dict[str, dict[str, str]]:
+    return {row.get(key) or "": row for row in csv.DictReader(file)}
+
+
+def find_private(dataset: Dataset, report: ReportProblem) -> None:
+    """Find private data: who marked, when and why, and references of consent forms."""
+    if any(p.consent for p in read_people(dataset.path).values()):
+        report(f"{DATA}/{PEOPLE}", "holds references of consent forms, which do not leave")
+    path = dataset.path / MARKS
+    for number, line in enumerate(path.read_bytes().splitlines() if path.is_file() else (), 1):
+        try:
+            mark = json.loads(line)
+            private = [key for key in ("who", "why", "when") if mark.get(key)]
+        except (ValueError, AttributeError):
+            report(f"{DATA}/{MARKS}", f"line {number} is no mark")
+            continue
+        if private:
+            report(f"{DATA}/{MARKS}", f"line {number} says {' and '.join(private)} of a mark, which does not leave")
+
+
+def compare_metadata(root: Path, dataset: Dataset, load: Callable[[str], Any], report: ReportProblem) -> int:
+    """Compare title, version, licence and day in every metadata file with ``dataset.toml`` and each other.
+
+    Returns:
+        How many statements were compared.
+    """
+    head = dataset.head
+    d = Description(dataset, find_licence(head.licence), head.about, head.consent, "", ())
+    croissant, package, cited = (load(f) for f in (CROISSANT_FILE, DATAPACKAGE_FILE, DATACITE_FILE))
+    crate = next((e for e in _get(load(CRATE_FILE), "@graph") or () if _get(e, "@id") == "./"), None)
+    day = _get(cited, "dates", 0, "date")
+    statements_by_file = {
+        CROISSANT_FILE: {
+            "title": (_get(croissant, "name"), d.title),
+            "version": (_get(croissant, "version"), d.version),
+            "licence": (_get(croissant, "license"), d.licence.url),
+            "day": (_get(croissant, "datePublished"), day),
+        },
+        DATAPACKAGE_FILE: {
+            "title": (_get(package, "title"), d.title),
+            "version": (_get(package, "version"), d.version),
+            "licence": (_get(package, "licenses", 0, "name"), d.licence.spdx),
+            "day": (_get(package, "created"), f"{day}T00:00:00Z"),
+        },
+        CRATE_FILE: {
+            "title": (_get(crate, "name"), d.title),
+            "version": (_get(crate, "version"), d.version),
+            "licence": (_get(crate, "license", "@id"), d.licence.url),
+            "day": (_get(crate, "datePublished"), day),
+        },
+        DATACITE_FILE: {
+            "title": (_get(cited, "titles", 0, "title"), d.title),
+            "version": (_get(cited, "version"), d.version),
+            "licence": (_get(cited, "rightsList", 0, "rightsIdentifier"), d.licence.spdx),
+        },
+    }
+    for file, statements in statements_by_file.items():
+        for what, (value, due) in statements.items():
+            if value != due:
+                report(file, f"its {what} is {value!r}; {DATA}/dataset.toml and the others say {due!r}")
+    if (root / SIMULATION_MARK).is_file() != d.simulated:
+        report(SIMULATION_MARK, f"{'is missing, though' if d.simulated else 'is there, but'} {DATA}/dataset.toml says "
+            f"simulated = {str(d.simulated).lower()}")  # fmt: skip
+    return sum(map(len, statements_by_file.values())) + 1
+
+
+def _get(table: Any, *path: str | int) -> Any:
+    """Return a value in nested JSON; None if there is none."""
+    for key in path:
+        try:
+            table = table[key]
+        except (KeyError, IndexError, TypeError):
+            return None
+    return table
+
+
+StageProgress = Callable[[str, int, int], None]
+EXTRA = "publish"
+# Rows of each stream that slow validators read by default.
+STREAM_ROWS = 1000
+SHOWN = 50
+# Files that PlushSense adds to the data folder when it is opened.
+_OWN = re.compile(rf"{DATA}/(recordings\.csv|streams\.csv|index\.json|[^/]+\.lock|cache/.*|evaluations/.*)")
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A problem that a validator found, and its file ("" for the whole package)."""
+
+    validator: str
+    file: str
+    problem: str
+
+    def __str__(self) -> str:
+        return f"{self.validator}: {f'{self.file}: ' if self.file else ''}{self.problem}"
+
+
+@dataclass
+class ValidationResult:
+    """Result of all validators; ``validators`` lists what each examined and how long it took."""
+
+    problems: list[Problem] = field(default_factory=list)
+    validators: list[dict[str, Any]] = field(default_factory=list)
+
+    @property
+    def valid(self) -> bool:
+        """Whether no validator found a problem."""
+        return not self.problems
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON."""
+        return {"valid": self.valid, "validators": self.validators, "problems": [vars(p) for p in self.problems]}
+
+
+@dataclass
+class PackageView:
+    """The package under validation; slow results are cached."""
+
+    root: Path
+    thorough: bool = False
+    packed: bool = False
+    found: list[tuple[str, str]] = field(default_factory=list)
+    looked_at: str = ""
+
+    def report(self, file: str, problem: str) -> None:
+        """Note a problem; only the first `SHOWN` are kept."""
+        if len(self.found) < SHOWN:
+            self.found.append((file, problem))
+
+    def load(self, file: str) -> Any:
+        """Read a JSON file of the package; None, and a problem, if it is unreadable."""
+        try:
+            return json.loads((self.root / file).read_text(encoding="utf-8"))
+        except (OSError, ValueError) as cause:
+            self.report(file, f"cannot be read: {cause}")
+            return None
+
+    @cached_property
+    def sums(self) -> dict[str, str]:
+        """SHA-256 of every file that is there."""
+        return {p.relative_to(self.root).as_posix(): sha256_of(p) for p in list_package_files(self.root)}
+
+    @cached_property
+    def built(self) -> IndexBuild:
+        """The data folder, read anew from its raw files."""
+        return build_index(self.root / DATA, DatasetHead.read(self.root / DATA))
+
+    def is_own(self, path: str) -> bool:
+        """Return whether PlushSense may have added a file to the data folder since; not in a zip."""
+        return not self.packed and _OWN.fullmatch(path) is not None
+
+    def is_local(self, path: object) -> bool:
+        """Return whether a path of a metadata file stays in the package and off the network."""
+        if not isinstance(path, str) or not path or ":" in path or "\\" in path:
+            return False
+        plain = PurePosixPath(path)
+        return not plain.is_absolute() and ".." not in plain.parts
+
+
+def validate_package(
+    package: str | Path, *, thorough: bool = False, progress: StageProgress | None = None
+) -> ValidationResult:
+    """Validate a package, a folder or a zip.
+
+    Args:
+        thorough: also the slow ones read every row of the streams, not only the first thousand of each.
+
+    Raises:
+        DatasetError: for what is no package.
+        MissingExtraError: without the validators.
+    """
+    with open_package(Path(package)) as root:
+        return check_folder(root, thorough=thorough, packed=Path(package).is_file(), progress=progress)
+
+
+def check_folder(
+    root: Path, *, thorough: bool = False, packed: bool = False, progress: StageProgress | None = None
+) -> ValidationResult:
+    """Validate the folder of a package.
+
+    ``packed``: it was unpacked from a zip, which nobody has opened as a data set.
+    """
+    checked = ValidationResult()
+    package = PackageView(root, thorough, packed)
+    for number, (name, validator) in enumerate(VALIDATORS.items()):
+        if progress is not None:
+            progress(f"validating: {name}", number, len(VALIDATORS))
+        began = time.perf_counter()
+        package.found, package.looked_at = [], ""
+        try:
+            validator(package)
+        except MissingExtraError:
+            raise
+        except PlushSenseError as cause:
+            package.report("", str(cause))
+        except Exception as cause:  # noqa: BLE001, RUF100
+            package.report("", f"the validator gave up: {type(cause).__name__}: {_short(cause)}")
+        checked.problems += [Problem(name, file, problem) for file, problem in package.found]
+        checked.validators.append(
+            {
+                "validator": name,
+                "looked_at": package.looked_at,
+                "problems": len(package.found),
+                "seconds": round(time.perf_counter() - began, 2),
+            }
+        )
+    if progress is not None:
+        progress("validating", len(VALIDATORS), len(VALIDATORS))
+    return checked
+
+
+def _short(cause: BaseException) -> str:
+    inner = cause
+    while inner.__cause__ is not None:
+        inner = inner.__cause__
+    return " ".join(str(inner).split())[:300]
+
+
+def _checksums(p: PackageView) -> None:
+    listed = read_checksums(p.root)
+    for path, expected in listed.items():
+        if path not in p.sums:
+            p.report(path, "is missing")
+        elif p.sums[path] != expected:
+            p.report(path, f"was changed: its SHA-256 is {p.sums[path][:12]}…, not {expected[:12]}…")
+        if (p.root / path).is_symlink():
+            p.report(path, "is a link, which may lead out of the package")
+    for path in sorted(p.sums.keys() - listed.keys()):
+        if path != CHECKSUMS and not p.is_own(path):
+            p.report(path, "is not listed in the checksums")
+    p.looked_at = f"{len(listed)} files"
+
+
+def _data(p: PackageView) -> None:
+    for file, reason in p.built.unreadable.items():
+        p.report(f"{DATA}/{file}", reason)
+    dataset = p.built.dataset
+    compare_tables(p.root, dataset, p.report)
+    find_private(dataset, p.report)
+    p.looked_at = f"{len(dataset.recordings)} recordings, {len(dataset.streams)} streams"
+
+
+def _metadata(p: PackageView) -> None:
+    compared = compare_metadata(p.root, p.built.dataset, p.load, p.report)
+    p.looked_at = f"{compared} statements"
+
+
+def _times(p: PackageView) -> None:
+    dataset = p.built.dataset
+    for path in p.sums:
+        name = parse_name(path) if path.startswith(f"{DATA}/") else None
+        if name is not None and name.epoch_ms >= LATEST_MS:
+            p.report(path, f"its name holds the time {name.epoch_ms}, which is not shifted")
+    for file in sorted({r.file for r in dataset.recordings} | {s.file for s in dataset.streams}):
+        frames = read_stream(dataset.path / file, dataset.layout).frames
+        if frames.host_ms is not None and int(frames.host_ms.max()) >= LATEST_MS:
+            p.report(f"{DATA}/{file}", f"the computer's clock says {int(frames.host_ms.max())}, which is not shifted")
+        latest = int(frames.device_ms.max())
+        if latest >= WALL_CLOCK_MS and latest >= LATEST_MS:
+            p.report(f"{DATA}/{file}", f"the toy's clock says {latest}, which is not shifted")
+    p.looked_at = "every name and row"
+
+
+def _croissant(p: PackageView) -> None:
+    document = p.load(CROISSANT_FILE)
+    if not isinstance(document, dict):
+        return
+    if not isinstance(document.get("@context"), dict):
+        p.report(CROISSANT_FILE, "its @context must be written out: an address would be fetched")
+        return
+    if document.get("conformsTo") != CROISSANT_CONFORMS_TO:
+        p.report(CROISSANT_FILE, f"it conforms to {document.get('conformsTo')!r}, not to {CROISSANT_CONFORMS_TO}")
+    for entry in document.get("distribution", []):
+        place = entry.get("contentUrl", entry.get("includes"))
+        if not p.is_local(place):
+            p.report(CROISSANT_FILE, f"'{entry.get('@id')}' lies at {place!r}, which is no path of the package")
+        elif "sha256" in entry and p.sums.get(place) != entry["sha256"]:
+            p.report(str(place), "has another SHA-256 than croissant.json says")
+    if p.found:
+        return
+    mlcroissant = need("mlcroissant", EXTRA)
+    need("absl.logging", EXTRA).set_verbosity("error")
+    metadata = mlcroissant.Dataset(str(p.root / CROISSANT_FILE)).metadata
+    for issue in sorted({*metadata.ctx.issues.errors, *metadata.ctx.issues.warnings}, key=str):
+        p.report(CROISSANT_FILE, str(issue))
+    records = compare_records(mlcroissant, p.root, p.built.dataset, None if p.thorough else STREAM_ROWS, p.report)
+    p.looked_at = ", ".join(f"{n} records of {name}" for name, n in records.items())
+
+
+def _frictionless(p: PackageView) -> None:
+    descriptor = p.load(DATAPACKAGE_FILE)
+    if not isinstance(descriptor, dict):
+        return
+    for resource in descriptor.get("resources", []):
+        for key in ("path", "schema"):
+            if not p.is_local(resource.get(key)):
+                p.report(
+                    DATAPACKAGE_FILE, f"a resource has the {key} {resource.get(key)!r}: a path of the package only"
+                )
+    if p.found:
+        return
+    frictionless = need("frictionless", EXTRA)
+    package = frictionless.Package(str(p.root / DATAPACKAGE_FILE))
+    rows = 0
+    for resource in package.resources:
+        limit = None
+        if resource.path.startswith(f"{DATA}/streams/") and not p.thorough:
+            # Part of a file has another checksum; that of the whole file is checked above.
+            limit, resource.hash, resource.bytes = STREAM_ROWS, None, None
+        report = resource.validate(limit_rows=limit) if limit else resource.validate()
+        for task in report.tasks:
+            rows += task.stats.get("rows", 0)
+            for error in [*task.errors][:SHOWN]:
+                p.report(resource.path, error.message)
+        for error in report.errors:
+            p.report(resource.path, error.message)
+    covered = {r.path for r in package.resources}
+    for path in p.sums:
+        if path.endswith(".csv") and path not in covered and not p.is_own(path) and path != f"{DATA}/{PEOPLE}":
+            p.report(path, "is no resource of datapackage.json")
+    p.looked_at = f"{len(package.resources)} resources, {rows} rows"
+
+
+def _crate(p: PackageView) -> None:
+    document = p.load(CRATE_FILE)
+    if document is None:
+        return
+    rocrate = need("rocrate.rocrate", EXTRA)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        crate = rocrate.ROCrate(str(p.root))
+    for warning in caught:
+        p.report(CRATE_FILE, str(warning.message))
+    for key in ("name", "description", "datePublished", "license"):
+        if not crate.root_dataset.get(key):
+            p.report(CRATE_FILE, f"the crate has no {key}")
+    listed = set()
+    for entity in crate.data_entities:
+        path = unquote(str(entity.id))
+        listed.add(path)
+        if not p.is_local(path):
+            p.report(CRATE_FILE, f"it lists {path!r}, which is no path of the package")
+        elif path not in p.sums:
+            p.report(path, "is listed in the crate but is not there")
+        elif entity.get("sha256") != p.sums[path]:
+            p.report(path, "has another SHA-256 than the crate says")
+        elif str(entity.get("contentSize")) != str((p.root / path).stat().st_size):
+            p.report(path, "has another size than the crate says")
+    for path in sorted(p.sums.keys() - listed - {CRATE_FILE, CHECKSUMS}):
+        if not p.is_own(path):
+            p.report(path, "is not listed in the crate")
+    p.looked_at = f"{len(listed)} files"
+
+
+def _datacite(p: PackageView) -> None:
+    document = p.load(DATACITE_FILE)
+    if document is None:
+        return
+    schema = need("datacite.schema45", EXTRA)
+    for error in sorted(schema.validator.iter_errors(document), key=lambda e: list(map(str, e.absolute_path))):
+        where = "/".join(map(str, error.absolute_path))
+        p.report(DATACITE_FILE, f"{f'{where}: ' if where else ''}{error.message[:300]}")
+    if not p.found:
+        xml = (p.root / DATACITE_XML_FILE).read_text(encoding="utf-8")
+        if xml != schema.tostring(document):
+            p.report(DATACITE_XML_FILE, f"does not say what {DATACITE_FILE} says")
+    p.looked_at = "schema 4.5"
+
+
+Validator = Callable[[PackageView], None]
+VALIDATORS: dict[str, Validator] = {
+    "checksums": _checksums,
+    "data": _data,
+    "times": _times,
+    "metadata": _metadata,
+    "croissant": _croissant,
+    "frictionless": _frictionless,
+    "ro-crate": _crate,
+    "datacite": _datacite,
+}

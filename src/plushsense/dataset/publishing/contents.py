@@ -1,0 +1,401 @@
+"""The published data set: raw files rewritten with shifted times and plain columns, and nothing private.
+
+Raw files are rewritten with the layout's column keys, one separator and shifted times, so that no sidecar, header note
+or malformed line of the original is included. Sessions are numbered, since their names may be dates; marks lose who,
+why and when.
+"""
+
+from __future__ import annotations
+
+import hmac
+import json
+import re
+import secrets
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import DatasetError
+from plushsense.core.layouts import DEVICE_MS, HOST_MS, CsvFormat, Layout
+from plushsense.core.recorder_csv import (
+    STREAM_NAME,
+    Frames,
+    format_header,
+    format_rows,
+    parse_name,
+    read_recording,
+    read_stream,
+    recording_filename,
+)
+from plushsense.dataset.index import DUPLICATE_FOLDER, build_index
+from plushsense.dataset.marks import MARKS, Mark, read_marks
+from plushsense.dataset.people import PEOPLE, PersonInfo, read_people, write_people
+from plushsense.dataset.publishing.description import DATA
+from plushsense.dataset.store import HEAD, RECORDINGS, STREAMS, Dataset, DatasetHead, RecordingInfo, StreamInfo
+
+YEAR_2000_MS = 946_684_800_000
+_SPREAD_MS = 366 * 86_400_000
+# All shifted times are before this: sessions of one person may be a few years apart.
+LATEST_MS = 1_262_304_000_000
+_FAR_MS = 9 * 366 * 86_400_000
+# A 32-bit clock in ms wraps after 49 days; larger values are dates.
+WALL_CLOCK_MS = 2**32
+
+
+@dataclass(frozen=True)
+class Shift:
+    """Time shift of one person: the true time ``anchor_ms`` becomes ``target_ms``; ``device``: the device clock too."""
+
+    anchor_ms: int
+    target_ms: int
+    device: bool
+
+    def plausible(self, times: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return which times can belong to this person; times years away are damage and would reveal the shift."""
+        return (times >= self.anchor_ms - _SPREAD_MS) & (times < self.anchor_ms + _FAR_MS)
+
+    def times(self, times: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Shift times; an implausible one is replaced by the last plausible one before it."""
+        good = self.plausible(times)
+        if not good.all():
+            if not good.any():
+                return np.full(len(times), self.target_ms, dtype=np.int64)
+            last = np.maximum.accumulate(np.where(good, np.arange(len(times)), -1))
+            times = times[np.where(last < 0, int(np.argmax(good)), last)]
+        return times - self.anchor_ms + self.target_ms
+
+    def time(self, time: int) -> int | None:
+        """Shift one time; None if it is implausible."""
+        return time - self.anchor_ms + self.target_ms if self.plausible(np.array([time]))[0] else None
+
+    def frames(self, frames: Frames, keep_host: bool) -> Frames:
+        """Return the rows with shifted clocks; the values are the same array."""
+        host = self.times(frames.host_ms) if keep_host and frames.host_ms is not None else None
+        device = self.times(frames.device_ms) if self.device else frames.device_ms
+        return replace(frames, host_ms=host, device_ms=device)
+
+
+def shift_of(subject: str, firsts: list[int], device: bool, key: bytes) -> Shift:
+    """Return the time shift of one person.
+
+    Args:
+        firsts: the first wall-clock time of each of the person's files.
+        device: whether the device clock is a wall clock too.
+        key: the secret that the instant is drawn from: the same key gives the same shift.
+    """
+    drawn = int.from_bytes(hmac.digest(key, subject.encode("utf-8"), "sha256")[:8], "big") % _SPREAD_MS
+    # The median decides which times are plausible, so that one damaged file does not matter.
+    middle = sorted(firsts)[len(firsts) // 2] if firsts else 0
+    near = [t for t in firsts if abs(t - middle) <= _FAR_MS // 2]
+    return Shift(min(near, default=0), YEAR_2000_MS + drawn, device)
+
+
+Progress = Callable[[int, int], None]
+PUBLIC_COLUMNS = ("age_group", "gender")
+# Codes that pandas would read as a number or a missing value.
+_NOT_A_CODE = re.compile(r"[-+]?[\d.]+(e\d+)?|na|n/a|null|none|nan|inf(inity)?|true|false", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class PublishOptions:
+    """Options of publishing: more ``columns`` of the people's file; ``key`` fixes the shifts."""
+
+    streams: bool = True
+    excluded: bool = False
+    columns: tuple[str, ...] = ()
+    key: bytes = field(default_factory=lambda: secrets.token_bytes(32), repr=False)
+
+
+@dataclass(frozen=True)
+class PackageContents:
+    """The published data set, its people, and the original of each recording."""
+
+    dataset: Dataset
+    people: dict[str, PersonInfo]
+    origin: dict[str, RecordingInfo]
+    notes: tuple[str, ...]
+
+
+def public_layout(layout: Layout, host: bool) -> Layout:
+    """Return the layout with plain columns: keys as header, ``,`` as separator, clocks first."""
+    clocks = (HOST_MS, DEVICE_MS) if host else (DEVICE_MS,)
+    columns = (*clocks, *layout.names, *(("label",) if layout.is_labelled else ()))
+    return replace(layout, csv=CsvFormat(columns, columns, ","))
+
+
+def write_contents(
+    dataset: Dataset, root: Path, head: DatasetHead, options: PublishOptions, progress: Progress | None = None
+) -> PackageContents:
+    """Write the published data set into ``root/data``; every file is read back and compared.
+
+    Raises:
+        DatasetError: when nothing would be left, or a file does not come back as it was.
+    """
+    return _ContentsWriter(dataset, root / DATA, head, options, progress).run()
+
+
+class _ContentsWriter:
+    def __init__(
+        self, dataset: Dataset, folder: Path, head: DatasetHead, options: PublishOptions, progress: Progress | None
+    ) -> None:
+        self.source = dataset
+        self.folder = folder
+        self.options = options
+        self.progress = progress or (lambda done, total: None)
+        self.labelled = dataset.layout.is_labelled
+        self.notes: list[str] = []
+        if self.labelled and not options.streams:
+            raise DatasetError(
+                f"'{dataset.path}' holds its recordings as parts of streams: it cannot be published without streams."
+            )
+        self.kept = [r for r in dataset.recordings if options.excluded or self.labelled or not r.excluded]
+        if not self.kept:
+            raise DatasetError(f"'{dataset.path}' has no recording left to publish: every one is excluded.")
+        self.streams = dataset.streams if options.streams else []
+        self.layout = public_layout(dataset.layout, self._all_have_host())
+        self.head = replace(head, layout=self.layout, source="")
+        held = {_folder_of(r.file) for r in self.kept} | {_folder_of(s.file) for s in self.streams}
+        self.codes = {folder: public for folder, public in public_codes(dataset).items() if folder in held}
+        self.shifts = self._shifts()
+        self.sessions = self._sessions()
+        self.taken: set[str] = set()
+
+    def run(self) -> PackageContents:
+        total = len(self.kept) * (not self.labelled) + len(self.streams)
+        done = 0
+        files: dict[str, str] = {}
+        for stream in self.streams:
+            files[stream.file] = self._write_stream(stream)
+            self.progress(done := done + 1, total)
+        for recording in [] if self.labelled else self.kept:
+            files[recording.file] = self._write_recording(recording)
+            self.progress(done := done + 1, total)
+        people = self._write_people()
+        ids = {r.id: self._id(r, files) for r in self.kept}
+        self._write_marks(ids)
+        (self.folder / HEAD).write_text(self.head.to_toml(), encoding="utf-8", newline="\n")
+        built = build_index(self.folder, self.head)
+        published = {r.id: r for r in built.dataset.recordings}
+        origin = {ids[r.id]: r for r in self.kept}
+        if built.unreadable or published.keys() != origin.keys():
+            odd = next(iter([*built.unreadable, *(published.keys() ^ origin.keys())]))
+            raise DatasetError(
+                f"The package would not hold what the data set holds: '{odd}' differs. Please report it."
+            )
+        for identity, before in origin.items():
+            after = published[identity]
+            for key in ("gesture", "rows", "first_row", "start", "stop", "excluded"):
+                if getattr(before, key) != getattr(after, key):
+                    raise DatasetError(
+                        f"'{identity}' would be published with another {key}: {getattr(after, key)!r} instead of "
+                        f"{getattr(before, key)!r}. Please report it."
+                    )
+        self._say_what_was_left_out(built.dataset, origin)
+        return PackageContents(built.dataset, people, origin, tuple(self.notes))
+
+    def _write_stream(self, stream: StreamInfo) -> str:
+        code = _folder_of(stream.file)
+        number = self.sessions[code][stream.session]
+        folder = f"{STREAMS}/{self.codes[code]}"
+        if self.labelled:
+            target = self._free(f"{folder}/session-{number}.csv")
+        else:
+            target = self._free(f"{folder}/{self._inner(code, stream.session)}{STREAM_NAME}")
+        raw = read_stream(self.source.path / stream.file, self.source.layout).frames
+        self._put(target, self.shifts[code].frames(raw, self._host), raw.values)
+        return target
+
+    def _write_recording(self, recording: RecordingInfo) -> str:
+        code = _folder_of(recording.file)
+        name = parse_name(Path(recording.file).name)
+        if name is None:
+            raise DatasetError(f"'{recording.file}' is not named <label>_<epoch ms>_<rows>.csv.")
+        raw = read_recording(self.source.path / recording.file, self.source.layout)
+        frames = raw.frames
+        if raw.integrated and recording.stream_row >= 0 and self.streams:
+            # A clock summed from delays begins at 0; use the stream's clock, so that the recording is located in it.
+            at = int(self.source.read_stream(recording.stream).device_ms[recording.stream_row])
+            frames = replace(frames, device_ms=frames.device_ms - frames.device_ms[0] + at)
+        shift = self.shifts[code]
+        shifted = shift.frames(frames, self._host)
+        epoch = shift.time(name.epoch_ms)
+        if epoch is None:
+            clock = shifted.host_ms if shifted.host_ms is not None else shifted.device_ms
+            epoch = int(clock[0])
+        folder = f"{RECORDINGS}/{self.codes[code]}/{self._inner(code, recording.session)}"
+        target = self._free(folder + recording_filename(name.label, max(0, epoch), name.rows))
+        self._put(target, shifted, frames.values)
+        return target
+
+    def _put(self, target: str, frames: Frames, values: object) -> None:
+        path = self.folder / target
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(format_header(self.layout) + format_rows(frames, self.layout), encoding="utf-8", newline="\n")
+        back = read_recording(path, self.layout)
+        same = (
+            back.malformed == 0
+            and np.array_equal(back.frames.values, values)  # type: ignore[arg-type]
+            and np.array_equal(back.frames.device_ms, frames.device_ms)
+            and (frames.labels is None or np.array_equal(back.frames.labels, frames.labels))  # type: ignore[arg-type]
+        )
+        if not same:
+            raise DatasetError(f"'{target}' would not be read back as it was recorded. Please report it.")
+
+    def _free(self, path: str) -> str:
+        """Return a path below the data folder that no other file has, also on file systems that ignore case."""
+        place, _, name = path.rpartition("/")
+        number = 2
+        while path.casefold() in self.taken:
+            path = f"{place}/{DUPLICATE_FOLDER}{number}/{name}"
+            number += 1
+        self.taken.add(path.casefold())
+        return path
+
+    def _inner(self, code: str, session: str) -> str:
+        return f"{self.sessions[code][session]}/" if len(self.sessions[code]) > 1 else ""
+
+    def _id(self, recording: RecordingInfo, files: dict[str, str]) -> str:
+        target = Path(files[recording.file])
+        kind = STREAMS if self.labelled else RECORDINGS
+        identity = target.relative_to(kind).with_suffix("").as_posix()
+        return identity if not self.labelled else f"{identity}#{recording.id.rpartition('#')[2]}"
+
+    @property
+    def _host(self) -> bool:
+        return HOST_MS in self.layout.csv.columns
+
+    def _all_have_host(self) -> bool:
+        if HOST_MS not in self.source.layout.csv.columns:
+            return False
+        layout, folder = self.source.layout, self.source.path
+        lacking = sum(read_stream(folder / s.file, layout).frames.host_ms is None for s in self.streams)
+        if not self.labelled:
+            lacking += sum(read_recording(folder / r.file, layout).frames.host_ms is None for r in self.kept)
+        if lacking:
+            self.notes.append(
+                f"Left out: the computer's clock, since {_count(lacking, 'file')} lacked it; the toy's clock stays."
+            )
+        return lacking == 0
+
+    def _shifts(self) -> dict[str, Shift]:
+        shifts = {}
+        for code in self.codes:
+            mine = [r for r in self.kept if _folder_of(r.file) == code]
+            firsts = [r.epoch_ms for r in mine]
+            clocks = [r.start_ms for r in mine]
+            for stream in () if mine else [s for s in self.streams if _folder_of(s.file) == code]:
+                frames = read_stream(self.source.path / stream.file, self.source.layout).frames
+                firsts.append(int((frames.device_ms if frames.host_ms is None else frames.host_ms)[0]))
+                clocks.append(int(frames.device_ms[0]))
+            shifts[code] = shift_of(code, firsts, max(clocks, default=0) >= WALL_CLOCK_MS, self.options.key)
+        return shifts
+
+    def _sessions(self) -> dict[str, dict[str, int]]:
+        """Number each person's sessions in the order of time; those without a recording come last."""
+        numbered = {}
+        for code in self.codes:
+            began: dict[str, int] = {}
+            for r in self.kept:
+                if _folder_of(r.file) == code:
+                    began[r.session] = min(r.epoch_ms, began.get(r.session, r.epoch_ms))
+            rest = sorted({s.session for s in self.streams if _folder_of(s.file) == code} - set(began))
+            ordered = [name for _, name in sorted((at, name) for name, at in began.items())] + rest
+            numbered[code] = {name: number for number, name in enumerate(ordered, 1)}
+        return numbered
+
+    def _write_people(self) -> dict[str, PersonInfo]:
+        known = read_people(self.source.path)
+        columns = {c for p in known.values() for c in p.more}
+        for column in self.options.columns:
+            if column not in columns:
+                raise DatasetError(
+                    f"{PEOPLE} has no column '{column}' to publish; besides {', '.join(PUBLIC_COLUMNS)} it has "
+                    f"{', '.join(sorted(columns)) or 'none'}."
+                )
+        people = {}
+        for code, public in self.codes.items():
+            if code in known:
+                p = known[code]
+                more = {c: p.more.get(c, "") for c in self.options.columns}
+                people[public] = PersonInfo(public, p.age_group, p.gender, "", more)
+        if people:
+            write_people(self.folder, people.values())
+        left = sorted(columns - set(self.options.columns)) + ["consent"] * any(p.consent for p in known.values())
+        if left:
+            # Only the number, since the name of a column may be private too.
+            self.notes.append(f"Left out: {_count(len(left), 'column')} of the people's table.")
+        return people
+
+    def _write_marks(self, ids: dict[str, str]) -> None:
+        standing = read_marks(self.source.path)
+        marks = []
+        for recording in self.kept:
+            mark = standing.get(recording.id)
+            if mark is None:
+                continue
+            identity = ids[recording.id]
+            if (mark.start, mark.stop) != (0, -1):
+                marks.append(Mark(identity, "trim", "", start=mark.start, stop=mark.stop))
+            if mark.excluded:
+                marks.append(Mark(identity, "exclude", ""))
+            marks += [Mark(identity, "accept", "", check=check) for check in sorted(mark.accepted)]
+        if marks:
+            lines = "".join(json.dumps(asdict(mark), ensure_ascii=False) + "\n" for mark in marks)
+            (self.folder / MARKS).write_text(lines, encoding="utf-8", newline="\n")
+
+    def _say_what_was_left_out(self, published: Dataset, origin: dict[str, RecordingInfo]) -> None:
+        out = [r for r in self.source.recordings if r.excluded]
+        if out and not self.options.excluded and not self.labelled:
+            still = " Their rows still stand in the session's stream." if self.streams else ""
+            self.notes.append(f"Left out: {_count(len(out), 'excluded recording')}.{still}")
+        elif out:
+            self.notes.append(f"In the package, but marked as excluded: {_count(len(out), 'recording')}.")
+        if self.source.streams and not self.streams:
+            self.notes.append(f"Left out: {_count(len(self.source.streams), 'session stream')}.")
+        trimmed = sum((r.start, r.stop) != (0, r.rows) for r in published.recordings)
+        if trimmed:
+            self.notes.append(
+                f"Trimmed: {_count(trimmed, 'recording')}; the files hold all rows, start and stop say which remain."
+            )
+        renamed = [code for code, public in self.codes.items() if code != public]
+        if renamed:
+            self.notes.append(
+                f"Renamed: {_count(len(renamed), 'subject code')} that looked like a number or nothing, now with "
+                "a P in front."
+            )
+        if self.streams and published.recordings and not self.labelled:
+            lost = sum(o.stream_row >= 0 and n.stream_row < 0 for n, o in _pairs(published, origin))
+            if lost:
+                self.notes.append(f"No longer found in their stream: {_count(lost, 'recording')}.")
+
+
+def _pairs(published: Dataset, origin: dict[str, RecordingInfo]) -> list[tuple[RecordingInfo, RecordingInfo]]:
+    return [(r, origin[r.id]) for r in published.recordings]
+
+
+def _count(n: int, what: str) -> str:
+    return f"{n} {what}{'' if n == 1 else 's'}"
+
+
+def _folder_of(file: str) -> str:
+    """Return the person's folder of a raw file."""
+    return Path(file).parts[1]
+
+
+def public_codes(dataset: Dataset) -> dict[str, str]:
+    """Return public codes by a person's folder, with a P before those that readers take for a number or missing."""
+    folders = {_folder_of(r.file) for r in dataset.recordings} | {_folder_of(s.file) for s in dataset.streams}
+    # "none" is our code for nobody.
+    fine = {f for f in folders if f == "none" or not _NOT_A_CODE.fullmatch(f)}
+    codes: dict[str, str] = {}
+    taken = {f.casefold() for f in fine}
+    for folder in sorted(folders):
+        public = folder
+        while folder not in fine and (public == folder or public.casefold() in taken):
+            public = f"P{public}"
+        taken.add(public.casefold())
+        codes[folder] = public
+    return codes

@@ -1,0 +1,337 @@
+"""Croissant metadata of a package (``croissant.json``), and comparing what mlcroissant loads with the files.
+
+Every value is compared: tables with their text, rows of recordings and streams with what PlushSense's own reader reads.
+"""
+
+from __future__ import annotations
+
+import csv
+import glob
+import itertools
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from plushsense.core.layouts import DEVICE_MS, HOST_MS
+from plushsense.core.recorder_csv import Frames, read_stream
+from plushsense.dataset.publishing.description import (
+    DATA,
+    INTEGER,
+    NUMBER,
+    TEXT,
+    YES_NO,
+    Description,
+    FileEntry,
+    PackageTable,
+    TableColumn,
+)
+from plushsense.dataset.store import Dataset
+
+CROISSANT_FILE = "croissant.json"
+CROISSANT_CONFORMS_TO = "http://mlcommons.org/croissant/1.1"
+FILE_FIELD = "file"
+
+_TYPES = {INTEGER: "cr:Int64", NUMBER: "cr:Float64", TEXT: "sc:Text", YES_NO: "sc:Boolean"}
+# The context of the specification, written out so that readers need not fetch it.
+_CONTEXT: dict[str, Any] = {
+    "@language": "en",
+    "@vocab": "https://schema.org/",
+    "arrayShape": "cr:arrayShape",
+    "citeAs": "cr:citeAs",
+    "column": "cr:column",
+    "conformsTo": "dct:conformsTo",
+    "containedIn": "cr:containedIn",
+    "cr": "http://mlcommons.org/croissant/",
+    "rai": "http://mlcommons.org/croissant/RAI/",
+    "data": {"@id": "cr:data", "@type": "@json"},
+    "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
+    "dct": "http://purl.org/dc/terms/",
+    "description": {"@container": "@language"},
+    "equivalentProperty": "cr:equivalentProperty",
+    "examples": {"@id": "cr:examples", "@type": "@json"},
+    "extract": "cr:extract",
+    "field": "cr:field",
+    "fileProperty": "cr:fileProperty",
+    "fileObject": "cr:fileObject",
+    "fileSet": "cr:fileSet",
+    "format": "cr:format",
+    "includes": "cr:includes",
+    "isArray": "cr:isArray",
+    "isLiveDataset": "cr:isLiveDataset",
+    "jsonPath": "cr:jsonPath",
+    "key": "cr:key",
+    "md5": "cr:md5",
+    "name": {"@container": "@language"},
+    "parentField": "cr:parentField",
+    "path": "cr:path",
+    "recordSet": "cr:recordSet",
+    "references": "cr:references",
+    "regex": "cr:regex",
+    "repeated": "cr:repeated",
+    "replace": "cr:replace",
+    "samplingRate": "cr:samplingRate",
+    "sc": "https://schema.org/",
+    "separator": "cr:separator",
+    "source": "cr:source",
+    "subField": "cr:subField",
+    "transform": "cr:transform",
+}
+
+
+def croissant(d: Description) -> dict[str, Any]:
+    """Return the metadata as JSON-LD; the tables' checksums come from ``d.files``."""
+    files = {f.path: f for f in d.files}
+    people = [_creator(c.name, c.orcid, c.affiliation) for c in d.creators]
+    document: dict[str, Any] = {
+        "@context": _CONTEXT,
+        "@type": "sc:Dataset",
+        "name": d.title,
+        "description": d.text,
+        "conformsTo": CROISSANT_CONFORMS_TO,
+        "license": d.licence.url,
+        "version": d.version,
+        "datePublished": d.published,
+        "citeAs": d.citation,
+        "creator": people,
+        "keywords": list(d.keywords),
+        "inLanguage": d.about.language,
+        "isLiveDataset": False,
+        "rai:dataCollection": d.about.collected or "Recorded with PlushSense: see README.md.",
+        "rai:personalSensitiveInformation": (
+            "None: a simulation." if d.simulated else f"Touch recordings of people under codes. Consent: {d.consent}"
+        ),
+        "rai:dataLimitations": " ".join([d.about.limits, *d.notes]).strip() or "See README.md.",
+        "distribution": [_distribution(t, files) for t in d.tables],
+        "recordSet": [_record_set(t) for t in d.tables],
+    }
+    if d.url:
+        document["url"] = d.url
+    if d.about.publisher:
+        document["publisher"] = {"@type": "sc:Organization", "name": d.about.publisher}
+    return document
+
+
+def _creator(name: str, orcid: str, affiliation: str) -> dict[str, Any]:
+    entry: dict[str, Any] = {"@type": "sc:Person", "name": name}
+    if orcid:
+        entry["url"] = f"https://orcid.org/{orcid}"
+    if affiliation:
+        entry["description"] = affiliation
+    return entry
+
+
+def _source_id(table: PackageTable) -> str:
+    return table.file or f"{table.name}-files"
+
+
+def _distribution(table: PackageTable, files: dict[str, FileEntry]) -> dict[str, Any]:
+    if not table.file:
+        return {
+            "@type": "cr:FileSet",
+            "@id": _source_id(table),
+            "name": _source_id(table),
+            "description": table.text,
+            "encodingFormat": "text/csv",
+            "includes": table.glob,
+        }
+    return {
+        "@type": "cr:FileObject",
+        "@id": _source_id(table),
+        "name": table.file,
+        "description": table.text,
+        "contentUrl": table.file,
+        "contentSize": f"{files[table.file].bytes} B",
+        "encodingFormat": "text/csv",
+        "sha256": files[table.file].sha256,
+    }
+
+
+def _record_set(table: PackageTable) -> dict[str, Any]:
+    fields = [_field(table, column) for column in table.columns]
+    if not table.file:
+        path = TableColumn(FILE_FIELD, TEXT, "the file in which the row stands, from the root of the package")
+        fields.insert(0, _field(table, path, {"fileProperty": "fullpath"}))
+    made: dict[str, Any] = {
+        "@type": "cr:RecordSet",
+        "@id": table.name,
+        "name": table.name,
+        "description": table.text,
+        "field": fields,
+    }
+    if table.key:
+        made["key"] = {"@id": f"{table.name}/{table.key}"}
+    return made
+
+
+def _field(table: PackageTable, column: TableColumn, extract: dict[str, str] | None = None) -> dict[str, Any]:
+    unit = f" [{column.unit}]" if column.unit else ""
+    made: dict[str, Any] = {
+        "@type": "cr:Field",
+        "@id": f"{table.name}/{column.name}",
+        "name": column.name,
+        "description": f"{column.text}{unit}",
+        "dataType": _TYPES[column.kind],
+        "source": {
+            "fileObject" if table.file else "fileSet": {"@id": _source_id(table)},
+            "extract": extract or {"column": column.name},
+        },
+    }
+    if column.refers:
+        other, _, name = column.refers.partition(".")
+        made["references"] = {"field": {"@id": f"{other}/{name}"}}
+    return made
+
+
+ReportProblem = Callable[[str, str], None]
+
+
+def compare_records(
+    mlcroissant: ModuleType, root: Path, dataset: Dataset, stream_rows: int | None, report: ReportProblem
+) -> dict[str, int]:
+    """Load every record set, compare it with the files, and return how many records of each were compared.
+
+    Args:
+        stream_rows: of each stream only so many rows, from its beginning; None: all.
+        say: called with a file and what is wrong there.
+    """
+    path = str(root / CROISSANT_FILE)
+    loaded = mlcroissant.Dataset(path)
+    by_id = {node.uuid: node for node in loaded.metadata.distribution}
+    compared = {}
+    seen: set[str] = set()
+    for record_set in loaded.metadata.record_sets:
+        name = record_set.uuid
+        source = by_id[next(f.source.uuid for f in record_set.fields)]
+        if type(source).__name__ == "FileObject":
+            compared[name] = _table(name, loaded.records(name), root / source.content_url, report)
+            seen.add(source.content_url)
+            continue
+        files = _files(dataset, name)
+        seen |= {file for file, _ in files}
+        if stream_rows is None or name == "samples":
+            compared[name] = _rows(name, loaded.records(name), files, dataset, None, report)
+            continue
+        compared[name] = 0
+        for file in files:
+            # One file at a time, so that only its beginning is parsed.
+            source.includes = [glob.escape(file[0])]
+            records = itertools.islice(iter(loaded.records(name)), stream_rows)
+            compared[name] += _rows(name, records, [file], dataset, stream_rows, report)
+    expected = {f for name in ("samples", "stream-samples") for f, _ in _files(dataset, name)}
+    for absent in sorted(expected - seen):
+        report(absent, "is in no record set of croissant.json")
+    return compared
+
+
+def _files(dataset: Dataset, name: str) -> list[tuple[str, Path]]:
+    if name == "samples":
+        files = {r.file for r in dataset.recordings} - {s.file for s in dataset.streams}
+    else:
+        files = {s.file for s in dataset.streams}
+    return [(f"{DATA}/{file}", dataset.path / file) for file in sorted(files)]
+
+
+def _table(name: str, records: Iterable[dict[str, Any]], path: Path, report: ReportProblem) -> int:
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    number = 0
+    for number, record in enumerate(records, 1):
+        if number > len(rows):
+            continue
+        for key, value in record.items():
+            column = key.rpartition("/")[2]
+            text = rows[number - 1].get(column)
+            if text is None or not _same(value, text):
+                report(
+                    path.name, f"row {number} has {column} {text!r}; as a record of '{name}' it is {_plain(value)!r}"
+                )
+                return number
+        if len(record) != len(rows[0]):
+            report(path.name, f"has {len(rows[0])} columns; a record of '{name}' has {len(record)}")
+            return number
+    if number != len(rows):
+        report(path.name, f"holds {len(rows)} rows; '{name}' loads {number} records")
+    return number
+
+
+def _plain(value: Any) -> Any:
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else value
+
+
+def _same(value: Any, text: str) -> bool:
+    value = _plain(value)
+    if value is None:
+        return text == ""
+    if isinstance(value, bool | np.bool_):
+        return text == ("true" if value else "false")
+    if isinstance(value, str):
+        return value == text
+    try:
+        return bool(value == (int(text) if isinstance(value, int | np.integer) else float(text)))
+    except ValueError:
+        return False
+
+
+def _rows(
+    name: str,
+    records: Iterable[dict[str, Any]],
+    files: list[tuple[str, Path]],
+    dataset: Dataset,
+    limit: int | None,
+    report: ReportProblem,
+) -> int:
+    """Compare the rows of recordings or streams file by file, in any order of files."""
+    waiting = dict(files)
+    compared = 0
+    key = f"{name}/{FILE_FIELD}"
+    for value, group in itertools.groupby(records, key=lambda record: record[key]):
+        file = str(_plain(value))
+        place = waiting.pop(file, None)
+        rows = list(group)
+        compared += len(rows)
+        if place is None:
+            report(file, f"'{name}' loads it, but it is not in the data")
+            continue
+        problem = _difference(rows, name, read_stream(place, dataset.layout).frames, dataset, limit)
+        if problem:
+            report(file, problem)
+    for file in waiting:
+        report(file, f"'{name}' does not load it")
+    return compared
+
+
+def _difference(
+    rows: list[dict[str, Any]], name: str, frames: Frames, dataset: Dataset, limit: int | None
+) -> str | None:
+    """Return how records differ from frames; None if they are equal."""
+    layout = dataset.layout
+    n = len(frames) if limit is None else min(limit, len(frames))
+    if len(rows) != n:
+        return f"'{name}' loads {len(rows)} of its {n} rows"
+    expected: dict[str, Any] = {DEVICE_MS: frames.device_ms}
+    if frames.host_ms is not None:
+        expected[HOST_MS] = frames.host_ms
+    if frames.labels is not None:
+        expected["label"] = frames.labels
+    for at, channel in enumerate(layout.channels):
+        expected[channel.name] = frames.values[:, at]
+    steps = {c.name: c.step for c in layout.channels}
+    for column, values in expected.items():
+        key = f"{name}/{column}"
+        if key not in rows[0]:
+            return f"'{name}' has no field '{column}'"
+        loaded = [row[key] for row in rows]
+        if column == "label":
+            same = [_plain(v) for v in loaded] == values[:n].tolist()
+        elif any(v is None for v in loaded):
+            same = False
+        elif steps.get(column, 1.0) == 1.0:
+            same = np.array_equal(np.array(loaded, dtype=np.int64), values[:n])
+        else:
+            same = np.array_equal(np.round(np.array(loaded) / steps[column]).astype(np.int64), values[:n])
+        if not same:
+            return f"'{name}' loads other values of {column} than the file holds"
+    return None

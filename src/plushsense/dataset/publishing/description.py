@@ -1,0 +1,252 @@
+"""Description of a package, the one source of all its metadata files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from plushsense.core.errors import DatasetError, nearest
+from plushsense.core.layouts import DEVICE_MS, HOST_MS, Channel, Layout
+from plushsense.dataset.about import About, Creator
+from plushsense.dataset.files import sha256_of
+from plushsense.dataset.store import Dataset
+
+
+@dataclass(frozen=True)
+class Licence:
+    """A licence: SPDX name, title, and the address of its text."""
+
+    spdx: str
+    title: str
+    url: str
+    travels: bool = False
+    """Whether its text must lie beside every copy."""
+
+
+_CC = "https://creativecommons.org/licenses"
+LICENCES: dict[str, Licence] = {
+    each.spdx: each
+    for each in (
+        Licence("CC0-1.0", "Creative Commons Zero 1.0", "https://creativecommons.org/publicdomain/zero/1.0/"),
+        Licence("CC-BY-4.0", "Creative Commons Attribution 4.0", f"{_CC}/by/4.0/"),
+        Licence("CC-BY-SA-4.0", "Creative Commons Attribution-ShareAlike 4.0", f"{_CC}/by-sa/4.0/"),
+        Licence("CC-BY-NC-4.0", "Creative Commons Attribution-NonCommercial 4.0", f"{_CC}/by-nc/4.0/"),
+        Licence("CC-BY-NC-SA-4.0", "Creative Commons Attribution-NonCommercial-ShareAlike 4.0", f"{_CC}/by-nc-sa/4.0/"),
+        Licence("CC-BY-ND-4.0", "Creative Commons Attribution-NoDerivatives 4.0", f"{_CC}/by-nd/4.0/"),
+        Licence(
+            "CC-BY-NC-ND-4.0", "Creative Commons Attribution-NonCommercial-NoDerivatives 4.0", f"{_CC}/by-nc-nd/4.0/"
+        ),
+        Licence("CC-BY-3.0", "Creative Commons Attribution 3.0", f"{_CC}/by/3.0/"),
+        Licence("ODC-By-1.0", "Open Data Commons Attribution 1.0", "https://opendatacommons.org/licenses/by/1-0/"),
+        Licence("ODbL-1.0", "Open Data Commons Open Database 1.0", "https://opendatacommons.org/licenses/odbl/1-0/"),
+        Licence("PDDL-1.0", "Open Data Commons Public Domain 1.0", "https://opendatacommons.org/licenses/pddl/1-0/"),
+        Licence("MIT", "MIT", "https://spdx.org/licenses/MIT.html", travels=True),
+        Licence("Apache-2.0", "Apache 2.0", "https://www.apache.org/licenses/LICENSE-2.0", travels=True),
+        Licence("BSD-3-Clause", "BSD 3-Clause", "https://spdx.org/licenses/BSD-3-Clause.html", travels=True),
+    )
+}
+
+
+def find_licence(spdx: str) -> Licence:
+    """Return the licence of an SPDX name, in any case.
+
+    Raises:
+        DatasetError: for a name that is not in `LICENCES`, with the nearest one.
+    """
+    for name, licence in LICENCES.items():
+        if name.casefold() == spdx.strip().casefold():
+            return licence
+    raise DatasetError(
+        f"'{spdx}' is no licence that can be published under: accepted are the SPDX names {', '.join(LICENCES)}."
+        f"{nearest(spdx.replace(' ', '-'), LICENCES)}"
+    )
+
+
+INTEGER, NUMBER, TEXT, YES_NO = "integer", "number", "string", "boolean"
+SIMULATION = "SIMULATION: recordings of a virtual toy. Nobody touched anything; they say nothing about a real toy."
+
+DATA = "data"
+RECORDINGS_TABLE = "recordings.csv"
+STREAMS_TABLE = "streams.csv"
+SUBJECTS_TABLE = "subjects.csv"
+GESTURES_TABLE = "gestures.csv"
+CHANNELS_TABLE = "channels.csv"
+CHECKSUMS = "checksums.sha256"
+
+
+@dataclass(frozen=True)
+class TableColumn:
+    """A column of a table: its kind (`INTEGER`, …), what it means, its unit, and the range of valid values."""
+
+    name: str
+    kind: str
+    text: str
+    unit: str = ""
+    valid: tuple[float, float] | None = None
+    refers: str = ""
+    """``table.column`` that its values stand in."""
+
+
+@dataclass(frozen=True)
+class PackageTable:
+    """A table of the package: one file, or (``files``) many of the same columns."""
+
+    name: str
+    text: str
+    columns: tuple[TableColumn, ...]
+    file: str = ""
+    files: tuple[str, ...] = ()
+    glob: str = ""
+    key: str = ""
+
+
+@dataclass(frozen=True)
+class FileEntry:
+    """A file of the package."""
+
+    path: str
+    bytes: int
+    sha256: str
+    media: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Description:
+    """The package: authors, terms, tables and files; ``published`` is the day in ISO format."""
+
+    dataset: Dataset
+    licence: Licence
+    about: About
+    consent: str
+    published: str
+    tables: tuple[PackageTable, ...]
+    notes: tuple[str, ...] = ()
+    """What was left out or changed on the way, one sentence each."""
+    files: tuple[FileEntry, ...] = field(default=())
+
+    @property
+    def name(self) -> str:
+        """A short name for files and identifiers."""
+        kept = "".join(c if c.isascii() and c.isalnum() else "-" for c in self.dataset.head.name.lower())
+        return "-".join(part for part in kept.split("-") if part) or "dataset"
+
+    @property
+    def version(self) -> str:
+        """Version of the data set, MAJOR.MINOR.PATCH."""
+        return self.dataset.head.version
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the recordings are of the virtual toy."""
+        return self.dataset.head.simulated
+
+    @property
+    def title(self) -> str:
+        """The title, marked SIMULATION if it is one."""
+        title = self.about.title or self.dataset.head.name
+        return f"SIMULATION: {title}" if self.simulated and not title.startswith("SIMULATION") else title
+
+    @property
+    def gestures_made(self) -> int:
+        """Number of gestures with recordings; the set can hold more."""
+        return len({r.gesture for r in self.dataset.recordings})
+
+    @property
+    def text(self) -> str:
+        """The description in a paragraph."""
+        d = self.dataset
+        counted = (
+            f"{len(d.recordings)} recordings of {self.gestures_made} gestures by {len(d.subjects)} people on "
+            f"'{d.layout.title}': {d.layout.n_channels} channels at about {d.layout.rate_hz:g} Hz"
+            f"{f', and {len(d.streams)} whole session streams' if d.streams else ''}."
+        )
+        parts = [SIMULATION if self.simulated else "", self.about.description, counted]
+        return " ".join(p for p in parts if p)
+
+    @property
+    def keywords(self) -> tuple[str, ...]:
+        """Keywords, with "simulation" if it is one."""
+        return (*self.about.keywords, *(("simulation",) if self.simulated else ())) or ("touch gestures",)
+
+    @property
+    def creators(self) -> tuple[Creator, ...]:
+        """The authors; the contact if nobody else is named."""
+        return self.about.creators or (Creator(self.about.contact.name),)
+
+    @property
+    def citation(self) -> str:
+        """The citation in one line."""
+        names = "; ".join(c.name for c in self.creators)
+        where = f" https://doi.org/{self.about.doi}" if self.about.doi else f" {self.about.homepage}".rstrip()
+        return f"{names} ({self.published[:4]}): {self.title}, version {self.version} [data set].{where}"
+
+    @property
+    def url(self) -> str:
+        """The address of the data set; "" if unknown."""
+        return f"https://doi.org/{self.about.doi}" if self.about.doi else self.about.homepage
+
+
+_MEDIA = {
+    ".csv": "text/csv",
+    ".tsv": "text/tab-separated-values",
+    ".json": "application/json",
+    ".jsonl": "application/jsonlines",
+    ".md": "text/markdown",
+    ".toml": "application/toml",
+    ".txt": "text/plain",
+    ".xml": "application/xml",
+    ".sha256": "text/plain",
+}
+
+
+def file_entry(root: Path, path: Path, text: str) -> FileEntry:
+    """Return the metadata of a file of the package in ``root``."""
+    relative = path.relative_to(root).as_posix()
+    return FileEntry(relative, path.stat().st_size, sha256_of(path), _MEDIA.get(path.suffix, "text/plain"), text)
+
+
+def sample_columns(layout: Layout, labelled: bool) -> tuple[TableColumn, ...]:
+    """Return the columns of a recording's or stream's file, in file order."""
+    columns = []
+    for key in layout.csv.columns:
+        if key == HOST_MS:
+            columns.append(
+                TableColumn(
+                    key, INTEGER, "time at which the computer took the row in; shifted, the date is fictitious", "ms"
+                )
+            )
+        elif key == DEVICE_MS:
+            columns.append(
+                TableColumn(
+                    key, INTEGER, "the toy's clock: the truth for rate, gaps and losses; a fall is a restart", "ms"
+                )
+            )
+        elif key == "label":
+            if labelled:
+                columns.append(TableColumn(key, TEXT, "gesture at this row"))
+        else:
+            columns.append(channel_column(layout.channels[layout.index(key)]))
+    return tuple(columns)
+
+
+def channel_column(channel: Channel) -> TableColumn:
+    """Return a measured channel as a column."""
+    physical = (
+        ""
+        if channel.offset == 0.0 and channel.scale == 1.0
+        else f"; physical value = (raw - {channel.offset:g}) * {channel.scale:g} {channel.unit}"
+    )
+    step = "" if channel.step == 1.0 else f"; in steps of {channel.step:g}"
+    valid = f"valid from {_plain(channel.valid_min)} to {_plain(channel.valid_max)}"
+    return TableColumn(
+        channel.name,
+        INTEGER if channel.step == 1.0 else NUMBER,
+        f"{channel.kind}, raw reading{physical}{step}; {valid}, what is outside is kept as it was read",
+        channel.unit,
+        (channel.valid_min, channel.valid_max),
+    )
+
+
+def _plain(value: float) -> str:
+    return str(int(value)) if value == int(value) else str(value)

@@ -1,0 +1,304 @@
+"""Publishing a data set as a package: refused if something is missing, written completely, then validated."""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+from collections import Counter
+from dataclasses import dataclass, field, replace
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+from plushsense.core.errors import DatasetError, need
+from plushsense.core.files import new_folder, write_file
+from plushsense.core.gestures import NOBODY
+from plushsense.core.recorder_csv import SIMULATION_MARK
+from plushsense.dataset.about import Contact
+from plushsense.dataset.people import PersonInfo
+from plushsense.dataset.publishing.bids import write_bids
+from plushsense.dataset.publishing.checking import StageProgress, ValidationResult, check_folder
+from plushsense.dataset.publishing.contents import PublishOptions, write_contents
+from plushsense.dataset.publishing.croissant import CROISSANT_FILE, croissant
+from plushsense.dataset.publishing.description import CHECKSUMS, SIMULATION, Description, file_entry, find_licence
+from plushsense.dataset.publishing.metadata import (
+    CRATE_FILE,
+    DATACITE_FILE,
+    DATACITE_XML_FILE,
+    DATAPACKAGE_FILE,
+    crate,
+    datacite,
+    datapackage,
+    schemas,
+)
+from plushsense.dataset.publishing.readme import (
+    LICENCE,
+    README,
+    REIDENTIFICATION,
+    REIDENTIFICATION_JSON,
+    licence_note,
+    readme,
+)
+from plushsense.dataset.publishing.tables import list_package_files, write_checksums, write_tables, write_zip
+from plushsense.dataset.store import HEAD, UNKNOWN_SUBJECT, Dataset, DatasetHead
+
+EXTRA = "publish"
+# In smaller groups, age group and gender alone may identify a person.
+FEWEST_ALIKE = 3
+_VERSION = re.compile(r"(0|[1-9]\d*)\.(0|[1-9]\d*)\.(0|[1-9]\d*)([-+][0-9A-Za-z.+-]+)?")
+_LICENCE_FILES = ("LICENSE", "LICENSE.txt", "LICENSE.md", "LICENCE", "LICENCE.txt", "COPYING")
+
+
+@dataclass(frozen=True)
+class Reidentification:
+    """Result of the re-identification test: a report, its short form, and its figures."""
+
+    report: str
+    short: str
+    figures: dict[str, Any]
+
+
+@dataclass
+class PublishResult:
+    """Result of publishing."""
+
+    folder: Path
+    zip: Path | None
+    files: int
+    bytes: int
+    description: Description
+    checked: ValidationResult
+    seconds: float
+    warnings: list[str] = field(default_factory=list)
+
+    @property
+    def valid(self) -> bool:
+        """Whether every validator accepts the package."""
+        return self.checked.valid
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON."""
+        d = self.description
+        return {
+            "package": str(self.folder),
+            "zip": str(self.zip) if self.zip else None,
+            "files": self.files,
+            "bytes": self.bytes,
+            "zip_bytes": self.zip.stat().st_size if self.zip else None,
+            "recordings": len(d.dataset.recordings),
+            "subjects": len(d.dataset.subjects),
+            "streams": len(d.dataset.streams),
+            "simulated": d.simulated,
+            "notes": list(d.notes),
+            "warnings": self.warnings,
+            "seconds": round(self.seconds, 1),
+            **self.checked.to_dict(),
+        }
+
+
+def complete_head(
+    head: DatasetHead, where: Path, licence: str = "", contact: str = "", consent: str = ""
+) -> DatasetHead:
+    """Return the head with the given values; refuse it while licence, contact or consent statement is missing.
+
+    Raises:
+        DatasetError: naming the lines to add to dataset.toml, or what of it cannot be used.
+    """
+    about = replace(head.about, contact=Contact.parse(contact)) if contact else head.about
+    head = replace(head, about=about, licence=licence or head.licence, consent=consent.strip() or head.consent)
+    lines, flags = [], []
+    if not head.licence:
+        lines.append('licence = "CC-BY-4.0"')
+        flags.append("--licence CC-BY-4.0")
+    if not head.consent.strip():
+        lines.append('consent = "what the people agreed to"')
+        flags.append('--consent "what the people agreed to"')
+    if not head.about.contact:
+        lines.append('in a table [about]  contact = { name = "Your Name", email = "you@example.org" }')
+        flags.append('--contact "Your Name <you@example.org>"')
+    if lines:
+        raise DatasetError(
+            f"'{where}' cannot be published without licence, contact and consent statement: set in '{where / HEAD}'  "
+            f"{'  and  '.join(lines)}  or say  {' '.join(flags)}"
+        )
+    if not _VERSION.fullmatch(head.version):
+        raise DatasetError(
+            f"'{where / HEAD}' has the version '{head.version}': three numbers are accepted, like 1.0.0."
+        )
+    return replace(head, licence=find_licence(head.licence).spdx)
+
+
+def save_head(dataset: Dataset, head: DatasetHead) -> None:
+    """Write a completed head into the data set's own ``dataset.toml``."""
+    write_file(dataset.path / HEAD, head.to_toml())
+
+
+def require_validators() -> None:
+    """Check that the validators are installed before any work is done.
+
+    Raises:
+        MissingExtraError: with the install command.
+    """
+    for module in ("mlcroissant", "frictionless", "rocrate", "datacite", "jinja2"):
+        need(module, EXTRA)
+
+
+def check_output_folder(dataset: Dataset, out: Path) -> Path:
+    """Check the target folder and return the path of the zip beside it.
+
+    Raises:
+        DatasetError: when something is there already, or ``out`` lies in the data set.
+    """
+    real = out.resolve()
+    target = real.with_name(real.name + ".zip")
+    if real.exists() and (not real.is_dir() or any(real.iterdir())):
+        raise DatasetError(f"'{out}' already holds something: give a new or empty folder, nothing is overwritten.")
+    if target.exists():
+        raise DatasetError(f"'{target}' is already there: nothing is overwritten, give another OUT.")
+    if dataset.path.resolve() in (real, *real.parents):
+        raise DatasetError(f"'{out}' lies in the data set itself: give a folder elsewhere.")
+    return target
+
+
+def publish(
+    dataset: Dataset,
+    out: Path,
+    head: DatasetHead,
+    *,
+    options: PublishOptions | None = None,
+    bids: bool = False,
+    reidentification: Reidentification | None = None,
+    published: str | None = None,
+    thorough: bool = False,
+    progress: StageProgress | None = None,
+) -> PublishResult:
+    """Write the package into the new folder ``out``, validate it, and pack it as ``out.zip`` if it is valid.
+
+    Args:
+        head: a `complete_head`.
+        reidentification: None leaves the report out, which the README then says.
+        published: the day it is published, ISO; today by default.
+        thorough: let the slow validators read every row of the streams too.
+        progress: called with the name of the stage, the work done and its total.
+
+    Raises:
+        DatasetError: when ``out`` or its zip is there already, or the data set cannot be published.
+        MissingExtraError: without the validators.
+    """
+    began = time.perf_counter()
+    require_validators()
+    progress = progress or (lambda what, done, total: None)
+    target = check_output_folder(dataset, out)
+    options = options or PublishOptions()
+    day = published or date.today().isoformat()
+    with new_folder(out, DatasetError) as work:
+        contents = write_contents(dataset, work, head, options, lambda done, total: progress("writing", done, total))
+        d = Description(
+            contents.dataset,
+            find_licence(head.licence),
+            head.about,
+            head.consent,
+            day,
+            write_tables(work, contents),
+            contents.notes,
+        )
+        _write_texts(work, d, dataset, reidentification)
+        if bids:
+            write_bids(work, d)
+        _write_metadata(work, d)
+    checked = check_folder(out, thorough=thorough, progress=progress)
+    if checked.valid:
+        write_zip(out, target, f"{d.name}-{d.version}")
+    files = list_package_files(out)
+    return PublishResult(
+        out,
+        target if checked.valid else None,
+        len(files),
+        sum(f.stat().st_size for f in files),
+        d,
+        checked,
+        time.perf_counter() - began,
+        _warnings(dataset, d, contents.people),
+    )
+
+
+def _write_texts(work: Path, d: Description, source: Dataset, found: Reidentification | None) -> None:
+    _text(work / README, readme(d, found.short if found else None))
+    own = next((source.path / name for name in _LICENCE_FILES if (source.path / name).is_file()), None)
+    text = own.read_text(encoding="utf-8", errors="replace") if own else licence_note(d)
+    _text(work / LICENCE, text)
+    if d.simulated:
+        _text(work / SIMULATION_MARK, f"{SIMULATION}\n")
+    if found is not None:
+        banner = f"**{SIMULATION}**\n\n" if d.simulated else ""
+        _text(work / REIDENTIFICATION, banner + found.report)
+        _json(work / REIDENTIFICATION_JSON, found.figures)
+
+
+def _write_metadata(work: Path, d: Description) -> None:
+    """Write the metadata files, each of which lists those before it; the checksums cover all."""
+    for path, schema in schemas(d).items():
+        (work / path).parent.mkdir(exist_ok=True)
+        _json(work / path, schema)
+    d = _with_files(work, d)
+    _json(work / CROISSANT_FILE, croissant(d))
+    _json(work / DATAPACKAGE_FILE, datapackage(d))
+    cited = datacite(d)
+    _json(work / DATACITE_FILE, cited)
+    xml = need("datacite.schema45", EXTRA).tostring(cited)
+    _text(work / DATACITE_XML_FILE, xml)
+    _json(work / CRATE_FILE, crate(_with_files(work, d)))
+    write_checksums(work)
+
+
+def _with_files(work: Path, d: Description) -> Description:
+    texts = {t.file: t.text for t in d.tables if t.file} | {f: t.text for t in d.tables for f in t.files}
+    texts |= {README: "what this is", LICENCE: "the licence"}
+    entries = tuple(
+        file_entry(work, path, texts.get(path.relative_to(work).as_posix(), "metadata"))
+        for path in list_package_files(work)
+        if path.name not in (CHECKSUMS, CRATE_FILE)
+    )
+    return replace(d, files=entries)
+
+
+def _warnings(source: Dataset, d: Description, people: dict[str, PersonInfo]) -> list[str]:
+    warnings = []
+    groups = Counter((p.age_group, p.gender, *p.more.values()) for p in people.values() if p.age_group or p.gender)
+    rare = sum(n for n in groups.values() if n < FEWEST_ALIKE)
+    if rare:
+        warnings.append(
+            f"{rare} people are of an age group and gender that fewer than {FEWEST_ALIKE} people share, so these alone "
+            "may tell who they are: use coarser groups in subjects.csv"
+        )
+    spoken = [s for s in d.dataset.subjects if not any(c.isdigit() for c in s)]
+    if spoken:
+        warnings.append(
+            f"subject codes are published as they are, and {len(spoken)} hold no digit ('{spoken[0]}'): if they are "
+            "names, pseudonymise the data set first"
+        )
+    if d.licence.travels and not any((source.path / name).is_file() for name in _LICENCE_FILES):
+        warnings.append(
+            f"{d.licence.spdx} asks that its text lies beside every copy: put it into the data set as LICENSE.txt"
+        )
+    if not d.about.title:
+        warnings.append(
+            f"the title is the data set's name, '{source.head.name}', often that of the folder that was imported: it "
+            "is published, so look at it, or set title in [about] in dataset.toml"
+        )
+    if not d.about.creators:
+        warnings.append("nobody is named as creator, so the contact is: add creators to [about] in dataset.toml")
+    if any(r.subject == UNKNOWN_SUBJECT for r in d.dataset.recordings):
+        warnings.append("the people of some recordings are not known, so they share one shift of time")
+    if not {r.subject for r in d.dataset.recordings} - {NOBODY, UNKNOWN_SUBJECT}:
+        warnings.append("no recording has a known person")
+    return warnings
+
+
+def _json(path: Path, table: dict[str, Any]) -> None:
+    _text(path, json.dumps(table, ensure_ascii=False, indent=1) + "\n")
+
+
+def _text(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8", newline="\n")

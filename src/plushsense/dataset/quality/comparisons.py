@@ -1,0 +1,434 @@
+"""Checks that compare recordings with each other."""
+
+from __future__ import annotations
+
+import itertools
+from collections import Counter
+from collections.abc import Iterator
+
+import numpy as np
+
+from plushsense.core.gestures import NOBODY
+from plushsense.dataset.quality.findings import PARTLY_THERE, Issue
+from plushsense.dataset.quality.measurements import (
+    LEVEL_KINDS,
+    NEVER_STOPPED_FACTOR,
+    DatasetSummary,
+    RecordingSummary,
+    gesture_of,
+)
+from plushsense.dataset.store import UNKNOWN_SUBJECT, RecordingInfo
+
+_ENOUGH = 4
+_FLAT_ROWS = 20
+_QUIET = 0.15
+_BURST = 0.4
+_SOMETHING = 0.05
+_AS_MUCH = 0.2
+_SEVERAL_USUAL = 0.2
+_SESSION_S = 60.0
+_PLAIN = 0.25
+_GENTLE = 0.5
+_TOLD_S = 0.3
+_RAIL = 0.99
+_ALIKE = 3
+_OFTEN = 0.04
+
+
+def usual_seconds(group: list[RecordingSummary]) -> float:
+    """Return the mean duration (as in the paper) of the recordings that were stopped.
+
+    One recording of three minutes among gestures of two seconds would raise the mean until half of the good ones
+    are outliers.
+    """
+    seconds = np.array([o.seconds for o in group])
+    return float(seconds[seconds <= NEVER_STOPPED_FACTOR * np.median(seconds)].mean())
+
+
+def never_stopped(o: RecordingSummary, group: list[RecordingSummary]) -> bool:
+    """Return whether a recording is longer than 10 times the median of its gesture."""
+    return o.seconds > NEVER_STOPPED_FACTOR * float(np.median([g.seconds for g in group]))
+
+
+def _is_cut_by_the_file(o: RecordingSummary, whole: DatasetSummary) -> bool:
+    """Return whether a run of equal labels touches an end of its file, so that its duration is not the person's."""
+    info = o.info
+    if not isinstance(info, RecordingInfo) or whole.dataset.layout.csv.columns[-1] != "label":
+        return False
+    rows = next((s.info.rows for s in whole.streams if s.info.id == info.stream), None)
+    return info.first_row == 0 or info.first_row + info.rows == rows
+
+
+def duration(w: DatasetSummary) -> Iterator[Issue]:
+    share = w.limits.duration
+    for group in w.groups.values():
+        group = [o for o in group if not _is_cut_by_the_file(o, w)]
+        if len(group) < _ENOUGH:
+            continue
+        mean = usual_seconds(group)
+        own: dict[str, list[float]] = {}
+        for o in group:
+            own.setdefault(o.info.subject, []).append(o.seconds)
+        for o in group:
+            off = o.seconds / mean - 1 if mean else 0.0
+            if abs(off) <= share or never_stopped(o, group):
+                continue
+            # A person who always takes longer has a tempo, not a fault.
+            mine = float(np.median(own[o.info.subject]))
+            habit = len(own[o.info.subject]) >= 3 and abs(o.seconds / mine - 1) <= share if mine else False
+            yield Issue(
+                f"lasts {o.seconds:.2f} s, {abs(off) * 100:.0f} % {'more' if off > 0 else 'less'} than the mean of its "
+                f"gesture ({mean:.2f} s)"
+                + (
+                    f", as this person's others do (their median {mine:.2f} s)"
+                    if habit
+                    else f"; this person's median is {mine:.2f} s"
+                ),
+                about=o.info.id,
+                severity="info" if habit else None,
+            )
+
+
+def flat(w: DatasetSummary) -> Iterator[Issue]:
+    """Find channels with one value throughout that usually have more."""
+    names = w.dataset.layout.names
+    long = [o for o in w.recordings if o.rows >= _FLAT_ROWS]
+    if not long:
+        return
+    constant = np.array([o.runs >= o.rows for o in long])
+    always = constant.mean(axis=0) > 0.5
+    for c in np.flatnonzero(always):
+        yield Issue(
+            f"channel {names[c]} does not change in {int(constant[:, c].sum())} of {len(long)} recordings",
+            channels=(int(c),),
+            severity="warning",
+        )
+    for o, row in zip(long, constant, strict=True):
+        dead = np.flatnonzero(row & ~always)
+        if len(dead):
+            yield Issue(
+                f"{_channels(names, dead)} {'has' if len(dead) == 1 else 'have'} one value throughout",
+                ((o.first_row, o.first_row + o.rows),),
+                tuple(dead.tolist()),
+                o.info.id,
+            )
+    for o in w.streams:
+        dead = np.flatnonzero((o.runs >= o.rows) & ~always)
+        if o.rows >= _FLAT_ROWS and len(dead):
+            yield Issue(
+                f"{_channels(names, dead)} {'has' if len(dead) == 1 else 'have'} one value throughout the session",
+                channels=tuple(dead.tolist()),
+                about=o.info.id,
+            )
+
+
+def _channels(names: tuple[str, ...], at: np.ndarray) -> str:
+    listed = ", ".join(names[c] for c in at[:4]) + (", …" if len(at) > 4 else "")
+    return f"channel {listed}" if len(at) == 1 else f"{len(at)} channels ({listed})"
+
+
+def stuck(w: DatasetSummary) -> Iterator[Issue]:
+    """Find channels that hold one value far longer than usual and then go on; all channels at once: the toy hung."""
+    if not w.recordings:
+        return
+    names = w.dataset.layout.names
+    limit = np.maximum(w.limits.stuck_s * 1000, 10 * w.usual_run_ms)
+    for o, least in [(o, limit) for o in w.recordings] + [(o, 4 * limit) for o in w.streams]:
+        held = o.runs * o.period_ms
+        found = np.flatnonzero((held > least) & (o.runs < o.rows))
+        if not len(found):
+            continue
+        c = int(found[np.argmax(held[found])])
+        first = int(o.run_at[c]) + o.first_row
+        yield Issue(
+            f"{_channels(names, found)} {'holds' if len(found) == 1 else 'hold'} one value for up to "
+            f"{held[c] / 1000:.1f} s (from row {first + 1}); usual is {w.usual_run_ms[c] / 1000:.2f} s",
+            ((first, first + int(o.runs[c])),),
+            tuple(found.tolist()),
+            o.info.id,
+            "error" if o.runs[c] > 0.5 * o.rows else None,
+        )
+
+
+def saturated(w: DatasetSummary) -> Iterator[Issue]:
+    """Find moving channels that stay at their highest or lowest value: the end of the sensor's range."""
+    if not w.recordings:
+        return
+    names = w.dataset.layout.names
+    usual = np.median([o.spread for o in w.recordings], axis=0)
+    # Where several recordings reach the same extreme, it is the sensor's limit; elsewhere a flat top must be longer.
+    tops = np.abs([o.top for o in w.recordings])
+    rail = tops.max(axis=0)
+    shared = (tops >= _RAIL * rail).sum(axis=0) >= _ALIKE
+    most = np.maximum(w.limits.saturated_s * 1000, 4 * w.usual_top_ms)
+    for o in w.recordings:
+        at_rail = shared & (np.abs(o.top) >= _RAIL * rail)
+        held = o.top_runs * o.period_ms
+        long = np.where(at_rail, held >= most / 2, held >= most) & (o.top_runs >= 3)
+        often = at_rail & (o.top_rows >= 10) & (o.top_rows >= _OFTEN * o.rows)
+        moving = (o.spread > 0.5 * usual) & (o.spread > 0) & (o.runs < o.rows)
+        found = np.flatnonzero((long | often) & moving)
+        if not len(found):
+            continue
+        c = int(found[np.argmax(held[found])])
+        first = int(o.top_at[c]) + o.first_row
+        yield Issue(
+            f"{_channels(names, found)} {'stays' if len(found) == 1 else 'stay'} at the highest or lowest value, "
+            f"{names[c]} for {held[c]:.0f} ms at {o.top[c]:g} (from row {first + 1}), {o.top_rows[c]} rows in all",
+            ((first, first + int(o.top_runs[c])),),
+            tuple(found.tolist()),
+            o.info.id,
+        )
+
+
+def drift(w: DatasetSummary) -> Iterator[Issue]:
+    """Find channels whose baseline changes from the first quarter of a session to the last."""
+    layout = w.dataset.layout
+    level = [c for c, ch in enumerate(layout.channels) if ch.kind in LEVEL_KINDS]
+    if not level or not w.recordings:
+        return
+    touched = np.percentile([o.spread for o in w.recordings], 90, axis=0)
+    for key, lows, about, seconds in _baselines(w):
+        if len(lows) < 8 or seconds < _SESSION_S:
+            continue
+        quarter = len(lows) // 4
+        change = np.median(lows[-quarter:], axis=0) - np.median(lows[:quarter], axis=0)
+        share = np.divide(change, touched, out=np.zeros_like(change), where=touched > 0)
+        found = np.array([c for c in level if abs(share[c]) > w.limits.drift], dtype=np.int64)
+        if len(found):
+            c = int(found[np.argmax(np.abs(share[found]))])
+            yield Issue(
+                f"the baseline of {_channels(layout.names, found)} drifts over {key}, {layout.names[c]} by "
+                f"{change[c]:+.0f}: {abs(share[c]) * 100:.0f} % of its signal when touched",
+                channels=tuple(found.tolist()),
+                about=about,
+            )
+
+
+def _baselines(w: DatasetSummary) -> Iterator[tuple[str, np.ndarray, str, float]]:
+    """Return for each session the baselines in order of time, (K, C): of its stream, else of its recordings."""
+    streamed = set()
+    for o in w.streams:
+        if o.lows is not None:
+            streamed.add((o.info.subject, o.info.session))
+            yield "the session", o.lows, o.info.id, o.seconds
+    sessions: dict[tuple[str, str], list[RecordingSummary]] = {}
+    for o in w.recordings:
+        sessions.setdefault((o.info.subject, o.info.session), []).append(o)
+    for (subject, session), outlines in sessions.items():
+        if (subject, session) not in streamed:
+            outlines.sort(key=lambda o: o.info.epoch_ms if isinstance(o.info, RecordingInfo) else 0)
+            passed = [o.info.epoch_ms for o in (outlines[0], outlines[-1]) if isinstance(o.info, RecordingInfo)]
+            yield f"session {session}", np.array([o.low for o in outlines]), subject, (passed[1] - passed[0]) / 1000
+
+
+def no_onset(w: DatasetSummary) -> Iterator[Issue]:
+    """Find recordings with hardly any activity, if their gesture usually has clear activity."""
+    for group in w.groups.values():
+        if len(group) < _ENOUGH:
+            continue
+        peaks = np.array([np.percentile(w.activity(o), 95) for o in group])
+        usual = float(np.median(peaks))
+        # A gesture that many people make without moving has no onset.
+        if usual < 2 * _SOMETHING or np.percentile(peaks, 20) < _PLAIN * usual:
+            continue
+        own: dict[str, list[float]] = {}
+        for o, peak in zip(group, peaks, strict=True):
+            own.setdefault(o.info.subject, []).append(float(peak))
+        for o, peak in zip(group, peaks, strict=True):
+            # A person who is always gentle has a style, not a fault, provided the activity is above rest.
+            mine = own[o.info.subject]
+            if len(mine) >= 3 and peak > max(0.5 * float(np.median(mine)), _GENTLE * w.limits.onset * usual):
+                continue
+            if (
+                peak < w.limits.onset * usual
+                and not _is_cut_by_the_file(o, w)
+                and o.seconds >= _TOLD_S
+                and not never_stopped(o, group)
+            ):
+                yield Issue(
+                    f"no onset is visible: the strongest moment has {100 * peak / usual:.0f} % of what is usual for "
+                    "this gesture",
+                    about=o.info.id,
+                )
+
+
+def bursts(activity: np.ndarray, quiet_blocks: int) -> list[tuple[int, int]]:
+    """Return stretches of active blocks, separated by stillness of at least ``quiet_blocks``.
+
+    Stretches much weaker than the largest are dropped: the toy is put down, a key is pressed.
+    """
+    top = float(np.percentile(activity, 95)) if len(activity) else 0.0
+    on = np.flatnonzero(activity > _QUIET * top)
+    if top < _SOMETHING or not len(on):
+        return []
+    parts = np.split(on, np.flatnonzero(np.diff(on) > quiet_blocks) + 1)
+    most = max(float(activity[p].sum()) for p in parts)
+    return [
+        (int(p[0]), int(p[-1]) + 1)
+        for p in parts
+        if activity[p].max() > _BURST * top and float(activity[p].sum()) > _AS_MUCH * most
+    ]
+
+
+def several_gestures(w: DatasetSummary) -> Iterator[Issue]:
+    """Find recordings with more than one stretch of activity, if the gesture usually has one."""
+    for group in w.groups.values():
+        if len(group) < _ENOUGH:
+            continue
+        found = []
+        for o in group:
+            block_s = o.hop * o.period_ms / 1000
+            found.append(bursts(w.activity(o), max(1, round(w.limits.quiet_s / block_s))))
+        counts = np.array([len(f) for f in found])
+        # If many recordings have several parts, the gesture has.
+        if np.mean(counts > 1) > _SEVERAL_USUAL:
+            continue
+        for o, parts in zip(group, found, strict=True):
+            if len(parts) > 1:
+                rows = tuple((a * o.hop + o.first_row, b * o.hop + o.first_row) for a, b in parts)
+                still = max((b[0] - a[1]) * o.period_ms / 1000 for a, b in itertools.pairwise(rows))
+                yield Issue(
+                    f"{len(parts)} separate gestures in one recording, with up to {still:.1f} s of stillness between "
+                    f"(second from row {rows[1][0] + 1})",
+                    rows,
+                    about=o.info.id,
+                )
+
+
+_OVERLAP = 0.1
+_MADE_BY = 0.9
+_AGREE = 0.6
+
+
+def duplicate(w: DatasetSummary) -> Iterator[Issue]:
+    """Find recordings or streams with the same values, whatever their clocks; the first by name is the original."""
+    first: dict[bytes, str] = {}
+    for o in sorted(w.recordings, key=lambda o: o.info.id):
+        if (o.runs >= o.rows).all():
+            continue  # Constant recordings are equal without being copies.
+        original = first.setdefault(o.content, o.info.id)
+        if original != o.info.id:
+            yield Issue(f"the same content as {original}", about=o.info.id)
+    seen: dict[str, str] = {}
+    for o in w.streams:
+        original = seen.setdefault(o.info.sha256, o.info.id)
+        if original != o.info.id:
+            yield Issue(f"the same content as {original}", about=o.info.id)
+
+
+def overlap(w: DatasetSummary) -> Iterator[Issue]:
+    """Find two recordings that hold the same stretch of their stream."""
+    placed = [
+        (o.info.stream, o.info.stream_row + o.info.start, o.info.stream_row + o.info.stop, o)
+        for o in w.recordings
+        if isinstance(o.info, RecordingInfo) and o.info.stream_row >= 0 and not o.info.file.startswith("streams/")
+    ]
+    placed.sort(key=lambda p: p[:2])
+    open_at: tuple[str, int, int, RecordingSummary] | None = None
+    for now in placed:
+        if open_at is not None and open_at[0] == now[0]:
+            shared = min(open_at[2], now[2]) - now[1]
+            if shared > _OVERLAP * (now[2] - now[1]):
+                yield Issue(
+                    f"{shared} of its {now[2] - now[1]} rows are in {open_at[3].info.id} too",
+                    ((0, shared),),
+                    about=now[3].info.id,
+                )
+        if open_at is None or open_at[0] != now[0] or now[2] > open_at[2]:
+            open_at = now
+
+
+def _people(w: DatasetSummary) -> dict[str, Counter[str]]:
+    """Count the recordings of each person by gesture, without gestures of free choice or made by nobody."""
+    counts: dict[str, Counter[str]] = {}
+    for o in w.recordings:
+        gesture = w.dataset.gestures.find(gesture_of(o))
+        counted = gesture is None or not (gesture.free_choice or gesture.nobody)
+        if o.info.subject not in (NOBODY, UNKNOWN_SUBJECT) and counted:
+            counts.setdefault(o.info.subject, Counter())[gesture_of(o)] += 1
+    return counts
+
+
+def missing(w: DatasetSummary) -> Iterator[Issue]:
+    """Find people with fewer recordings of a gesture than the others, where most made the same number."""
+    people = _people(w)
+    cells = Counter(n for counts in people.values() for n in counts.values())
+    if not cells:
+        return
+    short: dict[str, list[str]] = {}
+    for gesture in sorted({g for counts in people.values() for g in counts}):
+        made = Counter(counts[gesture] for counts in people.values() if counts[gesture])
+        if made.total() < _MADE_BY * len(people):
+            continue
+        agreed = made if made.total() >= 3 else cells
+        usual, n = max(agreed.items(), key=lambda item: (item[1], item[0]))
+        if n < _AGREE * agreed.total():
+            continue
+        for subject, counts in people.items():
+            if counts[gesture] < usual:
+                short.setdefault(subject, []).append(f"{counts[gesture]} of {usual} '{gesture}'")
+    for subject in sorted(short):
+        listed = short[subject]
+        more = f" and {len(listed) - 6} more gestures" if len(listed) > 6 else ""
+        yield Issue(f"{subject} has {', '.join(listed[:6])}{more}", about=subject)
+
+
+def _odd(counts: dict[str, int], factor: float) -> tuple[float, list[str]]:
+    usual = float(np.median(list(counts.values()))) if counts else 0.0
+    odd = [f"{name} {n}" for name, n in counts.items() if usual and (n * factor < usual or n > factor * usual)]
+    return usual, odd
+
+
+def class_balance(w: DatasetSummary) -> Iterator[Issue]:
+    counts = Counter(gesture_of(o) for o in w.recordings)
+    for gesture in w.dataset.gestures.gestures:
+        if gesture.nobody or gesture.free_choice:
+            counts.pop(gesture.label, None)
+        elif not w.dataset.gestures.inferred:
+            counts.setdefault(gesture.label, 0)
+    usual, odd = _odd(counts, w.limits.balance)
+    if odd:
+        yield Issue(
+            f"{len(odd)} of {len(counts)} gestures have far fewer or more recordings than the median ({usual:.0f}): "
+            + ", ".join(odd[:8])
+            + (", …" if len(odd) > 8 else "")
+        )
+
+
+def subject_balance(w: DatasetSummary) -> Iterator[Issue]:
+    counts = {subject: c.total() for subject, c in _people(w).items()}
+    usual, odd = _odd(counts, w.limits.balance)
+    if odd:
+        yield Issue(
+            f"{len(odd)} of {len(counts)} people have far fewer or more recordings than the median ({usual:.0f}): "
+            + ", ".join(odd[:8])
+            + (", …" if len(odd) > 8 else "")
+        )
+
+
+def not_in_stream(w: DatasetSummary) -> Iterator[Issue]:
+    streamed = {(s.info.subject, s.info.session) for s in w.streams}
+    for o in w.recordings:
+        if not isinstance(o.info, RecordingInfo):
+            continue
+        # Recordings of the untouched toy are in the folder of the person whose session it is.
+        folder = o.info.id.split("/", 1)[0]
+        if o.info.stream_row < 0 and (folder, o.info.session) in streamed:
+            yield Issue("not found in the session's stream", about=o.info.id)
+        for flag in o.info.flags:
+            if flag.startswith(PARTLY_THERE):
+                yield Issue(flag, about=o.info.id)
+
+
+def unknown_label(w: DatasetSummary) -> Iterator[Issue]:
+    if not w.dataset.gestures.has_affect:
+        return
+    counts = Counter(gesture_of(o) for o in w.recordings)
+    for label, n in sorted(counts.items()):
+        gesture = w.dataset.gestures.find(label)
+        if gesture is None or gesture.affect == "none":
+            yield Issue(
+                f"the label '{label}' ({n} recording{'s' if n > 1 else ''}) is not in the gesture set "
+                f"'{w.dataset.gestures.name}': no affect"
+            )

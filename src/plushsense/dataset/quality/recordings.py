@@ -1,0 +1,218 @@
+"""Checks of one recording or stream: values, rows and clock."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.dataset.quality.findings import CheckLimits, Issue, Severity
+from plushsense.dataset.quality.measurements import NEVER_STOPPED_FACTOR, Examination
+
+_FEW = 0.01
+_TELLING_ROWS = 20
+_OF_SPREAD = 0.02
+
+
+def _weight(share: float, limits: CheckLimits) -> Severity | None:
+    """Return the severity for a share of bad rows: few are tolerable, since readers hold the last valid value."""
+    return "error" if share > limits.garbage else "info" if share < _FEW else None
+
+
+def rows_against_name(s: Examination) -> Iterator[Issue]:
+    held = len(s.frames) if s.rows_in_file is None else s.rows_in_file
+    if s.rows_named is not None and s.rows_named != held:
+        yield Issue(f"holds {held} rows, its name says {s.rows_named}")
+
+
+def never_stopped(s: Examination) -> Iterator[Issue]:
+    if s.usual_rows is not None and len(s.frames) > NEVER_STOPPED_FACTOR * s.usual_rows:
+        yield Issue(
+            f"holds {len(s.frames)} rows where this gesture usually has {s.usual_rows:.0f}: never stopped?",
+            ((s.first_row, s.first_row + len(s.frames)),),
+        )
+
+
+def garbage(s: Examination) -> Iterator[Issue]:
+    """Find values outside the valid range."""
+    values = s.frames.values
+    outside: NDArray[np.bool_] = np.logical_or(values < s.layout.valid_min_int, values > s.layout.valid_max_int)
+    rows = outside.any(axis=1)
+    if rows.any():
+        channels = np.flatnonzero(outside.any(axis=0)).tolist()
+        names = [s.layout.names[c] for c in channels]
+        yield Issue(
+            f"{int(outside.sum())} value{'s' if outside.sum() > 1 else ''} outside the valid range "
+            f"({', '.join(names)}; first in row {s.row(int(np.argmax(rows)))})",
+            tuple((int(r) + s.first_row, int(r) + s.first_row + 1) for r in np.flatnonzero(rows)[:_SHOWN]),
+            tuple(channels),
+            severity=_weight(float(rows.mean()), s.limits),
+        )
+
+
+def blank_rows(s: Examination) -> Iterator[Issue]:
+    rows = ~s.frames.values.any(axis=1)
+    if s.layout.n_channels > 1 and rows.any():
+        yield Issue(
+            f"{int(rows.sum())} row{'s' if rows.sum() > 1 else ''} in which every channel reads 0 "
+            f"(first row {s.row(int(np.argmax(rows)))})",
+            tuple((int(r) + s.first_row, int(r) + s.first_row + 1) for r in np.flatnonzero(rows)[:_SHOWN]),
+            severity=_weight(float(rows.mean()), s.limits),
+        )
+
+
+def spikes(s: Examination) -> Iterator[Issue]:
+    """Find single rows in which a channel jumps far away and back: a failed reading."""
+    values = s.frames.values
+    if len(values) < _TELLING_ROWS:
+        return
+    steps = np.diff(values, axis=0)
+    there, back = steps[:-1], steps[1:]
+    size = np.where(np.sign(there) == -np.sign(back), np.minimum(np.abs(there), np.abs(back)), 0)
+    usual = np.percentile(np.abs(steps), 95, axis=0)
+    usual = np.maximum(usual, _OF_SPREAD * np.subtract(*np.percentile(values, (98, 2), axis=0)))
+    far = (size > s.limits.spike * np.maximum(usual, 1)) & (size > 3 * np.abs(values[2:] - values[:-2]))
+    # Values outside the valid range have a check of their own.
+    far &= (values[1:-1] >= s.layout.valid_min_int) & (values[1:-1] <= s.layout.valid_max_int)
+    rows = np.flatnonzero(far.any(axis=1)) + 1
+    if len(rows):
+        yield Issue(
+            f"{len(rows)} row{'s' if len(rows) > 1 else ''} in which a value jumps far away and back "
+            f"(first row {s.row(rows[0])}): a reading that failed?",
+            tuple((int(r) + s.first_row, int(r) + s.first_row + 1) for r in rows[:_SHOWN]),
+            severity=_weight(len(rows) / len(values), s.limits),
+        )
+
+
+def malformed(s: Examination) -> Iterator[Issue]:
+    if s.malformed:
+        yield Issue(f"{s.malformed} malformed line{'s' if s.malformed > 1 else ''} left out")
+
+
+def cut_line(s: Examination) -> Iterator[Issue]:
+    if s.cut:
+        yield Issue("the last line is cut off: left out")
+
+
+_SHOWN = 50
+_NIGHT_MS = 6 * 3_600_000
+_LEFT_OVER = 3
+_STANDSTILL_MS = 5000
+_RATE_OVER_S = 3
+_FEW_LOST = 3
+
+
+def _around(rows: NDArray[np.int64], s: Examination) -> tuple[tuple[int, int], ...]:
+    """Return the first places as stretches of two rows of the file."""
+    return tuple((int(r) + s.first_row, int(r) + s.first_row + 2) for r in rows[:_SHOWN])
+
+
+def format_duration(ms: float) -> str:
+    """Format a time in a suitable unit."""
+    return (
+        f"{ms:.0f} ms"
+        if ms < 10_000
+        else f"{ms / 1000:.0f} s"
+        if ms < 600_000
+        else f"{ms / 60_000:.0f} min"
+        if ms < 36_000_000
+        else f"{ms / 3_600_000:.0f} h"
+    )
+
+
+def clock_reset(s: Examination) -> Iterator[Issue]:
+    back = np.flatnonzero(s.steps < 0)
+    whole: Severity | None = None
+    if s.stream:
+        # A stream's first rows may be left over in the buffer of the serial port.
+        whole = "info" if len(back) and back.max() < _LEFT_OVER else "warning"
+    if len(back):
+        yield Issue(
+            f"the device clock runs backwards {len(back)}× (first after row {s.row(back[0])}, "
+            f"by {format_duration(-int(s.steps[back[0]]))})",
+            _around(back, s),
+            severity=whole,
+        )
+    if len(s.jumps):
+        most = int(s.steps[s.jumps].max())
+        yield Issue(
+            f"the device clock leaps ahead {len(s.jumps)}× (first after row {s.row(s.jumps[0])}, at most "
+            f"{format_duration(most)}) while hardly any time passes on the computer",
+            _around(s.jumps, s),
+            severity="info" if s.jumps.max() < _LEFT_OVER else whole,
+        )
+
+
+def gaps(s: Examination) -> Iterator[Issue]:
+    if len(s.gaps):
+        longest = int(s.steps[s.gaps].max())
+        at = int(s.gaps[int(np.argmax(s.steps[s.gaps]))])
+        yield Issue(
+            f"{len(s.gaps)} gap{'s' if len(s.gaps) > 1 else ''} over {s.gap_ms:.0f} ms, the longest {longest} ms "
+            f"(after row {s.row(at)})",
+            _around(s.gaps, s),
+            severity="error" if not s.stream and longest > s.limits.long_gap_ms else None,
+        )
+
+
+def lost_frames(s: Examination) -> Iterator[Issue]:
+    """Count periods without a frame; with an uneven clock only gaps count."""
+    if s.period_ms <= 0:
+        return
+    # Pauses and restarts have checks of their own.
+    good = (s.steps > 0) & (s.steps <= _STANDSTILL_MS)
+    good[s.jumps] = False
+    usual = float(np.mean(s.steps[good & (s.steps < 1.5 * s.period_ms)])) if good.any() else s.period_ms
+    missing = np.where(good, np.rint(s.steps / usual) - 1, 0)
+    long = s.gaps if s.uneven else np.flatnonzero((s.steps > 1.6 * s.period_ms) & (missing >= 1))
+    lost = int(missing[long].sum())
+    share = lost / (lost + len(s.frames))
+    if lost >= _FEW_LOST and share > s.limits.lost:
+        yield Issue(
+            f"about {lost} of {lost + len(s.frames)} frames are lost ({100 * share:.1f} %) by the device clock",
+            _around(long, s),
+        )
+
+
+def jitter(s: Examination) -> Iterator[Issue]:
+    if len(s.steps) < 20 or s.period_ms <= 0:
+        return
+    low, high = s.spread_ms
+    if s.jitters:
+        yield Issue(
+            f"the time between frames varies from {low:.0f} to {high:.0f} ms (median {s.period_ms:.0f} ms)"
+            + (": frames are stamped several at once" if s.in_bursts else "")
+        )
+
+
+def rate(s: Examination) -> Iterator[Issue]:
+    """Compare the measured rate, outside gaps, with that of the layout."""
+    even = s.steps[(s.steps >= 0) & (s.steps <= s.gap_ms)]
+    nominal = s.layout.rate_hz
+    if len(even) < 10 or even.sum() <= 0:
+        return
+    measured = 1000.0 * len(even) / float(even.sum())
+    if s.uneven and len(even) < _RATE_OVER_S * nominal:
+        return  # Too short for a rate with uneven stamps.
+    if abs(measured - nominal) > s.limits.rate * nominal:
+        yield Issue(f"measured {measured:.1f} Hz where the layout says {nominal:g} Hz")
+
+
+def resumed(s: Examination) -> Iterator[Issue]:
+    """Find pauses after which a stream was appended to, by the computer's clock."""
+    host = s.frames.host_ms
+    if host is None or s.frames.device_ms is host:
+        return
+    quiet = np.diff(host) - np.where(s.steps <= s.limits.pause_s * 1000, np.maximum(s.steps, 0), 0)
+    at = np.flatnonzero(quiet > s.limits.pause_s * 1000)
+    if not len(at):
+        return
+    longest = float(quiet[at].max())
+    # The time zone of the recorder is unknown, so midnight is too.
+    days = longest > _NIGHT_MS
+    yield Issue(
+        f"goes on after a pause {len(at)}× (the longest {format_duration(longest)} by the computer's clock, "
+        f"first after row {s.row(at[0])}{', most likely on another day' if days else ''})",
+        _around(at, s),
+    )

@@ -1,0 +1,329 @@
+"""Trimming of recordings by marks: suggestions from onset detection, and accepting, adjusting or undoing them.
+
+By default only the start is trimmed, as in the paper: the rows before the onset are reaction time, whereas people
+disagree about the end of a gesture (docs/trim.md reports both errors). A mark that a person set by hand is never
+replaced by a suggestion.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import ConfigError, DatasetError
+from plushsense.core.recorder_csv import Frames
+from plushsense.dataset.index import as_dataset
+from plushsense.dataset.marks import BY_HAND, SUGGESTED, Mark, MarkState, append_marks, match_ids, read_marks
+from plushsense.dataset.onset import CONTEXT_S, Suggestion, suggest
+from plushsense.dataset.quality.checking import author_name
+from plushsense.dataset.store import Dataset, RecordingInfo
+
+STATES = ("none", "suggested", "accepted", "adjusted")
+
+
+@dataclass(frozen=True)
+class Trim:
+    """Suggested trim and state of one recording.
+
+    ``seconds`` (rows + 1,) is the device time since the first row, at each row and at the end; resets are skipped.
+    ``state``: "none" (nothing to suggest, no mark), "suggested", "accepted" (a suggestion was), "adjusted" (a person
+    set it).
+    """
+
+    recording: RecordingInfo
+    suggestion: Suggestion
+    mark_state: MarkState
+    seconds: NDArray[np.float64]
+
+    @property
+    def state(self) -> str:
+        """The state, one of `STATES`."""
+        if self.mark_state.trimmed:
+            return "accepted" if self.mark_state.how == SUGGESTED else "adjusted"
+        return "suggested" if self.suggestion.onset_visible else "none"
+
+    def suggested_rows(self, offset: bool = False, above: float = 0.0) -> tuple[int, int]:
+        """Return the rows that accepting would keep; all if the start is not visible or less confident than ``above``.
+
+        With ``offset`` the end is trimmed too, if it is visible and as confident.
+        """
+        s = self.suggestion
+        if not s.onset_visible or s.onset_confidence < above:
+            return 0, self.recording.rows
+        ends = offset and s.offset_visible and s.offset_confidence >= above
+        return s.start, s.stop if ends else self.recording.rows
+
+    def current_rows(self, offset: bool = False) -> tuple[int, int]:
+        """Return the rows that a mark keeps, or else those suggested."""
+        if not self.mark_state.trimmed:
+            return self.suggested_rows(offset)
+        stop = self.recording.rows if self.mark_state.stop < 0 else min(self.mark_state.stop, self.recording.rows)
+        return min(self.mark_state.start, stop), stop
+
+    def to_dict(self, offset: bool = False) -> dict[str, Any]:
+        """Return plain values for JSON: the rows in force (or suggested), and the suggestion."""
+        start, stop = self.current_rows(offset)
+        s = self.suggestion
+        return {
+            "recording": self.recording.id,
+            "gesture": self.recording.gesture,
+            "rows": self.recording.rows,
+            "start": start,
+            "stop": stop,
+            "start_s": round(float(self.seconds[start]), 3),
+            "stop_s": round(float(self.seconds[stop]), 3),
+            "confidence": s.onset_confidence,
+            "state": self.state,
+            "suggested_start_s": round(float(self.seconds[s.start]), 3) if s.onset_visible else None,
+            "suggested_stop_s": round(float(self.seconds[s.stop]), 3) if s.offset_visible else None,
+            "offset_confidence": s.offset_confidence,
+            "note": s.why,
+        }
+
+
+@dataclass(frozen=True)
+class AcceptedTrims:
+    """Ids of recordings by what accepting did: marked, already so, no visible onset (or too unsure), set by hand."""
+
+    marked: tuple[str, ...] = ()
+    already: tuple[str, ...] = ()
+    not_visible: tuple[str, ...] = ()
+    kept_by_hand: tuple[str, ...] = ()
+
+
+def suggest_trims(
+    dataset: Dataset,
+    recordings: Iterable[RecordingInfo] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[Trim]:
+    """Return the suggestion and the state of each recording, in the order of the index.
+
+    Args:
+        recordings: which; by default those that no mark excludes.
+
+    Raises:
+        DatasetError: for a data set whose recordings are cut from labels, which need no trimming.
+    """
+    if dataset.layout.is_labelled:
+        raise DatasetError(
+            f"The recordings of '{dataset.head.name}' are cut where the label on the rows changes (layout "
+            f"'{dataset.layout.name}'), so there is no reaction time to trim: trim data sets of single recordings."
+        )
+    chosen = list(dataset.used if recordings is None else recordings)
+    standing = read_marks(dataset.path)
+    nobody = {g.label for g in dataset.gestures.gestures if g.nobody}
+    found = {}
+    # Sorted by stream, since the data set caches the last one.
+    for done, info in enumerate(sorted(chosen, key=lambda r: (r.stream, r.id)), 1):
+        frames = dataset.read(replace(info, start=0, stop=info.rows))
+        if info.gesture in nobody:
+            suggestion = Suggestion(0, info.rows, False, False, 0.0, 0.0, 1.0, "rest: all of it is the gesture")
+        else:
+            suggestion = suggest(frames, dataset.layout, _before(dataset, info))
+        found[info.id] = Trim(info, suggestion, standing.get(info.id, MarkState()), row_times_s(frames))
+        if progress is not None:
+            progress(done, len(chosen))
+    return [found[info.id] for info in chosen]
+
+
+def _before(dataset: Dataset, info: RecordingInfo) -> Frames | None:
+    """Return the rows of the stream just before the recording; None if it is in no stream."""
+    if info.stream_row <= 0:
+        return None
+    first = info.stream_row - math.ceil(CONTEXT_S * max(info.rate_hz, 1.0))
+    return dataset.read_stream(info.stream).slice(max(0, first), info.stream_row)
+
+
+def row_times_s(frames: Frames) -> NDArray[np.float64]:
+    """Return device time since the first row, at each row and at the end, (T + 1,); resets are skipped."""
+    steps = np.maximum(np.diff(frames.device_ms), 0)
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    return np.concatenate([[0.0], np.cumsum(steps), [float(steps.sum()) + usual]]) / 1000.0
+
+
+def find_recordings(dataset: Dataset, pattern: str) -> list[RecordingInfo]:
+    """Return the recordings that an id or a pattern with ``*`` and ``?`` matches.
+
+    Raises:
+        DatasetError: when it names none.
+    """
+    ids = {r.id: r for r in dataset.recordings}
+    return [ids[identity] for identity in match_ids(pattern, ids, "recording")]
+
+
+def accept_suggestions(
+    dataset: Dataset, chosen: Iterable[Trim], who: str, why: str = "", *, above: float = 0.0, offset: bool = False
+) -> AcceptedTrims:
+    """Mark `Trim.suggested_rows`: starts of at least confidence ``above``, and with ``offset`` ends too.
+
+    A mark set by hand stays, and an existing mark is not repeated. Open the data set again to see the marks.
+    """
+    marks, already, not_visible, by_hand = [], [], [], []
+    for trim in chosen:
+        info = trim.recording
+        start, stop = trim.suggested_rows(offset, above)
+        if trim.state == "adjusted":
+            by_hand.append(info.id)
+        elif (start, stop) == (0, info.rows):
+            not_visible.append(info.id)
+        elif trim.mark_state.how == SUGGESTED and trim.current_rows() == (start, stop):
+            already.append(info.id)
+        else:
+            end = stop if stop < info.rows else -1
+            marks.append(Mark(info.id, "trim", who, why, start=start, stop=end, how=SUGGESTED))
+    _append(dataset, marks)
+    return AcceptedTrims(tuple(m.recording for m in marks), tuple(already), tuple(not_visible), tuple(by_hand))
+
+
+def kept_rows(trim: Trim, start_s: float | None, stop_s: float | None) -> tuple[int, int]:
+    """Return the rows of a recording from ``start_s`` to ``stop_s`` (None: its edge).
+
+    Raises:
+        DatasetError: for times outside the recording, or that keep nothing.
+    """
+    info, end_s = trim.recording, float(trim.seconds[-1])
+    for value in (start_s, stop_s):
+        if value is not None and not 0.0 <= value <= end_s + 1e-3:
+            raise DatasetError(f"'{info.id}' cannot be trimmed at {value:g} s: it runs from 0 to {end_s:.3f} s.")
+    # Half a millisecond of tolerance: printed times are rounded to whole ones.
+    start = 0 if start_s is None else int(np.searchsorted(trim.seconds, start_s - 5e-4))
+    stop = info.rows if stop_s is None else int(np.searchsorted(trim.seconds, stop_s - 5e-4))
+    start, stop = min(start, info.rows), min(stop, info.rows)
+    if stop <= start:
+        raise DatasetError(
+            f"'{info.id}' has no row from {start_s or 0:g} to {end_s if stop_s is None else stop_s:g} s: give a later "
+            "end or an earlier start."
+        )
+    return start, stop
+
+
+def set_trim(
+    dataset: Dataset, trim: Trim, start_s: float | None, stop_s: float | None, who: str, why: str = ""
+) -> bool:
+    """Mark `kept_rows` of a recording as set by hand; returns False if that was in force already."""
+    return set_rows(dataset, trim, *kept_rows(trim, start_s, stop_s), who, why)
+
+
+def set_rows(dataset: Dataset, trim: Trim, start: int, stop: int, who: str, why: str = "") -> bool:
+    """Mark rows ``start`` to ``stop`` of a recording as set by hand; returns False if that was in force already.
+
+    Raises:
+        DatasetError: for rows that are not there, or none.
+    """
+    info = trim.recording
+    if not 0 <= start < stop <= info.rows:
+        raise DatasetError(f"'{info.id}' has rows 0 to {info.rows}: {start} to {stop} cannot be kept.")
+    if trim.state == "adjusted" and trim.current_rows() == (start, stop):
+        return False
+    end = stop if stop < info.rows else -1
+    _append(dataset, [Mark(info.id, "trim", who, why, start=start, stop=end, how=BY_HAND)])
+    return True
+
+
+def refresh_trims(dataset: Dataset, trims: Iterable[Trim]) -> list[Trim]:
+    """Return the same suggestions with the present marks."""
+    standing = read_marks(dataset.path)
+    return [replace(t, mark_state=standing.get(t.recording.id, MarkState())) for t in trims]
+
+
+def undo_trims(dataset: Dataset, recordings: Sequence[RecordingInfo], who: str, why: str = "") -> tuple[str, ...]:
+    """Undo the trim of recordings, accepted or set by hand; returns the ids of those that had one."""
+    standing = read_marks(dataset.path)
+    marked = [r.id for r in recordings if standing.get(r.id, MarkState()).trimmed]
+    _append(dataset, [Mark(identity, "untrim", who, why) for identity in marked])
+    return tuple(marked)
+
+
+def _append(dataset: Dataset, marks: list[Mark]) -> None:
+    if marks:
+        append_marks(dataset.path, marks)
+
+
+Kept = tuple[str, float | None, float | None]
+
+
+@dataclass(frozen=True)
+class TrimResult:
+    """Result of `decide_trims`: the recordings in their new state, and the ids of those that were marked."""
+
+    dataset: Dataset
+    trims: tuple[Trim, ...]
+    accepted: AcceptedTrims
+    adjusted: tuple[str, ...]
+    undone: tuple[str, ...]
+
+    @property
+    def changed(self) -> frozenset[str]:
+        """The ids of the recordings that got a mark."""
+        return frozenset((*self.accepted.marked, *self.adjusted, *self.undone))
+
+    @property
+    def states(self) -> dict[str, int]:
+        """Number of recordings in each of `STATES`."""
+        return dict(Counter(t.state for t in self.trims))
+
+
+def decide_trims(
+    dataset: Dataset | str | os.PathLike[str],
+    *,
+    only: str = "*",
+    accept: Sequence[str] = (),
+    above: float | None = None,
+    keep: Sequence[Kept] = (),
+    undo: Sequence[str] = (),
+    offset: bool = False,
+    who: str | None = None,
+    why: str = "",
+    progress: Callable[[int, int], None] | None = None,
+) -> TrimResult:
+    """Suggest trims and mark decisions, if any are given; without one nothing is marked.
+
+    Args:
+        only: an id or a pattern of the recordings to look at; by default all that no mark excludes.
+        accept: ids or patterns of those whose suggestion is taken. ``above``: the least confidence, 0 to 1; without
+            ``accept``, of all that are looked at.
+        keep: (id, from, to) in seconds, None for the edge, as set by hand.
+        undo: ids or patterns whose mark is taken back.
+        offset: whether a suggested end is taken too.
+        who: by default the login name.
+
+    Raises:
+        ConfigError: for a confidence that is none, or a ``keep`` of several recordings.
+        DatasetError: for names that are not there, and times outside a recording. Then nothing is marked.
+    """
+    if above is not None and not 0.0 <= above <= 1.0:
+        raise ConfigError(f"Accepting above {above:g}: a confidence from 0 to 1 is accepted.")
+    dataset = as_dataset(dataset)
+    chosen = dataset.used if only == "*" else find_recordings(dataset, only)
+    found = {t.recording.id: t for t in suggest_trims(dataset, chosen, progress)}
+    undone = {r.id: r for pattern in undo for r in find_recordings(dataset, pattern)}
+    by_name = {r.id: r for pattern in accept for r in find_recordings(dataset, pattern)}
+    to_keep = []
+    for identity, start_s, stop_s in keep:
+        (info, *others) = find_recordings(dataset, identity)
+        if others:
+            raise ConfigError(f"One recording is set at a time, and '{identity}' names {1 + len(others)}: give an id.")
+        to_keep.append((info, start_s, stop_s))
+    more = [r for r in [*by_name.values(), *(i for i, _, _ in to_keep)] if r.id not in found]
+    every = found | {t.recording.id: t for t in suggest_trims(dataset, more)}
+    for info, start_s, stop_s in to_keep:
+        kept_rows(every[info.id], start_s, stop_s)
+    accepting = bool(by_name) or above is not None
+    name = author_name(who) if accepting or undone or to_keep else ""
+    # All arguments are valid; from here on marks are written.
+    taken_back = undo_trims(dataset, list(undone.values()), name, why)
+    adjusted = tuple(
+        info.id for info, start_s, stop_s in to_keep if set_trim(dataset, every[info.id], start_s, stop_s, name, why)
+    )
+    accepted = AcceptedTrims()
+    if accepting:
+        again = refresh_trims(dataset, [every[identity] for identity in (by_name or found)])
+        accepted = accept_suggestions(dataset, again, name, why, above=above or 0.0, offset=offset)
+    return TrimResult(dataset, tuple(refresh_trims(dataset, found.values())), accepted, adjusted, taken_back)

@@ -1,0 +1,149 @@
+"""The network as .espdl for Espressif's ESP-DL, through esp-ppq (which needs PyTorch).
+
+ESP-DL has its own 8 bits: signed, one power of two a tensor (a filter on the P4). So this is a quantization of the
+float network by esp-ppq, not the toy's integers. Input ``scaled`` (1, C, span), output ``logits`` (1, K): the
+scaling stays with the caller, its numbers stand in the file's metadata.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import tempfile
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import BundleError, need
+from plushsense.deploy.convert.facts import LOGITS, Conversion, ConversionJob, Floats, compare, describe
+from plushsense.deploy.quantize import Ranges, folded, refuse_undeployable
+from plushsense.models.bundle import Bundle
+
+SCALED = "scaled"
+MAGIC = b"EDL2"
+HEAD_BYTES = 16
+_MOST = 128  # windows: esp-ppq simulates a few dozen a second
+
+
+def plain_model(bundle: Bundle) -> Any:
+    """Return the folded network as an ONNX model for esp-ppq: only Conv, Relu, GlobalAveragePool, Flatten and Gemm."""
+    onnx, arch = need("onnx", "espdl"), bundle.arch
+    make, real = onnx.helper.make_node, onnx.TensorProto.FLOAT
+    nodes, constants, z = [], [], SCALED
+    # Filters keep their own sizes: made even by their ranges they agreed less with the floats on the S3.
+    *convolutions, dense = [tuple(v.astype(np.float32) for v in part) for part in folded(arch, bundle.weights)]
+    for i, (layer, (w, b)) in enumerate(zip(arch.layers, convolutions, strict=True)):
+        constants += [onnx.numpy_helper.from_array(w, f"w{i}"), onnx.numpy_helper.from_array(b, f"b{i}")]
+        nodes += [
+            make(
+                "Conv",
+                [z, f"w{i}", f"b{i}"],
+                [f"conv{i}"],
+                name=f"conv{i}",
+                kernel_shape=[layer.kernel],
+                dilations=[layer.dilation],
+                pads=[0, 0],
+                strides=[1],
+                group=1,
+            ),
+            make("Relu", [f"conv{i}"], [f"relu{i}"], name=f"relu{i}"),
+        ]
+        z = f"relu{i}"
+    constants += [onnx.numpy_helper.from_array(v, n) for v, n in zip(dense, ("w", "b"), strict=True)]
+    nodes += [
+        make("GlobalAveragePool", [z], ["mean"], name="mean"),
+        make("Flatten", ["mean"], ["pooled"], name="pooled", axis=1),
+        make("Gemm", ["pooled", "w", "b"], [LOGITS], name="dense", transB=1),
+    ]
+    graph = onnx.helper.make_graph(
+        nodes,
+        "plushsense",
+        [onnx.helper.make_tensor_value_info(SCALED, real, [1, arch.channels, arch.span])],
+        [onnx.helper.make_tensor_value_info(LOGITS, real, [1, arch.classes])],
+        constants,
+    )
+    model = onnx.helper.make_model(graph, ir_version=9, opset_imports=[onnx.helper.make_opsetid("", 18)])
+    onnx.checker.check_model(model, full_check=True)
+    return model
+
+
+def to_espdl(job: ConversionJob, target: str = "esp32s3") -> Conversion:
+    """Convert the network for ``target`` (esp32, esp32s3, esp32c3, esp32p4 …); each has its own weight layout.
+
+    The file holds one made-up window and its answer, with which ESP-DL's ``model->test()`` tries it on the chip.
+    """
+    bundle = job.bundle
+    refuse_undeployable(bundle.arch)
+    job = job.thinned(_MOST)
+    scaled = bundle.scaler.apply(job.windows)
+    some = scaled[: job.given or None]
+    if not job.given and bundle.calibration:
+        ranges = Ranges.from_dict(bundle.calibration)
+        some = np.clip(some, ranges.low[:, None], ranges.high[:, None]).astype(np.float32)
+    model = plain_model(bundle)
+    facts = describe(bundle) | {"input": f"'{SCALED}': (value - offset) * scale a channel, (1, C, span)"}
+    facts |= {k: json.dumps(v) for k, v in bundle.scaler.to_dict().items()}
+    data, logits = _quantized(bundle, model, some, scaled, target, facts)
+    largest, sentence = compare(logits, job, "ESP-DL", exact=False)
+    whose = (
+        f"{len(some)} given windows" if job.given else "made-up windows only, so give windows of the training people"
+    )
+    return Conversion(
+        data,
+        largest,
+        (
+            f"For {target}, quantized by esp-ppq with ranges from {whose}; compared in esp-ppq's simulation with the "
+            "float network, not run on a chip.",
+            sentence,
+        ),
+    )
+
+
+def _quantized(
+    bundle: Bundle, model: Any, some: Floats, scaled: Floats, target: str, facts: dict[str, str]
+) -> tuple[bytes, NDArray[np.float32]]:
+    """Return the bytes of the file and the logits (N, K) of esp-ppq's simulation."""
+    torch = need("torch", "espdl")
+    output = io.StringIO()
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        contextlib.redirect_stdout(output),
+        contextlib.redirect_stderr(output),
+        warnings.catch_warnings(),
+    ):
+        warnings.simplefilter("ignore")
+        ppq, executor = need("esp_ppq.api", "espdl"), need("esp_ppq.executor", "espdl")
+        source, out = Path(folder, "model.onnx"), Path(folder, "model.espdl")
+        source.write_bytes(model.SerializeToString())
+        windows = [torch.from_numpy(np.ascontiguousarray(w[None])) for w in scaled]
+        graph = ppq.espdl_quantize_onnx(
+            str(source),
+            str(out),
+            [torch.from_numpy(np.ascontiguousarray(w[None])) for w in some],
+            len(some),
+            list(windows[0].shape),
+            inputs=[windows[-1]],
+            target=target,
+            quant_type="w8a8",
+            error_report=False,
+            export_config=False,
+            export_test_values=True,
+            verbose=0,
+            metadata_props=facts,
+        )
+        run = executor.TorchExecutor(graph, device="cpu")
+        logits = np.concatenate([run(w)[0].numpy() for w in windows])
+        data = out.read_bytes()
+    held = need("esp_ppq.parser.espdl.FlatBuffers.Dl.Model", "espdl")
+    kinds = [] if data[:4] != MAGIC else _kinds(held.Model.GetRootAs(data, HEAD_BYTES).Graph())
+    if kinds.count("Conv") != len(bundle.arch.layers):
+        raise BundleError(f"esp-ppq wrote no usable .espdl file ({len(data)} bytes, operators {kinds}): report this.")
+    return data, logits
+
+
+def _kinds(graph: Any) -> list[str]:
+    return [graph.Node(i).OpType().decode() for i in range(graph.NodeLength())]

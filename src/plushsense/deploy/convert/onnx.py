@@ -1,0 +1,206 @@
+"""The network as ONNX, written node by node: in floats, and in integers with QuantizeLinear (QDQ).
+
+Both read ``raw`` (N, C, span) float32, whole numbers as the toy measures them, and give ``logits`` and
+``probabilities`` (N, K). Operators of opset 18, IR version 9.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import need
+from plushsense.deploy.convert.facts import (
+    LIMIT,
+    LOGITS,
+    NOT_EXACT,
+    PROBABILITIES,
+    RAW,
+    Conversion,
+    ConversionJob,
+    Floats,
+    compare,
+    describe,
+    input_codes,
+    scaling,
+    sum_scales,
+)
+from plushsense.deploy.quantize import integer_network
+from plushsense.models.arch import NORM_EPSILON, Arch, ConvLayer, reflected
+from plushsense.models.bundle import Bundle
+from plushsense.runtime.integer import IntegerNetwork
+
+OPSET = 18
+IR_VERSION = 9
+
+
+class _OnnxGraph:
+    """Nodes in the order in which they are added; each has one output, whose name is the node's."""
+
+    def __init__(self) -> None:
+        self.onnx = need("onnx", "onnx")
+        self.nodes: list[Any] = []
+        self.constants: list[Any] = []
+
+    def constant(self, name: str, values: NDArray[Any]) -> str:
+        self.constants.append(self.onnx.numpy_helper.from_array(np.ascontiguousarray(values), name))
+        return name
+
+    def add(self, kind: str, out: str, *read: str, **settings: Any) -> str:
+        self.nodes.append(self.onnx.helper.make_node(kind, list(read), [out], name=out, **settings))
+        return out
+
+    def columns(self, name: str, values: Floats) -> str:
+        """Add a constant with one value a channel, shaped for windows (N, C, T)."""
+        return self.constant(name, values[:, None])
+
+    def model(self, bundle: Bundle) -> bytes:
+        """Return the checked graph from RAW to PROBABILITIES as bytes."""
+        onnx, arch = self.onnx, bundle.arch
+        real = onnx.TensorProto.FLOAT
+        graph = onnx.helper.make_graph(
+            self.nodes,
+            "plushsense",
+            [onnx.helper.make_tensor_value_info(RAW, real, ["N", arch.channels, arch.span])],
+            [onnx.helper.make_tensor_value_info(n, real, ["N", arch.classes]) for n in (LOGITS, PROBABILITIES)],
+            self.constants,
+        )
+        model = onnx.helper.make_model(
+            graph,
+            producer_name="plushsense",
+            ir_version=IR_VERSION,
+            opset_imports=[onnx.helper.make_opsetid("", OPSET)],
+            doc_string=f"Touch gestures, {arch.title}",
+        )
+        onnx.helper.set_model_props(model, describe(bundle))
+        onnx.checker.check_model(model, full_check=True)
+        return bytes(model.SerializeToString(deterministic=True))
+
+
+def float_model(bundle: Bundle, scaled: bool = False) -> bytes:
+    """Return the float network as ONNX; with ``scaled`` its input is already scaled."""
+    g, arch = _OnnxGraph(), bundle.arch
+    z = RAW
+    if not scaled:
+        whole, scale, rest = scaling(bundle.scaler)
+        z = g.add("Sub", "shifted", z, g.columns("scaler.offset", whole))
+        z = g.add("Mul", "sized", z, g.columns("scaler.scale", scale))
+        z = g.add("Add", "scaled", z, g.columns("scaler.rest", rest))
+    for i, layer in enumerate(arch.layers):
+        z, pads = _padding(g, i, arch, layer, z)
+        w, b = (g.constant(n, bundle.weights[n]) for n in (f"conv{i}.weight", f"conv{i}.bias"))
+        z = g.add("Conv", f"conv{i}", z, w, b, dilations=[layer.dilation], kernel_shape=[layer.kernel], pads=pads)
+        z = g.add("Relu", f"relu{i}", z)
+        gain, shift = (g.constant(n, bundle.weights[n]) for n in (f"norm{i}.gain", f"norm{i}.shift"))
+        if arch.norm == "batch":
+            mean, var = (g.constant(n, bundle.weights[n]) for n in (f"norm{i}.mean", f"norm{i}.var"))
+            z = g.add("BatchNormalization", f"norm{i}", z, gain, shift, mean, var, epsilon=NORM_EPSILON)
+        else:
+            z = g.add("Transpose", f"norm{i}.rows", z, perm=[0, 2, 1])
+            z = g.add("LayerNormalization", f"norm{i}.normed", z, gain, shift, axis=-1, epsilon=NORM_EPSILON)
+            z = g.add("Transpose", f"norm{i}", z, perm=[0, 2, 1])
+    z = _mean(g, z)
+    w, b = (g.constant(n, bundle.weights[n]) for n in ("dense.weight", "dense.bias"))
+    g.add("Gemm", LOGITS, z, w, b, transB=1)
+    g.add("Softmax", PROBABILITIES, LOGITS, axis=-1)
+    return g.model(bundle)
+
+
+def _padding(g: _OnnxGraph, i: int, arch: Arch, layer: ConvLayer, z: str) -> tuple[str, list[int]]:
+    if arch.padding == "stream" or not layer.reach:
+        return z, [0, 0]
+    if arch.padding == "causal":
+        return z, [layer.reach, 0]
+    if layer.reach < arch.window:
+        pads = np.array([0, 0, layer.reach, 0, 0, 0], dtype=np.int64)
+        return g.add("Pad", f"mirror{i}", z, g.constant(f"mirror{i}.pads", pads), mode="reflect"), [0, 0]
+    # More than one reflection, which Pad does not do.
+    places = reflected(arch.window, layer.reach).astype(np.int64)
+    return g.add("Gather", f"mirror{i}", z, g.constant(f"mirror{i}.places", places), axis=2), [0, 0]
+
+
+def _mean(g: _OnnxGraph, z: str) -> str:
+    return g.add("ReduceMean", "pooled", z, g.constant("time", np.array([2], dtype=np.int64)), keepdims=0)
+
+
+def integer_model(bundle: Bundle, network: IntegerNetwork) -> bytes:
+    """Return the integer network as ONNX with QuantizeLinear and DequantizeLinear.
+
+    Activations keep the codes of `IntegerNetwork` (uint8, scale 1): a filter's own scale stands with its int8
+    weights. Means over time and the dense layer are in floats, on weights that are int8.
+    """
+    g, arch = _OnnxGraph(), network.arch
+    one = g.constant("code.scale", np.array(1, dtype=np.float32))
+    zero = g.constant("code.zero", np.array(0, dtype=np.uint8))
+
+    def codes(z: str, name: str) -> str:
+        return g.add(
+            "DequantizeLinear", f"{name}.read", g.add("QuantizeLinear", f"{name}.codes", z, one, zero), one, zero
+        )
+
+    def parted(name: str, whole: NDArray[Any], scales: NDArray[np.float64]) -> str:
+        scale = g.constant(f"{name}.scale", scales.astype(np.float32))
+        none = g.constant(f"{name}.zero", np.zeros(len(scales), dtype=whole.dtype))
+        return g.add("DequantizeLinear", f"{name}.real", g.constant(name, whole), scale, none, axis=0)
+
+    offset, gain, start = input_codes(network)
+    z = g.add("Sub", "shifted", RAW, g.columns("input.offset", offset))
+    z = g.add("Mul", "sized", z, g.columns("input.gain", gain))
+    z = codes(g.add("Add", "scaled", z, g.columns("input.start", start)), "input")
+    for i, (layer, part) in enumerate(zip(arch.layers, network.layers, strict=True)):
+        sizes = sum_scales(part.scale.multiplier, part.scale.before, part.scale.after)
+        w, b = (
+            parted(f"conv{i}.weight", part.weights, sizes),
+            parted(f"conv{i}.bias", part.bias.astype(np.int32), sizes),
+        )
+        z = g.add("Conv", f"conv{i}", z, w, b, dilations=[layer.dilation], kernel_shape=[layer.kernel])
+        z = codes(g.add("Relu", f"relu{i}", z), f"layer{i}")
+    z = _mean(g, z)
+    dense = network.dense
+    sizes = sum_scales(dense.scale.multiplier, dense.scale.before, dense.scale.after) / 256
+    w = parted("dense.weight", dense.weights, sizes * arch.pooled)
+    z = g.add("Gemm", "dense", z, w, g.constant("dense.bias", (dense.bias * sizes).astype(np.float32)), transB=1)
+    low, high = (
+        g.constant(f"logits.{n}", np.array(v, dtype=np.float32)) for n, v in (("low", -LIMIT), ("high", LIMIT))
+    )
+    g.add("Clip", LOGITS, z, low, high)
+    g.add("Softmax", PROBABILITIES, LOGITS, axis=-1)
+    return g.model(bundle)
+
+
+def answers(model: bytes, windows: NDArray[Any]) -> NDArray[np.float32] | None:
+    """Return the logits (N, K) of raw windows in onnxruntime; None where it is not installed."""
+    if importlib.util.find_spec("onnxruntime") is None:
+        return None
+    ort = need("onnxruntime", "onnx")
+    settings = ort.SessionOptions()
+    settings.intra_op_num_threads = 1
+    settings.log_severity_level = 3
+    # Processors without VNNI add products of 8 bits in 16 bits, which overflows, unless precision is asked for.
+    settings.add_session_config_entry("session.x64quantprecision", "1")
+    session = ort.InferenceSession(model, settings, providers=["CPUExecutionProvider"])
+    return np.asarray(session.run([LOGITS], {RAW: windows.astype(np.float32)})[0])
+
+
+_UNCHECKED = "Not tried: run  pip install 'plushsense[onnx]'  to have it compared in onnxruntime."
+
+
+def to_onnx(job: ConversionJob) -> Conversion:
+    """Convert the float network."""
+    model = float_model(job.bundle)
+    logits = answers(model, job.windows)
+    largest, sentence = (None, _UNCHECKED) if logits is None else compare(logits, job, "ONNX")
+    return Conversion(model, largest, (sentence, f"Input '{RAW}' (N, {job.bundle.arch.channels}, span)."))
+
+
+def to_integer_onnx(job: ConversionJob) -> Conversion:
+    """Convert the integer network; close to the exported C, not equal in every bit."""
+    network = integer_network(job.bundle)
+    model = integer_model(job.bundle, network)
+    logits = answers(model, job.windows)
+    expected = network.forward(job.windows) / 256
+    largest, sentence = (None, _UNCHECKED) if logits is None else compare(logits, job, "ONNX", expected, exact=False)
+    return Conversion(model, largest, (sentence, NOT_EXACT))

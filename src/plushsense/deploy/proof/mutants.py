@@ -1,0 +1,174 @@
+"""Mutants: deliberate errors, applied one at a time, each of which `plushsense verify` has to detect.
+
+A mutant changes a number in the model's bytes (a weight, a shift, a range; with a new checksum), or replaces a text in
+``plushsense.c`` (an index, a rounding, a clamp). The texts are in ``mutants.toml``.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import BadInput
+from plushsense.core.toml import load_table, read_toml
+from plushsense.runtime.fixed import PROBABILITY_BITS
+from plushsense.runtime.image import GROUP, HEAD_BYTES, image_head
+
+Kind = Literal["weight", "shift", "index", "rounding", "clamp", "rule", "constant", "event", "gate", "health"]
+RULES: tuple[Kind, ...] = ("event", "gate", "health")  # what the test scenarios are for
+
+
+@dataclass(frozen=True)
+class SourceMutant:
+    """A replacement of text in plushsense.c; ``name`` says what breaks, ``when`` which models can show it."""
+
+    kind: Kind
+    name: str
+    find: str
+    replace: str
+    when: Literal["always", "dilated", "magnitude", "ranged", "smoothed", "stepped", "ties"] = "always"
+
+
+@dataclass(frozen=True)
+class _MutantFile:
+    mutants: tuple[SourceMutant, ...]
+
+
+@cache
+def source_mutants() -> tuple[SourceMutant, ...]:
+    """Read the mutants of plushsense.c from ``mutants.toml``."""
+    path = Path(__file__).with_name("mutants.toml")
+    return load_table(read_toml(path, "mutants", BadInput), _MutantFile, path.name, BadInput).mutants
+
+
+_FIXED_BYTES, _SCALE_BYTES = 28, 8
+_GAP_AT, _SMOOTHING_AT = 16, 24
+_INT32 = (1 << 31) - 1
+_MOST_SHIFT = 30
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One mutant: the changed bytes of the model, or the changed C; the other is None."""
+
+    kind: Kind
+    name: str
+    image: bytes | None = None
+    source: str | None = None
+
+
+def mutants_of(image: bytes, source: str) -> list[Mutant]:
+    """Return the mutants of the image and of ``plushsense.c`` that this model can show.
+
+    Raises:
+        BadInput: when a text to replace does not occur in the C exactly once.
+    """
+    at = _ImageOffsets(image)
+    found = []
+    for n, layer in enumerate([*at.layers, at.dense], 1):
+        what = f"layer {n}" if layer is not at.dense else "the dense layer"
+        weight, filter_ = layer.largest_weight()
+        found.append(_in_image("weight", f"one weight of {what} by one", image, weight, "B"))
+        shift = layer.scales_at + _SCALE_BYTES * filter_ + 7
+        found.append(_in_image("shift", f"one shift of {what} by one", image, shift, "B", _MOST_SHIFT))
+    found.append(_in_image("shift", "one input's shift by one", image, at.inputs[0] + 11, "B", _MOST_SHIFT))
+    found.append(_in_image("constant", "the longest gap by one", image, HEAD_BYTES + _GAP_AT, "I", by=at.units_per_ms))
+    where = HEAD_BYTES + _SMOOTHING_AT
+    found.append(_in_image("constant", "the smoothing's weight by one", image, where, "H", 1 << PROBABILITY_BITS))
+    ranged = [n for n, (_, high) in enumerate(at.ranges) if high < _INT32]
+    for n in ranged[:1]:
+        where = HEAD_BYTES + _FIXED_BYTES + 8 * n + 4
+        found.append(_in_image("constant", f"the valid range of channel {n + 1} by one", image, where, "i"))
+    shows = {
+        "always": True,
+        "dilated": any(layer.dilation > 1 for layer in at.layers),
+        "magnitude": at.magnitudes,
+        "ranged": bool(ranged),
+        # With a step of one sample there is no phase.
+        "stepped": at.step > 1,
+        # Without smoothing nothing is rounded.
+        "smoothed": at.smoothing < 1 << PROBABILITY_BITS,
+        # With fine time units ties are rare.
+        "ties": at.units_per_ms <= 10,
+    }
+    for each in source_mutants():
+        if source.count(each.find) != 1:
+            raise BadInput(
+                f"The mutant '{each.name}' cannot be applied: its text ({each.find.strip()!r}) occurs "
+                f"{source.count(each.find)} times in plushsense.c, and not once; export the model again with this "
+                "PlushSense, or undo your changes to that file."
+            )
+        if shows[each.when]:
+            found.append(Mutant(each.kind, each.name, source=source.replace(each.find, each.replace)))
+    return found
+
+
+def _in_image(kind: Kind, name: str, image: bytes, at: int, form: str, most: int | None = None, by: int = 1) -> Mutant:
+    """Return the image with the number at an offset one greater (smaller at its maximum) and a valid checksum."""
+    most = most if most is not None else (1 << (8 * struct.calcsize(form) - form.islower())) - 1
+    (value,) = struct.unpack_from("<" + form, image, at)
+    changed = bytearray(image)
+    struct.pack_into("<" + form, changed, at, value + by if value + by <= most else value - by)
+    body = bytes(changed[HEAD_BYTES:])
+    return Mutant(kind, name, image=image_head(body) + body)
+
+
+@dataclass(frozen=True, eq=False)
+class _LayerOffsets:
+    """Offsets of a layer's scales and weights in the image; ``index`` (F, C, K) has those of the ``weights``."""
+
+    dilation: int
+    scales_at: int
+    weights: NDArray[np.int64]
+    index: NDArray[np.int64]
+    after: list[_LayerOffsets]
+
+    def largest_weight(self) -> tuple[int, int]:
+        """Return the offset of the most influential weight, and its filter: a dead filter would hide any mutant."""
+        f = np.abs(self.after[0].weights).sum(axis=(0, 2)) if self.after else np.abs(self.weights).sum(axis=(1, 2))
+        filter_ = int(f[: len(self.weights)].argmax())
+        own = int(np.abs(self.weights[filter_]).argmax())
+        return int(self.index[filter_].flat[own]), filter_
+
+
+class _ImageOffsets:
+    """Offsets in an image, whose format is that of `plushsense.runtime.image`."""
+
+    def __init__(self, image: bytes) -> None:
+        count, channels, inputs, classes, self.step = struct.unpack_from("<BBBBH", image, HEAD_BYTES)
+        (self.units_per_ms,) = struct.unpack_from("<I", image, HEAD_BYTES + 20)
+        (self.smoothing,) = struct.unpack_from("<H", image, HEAD_BYTES + _SMOOTHING_AT)
+        at = HEAD_BYTES + _FIXED_BYTES
+        self.ranges = [struct.unpack_from("<ii", image, at + 8 * i) for i in range(channels)]
+        at += 8 * channels
+        self.inputs: list[int] = []
+        self.magnitudes = False
+        for _ in range(inputs):
+            self.magnitudes |= image[at] == 1
+            self.inputs.append(at + 2 + image[at + 1])
+            at = self.inputs[-1] + 12
+        self.layers: list[_LayerOffsets] = []
+        stored = np.frombuffer(image, dtype=np.uint8).astype(np.int64) - 128
+        filters = 0
+        for _ in range(count):
+            kernel, dilation, read, filters = struct.unpack_from("<HHHH", image, at)
+            scales = at + 8
+            at = scales + _SCALE_BYTES * filters
+            shape = (-(-filters // GROUP), kernel, -(-read // GROUP), GROUP, GROUP)
+            index = at + np.arange(np.prod(shape)).reshape(shape)
+            index = index.transpose(0, 3, 2, 4, 1).reshape(shape[0] * GROUP, shape[2] * GROUP, kernel)
+            index = index[:filters, :read]
+            self.layers.append(_LayerOffsets(dilation, scales, stored[index], index, []))
+            at += int(np.prod(shape))
+        scales = at
+        at += _SCALE_BYTES * classes
+        index = at + np.arange(classes * filters).reshape(classes, filters, 1)
+        self.dense = _LayerOffsets(1, scales, stored[index], index, [])
+        for one, other in zip(self.layers, [*self.layers[1:], self.dense], strict=True):
+            one.after.append(other)

@@ -1,0 +1,311 @@
+"""Test scenarios: an export's network with other decision rules, so that every line of the rules in its C is run.
+
+The rules of a trained model rarely fire, and on generated frames maybe never: a wrong line would pass unnoticed. A
+scenario keeps the layers and inputs, but shifts and scales the logits so that every class is the best at some time,
+assigns other idle classes and affects, and derives the thresholds of health, gate and events from the frames.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import BundleError
+from plushsense.core.gestures import Gesture, GestureSet
+from plushsense.core.recorder_csv import Frames
+from plushsense.deploy.golden import (
+    ANSWER,
+    COLUMNS,
+    EVENT,
+    HEAD,
+    HEALTH,
+    TRACKING,
+    FrameGenerator,
+    Ints,
+    answers_of,
+    column,
+    measured,
+)
+from plushsense.runtime.decisions import Rules
+from plushsense.runtime.events import ANSWERS, BEGUN, ENDED, GATE, KINDS, NO_GESTURE, ONE, SOURCES, EventSettings
+from plushsense.runtime.fixed import LOGIT_LIMIT, PROBABILITY_BITS, LogitScale, split_ratio
+from plushsense.runtime.gate import JERK, LEVEL, Gate, GateSettings, Rule, Signal, Term
+from plushsense.runtime.health import HealthSettings
+from plushsense.runtime.image import IntegerModel
+from plushsense.runtime.integer import IntegerDense
+from plushsense.windows.clock import resample
+from plushsense.windows.features import Scaler, network_inputs
+
+_SPREAD = 450  # of a logit over the frames, in steps of 1/256
+_INSIDE = 8  # of a valid range, at each end: room for a sensor to be stuck there
+_AFFECTS: tuple[tuple[str, bool], ...] = (
+    ("positive", False),
+    ("neutral", True),
+    ("negative", False),
+    ("none", False),
+    ("neutral", False),
+)
+
+
+@dataclass(frozen=True)
+class _ScenarioSettings:
+    """Settings of a scenario.
+
+    ``gate``: whether there is one; ``often``: whether it fires often. ``near``: the leave share is that of entering, so
+    that events end; otherwise it is far lower, so that other events replace them.
+    """
+
+    gate: bool
+    often: bool
+    near: bool
+    end: tuple[int, int]
+    hold: tuple[int, int]
+    smoothing: int
+
+
+SCENARIO_SETTINGS = (
+    _ScenarioSettings(True, False, True, (1, 2), (5, 9), 12_000),
+    _ScenarioSettings(True, True, False, (3, 4), (1, 4), 6000),
+    _ScenarioSettings(False, False, True, (3, 3), (0, 2), 1 << PROBABILITY_BITS),
+    _ScenarioSettings(False, False, False, (4, 8), (1, 4), 16_000),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Scenario:
+    """A model, generated frames (n, 1 + C), frames before a silence, and the expected rows (m, 12 + 2 K)."""
+
+    model: IntegerModel
+    frames: Ints
+    silences: tuple[int, ...]
+    rows: NDArray[np.int32]
+
+
+def scenarios_of(model: IntegerModel, scaler: Scaler, repeat: int = 0) -> list[Scenario]:
+    """Return one scenario of each `SCENARIO_SETTINGS` for a model; deterministic, different for each ``repeat``."""
+    return [
+        _scenario(replace(model, rules=Rules(), gestures=_gestures(model, settings)), scaler, settings, seed)
+        for seed, settings in enumerate(SCENARIO_SETTINGS, 1 + repeat * len(SCENARIO_SETTINGS))
+    ]
+
+
+def all_outcomes() -> set[str]:
+    """Return the outcomes that scenarios should cover; a network with few classes may not reach all."""
+    events = {f"{what} by {source}" for what in KINDS.values() for source in SOURCES}
+    ends = {"lost in silence", "lost in a gap", "lost in a fault", "replaced", "replaced by the gate"}
+    health = {"fault", "recovery", "suspect only"}
+    return events | ends | health | set(ANSWERS) | {"gate while warming", "unnamed", "without affect", "resting"}
+
+
+def covered(scenario: Scenario) -> set[str]:
+    """Return those of `all_outcomes` that a scenario covers."""
+    rows, found = scenario.rows.astype(np.int64), set()
+    answered = column(rows, "answer")[column(rows, "state") == TRACKING]
+    found |= {ANSWERS[k] for k in set(answered.tolist())}
+    at = {name: n for n, name in enumerate(COLUMNS[EVENT])}
+    state, warm, ended = COLUMNS[ANSWER].index("state"), False, None
+    frame = COLUMNS[ANSWER].index("frame")
+    for n, row in enumerate(rows.tolist()):
+        after = rows[n + 1].tolist() if n + 1 < len(rows) else None
+        if row[0] == ANSWER:
+            warm = row[state] == TRACKING
+        elif row[0] == HEALTH:
+            fault, suspect = row[state] == 2, row[5]
+            found.add("fault" if fault else "suspect only" if suspect else "recovery")
+        else:
+            what, source = row[at["what"]], row[at["source"]]
+            found.add(f"{KINDS[what]} by {SOURCES[source]}")
+            if what == BEGUN:
+                if source == GATE and not warm:
+                    found.add("gate while warming")
+                if row[at["gesture"]] == NO_GESTURE:
+                    found.add("unnamed")
+                if row[at["affect"]] == 0:
+                    found.add("without affect")
+                if ended is not None and row[at["ms"]] - ended > 0:
+                    found.add("resting")
+            if what == ENDED:
+                ended = row[at["ms"]]
+                if (
+                    after is not None
+                    and after[0] == EVENT
+                    and after[at["what"]] == BEGUN
+                    and after[frame] == row[frame]
+                ):
+                    found.add("replaced by the gate" if after[at["source"]] == GATE else "replaced")
+                elif after is not None and after[0] == HEALTH and after[frame] == row[frame] and after[state] == 2:
+                    found.add("lost in a fault")
+                elif row[frame] in scenario.silences and row[at["since"]] == row[at["ms"]]:
+                    found.add("lost in silence")
+                elif after is not None and after[HEAD - 2] > row[HEAD - 2]:
+                    found.add("lost in a gap")
+    return found
+
+
+def _scenario(plain: IntegerModel, scaler: Scaler, settings: _ScenarioSettings, seed: int) -> Scenario:
+    rng = np.random.default_rng(seed)
+    health = _health(plain, scaler, rng)
+    frames, silences = (_troubled if settings.gate else _calm)(plain, scaler, health, rng)
+    level = _NormalizedModel(plain, _logits(answers_of(plain, frames)))
+    gate = _gate(plain, frames, settings.often, rng) if settings.gate else GateSettings()
+    rules = Rules(_events(level, settings, rng), gate, health)
+    model = replace(level.model, smoothing=settings.smoothing, rules=rules)
+    return Scenario(model, frames, silences, answers_of(model, frames, silences))
+
+
+def _logits(rows: NDArray[np.int32]) -> NDArray[np.float64]:
+    """Return the logits (n, K) of the answers after the warm-up."""
+    classes = (rows.shape[1] - HEAD) // 2
+    tracking = (rows[:, 0] == ANSWER) & (rows[:, COLUMNS[ANSWER].index("state")] == TRACKING)
+    return rows[tracking, HEAD : HEAD + classes].astype(np.float64)
+
+
+def _gestures(model: IntegerModel, settings: _ScenarioSettings) -> GestureSet:
+    # Where events replace each other, mostly by one of the same affect.
+    more = (0, 2, 4, 0, 2, 1) if settings.near else (0, 0, 0, 2, 0, 1)
+    affects = [_AFFECTS[k if k < 5 else more[k % 6]] for k in range(len(model.gestures))]
+    gestures = tuple(
+        Gesture(g.label, affect, idle=idle) for g, (affect, idle) in zip(model.gestures.gestures, affects, strict=True)
+    )
+    return GestureSet(model.gestures.name, gestures)
+
+
+class _NormalizedModel:
+    """A model with a new last layer, whose logits (n, K) all have mean 0 and the same spread.
+
+    ``shares`` (n,) are those of the best class, ``known`` (n,) the highest logits.
+    """
+
+    def __init__(self, model: IntegerModel, logits: NDArray[np.float64]) -> None:
+        dense = model.network.dense
+        mean, spread = logits.mean(axis=0), np.maximum(logits.std(axis=0), 1.0)
+        gain = np.clip(_SPREAD / spread, 1 / 64, 64)
+        bias, rows = dense.bias.copy(), []
+        for k in range(len(gain)):
+            before, multiplier, after = (int(getattr(dense.scale, n)[k]) for n in ("before", "multiplier", "after"))
+            ratio = max(multiplier, 1) / 2.0 ** (before + after)
+            bias[k] -= round(float(mean[k]) / ratio)
+            rows.append(split_ratio(ratio * gain[k], 2 * LOGIT_LIMIT / (ratio * gain[k])))
+        try:
+            level = IntegerDense(dense.weights, bias, LogitScale(*np.array(rows, dtype=np.int64).T))
+            self.model = replace(model, network=replace(model.network, dense=level))
+            logits = (logits - mean) * gain
+        except BundleError:  # a sum could leave 32 bits
+            self.model = model
+        logits = np.clip(logits, -LOGIT_LIMIT, LOGIT_LIMIT)
+        self.known = logits.max(axis=1)
+        self.shares = ONE / np.exp((logits - self.known[:, None]) / 256).sum(axis=1)
+
+
+def _events(level: _NormalizedModel, settings: _ScenarioSettings, rng: np.random.Generator) -> EventSettings:
+    def share(low: float, high: float) -> int:
+        """Return a random quantile of the shares."""
+        return int(np.quantile(level.shares, rng.uniform(low, high)))
+
+    def steps(low: int, high: int) -> int:
+        return int(rng.integers(low, high + 1))
+
+    enter = share(0.35, 0.6)
+    return EventSettings(
+        enter=enter,
+        leave=enter if settings.near else share(0.0, 0.05) // 2,
+        enter_affect=share(0.4, 0.7),
+        leave_affect=share(0.1, 0.4),
+        sure=int(rng.integers(ONE // 8, ONE // 3)),
+        known=int(np.quantile(level.known, 0.12)),
+        least=steps(2, 3),
+        switch=steps(2, 4),
+        end=steps(*settings.end),
+        hold=steps(*settings.hold),
+        rest=steps(1, 4),
+        wait=steps(2, 6),
+    )
+
+
+def _health(model: IntegerModel, scaler: Scaler, rng: np.random.Generator) -> HealthSettings:
+    """Return limits about six spreads from the mean, inside the valid range, so that its ends lie beyond them."""
+    layout = model.layout
+    mean, spread = measured(layout, scaler)
+    inside = np.minimum(_INSIDE, (layout.valid_max_int - layout.valid_min_int) // 2)
+    ends = layout.valid_min_int + inside, layout.valid_max_int - inside
+    low, high = (np.clip(np.rint(mean + way * spread), *ends).astype(np.int64) for way in (-6, 6))
+    times = {name: int(rng.integers(80, 260)) for name in ("fault_ms", "still_ms", "recover_ms")}
+    return HealthSettings(tuple(low.tolist()), tuple(high.tolist()), **times)
+
+
+def _troubled(
+    model: IntegerModel, scaler: Scaler, health: HealthSettings, rng: np.random.Generator
+) -> tuple[Ints, tuple[int, ...]]:
+    """Generate frames with impacts and failing sensors, also during warm-up, and the silences."""
+    layout, span = model.layout, model.network.arch.span
+    generator, silences = FrameGenerator(layout, scaler, rng), []
+    part = span + 400
+    generator.touches(part, blows=0.02, garbage=0.05 / len(generator.mean))
+    for _ in range(4):
+        generator.touches(int(rng.integers(20, 60)), blows=0.05)
+        silences.append(len(generator.rows) - 1)
+    generator.touches(200, lost=0.03, blows=0.02)
+    for n in range(40):
+        generator.touches(7)
+        generator.frozen(4)
+        if n % 2:  # otherwise the gate only prolongs its event
+            silences.append(len(generator.rows) - 1)
+    for _ in range(3):
+        generator.touches(30, blows=0.2)
+        generator.wait(layout.gap_ms + 1)
+    generator.touches(part, blows=0.03)
+    generator.troubles(health, span + 250)
+    generator.now = 7
+    generator.touches(part, garbage=0.15 / len(generator.mean), blows=0.02)
+    return np.array(generator.rows, dtype=np.int64), tuple(silences)
+
+
+def _calm(
+    model: IntegerModel, scaler: Scaler, health: HealthSettings, rng: np.random.Generator
+) -> tuple[Ints, tuple[int, ...]]:
+    """Generate frames with long touches, some suspect frames, and the silences."""
+    generator, silences = FrameGenerator(model.layout, scaler, rng), []
+    generator.touches(model.network.arch.span)
+    for n in range(24):
+        generator.touches(170, garbage=(0.08 if n % 2 else 0.01) / len(generator.mean))
+        silences.append(len(generator.rows) - 1)
+    return np.array(generator.rows, dtype=np.int64), tuple(silences)
+
+
+def _gate(model: IntegerModel, frames: Ints, often: bool, rng: np.random.Generator) -> GateSettings:
+    """Return signals of every kind with thresholds that the frames exceed sometimes, or ``often``."""
+    arch, layout = model.network.arch, model.layout
+    segments = [network_inputs(s.data, layout) for s in resample(Frames(frames[:, 1:], frames[:, 0]), layout) if len(s)]
+    rows = max(segments, key=len)
+    reach = int(np.abs(rows).max()).bit_length()
+
+    def some(n: int) -> tuple[int, ...]:
+        return tuple(int(i) for i in rng.integers(0, arch.channels, n))
+
+    several, lag = some(min(3, arch.channels)), int(rng.integers(2, 5))
+    signals = (
+        Signal(JERK, several, lag=lag, shift=max(0, reach - 18), baseline=3, noise=4, floor=2),
+        Signal(JERK, some(2), lag=1, shift=max(0, reach - 12), baseline=6, noise=6, floor=1),
+        Signal(LEVEL, some(1), shift=max(0, reach - 20), baseline=5, noise=5, floor=3),
+        Signal(LEVEL, some(1), shift=max(0, reach - 8), baseline=2, noise=7, floor=4),
+    )
+    loud = Rule((Term(0, 1 << 25),), 0, NO_GESTURE)
+    gate = Gate(GateSettings(signals, (loud,)))
+    sizes = np.array([(gate.push(row), list(gate.sizes))[1] for row in rows.tolist()])
+
+    def term(signal: int, quantile: float, sign: int, times: int) -> Term:
+        return Term(signal, max(1, int(np.quantile(sizes[:, signal], quantile, method="lower"))), sign, times)
+
+    gesture = int(rng.integers(0, arch.classes))
+    more = (Rule((term(1, 0.5, 1, 4),), 2, NO_GESTURE, within=0, deaf=3),) if often else ()
+    return GateSettings(
+        signals,
+        (
+            Rule((term(0, 0.97, 1, 2), term(2, 0.8, 0, 1)), 3, NO_GESTURE, within=3, deaf=int(rng.integers(5, 25))),
+            Rule((term(3, 0.9, -1, 3), term(1, 0.9, 0, 1)), 1, gesture, within=6, deaf=int(rng.integers(0, 12))),
+            Rule((term(2, 0.93, 1, 2), term(3, 0.5, 0, 1), term(1, 0.5, 1, 1)), 0, NO_GESTURE, within=4, deaf=30),
+            *more,
+        ),
+    )

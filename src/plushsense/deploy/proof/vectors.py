@@ -1,0 +1,319 @@
+"""Expected answers of a toy: golden vectors of an export folder, recordings, generated frames."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import BadInput, ConfigError, nearest
+from plushsense.core.layouts import Layout
+from plushsense.core.recorder_csv import Frames
+from plushsense.dataset.store import Dataset
+from plushsense.deploy.emit import BUNDLE, FACTS, GOLDEN, IMAGE, LIBRARY, code_files, read_facts
+from plushsense.deploy.golden import COLUMNS, HEAD, TRACKING, answers_of, column, golden_frames, read_golden
+from plushsense.deploy.proof.scenarios import scenarios_of
+from plushsense.deploy.quantize import integer_model
+from plushsense.models.bundle import Bundle
+from plushsense.runtime.image import IntegerModel, memory_bytes
+from plushsense.windows.clock import resample
+
+_LOW, _HIGH = -(1 << 31), (1 << 31) - 1
+_PAUSE_MS = 1000
+
+
+def frames_of(dataset: Dataset, layout: Layout, *, subjects: Sequence[str] = (), rows: int) -> Ints:
+    """Read frames (n, 1 + C) from a data set, at least ``rows`` of them where there are as many.
+
+    Session streams of each person where there are, else the person's recordings; each is begun after a pause that
+    makes a toy start again, with its own gaps and resets kept. Of many streams the same share is taken of each, from
+    its beginning. Stamps wrap at 2^32 as a toy's do; values are held within 32 bits.
+
+    Raises:
+        ConfigError: for another layout than the model's, or a person who is not there.
+    """
+    if dataset.layout.channels != layout.channels:
+        raise ConfigError(
+            f"The data set '{dataset.head.name}' holds layout '{dataset.layout.name}' "
+            f"({', '.join(dataset.layout.names)}), but the model reads '{layout.name}' ({', '.join(layout.names)}), "
+            "with its own units and valid ranges: give recordings of the model's layout."
+        )
+    known = sorted({r.subject for r in dataset.recordings} | {s.subject for s in dataset.streams})
+    for subject in subjects:
+        if subject not in known:
+            raise ConfigError(
+                f"The data set '{dataset.head.name}' has nobody '{subject}': accepted are {', '.join(known)}."
+                f"{nearest(subject, known)}"
+            )
+    pieces = list(_pieces(dataset, subjects or known))
+    lengths = np.array([len(p) for p in pieces], dtype=np.int64)
+    takes = np.zeros_like(lengths)
+    # The shortest first: what they lack falls to the others.
+    for left, at in zip(range(len(pieces), 0, -1), np.argsort(lengths, kind="stable"), strict=True):
+        takes[at] = min(lengths[at], max(0, -(-(rows - int(takes.sum())) // left)))
+    found: list[Ints] = []
+    now = _PAUSE_MS
+    for piece, take in zip(pieces, takes.tolist(), strict=True):
+        if not take:
+            continue
+        part = piece.slice(0, take)
+        ms = part.device_ms.astype(np.int64) - int(part.device_ms[0]) + now
+        found.append(np.column_stack([ms & 0xFFFFFFFF, np.clip(part.values, _LOW, _HIGH)]))
+        now = int(ms[-1]) + layout.gap_ms + _PAUSE_MS
+    return np.concatenate(found) if found else np.empty((0, 1 + len(layout.channels)), dtype=np.int64)
+
+
+def _pieces(dataset: Dataset, subjects: Sequence[str]) -> Iterator[Frames]:
+    for subject in subjects:
+        streams = [s for s in dataset.streams if s.subject == subject]
+        if streams:
+            yield from (dataset.read_stream(s.id) for s in streams)
+        else:
+            yield from (dataset.read(r) for r in dataset.used if r.subject == subject)
+
+
+Ints = NDArray[np.int64]
+# Fits into every emulator beside the program.
+MOST_FRAME_BYTES = 8 << 20
+
+
+@dataclass(frozen=True, eq=False)
+class Vectors:
+    """Frames (n, 1 + C) and the expected rows (m, 12 + 2 K); the clock makes ``samples`` even samples of the frames.
+
+    ``model``: the model of the case, if not the export's own; ``silences``: frames before a silence.
+    """
+
+    name: str
+    frames: Ints
+    answers: NDArray[np.int32]
+    samples: int
+    model: IntegerModel | None = None
+    silences: tuple[int, ...] = ()
+
+    @property
+    def decisions(self) -> int:
+        """Number of answers outside the warm-up."""
+        return int((column(self.answers, "state") == TRACKING).sum())
+
+    @property
+    def memory_bytes(self) -> int:
+        """Memory of a toy for ``model``; 0 for the export's own model."""
+        return memory_bytes(self.model) if self.model else 0
+
+    def to_bytes(self) -> bytes:
+        """Serialise the case for the harness: model (empty: the export's own), silences, frames, each with a count."""
+        image = self.model.to_bytes() if self.model else b""
+        counts = [struct.pack("<I", n) for n in (len(image), len(self.silences), len(self.frames))]
+        frames = (self.frames & 0xFFFFFFFF).astype("<u4").tobytes()
+        silences = struct.pack(f"<{len(self.silences)}I", *self.silences)
+        return counts[0] + image + bytes(-len(image) % 4) + counts[1] + silences + counts[2] + frames
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Number of frames, samples and answers streamed under one name."""
+
+    name: str
+    frames: int
+    samples: int
+    answers: int
+
+
+def counted(streams: Sequence[Vectors]) -> tuple[Counts, ...]:
+    return tuple(
+        Counts(name, sum(len(v.frames) for v in own), sum(v.samples for v in own), sum(len(v.answers) for v in own))
+        for name in dict.fromkeys(v.name for v in streams)
+        for own in [[v for v in streams if v.name == name]]
+    )
+
+
+class Export:
+    """Export folder, opened for verification.
+
+    ``changed`` names the library and model files that are not what this version writes for the bundle in the folder.
+
+    Raises:
+        BadInput: when it is none, lacks a file, or holds golden vectors that are not those of its model.
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        self.folder = Path(folder)
+        facts = read_facts(self.folder)
+        self.title = str(facts["title"])
+        self._require_file(BUNDLE)
+        self.bundle = Bundle.load(self.folder / BUNDLE)
+        model = integer_model(self.bundle)
+        smoothing = facts.get("smoothing", model.smoothing)
+        if isinstance(smoothing, bool) or not isinstance(smoothing, int):
+            raise BadInput(f"'{self.folder / FACTS}' has the smoothing {smoothing!r}: export the model again.")
+        self.model: IntegerModel = replace(model, smoothing=smoothing)
+        self._code = code_files(self.model, self.bundle)
+        found = {name: self._require_file(name).read_bytes() for name in self._code}
+        self.changed = tuple(name for name, content in self._code.items() if found[name] != content)
+        self.image, self.source = found[IMAGE], found[LIBRARY[1]]
+        self._scenarios: dict[int, list[Vectors]] = {}
+        arch = self.model.network.arch
+        frames, answers = read_golden(self.folder / GOLDEN, len(self.model.layout.channels), arch.classes)
+        self.golden = Vectors("golden", frames, answers, self.samples_of(frames))
+        # The golden vectors of a model edited by hand may differ: the runs report that.
+        self.is_own = IMAGE not in self.changed
+        if self.is_own:
+            seen = compare(answers_of(self.model, frames), answers.astype("<i4").tobytes(), self.labels)
+            if seen.first:
+                raise BadInput(
+                    f"The golden vectors in '{self.folder / GOLDEN}' are not those of {BUNDLE}: they are damaged, or "
+                    f"of another model ({seen.first}); export the model again."
+                )
+
+    def _require_file(self, name: str) -> Path:
+        path = self.folder / name
+        if not path.is_file():
+            raise BadInput(f"The export '{self.folder}' lacks {name}: export the model again.")
+        return path
+
+    def require_unchanged(self) -> None:
+        """BadInput when a library or model file is not what this version writes: compiled, it could do anything."""
+        if self.changed:
+            one = len(self.changed) == 1
+            raise BadInput(
+                f"{', '.join(self.changed)} in '{self.folder}' {'is' if one else 'are'} not what this PlushSense "
+                f"writes for {BUNDLE}, and nothing was compiled: export the model again, or give --trust to compile "
+                f"and run {'it' if one else 'them'} on this computer all the same."
+            )
+
+    def code(self, room: Path) -> Path:
+        """Return the folder to compile from.
+
+        Files that are this version's own are written anew into ``room``, so that no other file of the export (a
+        ``string.h``, a precompiled header) reaches the compiler; changed files are compiled where they are.
+        """
+        if self.changed:
+            return self.folder
+        room.mkdir(parents=True)
+        for name, content in self._code.items():
+            (room / name).write_bytes(content)
+        return room
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        return self.model.gestures.labels
+
+    def samples_of(self, frames: Ints) -> int:
+        """Return the number of even samples that the clock makes of frames."""
+        return sum(map(len, resample(Frames(frames[:, 1:], frames[:, 0]), self.model.layout)))
+
+    def answered(self, name: str, frames: Ints) -> Vectors:
+        """Pair frames with the expected answers; refuses as `require_own`."""
+        self.require_own()
+        return Vectors(name, frames, answers_of(self.model, frames), self.samples_of(frames))
+
+    def require_own(self) -> None:
+        """Raise BadInput when plush_model.bin is not what this PlushSense makes of the bundle beside it."""
+        if not self.is_own:
+            raise BadInput(
+                f"{IMAGE} in '{self.folder}' is not what this PlushSense makes of {BUNDLE} beside it, so that only the "
+                "golden vectors can be checked: export the model again."
+            )
+
+    def scenarios(self, repeat: int = 0) -> list[Vectors]:
+        """Return the test scenarios of the export's network, different for each ``repeat``.
+
+        None for a model that is not that of the bundle beside it.
+        """
+        if not self.is_own:
+            return []
+        if repeat not in self._scenarios:
+            self._scenarios[repeat] = [
+                Vectors("scenario", s.frames, s.rows, self.samples_of(s.frames), s.model, s.silences)
+                for s in scenarios_of(self.model, self.bundle.scaler, repeat)
+            ]
+        return self._scenarios[repeat]
+
+    def made_up(self, samples: int) -> list[Vectors]:
+        """Generate more frames like the golden ones, until they make this many samples."""
+        seed, have = 2, 0
+        pieces: list[Ints] = []
+        while have < samples:
+            span, health = self.model.network.arch.span, self.model.rules.health
+            pieces.append(golden_frames(self.model.layout, self.bundle.scaler, span, seed, health=health))
+            have += self.samples_of(pieces[-1])
+            seed += 1
+        return [self.answered("made up", p) for p in in_parts(np.concatenate(pieces))] if pieces else []
+
+    def recorded(self, dataset: Dataset, subjects: Sequence[str], samples: int) -> list[Vectors]:
+        """Read recordings until they make this many samples or there are no more; refuses as `frames_of`."""
+        layout = self.model.layout
+        rows = samples
+        while True:
+            frames = frames_of(dataset, layout, subjects=subjects, rows=rows)
+            have = self.samples_of(frames)
+            if have >= samples or len(frames) < rows:
+                break
+            rows += max(samples - have, rows // 4)
+        if not len(frames):
+            raise ConfigError(f"The data set '{dataset.head.name}' holds nothing to stream: give another one.")
+        name = "simulated recordings" if dataset.head.simulated else "recordings"
+        return [self.answered(name, part) for part in in_parts(frames)]
+
+
+@dataclass(frozen=True)
+class RowComparison:
+    """Result of comparing rows with the expected ones."""
+
+    vectors: int
+    mismatches: int
+    max_abs_diff: int
+    first: str | None
+
+
+def compare(expected: NDArray[np.int32], got: bytes, labels: Sequence[str]) -> RowComparison:
+    """Compare the output of a toy with the expected rows (m, 12 + 2 K); ``first`` is half a sentence."""
+    width = expected.shape[1]
+    whole = len(got) // (4 * width)
+    rows = np.frombuffer(got[: whole * 4 * width], dtype="<i4").reshape(whole, width).astype(np.int64)
+    words = got[whole * 4 * width :].decode("utf-8", "replace").strip()
+    both = min(len(expected), whole)
+    off = np.abs(rows[:both] - expected[:both])
+    wrong = np.flatnonzero(off.any(axis=1))
+    mismatches = len(wrong) + max(len(expected), whole) - both
+    first = None
+    if len(wrong):
+        at = int(wrong[0])
+        field = int(np.flatnonzero(off[at])[0])
+        first = (
+            f"row {at} ({_row(expected[at])}): {_column(field, int(expected[at, 0]), labels)} should be "
+            f"{int(expected[at, field])} and is {int(rows[at, field])}"
+        )
+    elif whole < len(expected):
+        first = f"row {whole} ({_row(expected[whole])}) never came"
+    elif whole > len(expected):
+        first = f"row {both} ({_row(rows[both])}) is one too many"
+    if words:
+        first = f"{words.rstrip('.')}" if first is None else f"{words.rstrip('.')}; {first}"
+        mismatches = max(mismatches, 1)
+    return RowComparison(len(expected), mismatches, int(off.max()) if off.size else 0, first)
+
+
+def _row(row: NDArray[Any]) -> str:
+    """Return the kind and the frame of a row as text."""
+    kind = ("answer", "event", "health")[int(row[0])] if int(row[0]) in COLUMNS else "of no kind"
+    return f"{kind}, frame {int(row[1])}"
+
+
+def _column(field: int, kind: int, labels: Sequence[str]) -> str:
+    if field < HEAD:
+        return f"'{COLUMNS.get(kind, COLUMNS[0])[field]}'"
+    what, at = divmod(field - HEAD, len(labels))
+    return f"{('the logit', 'the smoothed probability')[what]} of '{labels[at]}'"
+
+
+def in_parts(frames: Ints) -> list[Ints]:
+    """Split frames into parts that fit into every emulator; each part begins a new stream."""
+    rows = MOST_FRAME_BYTES // (4 * frames.shape[1])
+    return [frames[at : at + rows] for at in range(0, len(frames), rows)]

@@ -1,0 +1,420 @@
+"""Verification that the C in an export folder gives exactly the answers of the integer model in Python.
+
+The library and model files in the folder must be those that this version writes, or nothing is compiled. With ``trust``
+changed files are compiled as they are. Golden vectors and test scenarios (`plushsense.deploy.proof.scenarios`) always
+run; recordings, or more generated frames, on demand. Every number of every answer, event and change of health is
+compared.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from itertools import repeat
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from plushsense.core.errors import BuildError, ProgramError, ToolError
+from plushsense.deploy.emit import IMAGE, LIBRARY, MODEL
+from plushsense.deploy.proof.mutants import RULES, Mutant, mutants_of
+from plushsense.deploy.proof.vectors import Counts, Export, RowComparison, Vectors, compare, counted
+from plushsense.deploy.targets import C_FOLDER, TARGETS, build, missing_tools, require, target_named
+
+Progress = Callable[[int, int], None]
+Stream = tuple[Vectors, ...]  # what one program runs, one after the other
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror")
+SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-g")
+HARNESS = C_FOLDER / "harness.c"
+MORE_SCENARIOS = 3
+_ENCODING = "latin-1"  # reads any bytes
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One way to compile, which is one row of the report.
+
+    ``image``: the model is read from plush_model.bin and not compiled in; ``cpp``: the caller is C++, the library C.
+    """
+
+    target: str
+    cc: str | None = None
+    optimise: str = "-O2"
+    flags: tuple[str, ...] = STRICT
+    image: bool = False
+    cpp: bool = False
+
+    @property
+    def compiler(self) -> str:
+        return self.cc or TARGETS[self.target].compiler
+
+    @property
+    def options(self) -> str:
+        """Flags as text, without the warnings, which are the same everywhere."""
+        also = [("sanitizers", SANITIZERS[0] in self.flags), ("called from C++", self.cpp), (IMAGE, self.image)]
+        return " ".join([self.optimise, *(word for word, is_so in also if is_so)])
+
+
+def settings_of(target: str) -> list[Setting]:
+    """Return the settings with which a target's programs are compiled."""
+    if target != "host":
+        return [Setting(target, optimise=o) for o in ("-O2", "-Os")]
+    found = [Setting(target, cc, o) for cc in ("gcc", "clang") for o in ("-O0", "-O2", "-O3")]
+    found += [Setting(target, cc, "-O1", (*STRICT, *SANITIZERS)) for cc in ("gcc", "clang")]
+    # -std=c99 is not for C++; exceptions would need its library.
+    found.append(Setting(target, "gcc", "-O2", (*STRICT[1:], "-fno-exceptions"), cpp=True))
+    found.append(Setting(target, "gcc", "-O2", image=True))
+    return found
+
+
+@dataclass(frozen=True)
+class SettingResult:
+    """Result of one setting: ``vectors`` counts answers, ``first`` describes the first that differs."""
+
+    target: str
+    compiler: str
+    flags: str
+    vectors: int
+    mismatches: int
+    max_abs_diff: int
+    seconds: float
+    first: str | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the result as plain values for JSON."""
+        return {**vars(self), "seconds": round(self.seconds, 2)}
+
+
+@dataclass(frozen=True)
+class MutantResult:
+    """Result of one mutant on one target."""
+
+    target: str
+    kind: str
+    name: str
+    caught: bool
+    first: str | None
+
+    @property
+    def silent(self) -> bool:
+        """Whether a mutant of the rules stayed undetected because no test scenario of this network reaches its line.
+
+        With two classes only, for example; it is no defect of the C.
+        """
+        return not self.caught and self.kind in RULES
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the result as plain values for JSON."""
+        return {
+            "target": self.target,
+            "kind": self.kind,
+            "fault": self.name,
+            "caught": self.caught,
+            "first": self.first,
+            "silent": self.silent,
+        }
+
+
+@dataclass(frozen=True)
+class VerificationReport:
+    """Result of a verification; ``passed`` when nothing differs and every mutant that the model can show was caught.
+
+    ``decisions`` counts the answers outside the warm-up: without any, nothing is proven. ``changed`` names the files
+    with C or the model's bytes that are not what this PlushSense writes for the bundle beside them: then it is only
+    known that they agree with the vectors, and ``own`` is False.
+    """
+
+    title: str
+    changed: tuple[str, ...]
+    decisions: int
+    counts: tuple[Counts, ...]
+    runs: tuple[SettingResult, ...]
+    not_run: tuple[tuple[str, str], ...]
+    mutants: tuple[MutantResult, ...]
+
+    @property
+    def own(self) -> bool:
+        """Whether what was compiled is what this PlushSense writes for the bundle."""
+        return not self.changed
+
+    @property
+    def mismatches(self) -> int:
+        return sum(r.mismatches for r in self.runs)
+
+    @property
+    def first(self) -> str | None:
+        """Description of the first answer that differs, as a sentence."""
+        return next((r.first for r in self.runs if r.first), None)
+
+    @property
+    def passed(self) -> bool:
+        return self.mismatches == 0 and self.decisions > 0 and all(m.caught or m.silent for m in self.mutants)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the object that ``plushsense verify --json`` prints."""
+        return {
+            "title": self.title,
+            "passed": self.passed,
+            "own": self.own,
+            "changed": list(self.changed),
+            "decisions": self.decisions,
+            "vectors": sum(r.vectors for r in self.runs),
+            "mismatches": self.mismatches,
+            "max_abs_diff": max((r.max_abs_diff for r in self.runs), default=0),
+            "first": self.first,
+            "streams": [dict(vars(c)) for c in self.counts],
+            "runs": [r.to_dict() for r in self.runs],
+            "not_run": [{"what": what, "why": why} for what, why in self.not_run],
+            "faults": [m.to_dict() for m in self.mutants],
+        }
+
+
+def verify(
+    export: Export,
+    targets: Sequence[str] = (),
+    vectors: Sequence[Vectors] = (),
+    *,
+    mutants: Callable[[Mutant], bool] | None = None,
+    only: Callable[[Setting], bool] = lambda setting: True,
+    trust: bool = False,
+    jobs: int | None = None,
+    progress: Progress | None = None,
+) -> VerificationReport:
+    """Compile the C of the export folder for each target, run it, and compare every answer.
+
+    Args:
+        export: the folder.
+        targets: names of `TARGETS`; empty: all for which the tools are here.
+        vectors: what to run besides the golden vectors.
+        mutants: selects the mutants to apply, one at a time; each must be detected on every target. None: none. For a
+            mutant of the rules that the scenarios do not show, more are generated, up to `MORE_SCENARIOS` times.
+        only: which settings of a target to run.
+        trust: also compile and run library and model files that are not what this version writes.
+        jobs: programs at a time; None: one a core.
+
+    Raises:
+        BadInput: when such a file is not what this version writes, and ``trust`` is not given.
+        ConfigError: for an unknown target; ToolError: for a named one whose tools are missing.
+    """
+    if not trust:
+        export.require_unchanged()
+    settings, not_run = _choose(targets, only)
+    scenarios = export.scenarios()
+    streams = [(export.golden,), *([tuple(scenarios)] if scenarios else []), *((v,) for v in vectors)]
+    selected: list[Mutant] = []
+    if mutants:
+        export.require_own()
+        selected = [m for m in mutants_of(export.image, export.source.decode(_ENCODING)) if mutants(m)]
+    chosen = list(dict.fromkeys(s.target for s in settings))
+    total, done = len(settings) + len(selected) * len(chosen), 0
+    jobs = jobs or os.cpu_count() or 1
+    runs: list[SettingResult] = []
+    results: list[MutantResult] = []
+    with (
+        tempfile.TemporaryDirectory(prefix="plushsense-verify-", ignore_cleanup_errors=True) as work,
+        ThreadPoolExecutor(jobs) as pool,
+    ):
+        folder = Path(work)
+        code = export.code(folder / "code")
+        for n, stream in enumerate(streams):
+            (folder / f"cases-{n}.bin").write_bytes(b"".join(v.to_bytes() for v in stream))
+
+        def report() -> None:
+            nonlocal done
+            done += 1
+            if progress:
+                progress(done, total)
+
+        def run(n: int, setting: Setting) -> SettingResult:
+            return _run(export, code, setting, list(enumerate(streams)), folder, folder / f"run-{n}")
+
+        for found in pool.map(run, range(len(settings)), settings):
+            runs.append(found)
+            report()
+        # In C that is wrong already every mutant would count as caught.
+        if any(r.mismatches for r in runs):
+            selected = []
+
+        first_of = {target: next(s for s in settings if s.target == target) for target in chosen}
+
+        def run_mutant(n: int, cases: Sequence[tuple[int, Stream]]) -> MutantResult:
+            mutant, target = pairs[n]
+            return _run_mutant(export, code, mutant, first_of[target], cases, folder, folder / f"mutant-{n}")
+
+        pairs = [(mutant, target) for mutant in selected for target in chosen]
+        for each in pool.map(run_mutant, range(len(pairs)), repeat(list(enumerate(streams))[: 1 + bool(scenarios)])):
+            results.append(each)
+            report()
+        # A mutant that needs a rare sequence of steps may show in other scenarios.
+        for again in range(1, 1 + MORE_SCENARIOS):
+            missed = [n for n, result in enumerate(results) if result.silent]
+            if not missed:
+                break
+            n, stream = len(streams) + again, tuple(export.scenarios(again))
+            (folder / f"cases-{n}.bin").write_bytes(b"".join(v.to_bytes() for v in stream))
+            unchanged = [
+                _run(export, code, first_of[target], [(n, stream)], folder, folder / f"again-{target}")
+                for target in chosen
+            ]
+            if any(r.mismatches for r in unchanged):
+                runs += unchanged
+                break
+            for at, each in zip(missed, pool.map(run_mutant, missed, repeat([(n, stream)])), strict=True):
+                results[at] = each
+    every = [v for stream in streams for v in stream]
+    # Scenarios have models of their own.
+    decisions = sum(v.decisions for v in every if v.model is None)
+    return VerificationReport(
+        export.title, export.changed, decisions, counted(every), tuple(runs), tuple(not_run), tuple(results)
+    )
+
+
+def _choose(targets: Sequence[str], only: Callable[[Setting], bool]) -> tuple[list[Setting], list[tuple[str, str]]]:
+    """Return the settings that can run here, and the others with the reason."""
+    found: list[Setting] = []
+    not_run: list[tuple[str, str]] = []
+    for name in dict.fromkeys(targets or TARGETS):
+        settings = [s for s in settings_of(target_named(name).name) if only(s)]
+        lacks = {s: _lacks(s) for s in settings}
+        here = [s for s in settings if not lacks[s]]
+        if targets and not here:
+            require(name)
+        found += here
+        if not here:
+            not_run.append((name, next(iter(lacks.values()), "no setting was selected")))
+        else:
+            not_run += [(f"{name}, {s.compiler} {s.options}", why) for s, why in lacks.items() if why]
+    if not found:
+        raise ToolError(
+            "Nothing can be checked here, because no compiler is installed: install one "
+            f"({'; '.join(f'{name}: {why}' for name, why in not_run)})."
+        )
+    return found, not_run
+
+
+def _lacks(setting: Setting) -> str:
+    """Return why a setting cannot run here; empty when it can."""
+    missing = missing_tools(setting.target, cc=setting.cc)
+    if setting.cpp and shutil.which("g++") is None:
+        missing.append("g++")
+    if missing:
+        return f"not installed: Debian's {' '.join(missing)}"
+    return _no_sanitizers(setting) if SANITIZERS[0] in setting.flags else ""
+
+
+def _no_sanitizers(setting: Setting) -> str:
+    """Return why the sanitizers do not work here (missing libraries, system policy); empty when they do."""
+    with tempfile.TemporaryDirectory(prefix="plushsense-verify-") as work:
+        source = Path(work) / "nothing.c"
+        source.write_text("int main(void)\n{\n    return 0;\n}\n")
+        try:
+            build(setting.target, [source], Path(work), cc=setting.cc, flags=setting.flags).run()
+        except ToolError:
+            also = " (Debian's libclang-rt-dev)" if setting.compiler == "clang" else ""
+            return f"{setting.compiler} makes no program with sanitizers here{also}"
+    return ""
+
+
+def _run(
+    export: Export, code: Path, setting: Setting, streams: Iterable[tuple[int, Stream]], work: Path, out: Path
+) -> SettingResult:
+    began = time.monotonic()
+    compared = []
+    for n, stream in streams:
+        try:
+            compared.append(_attempt(export, code, setting, stream, work / f"cases-{n}.bin", out, both=True))
+        except BuildError as cause:
+            count = sum(len(v.answers) for v in stream)
+            compared.append(RowComparison(count, count, 0, f"On {setting.target} ({setting.options}): {cause}"))
+    shutil.rmtree(out, ignore_errors=True)
+    return SettingResult(
+        setting.target,
+        setting.compiler,
+        setting.options,
+        sum(c.vectors for c in compared),
+        sum(c.mismatches for c in compared),
+        max(c.max_abs_diff for c in compared),
+        time.monotonic() - began,
+        next((c.first for c in compared if c.first), None),
+    )
+
+
+def _attempt(
+    export: Export, folder: Path, setting: Setting, stream: Stream, cases: Path, out: Path, *, both: bool = False
+) -> RowComparison:
+    """Run one program on one stream; ``first`` of the result is a whole sentence.
+
+    ``both``: a program that reads plush_model.bin also checks that plush_model.c holds the same bytes.
+    """
+    where = f"On {setting.target} ({setting.compiler} {setting.options}), {stream[0].name}"
+    expected = np.concatenate([v.answers for v in stream])
+    out.mkdir(parents=True, exist_ok=True)
+    # A copy, because the compiler would find PlushSense's own plushsense.h beside the original first.
+    harness = out / ("harness.cpp" if setting.cpp else "harness.c")
+    shutil.copyfile(HARNESS, harness)
+    both = both and setting.image
+    sources = [folder / LIBRARY[1], harness] + ([folder / MODEL[1]] if both or not setting.image else [])
+    blobs = {"cases": cases} | ({"image": folder / IMAGE} if setting.image else {})
+    classes = len(export.labels)
+    defines = {"PLUSH_HARNESS_CHANNELS": stream[0].frames.shape[1] - 1, "PLUSH_HARNESS_CLASSES": classes}
+    defines["PLUSH_HARNESS_MEMORY_BYTES"] = max(v.memory_bytes for v in stream)
+    defines |= {"PLUSH_HARNESS_IMAGE": 1} if setting.image else {}
+    if both:
+        defines["PLUSH_HARNESS_BOTH"] = 1
+    program = build(
+        setting.target,
+        sources,
+        out,
+        include=[folder],
+        defines=defines,
+        optimise=setting.optimise,
+        blobs=blobs,
+        cc=setting.cc,
+        flags=setting.flags,
+    )
+    try:
+        got = program.run(timeout_s=60 + 0.02 * sum(len(v.frames) for v in stream))
+    except ProgramError as cause:
+        return RowComparison(len(expected), len(expected), 0, f"{where}: {cause}")
+    result = compare(expected, got, export.labels)
+    return replace(result, first=f"{where}: {result.first}.") if result.first else result
+
+
+def _run_mutant(
+    export: Export,
+    code: Path,
+    mutant: Mutant,
+    setting: Setting,
+    streams: Sequence[tuple[int, Stream]],
+    work: Path,
+    out: Path,
+) -> MutantResult:
+    """Build a copy with one mutant and compare its answers to the golden vectors and the test scenarios.
+
+    Scenarios have models of their own and cannot show a mutant of the export's model.
+    """
+    copy = out / "export"
+    copy.mkdir(parents=True)
+    for name in (*LIBRARY, *MODEL, IMAGE):
+        shutil.copyfile(code / name, copy / name)
+    if mutant.image is not None:
+        (copy / IMAGE).write_bytes(mutant.image)
+    if mutant.source is not None:
+        (copy / LIBRARY[1]).write_text(mutant.source, _ENCODING)
+    # On the host compiling takes longer than running.
+    optimise = "-O1" if setting.target == "host" else "-O2"
+    plain = replace(setting, optimise=optimise, flags=("-std=c99",), image=mutant.image is not None)
+    cases = streams[: 1 if mutant.image is not None else None]
+    # Mutants of the rules show in the scenarios first.
+    for n, stream in reversed(cases) if mutant.kind in RULES else cases:
+        result = _attempt(export, copy, plain, stream, work / f"cases-{n}.bin", out)
+        if result.mismatches:
+            break
+    shutil.rmtree(out, ignore_errors=True)
+    return MutantResult(setting.target, mutant.kind, mutant.name, result.mismatches > 0, result.first)

@@ -1,0 +1,171 @@
+"""Toys that send lines over a serial port (a cable, or a Bluetooth driver's port; through pyserial) or over TCP."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import socket
+import sys
+import time
+from pathlib import Path
+
+import serial as pyserial
+from serial.tools import list_ports
+
+from plushsense.core.errors import DeviceError
+from plushsense.core.layouts import Layout
+from plushsense.devices.base import Device, Frame, now_ms
+from plushsense.devices.opening import DeviceAddress
+from plushsense.devices.wire import LineParser
+
+BAUD = 115_200
+
+# SerialException is an OSError; a port that vanishes while it is opened or read raises one of the others.
+_FAULTS: tuple[type[Exception], ...] = (OSError, TypeError, ValueError)
+if sys.platform != "win32":
+    import termios
+
+    _FAULTS = (*_FAULTS, termios.error)
+
+
+def serial_ports() -> list[tuple[str, str]]:
+    """Return name and description of each serial port of this computer."""
+    return sorted((str(p.device), str(p.description or "")) for p in list_ports.comports())
+
+
+class SerialDevice(Device):
+    """Frames from a serial port. A toy that is unplugged raises DeviceError."""
+
+    def __init__(self, url: str, layout: Layout, port: str, baud: int = BAUD) -> None:
+        super().__init__(url, layout)
+        try:
+            # Two readers would each get a part of the bytes, so a second one is refused (Windows always does).
+            alone = True if os.name == "posix" else None
+            self._port = pyserial.Serial(port, baud, timeout=0.1, exclusive=alone)
+        except _FAULTS as cause:
+            raise DeviceError(_refusal(url, port, cause)) from None
+        self._parser = LineParser(layout, self.counters, joining=True)
+
+    def read(self) -> list[Frame] | None:
+        """Return the received frames, waiting at most 0.1 s, or not at all with a ``wait_s`` of 0."""
+        try:
+            waiting = self._port.in_waiting
+            if not waiting and self.wait_s <= 0.0:
+                return []
+            data = self._port.read(max(1, min(waiting, 65536)))
+        except _FAULTS as cause:  # pyserial also trips over its own closed port
+            if self.closed:
+                return None
+            self._parser.finish()
+            raise DeviceError(f"'{self.url}' went away ({_reason(cause)}): was it unplugged or switched off?") from None
+        self.arrived_s = time.perf_counter()
+        host = now_ms()
+        return [Frame(host, line.device_ms, line.values) for line in self._parser.feed(data)]
+
+    def _shut(self) -> None:
+        with contextlib.suppress(*_FAULTS):
+            self._port.close()
+
+
+def _reason(cause: Exception) -> str:
+    number = getattr(cause, "errno", None)
+    return os.strerror(number) if number else " ".join(str(cause).split()) or type(cause).__name__
+
+
+def _refusal(url: str, port: str, cause: Exception) -> str:
+    number = getattr(cause, "errno", None)
+    if isinstance(cause, ValueError):
+        return f"'{url}' cannot be opened: {cause}."
+    if os.name == "posix" and Path(port).exists():
+        if number in (13, 1):
+            return f"'{url}': this user may not open {port}; on Linux join the group dialout and log in again."
+        if number == 11 or "lock" in str(cause).lower():
+            return f"'{url}': another program is using {port}; close it first."
+        return f"'{url}' cannot be opened: {_reason(cause)}."
+    if "access is denied" in str(cause).lower() or "PermissionError" in str(cause):
+        return f"'{url}': another program is using {port}; close it first."
+    ports = [name for name, _ in serial_ports()]
+    here = f"the ports here are {', '.join(ports)}" if ports else "this computer has no serial port now"
+    return f"'{url}': there is no port {port}; {here}."
+
+
+def open_serial(address: DeviceAddress, layout: Layout) -> SerialDevice:
+    """Open ``serial:///dev/ttyUSB0?baud=115200`` or ``serial://COM3``."""
+    address.check_keys(("baud",))
+    if not address.place.strip("/"):
+        raise DeviceError(f"'{address.url}' names no port: write serial:///dev/ttyUSB0 or serial://COM3.")
+    place = address.place
+    if place.startswith("/") and place[1:].upper().startswith("COM"):
+        place = place[1:]
+    return SerialDevice(address.url, layout, place, address.whole("baud", BAUD, 50, 4_000_000))
+
+
+CONNECT_S = 5.0
+_KEEPALIVE = {"TCP_KEEPIDLE": 3, "TCP_KEEPALIVE": 3, "TCP_KEEPINTVL": 1, "TCP_KEEPCNT": 3}
+"""Seconds of silence, seconds between probes, number of probes; macOS calls the first TCP_KEEPALIVE."""
+
+
+class TcpDevice(Device):
+    """Frames from a TCP connection. One closed in order ends the frames; a broken one raises DeviceError."""
+
+    def __init__(self, url: str, layout: Layout, host: str, port: int) -> None:
+        super().__init__(url, layout)
+        try:
+            self._socket = socket.create_connection((host, port), timeout=CONNECT_S)
+        except socket.gaierror:
+            raise DeviceError(f"'{url}': there is no host '{host}'; check the name.") from None
+        except ConnectionRefusedError:
+            raise DeviceError(
+                f"'{url}': nobody listens on port {port} of {host}; start the toy there (plushsense toy --tcp {port})."
+            ) from None
+        except (TimeoutError, OSError, UnicodeError) as cause:
+            silent = isinstance(cause, TimeoutError)
+            reason = "no answer" if silent else getattr(cause, "strerror", None) or cause
+            raise DeviceError(f"'{url}' cannot be reached: {reason}.") from None
+        _enable_keepalive(self._socket)
+        self._parser = LineParser(layout, self.counters)
+
+    def read(self) -> list[Frame] | None:
+        """Return the received frames, waiting at most ``wait_s``; return None when the other side closed in order."""
+        try:
+            self._socket.settimeout(self.wait_s)
+            data = self._socket.recv(65536)
+        except BlockingIOError:
+            return []
+        except OSError as cause:
+            if self.closed:
+                return None
+            if isinstance(cause, TimeoutError) and cause.errno is None:  # ours; the network's has a number
+                return []
+            self._parser.finish()
+            raise DeviceError(f"'{self.url}' went away: {cause.strerror or cause}.") from None
+        self.arrived_s = time.perf_counter()
+        if not data:
+            self._parser.finish()
+            return None
+        host = now_ms()
+        return [Frame(host, line.device_ms, line.values) for line in self._parser.feed(data)]
+
+    def _shut(self) -> None:
+        with contextlib.suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)
+        self._socket.close()
+
+
+def _enable_keepalive(connection: socket.socket) -> None:
+    """Enable TCP keepalive, so that a toy without power is detected within 6 s."""
+    with contextlib.suppress(OSError):
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        for name, value in _KEEPALIVE.items():
+            if hasattr(socket, name):
+                connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
+
+
+def open_tcp(address: DeviceAddress, layout: Layout) -> TcpDevice:
+    """Open ``tcp://host:port``."""
+    address.check_keys(())
+    match = re.fullmatch(r"(\[[^\]]+\]|[^:/\[\]]+):(\d{1,5})/?", address.place, re.ASCII)
+    if match is None or not 1 <= int(match[2]) <= 65535:
+        raise DeviceError(f"'{address.url}': a network toy is tcp://host:port, with a port from 1 to 65535.")
+    return TcpDevice(address.url, layout, match[1].strip("[]"), int(match[2]))

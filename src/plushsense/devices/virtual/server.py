@@ -1,0 +1,282 @@
+"""Serve the virtual toy to other programs, on a pseudo terminal or a local TCP port."""
+
+from __future__ import annotations
+
+import os
+import select
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from plushsense.core.errors import ConfigError, DeviceError
+from plushsense.core.layouts import Layout, load_layout
+from plushsense.devices.base import Pacer
+from plushsense.devices.virtual.stream import PerformedGesture, Prompts, ToySpec, ToyStream
+
+HOST = "127.0.0.1"
+_STALL_S = 0.5
+"""After this time without reading, lines are dropped, as on a real serial line."""
+_FAST_STALL_S = 10.0
+"""The same for a toy faster than real time, which has to wait for a reader that writes a file."""
+_FAST_QUEUE = 512
+"""Most unread bytes of such a toy on a pseudo terminal; the system's buffers would hold seconds of data."""
+
+
+@dataclass
+class ToyCounters:
+    """Numbers of lines sent, lines dropped for want of a reader, gestures begun, connections accepted."""
+
+    sent: int = 0
+    dropped: int = 0
+    gestures: int = 0
+    connections: int = 0
+
+
+class _Outlet:
+    """Non-blocking output that waits for a slow reader, drops lines without one, and never sends part of a line."""
+
+    def __init__(
+        self,
+        write: Callable[[bytes], int],
+        fileno: int,
+        *,
+        absent: bool = False,
+        stall_s: float = _STALL_S,
+        unread: Callable[[], int] | None = None,
+    ) -> None:
+        self._write = write
+        self._fileno = fileno
+        self._absent = absent
+        self._stall_s = stall_s
+        self._unread = unread
+        self._rest = b""
+
+    def send(self, data: bytes, stop: threading.Event) -> bool:
+        """Send lines; False when they were dropped. OSError when the reader's end is gone."""
+        whole = self._rest + data
+        pending = whole
+        deadline = time.monotonic() + (0.0 if self._absent else self._stall_s)
+        if self._unread is not None and not self._absent:
+            while self._unread() > _FAST_QUEUE and time.monotonic() < deadline and not stop.wait(0.0005):
+                pass
+        while pending:
+            try:
+                pending = pending[self._write(pending) :]
+                self._absent = False
+            except BlockingIOError:
+                left = deadline - time.monotonic()
+                if left > 0.0 and not stop.is_set():
+                    select.select([], [self._fileno], [], min(left, 0.05))
+                    continue
+                self._absent = True
+                sent = whole[: len(whole) - len(pending)]
+                if sent:
+                    begun = not sent.endswith(b"\n")
+                    self._rest = pending[: pending.find(b"\n") + 1] if begun else b""
+                return False
+        self._rest = b""
+        return True
+
+
+def serve_tcp(
+    port: int,
+    spec: ToySpec | None = None,
+    *,
+    layout: Layout | None = None,
+    speed: float = 1.0,
+    seconds: float = 0.0,
+    on_ready: Callable[[str], None] | None = None,
+    on_performed: Callable[[PerformedGesture], None] | None = None,
+    on_sent: Callable[[bytes], None] | None = None,
+    prompts: Prompts | None = None,
+    stop: threading.Event | None = None,
+) -> ToyCounters:
+    """Serve the virtual toy on ``127.0.0.1:port``, to one reader after another, until ``stop`` is set.
+
+    The toy goes on while nobody listens, as a real one does.
+
+    Args:
+        port: 0 takes a free one; ``on_ready`` gets the URL.
+        spec: which toy; the default is person 1.
+        speed: 1 real time, 0 as fast as the reader takes it (the toy then waits for a reader).
+        seconds: of device time after which it ends; 0: never.
+        on_performed: called with each gesture as it begins.
+        on_sent: called with the lines that were sent, without the dropped ones.
+        prompts: gestures for the person to make; None: random gestures.
+
+    Raises:
+        DeviceError: when the port is taken or not allowed.
+        ConfigError: for a layout that the virtual toy does not speak.
+    """
+    spec, layout = spec or ToySpec(), layout or load_layout("plush-15")
+    if not 0 <= port <= 65535:
+        raise ConfigError(f"The port is {port}; a whole number from 0 (a free one) to 65535 is accepted.")
+    if not speed >= 0.0:
+        raise ConfigError(f"The toy's speed is {speed}; it must be 0 (as fast as possible) or above.")
+    stream = ToyStream(spec, layout, prompts)
+    try:
+        server = socket.create_server((HOST, port))
+    except OSError as cause:
+        raise DeviceError(
+            f"The toy cannot listen on port {port} of {HOST}: {cause.strerror or cause}; choose another port."
+        ) from None
+    counters = ToyCounters()
+    stop = stop or threading.Event()
+    with server:
+        server.setblocking(False)
+        if on_ready is not None:
+            on_ready(f"tcp://{HOST}:{server.getsockname()[1]}")
+        client: socket.socket | None = None
+        outlet: _Outlet | None = None
+
+        def send(data: bytes) -> bool:
+            nonlocal client, outlet
+            while client is None and not stop.is_set():
+                try:
+                    client, _ = server.accept()
+                except BlockingIOError:
+                    if speed > 0.0:
+                        return False
+                    select.select([server], [], [], 0.05)
+                    continue
+                client.setblocking(False)
+                client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                outlet = _Outlet(client.send, client.fileno(), stall_s=_stall_s(speed))
+                counters.connections += 1
+            if client is None or outlet is None:
+                return False
+            try:
+                return outlet.send(data, stop)
+            except OSError:  # the reader has gone: the next one may come
+                client.close()
+                client = outlet = None
+                return False
+
+        try:
+            _run(stream, send, counters, speed, seconds, on_performed, on_sent, stop)
+        finally:
+            if client is not None:
+                client.close()
+    return counters
+
+
+def serve_pty(
+    spec: ToySpec | None = None,
+    *,
+    layout: Layout | None = None,
+    speed: float = 1.0,
+    seconds: float = 0.0,
+    on_ready: Callable[[str], None] | None = None,
+    on_performed: Callable[[PerformedGesture], None] | None = None,
+    on_sent: Callable[[bytes], None] | None = None,
+    prompts: Prompts | None = None,
+    stop: threading.Event | None = None,
+) -> ToyCounters:
+    """Serve the virtual toy on a pseudo terminal that looks like a serial port, until ``stop`` is set.
+
+    Linux and macOS. ``on_ready`` gets the URL (``serial:///dev/pts/5``). Arguments and errors otherwise as
+    `serve_tcp`, but speed 0 is not for a port that nobody may be reading. A toy faster than real time waits up to 10 s
+    for a slow reader, so that its speed causes no losses.
+
+    Raises:
+        DeviceError: on Windows, which has no pseudo terminals.
+    """
+    if sys.platform == "win32":
+        raise DeviceError("Windows has no pseudo terminals: serve the toy over TCP instead (toy --tcp PORT).")
+    import pty
+    import tty
+
+    if not speed > 0.0:
+        raise ConfigError(f"The toy's speed on a pseudo terminal is {speed:g}; it must be above 0.")
+    stream = ToyStream(spec or ToySpec(), layout or load_layout("plush-15"), prompts)
+    master, slave = pty.openpty()
+    try:
+        # Raw mode: no echo, unchanged line ends. The slave stays open, so that readers may come and go.
+        tty.setraw(slave)
+        os.set_blocking(master, False)
+        counters = ToyCounters()
+        stop = stop or threading.Event()
+        fast = speed > 1.0
+        outlet = _Outlet(
+            lambda data: os.write(master, data),
+            master,
+            absent=not fast,
+            stall_s=_stall_s(speed),
+            unread=(lambda: _unread(slave)) if fast else None,
+        )
+        if on_ready is not None:
+            on_ready(f"serial://{os.ttyname(slave)}")
+        _run(stream, lambda data: outlet.send(data, stop), counters, speed, seconds, on_performed, on_sent, stop)
+    finally:
+        os.close(master)
+        os.close(slave)
+    return counters
+
+
+def _unread(slave: int) -> int:
+    """Return the number of unread bytes on a pseudo terminal."""
+    if sys.platform == "win32":
+        return 0
+    import fcntl
+    import struct
+    import termios
+
+    waiting = fcntl.ioctl(slave, termios.FIONREAD, b"\0" * 4)
+    return int(struct.unpack("i", waiting)[0])
+
+
+def _stall_s(speed: float) -> float:
+    return _STALL_S if speed <= 1.0 else _FAST_STALL_S
+
+
+def _run(
+    stream: ToyStream,
+    send: Callable[[bytes], bool],
+    counters: ToyCounters,
+    speed: float,
+    seconds: float,
+    on_performed: Callable[[PerformedGesture], None] | None,
+    on_sent: Callable[[bytes], None] | None,
+    stop: threading.Event,
+) -> None:
+    """Send each line when it is due by the device clock."""
+    pacer = Pacer(speed)
+    first_ms: int | None = None
+    batch, lines = bytearray(), 0
+
+    largest = 4096 if speed <= 1.0 else _FAST_QUEUE
+
+    def flush() -> None:
+        nonlocal lines
+        if batch:
+            if send(bytes(batch)):
+                counters.sent += lines
+                if on_sent is not None:
+                    on_sent(bytes(batch))
+            else:
+                counters.dropped += lines
+            batch.clear()
+            lines = 0
+
+    for line in stream:
+        if stop.is_set():
+            break
+        if first_ms is None:
+            first_ms = line.device_ms
+        if seconds and line.device_ms - first_ms >= seconds * 1000.0:
+            break
+        due = pacer.due_s(line.device_ms)
+        if due > 0.0 or len(batch) > largest:
+            flush()
+            if due > 0.0 and stop.wait(due):
+                break
+        if line.begins is not None:
+            counters.gestures += 1
+            if on_performed is not None:
+                on_performed(line.begins)
+        batch += line.data
+        lines += bool(line.data)
+    flush()

@@ -1,0 +1,468 @@
+"""Selective prediction of a network on people left out: when its confidence tells that it does not know.
+
+One answer a recording, that of the last step in it: a person's steps within one are hardly more than one witness.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import BadInput, ConfigError, DatasetError
+from plushsense.core.gestures import NOBODY, GestureSet
+from plushsense.dataset.index import as_dataset, open_dataset
+from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
+from plushsense.evaluation.crossval import fold_fingerprint, windows_fingerprint
+from plushsense.evaluation.folds import WindowFold, fold_windows
+from plushsense.jobs.journal import Job, Report, Result, job_id
+from plushsense.jobs.pool import run_jobs
+from plushsense.models.arch import Arch
+from plushsense.models.bundle import Bundle
+from plushsense.reports.figures import new_figure
+from plushsense.runtime.decisions import DecideSpec
+from plushsense.runtime.events import ONE
+from plushsense.runtime.fixed import smoothing_weight
+from plushsense.runtime.trace import TraceReplayer
+from plushsense.scoring.metrics import RiskCoverage, auroc, confidences, risk_coverage
+from plushsense.scoring.splits import parse_split
+from plushsense.training.spec import TrainSpec
+from plushsense.tuning.decisions import (
+    COVERAGE,
+    KNOWN_SHARE,
+    covered,
+    known_threshold,
+    labelled_steps,
+    marked_streams,
+    sure_threshold,
+)
+from plushsense.windows.cut import WindowSet
+from plushsense.workflow.config import RunConfig, from_settings
+from plushsense.workflow.preparation import Warn, choose_classes, outside_streams, silent, windows_for
+from plushsense.workflow.reporting import journal_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Ends:
+    """The last answer in each of n recordings.
+
+    ``logits`` (n, K) of that step and ``shares`` (n, K) smoothed, of the network's K classes; ``highest`` (n,) smoothed
+    logit; ``label`` (n,) the gesture that was made, of the network's or not; ``person`` (n,).
+    """
+
+    logits: Floats
+    shares: Floats
+    highest: Floats
+    label: NDArray[np.str_]
+    person: NDArray[np.str_]
+
+
+def ends(bundle: Bundle, dataset: Dataset, subjects: Iterable[str], spec: DecideSpec, gestures: GestureSet) -> Ends:
+    """Return the answers at the ends of the recordings of ``gestures`` in some people's streams."""
+    weight = smoothing_weight(spec.smoothing_s, bundle.arch.step * bundle.layout.period_us / 1e6)
+    rows: list[tuple[NDArray[Any], NDArray[Any], Any, str, str]] = []
+    for heard in marked_streams(bundle, dataset, subjects, spec, gestures):
+        parts = heard.trace.parts
+        smoothed = TraceReplayer(heard.trace).smoothed(weight)
+        for truth in heard.truths:
+            if truth.gesture < 0:
+                continue
+            for part, after in zip(parts, smoothed, strict=True):
+                times = heard.trace.step_times_us(part)
+                at = int(np.searchsorted(times, truth.stop_us, side="right")) - 1
+                if at >= 0 and times[at] > truth.start_us:
+                    label = gestures.labels[truth.gesture]
+                    rows.append((part.logits[at], after.shares[at], after.highest[at], label, heard.person))
+    k = len(bundle.gestures)
+    logits = np.array([r[0] for r in rows], dtype=np.float64).reshape(len(rows), k) / 256
+    return Ends(
+        logits,
+        np.array([r[1] for r in rows], dtype=np.int64).reshape(len(rows), k) / ONE,
+        np.array([r[2] for r in rows], dtype=np.int64) / 256,
+        np.array([r[3] for r in rows], dtype=np.str_),
+        np.array([r[4] for r in rows], dtype=np.str_),
+    )
+
+
+def fold_answers(
+    bundle: Bundle,
+    dataset: Dataset,
+    validation: Sequence[str],
+    test: Sequence[str],
+    *,
+    coverage: float,
+    known_share: float,
+) -> dict[str, Any]:
+    """Return the answers of one fold's network on people left out, with thresholds of the validation people."""
+    spec = DecideSpec()
+    calibration = labelled_steps(bundle, marked_streams(bundle, dataset, validation, spec), spec)
+    if not len(calibration.truth):
+        return {"people": [], "covered": [], "size": [], "sure": 1.0, "known": None, **_arrays(None)}
+    sure, known = sure_threshold(calibration, coverage), known_threshold(calibration, known_share)
+    steps = labelled_steps(bundle, marked_streams(bundle, dataset, test, spec), spec)
+    people = sorted(set(steps.person.tolist()))
+    each = [steps.take(steps.person == person) for person in people]
+    return {
+        "people": people,
+        "covered": [covered(mine, sure) for mine in each],
+        "size": [float((mine.shares >= sure * ONE).sum(axis=1).mean()) for mine in each],
+        "sure": sure,
+        "known": known,
+        **_arrays(ends(bundle, dataset, test, spec, dataset.gestures)),
+    }
+
+
+def _arrays(found: Ends | None) -> dict[str, Any]:
+    names = ("logits", "shares", "highest", "label", "person")
+    return {name: np.zeros(0) if found is None else getattr(found, name) for name in names}
+
+
+@dataclass(frozen=True)
+class FoldAnswers:
+    """A fold's answers as kept: with the labels of its network, and the one that was withheld from it or ""."""
+
+    fold: str
+    withheld: str
+    labels: tuple[str, ...]
+    result: Mapping[str, Any]
+
+    @property
+    def scores(self) -> dict[str, Floats]:
+        """Confidences of every recording, (n,) each."""
+        r = self.result
+        return confidences(r["logits"], r["shares"], r["highest"], float(r["sure"]))
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """(n,) recordings of a gesture that the network was trained on."""
+        return np.isin(self.result["label"], self.labels)
+
+    @property
+    def right(self) -> NDArray[np.bool_]:
+        """(n,) recordings whose most likely class, smoothed, is what was made."""
+        best = np.array(self.labels, dtype=np.str_)[self.result["shares"].argmax(axis=1)]
+        return np.asarray(best == self.result["label"])
+
+
+@dataclass(frozen=True)
+class Abstaining:
+    """The outcome: ``table`` as ``--json`` shows it, and the pooled ``curves`` by confidence."""
+
+    table: dict[str, Any]
+    curves: dict[str, RiskCoverage]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        return self.table
+
+
+def summarise(folds: Sequence[FoldAnswers], coverage: float, known_share: float) -> Abstaining:
+    """Return curves and figures of all folds together, by person and by withheld gesture."""
+    whole = [t for t in folds if not t.withheld and len(t.result["label"])]
+    right = np.concatenate([t.right[t.known] for t in whole])
+    person = np.concatenate([t.result["person"][t.known] for t in whole])
+    pooled = {name: np.concatenate([t.scores[name][t.known] for t in whole]) for name in whole[0].scores}
+    curves = {name: risk_coverage(score, right) for name, score in pooled.items()}
+    rows = []
+    for name, curve in curves.items():
+        gains = [risk_coverage(pooled[name][person == who], right[person == who]).gain for who in np.unique(person)]
+        rows.append(
+            {
+                "confidence": name,
+                "aurc": curve.area,
+                "gain": curve.gain,
+                "gain_by_person": _spread(gains),
+                "coverage_at_risk_20": curve.coverage_at(0.2),
+                "auroc_right": auroc(pooled[name][right], pooled[name][~right]),
+            }
+        )
+    by_person = [share for t in whole for share in t.result["covered"]]
+    unknown = [t for t in whole if (~t.known).any()]
+    withheld: dict[str, dict[str, Any]] = {}
+    for label in dict.fromkeys(t.withheld for t in folds if t.withheld):
+        made = [t for t in folds if t.withheld == label and (t.result["label"] == label).any()]
+        if made:
+            withheld[label] = _against(made, known_share)
+    table = {
+        "recordings": len(right),
+        "people": len(np.unique(person)),
+        "accuracy": float(right.mean()),
+        "aurc_random": curves["softmax"].random,
+        "aurc_oracle": curves["softmax"].oracle,
+        "confidences": rows,
+        "stated_coverage": {
+            "stated": coverage,
+            "by_person": _spread(by_person),
+            "least": min(by_person),
+            "by_fold": [float(np.mean(t.result["covered"])) for t in whole],
+            "classes_in_set": float(np.mean([size for t in whole for size in t.result["size"]])),
+            "on": "steps in the second half of a recording",
+        },
+        "free_choice": _against(unknown, known_share) if unknown else None,
+        "withheld": withheld,
+        "withheld_mean": {
+            name: _spread([row["auroc"][name]["mean"] for row in withheld.values()]) for name in curves if withheld
+        },
+    }
+    return Abstaining(table, curves)
+
+
+def _against(folds: Sequence[FoldAnswers], known_share: float) -> dict[str, Any]:
+    """Known against unknown: AUROC by confidence over folds, and what the fitted threshold calls unknown."""
+    auc: dict[str, list[float]] = {}
+    passed, caught, count = [], [], 0
+    for t in folds:
+        other = np.asarray(t.result["label"] == t.withheld) if t.withheld else ~t.known
+        count += int(other.sum())
+        for name, score in t.scores.items():
+            auc.setdefault(name, []).append(auroc(score[t.known], score[other]))
+        if t.result["known"] is not None:
+            under = np.asarray(t.result["highest"] < t.result["known"])
+            passed.append(float((~under[t.known]).mean()))
+            caught.append(float(under[other].mean()))
+    return {
+        "recordings": count,
+        "folds": len(folds),
+        "auroc": {name: _spread(values) for name, values in auc.items()},
+        "known_share_stated": known_share,
+        "known_passed": _spread(passed),
+        "unknown_caught": _spread(caught),
+    }
+
+
+def _spread(values: Sequence[float]) -> dict[str, float | None]:
+    """Mean and standard deviation of what is a number."""
+    real = [v for v in values if np.isfinite(v)]
+    return {
+        "mean": float(np.mean(real)) if real else None,
+        "sd": float(np.std(real, ddof=1)) if len(real) > 1 else None,
+        "n": len(real),
+    }
+
+
+# Okabe and Ito's colours with line styles, so that any colour vision tells them apart.
+_STYLES = (
+    ("#0072b2", "-"),
+    ("#d55e00", "--"),
+    ("#009e73", "-."),
+    ("#cc79a7", ":"),
+    ("#e69f00", "-"),
+    ("#56b4e9", "--"),
+    ("#000000", "-."),
+)
+
+
+def curves(found: Mapping[str, RiskCoverage], *, title: str = "") -> Figure:
+    """Draw one curve for each confidence between those of the oracle and of chance, the best first in the legend."""
+    figure = new_figure(6.4, 4.2)
+    axes = figure.add_subplot()
+    ranked = sorted(found.items(), key=lambda item: item[1].area)
+    first = ranked[0][1]
+    axes.axhline(100 * first.random, color="#888888", linewidth=1.0, label=f"chance (area {first.random:.3f})")
+    for (name, curve), (colour, style) in zip(ranked, _STYLES, strict=False):
+        label = f"{name} ({curve.area:.3f}; {100 * curve.gain:.0f} % of the oracle's gain)"
+        axes.plot(100 * curve.coverage, 100 * curve.risk, style, color=colour, linewidth=1.5, label=label)
+    right = 1 - first.random
+    coverage = np.linspace(0.001, 1, 400)
+    axes.plot(
+        100 * coverage,
+        100 * np.maximum(coverage - right, 0) / coverage,
+        color="#888888",
+        linewidth=1.0,
+        linestyle=(0, (1, 1)),
+        label=f"oracle ({first.oracle:.3f})",
+    )
+    axes.set(xlim=(0, 100), ylim=(0, None), xlabel="Coverage (% of gestures answered, the surest first)")
+    axes.set_ylabel("Risk (% of the answers that are wrong)")
+    axes.grid(color="#dddddd", linewidth=0.5)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(fontsize=7.5, frameon=False, loc="upper left", bbox_to_anchor=(0, 1.0))
+    axes.set_ylim(0, 100 * max(first.random, *(float(c.risk.max()) for c in found.values())) * 1.75)
+    if title:
+        axes.set_title(title, fontsize=10, parse_math=False)
+    return figure
+
+
+# Raise it when the meaning of what is kept changes, that of the default smoothing included.
+_VERSION = 1
+FIGURE, TABLE = "risk-coverage.png", "abstaining.json"
+
+
+@dataclass(frozen=True)
+class _AnswerWork:
+    """Trains without ``withheld`` (a task is a fold and that label, or ""), and hears the people left out."""
+
+    dataset: str
+    arch: Arch
+    spec: TrainSpec
+    gestures: GestureSet
+    coverage: float
+    known_share: float
+
+    def __call__(self, shared: WindowSet, task: tuple[WindowFold, str], report: Report, /) -> Result:
+        from plushsense.training.fit import fit
+
+        fold, withheld = task
+        dataset = _opened(self.dataset)
+        gestures = self.gestures.subset([g for g in self.gestures.labels if g != withheld])
+        train, validation = (_without(shared.take(at), withheld) for at in (fold.train, fold.validation))
+        arch = replace(self.arch, classes=len(gestures))
+        fitted = fit(train, validation, arch, self.spec, lambda epoch, epochs, _: report((epoch, epochs)))
+        bundle = Bundle(arch, fitted.weights, dataset.layout, fitted.scaler, gestures)
+        validation_people, test_people = (
+            sorted(set(shared.subject[at].tolist()) - {NOBODY, UNKNOWN_SUBJECT}) for at in (fold.validation, fold.test)
+        )
+        return fold_answers(
+            bundle, dataset, validation_people, test_people, coverage=self.coverage, known_share=self.known_share
+        )
+
+
+@lru_cache(maxsize=1)
+def _opened(path: str) -> Dataset:
+    return open_dataset(Path(path))
+
+
+def _without_other_people(fold: WindowFold, windows: WindowSet, dataset: Dataset) -> WindowFold:
+    """Return the fold without training windows from the streams of validation and test people."""
+    heard = set(windows.subject[np.concatenate([fold.validation, fold.test])].tolist()) - {NOBODY}
+    return replace(fold, train=fold.train[outside_streams(windows, dataset, heard)[fold.train]])
+
+
+def _without(windows: WindowSet, label: str) -> WindowSet:
+    """Return the windows of all other gestures, with class indices of their own."""
+    if not label:
+        return windows
+    at = windows.labels.index(label)
+    mine = windows.take(np.flatnonzero(windows.y != at))
+
+    def rest(names: tuple[str, ...]) -> tuple[str, ...]:
+        return names[:at] + names[at + 1 :]
+
+    return replace(
+        mine,
+        y=mine.y - (mine.y > at),
+        labels=rest(mine.labels),
+        affects=rest(mine.affects),
+        families=rest(mine.families),
+    )
+
+
+def abstaining(
+    dataset: Dataset | str | os.PathLike[str],
+    config: RunConfig | None = None,
+    *,
+    split: str = "by-subject:5",
+    withhold: bool = False,
+    coverage: float = COVERAGE,
+    known_share: float = KNOWN_SHARE,
+    out: str | os.PathLike[str] | None = None,
+    progress: Callable[[int, int, int], None] | None = None,
+    warn: Warn = silent,
+    **settings: Any,
+) -> Abstaining:
+    """Evaluate abstention: risk against coverage, stated coverage, known against unknown gestures.
+
+    Networks are trained by folds of people; thresholds come from those who validate, and every figure from the streams
+    of those left out. Finished trainings are kept in the data set's ``cache`` folder.
+
+    Args:
+        split: whole people only: "by-subject:5", "leave-one-subject-out".
+        withhold: also train without each gesture in turn, and ask whether it is taken for unknown: as many
+            trainings again for each gesture.
+        coverage: at which the conformal sets are fitted; known_share: of known gestures that pass as known.
+        out: a folder for ``abstaining.json`` and the figure.
+        progress: called with (trainings done, of all, from before).
+
+    Raises:
+        ConfigError: for a split of windows or recordings; DatasetError: without streams.
+    """
+    dataset = as_dataset(dataset)
+    config = config or from_settings(**settings)
+    asked = parse_split(split)
+    if not asked.apart:
+        raise ConfigError(
+            f"The split '{split}' does not keep people apart: accepted are by-subject:K and leave-one-subject-out."
+        )
+    if not any(r.stream_row >= 0 for r in dataset.used):
+        raise DatasetError(
+            f"No recording of '{dataset.head.name}' lies in a stream: what is sure is asked there, as a toy hears it."
+        )
+    gestures = choose_classes(dataset, config.evaluation.classes, warn)
+    arch = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
+    windows = windows_for(dataset, arch, config.windows, gestures, warn)
+    folds = [
+        _without_other_people(fold, windows, dataset)
+        for fold in fold_windows(windows, windows, asked, config.evaluation.seed)
+    ]
+    from plushsense.training.fit import resolve_device
+
+    key = {
+        "version": _VERSION,
+        "dataset": dataset.hash,
+        "windows": windows_fingerprint(windows),
+        "arch": arch.to_dict(),
+        "training": resolve_device(config.training).key(),
+        "shares": [coverage, known_share],
+    }
+    # Fold by fold, so that a run that is stopped has heard of every gesture.
+    without = [(fold, label) for fold in folds for label in gestures.labels if withhold and len(gestures) > 2]
+    jobs = [
+        Job(job_id({**key, "fold": fold_fingerprint(fold), "withheld": label}), (fold, label))
+        for fold, label in [*((fold, "") for fold in folds), *without]
+    ]
+    done = resumed = 0
+
+    def count(_: Job, __: Result, kept: bool) -> None:
+        nonlocal done, resumed
+        done, resumed = done + 1, resumed + kept
+        if progress is not None:
+            progress(done, len(jobs), resumed)
+
+    results = run_jobs(
+        jobs,
+        _AnswerWork(str(dataset.path), arch, config.training, gestures, coverage, known_share),
+        shared=windows,
+        workers=config.evaluation.processes,
+        journal=journal_of(dataset, "abstaining"),
+        on_done=count,
+    )
+    answers = [
+        FoldAnswers(
+            job.task[0].name, job.task[1], tuple(g for g in gestures.labels if g != job.task[1]), results[job.id]
+        )
+        for job in jobs
+    ]
+    if not any(len(t.result["label"]) for t in answers if not t.withheld):
+        raise BadInput(
+            "Nobody who was left out has a stream with recordings in it, or nobody to set thresholds on has."
+        )
+    found = summarise(answers, coverage, known_share)
+    found.table.update(split=asked.text, simulated=dataset.head.simulated, dataset=dataset.head.name)
+    if out is not None:
+        with dataset.generation.writing():
+            save(found, Path(out))
+    return found
+
+
+def save(found: Abstaining, out: Path) -> None:
+    """Write the figures as JSON and the curves as a picture."""
+    from plushsense.reports.figures import png
+
+    out.mkdir(parents=True, exist_ok=True)
+    (out / TABLE).write_text(json.dumps(found.table, indent=1, ensure_ascii=False), encoding="utf-8", newline="\n")
+    title = f"{found.table['dataset']}, {found.table['people']} people left out ({found.table['split']})"
+    title += "  [SIMULATION]" if found.table["simulated"] else ""
+    (out / FIGURE).write_bytes(png(curves(found.curves, title=title), dpi=110))

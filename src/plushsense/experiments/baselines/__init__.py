@@ -1,0 +1,1 @@
+"""Classical and recurrent baselines beside our network, under several splits. Read run, score, report."""

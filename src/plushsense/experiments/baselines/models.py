@@ -1,0 +1,308 @@
+"""The classical programs that a network must beat: statistics or flattened windows, with and without PCA.
+
+A baseline is scaling, perhaps PCA, and a classifier of scikit-learn (extra ``baselines``), all fitted to the training
+windows of a fold and to nothing else. Names such as "cubic SVM" and "subspace kNN" are those of MATLAB's Classification
+Learner, which the paper used (sections 3.4 and 4.5); it gives no settings, so ours stand beside each name below.
+"""
+
+from __future__ import annotations
+
+import pickle
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import BadInput, ConfigError, nearest, need
+from plushsense.experiments.baselines.score import Contender, Reader
+from plushsense.windows.cut import WindowSet
+from plushsense.windows.features import Scaler, statistics
+
+Floats = NDArray[np.float64]
+
+# Part of every job's id: raise it when the same name would be another program.
+BASELINES_VERSION = 1
+# The share of the variance that PCA keeps.
+PCA_VARIANCE = 0.95
+TREES = 200
+
+EXTRA = "baselines"
+
+
+def _sklearn(module: str) -> Any:
+    return need(f"sklearn.{module}", extra=EXTRA)
+
+
+def _forest(seed: int) -> Any:
+    return _sklearn("ensemble").RandomForestClassifier(TREES, random_state=seed, n_jobs=1)
+
+
+def _extra_trees(seed: int) -> Any:
+    return _sklearn("ensemble").ExtraTreesClassifier(TREES, random_state=seed, n_jobs=1)
+
+
+def _knn(seed: int) -> Any:
+    return _sklearn("neighbors").KNeighborsClassifier(5, n_jobs=1)
+
+
+def _subspace_knn(seed: int) -> Any:
+    """Return 30 nearest-neighbour classifiers, each on another random half of the values (Ho 1998)."""
+    one = _sklearn("neighbors").KNeighborsClassifier(1, n_jobs=1)
+    return _sklearn("ensemble").BaggingClassifier(
+        one, 30, max_features=0.5, bootstrap=False, random_state=seed, n_jobs=1
+    )
+
+
+def _cubic_svm(seed: int) -> Any:
+    return _sklearn("svm").SVC(kernel="poly", degree=3, coef0=1.0, C=1.0)
+
+
+def _rbf_svm(seed: int) -> Any:
+    return _sklearn("svm").SVC(kernel="rbf", C=1.0)
+
+
+def _tree(seed: int) -> Any:
+    return _sklearn("tree").DecisionTreeClassifier(random_state=seed)
+
+
+def _boosting(seed: int) -> Any:
+    return _sklearn("ensemble").HistGradientBoostingClassifier(max_iter=100, early_stopping=False, random_state=seed)
+
+
+def _mlp(seed: int) -> Any:
+    return _sklearn("neural_network").MLPClassifier((64,), max_iter=200, random_state=seed)
+
+
+# How each classifier is made; it is given the seed.
+BASELINES: dict[str, Callable[[int], Any]] = {
+    "forest": _forest,
+    "extra-trees": _extra_trees,
+    "knn": _knn,
+    "subspace-knn": _subspace_knn,
+    "cubic-svm": _cubic_svm,
+    "rbf-svm": _rbf_svm,
+    "tree": _tree,
+    "boosting": _boosting,
+    "mlp": _mlp,
+}
+
+TITLES = {
+    "forest": f"random forest ({TREES})",
+    "extra-trees": f"extra trees ({TREES})",
+    "knn": "kNN (5)",
+    "subspace-knn": "subspace kNN (30)",
+    "cubic-svm": "cubic SVM",
+    "rbf-svm": "RBF SVM",
+    "tree": "decision tree",
+    "boosting": "gradient boosting",
+    "mlp": "MLP (64)",
+}
+
+
+def _statistics(windows: WindowSet, samples: int) -> Floats:
+    return statistics(windows.x[:, :, -samples:], windows.rate_hz)
+
+
+def _flattened(windows: WindowSet, samples: int) -> Floats:
+    return windows.x[:, :, -samples:].reshape(len(windows), -1).astype(np.float64)
+
+
+# What takes longest and gains least: on flattened windows of 3 channels one fit took 52 s, on 11 it would take minutes.
+TOO_LONG = (("boosting", "flattened", False),)
+
+# What a classifier is given of a window's last ``samples`` samples, (N, values).
+FEATURES: dict[str, Callable[[WindowSet, int], Floats]] = {"statistics": _statistics, "flattened": _flattened}
+
+
+@dataclass(frozen=True)
+class ClassicalFit:
+    """Fits one baseline; ``samples`` is the window that it reads, counted from the end."""
+
+    name: str
+    features: str
+    pca: bool
+    samples: int
+    seed: int
+
+    def __call__(self, train: WindowSet, validation: WindowSet, /) -> Reader:
+        """Fit scaling, PCA and classifier to ``train``; ``validation`` is not used."""
+        enough_to_learn(train)
+        steps = [_sklearn("preprocessing").StandardScaler()]
+        if self.pca:
+            steps.append(_sklearn("decomposition").PCA(PCA_VARIANCE, svd_solver="full"))
+        pipeline = _sklearn("pipeline").make_pipeline(*steps, BASELINES[self.name](self.seed))
+        with warnings.catch_warnings():
+            # The small network is given its rounds, like everybody; that it could do with more is no news to the user.
+            warnings.simplefilter("ignore", _sklearn("exceptions").ConvergenceWarning)
+            pipeline.fit(FEATURES[self.features](train, self.samples), train.y)
+        return ClassicalReader(pipeline, self.features, self.samples)
+
+
+class ClassicalReader:
+    """A fitted baseline.
+
+    ``size_bytes`` is the length of its pickle, taken in memory: a measure like MATLAB's "model size", never a format in
+    which anything is kept or read.
+    """
+
+    def __init__(self, pipeline: Any, features: str, samples: int) -> None:
+        self.pipeline, self._features, self._samples = pipeline, features, samples
+
+    @property
+    def size_bytes(self) -> int:
+        return len(pickle.dumps(self.pipeline, protocol=pickle.HIGHEST_PROTOCOL))
+
+    def __call__(self, windows: WindowSet, /) -> NDArray[np.float32]:
+        return likelihoods(self.pipeline, FEATURES[self._features](windows, self._samples), len(windows.labels))
+
+
+def likelihoods(model: Any, x: Any, classes: int) -> NDArray[np.float32]:
+    """Return probabilities (N, K) over all classes; 0 for a class without training windows.
+
+    A support vector machine gives no probabilities: its decision values, votes with their margins, go through a
+    softmax, which keeps their order and is not calibrated.
+    """
+    out = np.zeros((len(x), classes), dtype=np.float32)
+    if hasattr(model, "predict_proba"):
+        out[:, model.classes_] = model.predict_proba(x)
+        return out
+    margin = np.asarray(model.decision_function(x), dtype=np.float64)
+    if margin.ndim == 1:
+        margin = np.stack([-margin, margin], axis=1)
+    power = np.exp(margin - margin.max(axis=1, keepdims=True))
+    out[:, model.classes_] = power / power.sum(axis=1, keepdims=True)
+    return out
+
+
+def enough_to_learn(train: WindowSet) -> None:
+    """Refuse a fold that trains on windows of one gesture."""
+    if len(np.unique(train.y)) < 2:
+        found = ", ".join(train.labels[k] for k in np.unique(train.y)) or "none"
+        raise BadInput(
+            f"A fold has windows of {found} only to train on, and two gestures are needed: use fewer folds, or choose "
+            "others with --classes."
+        )
+
+
+def classical(
+    names: Sequence[str], features: Sequence[str], pca: Sequence[bool], samples: int, seed: int
+) -> list[Contender]:
+    """Return every requested baseline on every requested view of the windows, except those that take `TOO_LONG`.
+
+    Raises:
+        ConfigError: for a name or a view that there is not, with the nearest.
+        MissingExtraError: without scikit-learn.
+    """
+    for what, given, known in (("baseline", names, tuple(BASELINES)), ("features", features, tuple(FEATURES))):
+        for one in given:
+            if one not in known:
+                raise ConfigError(f"Unknown {what} '{one}': accepted are {', '.join(known)}.{nearest(one, known)}")
+    library = f"scikit-learn {need('sklearn', extra=EXTRA).__version__}"
+    return [
+        Contender(
+            name,
+            TITLES[name],
+            view,
+            reduced,
+            ClassicalFit(name, view, reduced, samples, seed),
+            {"version": BASELINES_VERSION, "library": library, "samples": samples, "seed": seed},
+        )
+        for view in features
+        for reduced in pca
+        for name in names
+        if (name, view, reduced) not in TOO_LONG
+    ]
+
+
+# Part of every job's id: raise it when the same name would be another program.
+ROCKETS_VERSION = 1
+EXTRA_ROCKETS = "rocket"
+
+# The title, and aeon's class.
+ROCKETS: dict[str, tuple[str, str]] = {
+    "minirocket": ("MiniRocket", "MiniRocketClassifier"),
+    "multirocket-hydra": ("MultiRocket-Hydra", "MultiRocketHydraClassifier"),
+}
+# Windows that compile a rocket's kernels.
+_FIRST = 32
+
+
+@dataclass(frozen=True)
+class RocketFit:
+    """Fits a classifier of random convolutions (Dempster, Schmidt & Webb 2021, 2023) to windows scaled by channel.
+
+    Its kernels are compiled when they first run in a process (seconds to a minute): a few windows are read for that
+    first, so that no time that is reported holds it.
+    """
+
+    name: str
+    samples: int
+    seed: int
+
+    def __call__(self, train: WindowSet, validation: WindowSet, /) -> Reader:
+        """Fit the classifier to ``train``; ``validation`` is not used."""
+        enough_to_learn(train)
+        scaler = Scaler.fit(train.x[:, :, -self.samples :])
+        x = scaler.apply(train.x[:, :, -self.samples :])
+        model = _rocket(self.name, self.seed)
+        model.fit(x, train.y)
+        return RocketReader(model, scaler, self.samples)
+
+    def prepare(self, train: WindowSet, /) -> None:
+        """Compile, once a process: before the clock starts."""
+        _compiled(self.name, train.x.shape[1], min(self.samples, train.x.shape[2]))
+
+
+class RocketReader:
+    """A fitted rocket; ``size_bytes`` the length of its pickle in memory, as for a `ClassicalReader`."""
+
+    def __init__(self, model: Any, scaler: Scaler, samples: int) -> None:
+        self.model, self._scaler, self._samples = model, scaler, samples
+
+    @property
+    def size_bytes(self) -> int:
+        return len(pickle.dumps(self.model, protocol=pickle.HIGHEST_PROTOCOL))
+
+    def __call__(self, windows: WindowSet, /) -> NDArray[np.float32]:
+        x = self._scaler.apply(windows.x[:, :, -self._samples :])
+        return likelihoods(self.model, x, len(windows.labels))
+
+
+def _rocket(name: str, seed: int) -> Any:
+    module = need("aeon.classification.convolution_based", extra=EXTRA_ROCKETS)
+    return getattr(module, ROCKETS[name][1])(random_state=seed, n_jobs=1)
+
+
+@lru_cache(maxsize=8)
+def _compiled(name: str, channels: int, samples: int) -> None:
+    """Run a rocket's kernels once in this process, on noise."""
+    x = np.random.default_rng(0).normal(size=(_FIRST, channels, samples)).astype(np.float32)
+    model = _rocket(name, 0)
+    model.fit(x, np.arange(_FIRST) % 2)
+    model.predict_proba(x[:2])
+
+
+def rockets(names: Sequence[str], samples: int, seed: int) -> list[Contender]:
+    """Return the classifiers of aeon, which read the window itself.
+
+    Raises:
+        MissingExtraError: without aeon, or without PyTorch, which MultiRocket-Hydra needs.
+    """
+    library = f"aeon {need('aeon', extra=EXTRA_ROCKETS).__version__}" if names else ""
+    if "multirocket-hydra" in names:
+        need("torch", extra=EXTRA_ROCKETS)
+    return [
+        Contender(
+            name,
+            ROCKETS[name][0],
+            "windows",
+            False,
+            RocketFit(name, samples, seed),
+            {"version": ROCKETS_VERSION, "library": library, "samples": samples, "seed": seed},
+        )
+        for name in names
+    ]

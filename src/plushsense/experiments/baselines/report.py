@@ -1,0 +1,186 @@
+"""Table, figure and page of the baselines: the scores of each program under each split, and its costs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from plushsense.reports.figures import data_uri, new_figure
+from plushsense.reports.page import render_page
+from plushsense.reports.table import Column, Table, count, mean_sd, number
+from plushsense.reports.wording import CONTEXT_SHORT
+from plushsense.scoring.metrics import column_metrics
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+SIMULATION = "SIMULATION: these scores are of the virtual toy and say nothing about a real one."
+COUNTS = (
+    "Only the number by person counts: in the leaky split overlapping windows of one recording, and recordings of one "
+    "person, stand on both sides, so that a program is paid for recognising what it has already seen, while whoever "
+    "touches the toy next is new to it."
+)
+LEAKY = (
+    "A leaky split has overlapping windows of one recording, and recordings of one person, on both sides: its numbers "
+    "say little about a new person, and only a split by person counts."
+)
+# Okabe and Ito's blue and vermillion; filled against open says the same without colour.
+_HONEST, _LEAKY = "#0072b2", "#d55e00"
+Program = tuple[str, str, bool]
+"""Name, features, and whether PCA reduces them."""
+
+
+def program_table(result: Mapping[str, Any]) -> Table:
+    """Return one row for each program, the best under the first split first.
+
+    Of each split accuracy and macro-F1, with accuracy / macro-F1 pooled over all windows as a note; the gap in accuracy
+    between the first leaky split and the first by person; the costs, which are those under the first split.
+    """
+    splits = [split["split"] for split in result["splits"]]
+    by_program: dict[Program, dict[str, Mapping[str, Any]]] = {}
+    for row in result["models"]:
+        by_program.setdefault(_program(row), {})[row["split"]] = row
+    gaps: dict[Program, float] = {}
+    for gap in result["gaps"]:
+        gaps.setdefault(_program(gap), gap["accuracy"])
+    ranked = sorted(by_program.items(), key=lambda item: -float(item[1][splits[0]]["accuracy"]["mean"]))
+    rows = []
+    for program, by_split in ranked:
+        first = by_split[splits[0]]
+        row = {
+            "title": first["title"],
+            "reads": first["features"] + (", PCA" if first["pca"] else ""),
+            "gap": f"{gaps[program]:+.3f}" if program in gaps else "",
+            "size": size(first["size_bytes"]),
+            "predict": milliseconds(first["predict_ms"]),
+            "batch": milliseconds(first["predict_batch_ms"]),
+            "train": f"{first['train_s']:.2f}" if first["train_s"] < 10 else f"{first['train_s']:.0f}",
+            "class": "ours" if first["name"] == "network" else "",
+        }
+        for split, scores in by_split.items():
+            pooled = scores["pooled"]
+            row |= {f"{key} {split}": mean_sd(scores[key]) for key in column_metrics()}
+            note = "pooled " + " / ".join(number(pooled[key]) for key in column_metrics())
+            row[f"accuracy {split}"] = (mean_sd(scores["accuracy"]), note)
+        rows.append(row)
+    columns = [Column("title", "Program", plain="program"), Column("reads", "Reads", plain="reads")]
+    for split in result["splits"]:
+        name, leaky, group = split["split"], split["leaky"], f"{split['split']}, {split['folds']} folds"
+        for key, metric in column_metrics().items():
+            plain = f"{metric.name}, {name}" if key == "accuracy" else metric.name
+            columns.append(Column(f"{key} {name}", metric.title, "right", group=group, leaky=leaky, plain=plain))
+    if result["gaps"]:
+        columns.append(Column("gap", "Gap in accuracy", "right", plain="gap"))
+    columns += [
+        Column("size", "Size", "right", plain="size"),
+        Column("predict", "alone", "right", group="ms a window", plain="ms alone"),
+        Column("batch", "in a batch", "right", group="ms a window", plain="ms batch"),
+        Column("train", "Training, s", "right", plain="train s"),
+    ]
+    return Table("programs", "Every program", tuple(columns), tuple(rows))
+
+
+def score_table(result: Mapping[str, Any]) -> Table:
+    """Return one row for each program and split as numbers, for CSV."""
+    rows = []
+    for row in result["models"]:
+        scores = {f"{m}_{part}": row[m][part] for m in column_metrics() for part in ("mean", "sd")}
+        rows.append(row | scores | {f"{m}_pooled": row["pooled"][m] for m in column_metrics()})
+    names = ["name", "title", "features", "pca", "split", "leaky", "over", "folds"]
+    names += [f"{m}_{part}" for m in column_metrics() for part in ("mean", "sd", "pooled")]
+    names += ["size_bytes", "predict_ms", "predict_batch_ms", "train_s", "train_s_in_all"]
+    return Table("baselines", "Every program and split", tuple(Column(name, name) for name in names), tuple(rows))
+
+
+def _program(row: Mapping[str, Any]) -> Program:
+    return row["name"], row["features"], row["pca"]
+
+
+def size(n: int) -> str:
+    """Return bytes as kB or MB (thousands)."""
+    return f"{n / 1e6:.1f} MB" if n >= 1e6 else f"{n / 1e3:.1f} kB"
+
+
+def milliseconds(value: float) -> str:
+    """Return milliseconds with about three digits."""
+    return f"{value:.3f}" if value < 1 else f"{value:.1f}" if value < 100 else f"{value:.0f}"
+
+
+def describe_costs(result: Mapping[str, Any]) -> str:
+    """Return a note on how sizes and times were measured."""
+    return (
+        "Size: classical programs as they are pickled in memory, our network as its bundle, recurrent ones as their "
+        "float32 weights. Processor time in milliseconds a window, read alone (median) or many at once, and seconds of "
+        "training (median over folds), with everything from raw samples to probabilities, on this machine: "
+        f"{result['machine']}."
+    )
+
+
+def describe_data(result: Mapping[str, Any]) -> str:
+    """Return a sentence on the data of the comparison."""
+    return (
+        f"{result['dataset']}: {count(result['windows'])} windows of {count(result['recordings'])} recordings, "
+        f"{result['subjects']} people, {len(result['labels'])} gestures; {result['window_s']:g} s windows, "
+        f"{CONTEXT_SHORT.get(result['context'], result['context'])}; seed {result['seed']}."
+    )
+
+
+def figure(result: Mapping[str, Any]) -> Figure:
+    """Draw a line for each program from its accuracy under the first split by person to the first leaky one."""
+    splits: Sequence[Mapping[str, Any]] = result["splits"]
+    honest = next((s["split"] for s in splits if not s["leaky"]), None)
+    leaky = next((s["split"] for s in splits if s["leaky"]), None)
+    at: dict[Program, dict[str, float]] = {}
+    named: dict[Program, str] = {}
+    for row in result["models"]:
+        key = _program(row)
+        at.setdefault(key, {})[row["split"]] = row["accuracy"]["mean"]
+        named[key] = f"{row['title']}, {row['features']}{', PCA' if row['pca'] else ''}"
+    main = honest or leaky or ""
+    order = sorted(at, key=lambda key: at[key][main])
+    picture = new_figure(9.0, 1.5 + 0.24 * len(order))
+    axes = picture.add_subplot()
+    for y, key in enumerate(order):
+        if honest is not None and leaky is not None:
+            axes.plot([at[key][honest], at[key][leaky]], [y, y], color="#999999", linewidth=1.4, zorder=1)
+    for split, inside, edge, mark in ((honest, _HONEST, _HONEST, ""), (leaky, "#ffffff", _LEAKY, " (leaky)")):
+        if split is not None:
+            axes.scatter(
+                [at[key][split] for key in order],
+                range(len(order)),
+                s=34,
+                linewidths=1.6,
+                zorder=2,
+                facecolor=inside,
+                edgecolor=edge,
+                label=f"{split}{mark}",
+            )
+    axes.set_yticks(range(len(order)), [named[key] for key in order], fontsize=8, parse_math=False)
+    for tick, key in zip(axes.get_yticklabels(), order, strict=True):
+        if key[0] == "network":
+            tick.set_fontweight("bold")
+    axes.set_xlim(0, 1)
+    axes.set_ylim(-0.7, len(order) - 0.3)
+    axes.set_xlabel("Accuracy: share of windows, mean over people (leaky split: over folds)")
+    axes.grid(axis="x", color="#dddddd", linewidth=0.5)
+    axes.spines[["top", "right"]].set_visible(False)
+    picture.legend(loc="outside upper right", ncols=2, fontsize=8, frameon=False)
+    title = f"{result['dataset']}, {result['subjects']} people"
+    axes.set_title(title + (": SIMULATION" if result["simulated"] else ""), fontsize=10, loc="left", parse_math=False)
+    return picture
+
+
+def page(result: Mapping[str, Any]) -> str:
+    """Return the comparison as one self-contained HTML page."""
+    return render_page(
+        "baselines.html.j2",
+        title=f"PlushSense baselines: {result['dataset']}",
+        simulated=result["simulated"],
+        about=describe_data(result),
+        table=program_table(result),
+        metrics=column_metrics(),
+        counts=COUNTS if result["gaps"] else LEAKY,
+        any_leaky=any(s["leaky"] for s in result["splits"]),
+        costs=describe_costs(result),
+        picture=data_uri(figure(result)),
+    )

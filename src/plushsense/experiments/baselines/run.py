@@ -1,0 +1,277 @@
+"""Baselines beside our network: the same windows, several splits, one table."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import ConfigError, nearest, need
+from plushsense.core.files import write_file
+from plushsense.core.gestures import GestureSet
+from plushsense.core.layouts import Layout
+from plushsense.core.version import __version__
+from plushsense.dataset.index import as_dataset
+from plushsense.dataset.store import Dataset
+from plushsense.experiments.baselines.models import BASELINES, FEATURES, ROCKETS, TITLES, TOO_LONG, classical, rockets
+from plushsense.experiments.baselines.score import CompareProgress, Contender, Reader, compare
+from plushsense.jobs.journal import job_id
+from plushsense.models.arch import Arch
+from plushsense.models.bundle import Bundle
+from plushsense.models.reference import Network
+from plushsense.scoring.splits import parse_split
+from plushsense.training.spec import TrainSpec
+from plushsense.windows.cut import ANYWHERE, WindowSet
+from plushsense.windows.features import Scaler
+from plushsense.workflow.config import RunConfig, from_settings
+from plushsense.workflow.preparation import Warn, choose_classes, silent, windows_for
+from plushsense.workflow.reporting import check_folder, journal_of, machine
+
+SPLITS = ("leave-one-subject-out", "windows:5")
+TABLE, SHEET, PAGE, PICTURE = "baselines.json", "baselines.csv", "baselines.html", "baselines.png"
+
+RECURRENT = {"lstm": "LSTM (32)", "bilstm": "BiLSTM (32)"}
+NETWORK = "network"
+# By name: classical programs, recurrent networks, rockets (extra), and our own network.
+MODELS = (*BASELINES, *RECURRENT, *ROCKETS, NETWORK)
+# "quick": seconds a fold in sum. "all" leaves out the rockets, whose package not everybody can install.
+SETS: dict[str, tuple[str, ...]] = {
+    "quick": ("forest", "extra-trees", "knn", "rbf-svm", "tree"),
+    "classical": tuple(BASELINES),
+    "all": (*BASELINES, *RECURRENT, NETWORK),
+}
+PCA: dict[str, tuple[bool, ...]] = {"both": (False, True), "no": (False,), "yes": (True,)}
+
+
+@dataclass(frozen=True)
+class NetworkFit:
+    """Trains one of our networks; its size is that of its bundle."""
+
+    arch: Arch
+    spec: TrainSpec
+    layout: Layout
+    gestures: GestureSet
+
+    def __call__(self, train: WindowSet, validation: WindowSet, /) -> Reader:
+        from plushsense.training.fit import fit
+
+        fitted = fit(train, validation, self.arch, self.spec)
+        bundle = Bundle(self.arch, fitted.weights, self.layout, fitted.scaler, self.gestures)
+        with tempfile.TemporaryDirectory() as folder:
+            size = bundle.save(Path(folder, "network.plush")).stat().st_size
+        return NetworkReader(bundle.network(), fitted.scaler, size)
+
+
+@dataclass(frozen=True)
+class NetworkReader:
+    """A trained network as it runs beside a toy: in NumPy."""
+
+    network: Network
+    scaler: Scaler
+    size_bytes: int
+
+    def __call__(self, windows: WindowSet, /) -> NDArray[np.float32]:
+        x = self.scaler.apply(windows.x[:, :, windows.x.shape[2] - self.network.arch.span :])
+        return self.network.probabilities(x).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class RecurrentFit:
+    """Trains an LSTM or a BiLSTM on the last ``samples`` of the windows."""
+
+    spec: TrainSpec
+    samples: int
+    both_ways: bool
+
+    def __call__(self, train: WindowSet, validation: WindowSet, /) -> Reader:
+        from plushsense.training.recurrent import fit_recurrent
+
+        return fit_recurrent(train, self.spec, self.samples, both_ways=self.both_ways)
+
+
+def chosen(models: str | Sequence[str]) -> tuple[str, ...]:
+    """Return the programs of a list (or a text with commas) of names and sets, each once, in the order of the table.
+
+    Raises:
+        ConfigError: for a name that there is not, with the nearest.
+    """
+    given = [m.strip() for m in models.split(",")] if isinstance(models, str) else list(models)
+    names: set[str] = set()
+    for one in given:
+        if one not in MODELS and one not in SETS:
+            known = (*SETS, *MODELS)
+            raise ConfigError(f"Unknown model '{one}': accepted are {', '.join(known)}.{nearest(one, known)}")
+        names |= set(SETS.get(one, (one,)))
+    return tuple(name for name in MODELS if name in names)
+
+
+def contenders(
+    models: Sequence[str],
+    features: Sequence[str],
+    pca: Sequence[bool],
+    config: RunConfig,
+    arch: Arch,
+    layout: Layout,
+    gestures: GestureSet,
+    windows: WindowSet,
+) -> list[Contender]:
+    """Return the requested programs, ready to be compared; all with the seed of the training."""
+    spec, samples = config.training, layout.samples(config.windows.window_s)
+    made = classical([m for m in models if m in BASELINES], features, pca, samples, spec.seed)
+    made += rockets([m for m in models if m in ROCKETS], samples, spec.seed)
+    if NETWORK in models or set(models) & set(RECURRENT):
+        need("torch", extra="train")
+        from plushsense.training.fit import resolve_device
+
+        spec = resolve_device(spec)
+    vectors = [list(v) for v in windows.vectors]
+    for name in (m for m in models if m in RECURRENT):
+        from plushsense.training.recurrent import RECURRENT_VERSION, UNITS
+
+        key = {"version": RECURRENT_VERSION, "units": UNITS, "samples": samples, "vectors": vectors}
+        key["training"] = spec.key()
+        fit = RecurrentFit(spec, samples, name == "bilstm")
+        made.append(Contender(name, RECURRENT[name], "windows", False, fit, key))
+    if NETWORK in models:
+        key = {"arch": arch.to_dict(), "training": spec.key(), "vectors": vectors}
+        title = f"{arch.title} {arch.padding} (ours)"
+        network = NetworkFit(arch, spec, layout, gestures)
+        made.append(Contender(NETWORK, title, "windows", False, network, key))
+    return made
+
+
+def baselines(
+    dataset: Dataset | str | os.PathLike[str],
+    config: RunConfig | None = None,
+    *,
+    splits: Sequence[str] = SPLITS,
+    models: str | Sequence[str] = "all",
+    features: Sequence[str] = tuple(FEATURES),
+    pca: str = "both",
+    out: str | os.PathLike[str] | None = None,
+    overwrite: bool = False,
+    cluster: str | None = None,
+    progress: Callable[[CompareProgress], None] | None = None,
+    warn: Warn = silent,
+    **settings: Any,
+) -> dict[str, Any]:
+    """Classical programs, recurrent networks and our own network on the same windows, under several splits.
+
+    Windows are cut as for the network; the others read their last ``window_s`` seconds. Finished folds are kept in the
+    data set's ``cache`` folder; a comparison that was stopped goes on from there.
+
+    Args:
+        config, settings: as for `evaluate`; its split is not used.
+        splits: such as "leave-one-subject-out", "by-subject:5", "windows:5" (leaky); the gap between them is reported.
+        models: names of `MODELS` and sets of `SETS`.
+        cluster: address of a Ray cluster that does the work instead of this machine's processes.
+        pca: "both", "no" or "yes"; it concerns the classical programs.
+        out: a folder for the table as JSON, CSV and a page; a comparison of other settings or data that is there is
+            refused unless ``overwrite``.
+
+    Returns:
+        what `plushsense.experiments.baselines.score.compare` returns, with ``dataset``, ``dataset_hash``,
+        ``simulated``, ``preset``, ``training``, ``window_s``, ``id``, ``code_version`` and ``machine``.
+    """
+    dataset = as_dataset(dataset)
+    config = config or from_settings(**settings)
+    if config.windows.context == ANYWHERE:
+        raise ConfigError("Programs are compared on windows of gestures: choose the context stream or loop.")
+    names = chosen(models)
+    identity = comparison_id(dataset, config, splits, models, features, pca)
+    asked = [parse_split(text).text for text in splits]
+    if out is not None:
+        _check_place(Path(out), identity, overwrite)
+    gestures = choose_classes(dataset, config.evaluation.classes, warn)
+    network = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
+    windows = windows_for(dataset, network, config.windows, gestures, warn)
+    for name, view, reduced in TOO_LONG:
+        if name in names and view in features and reduced in PCA[pca]:
+            how = "with" if reduced else "without"
+            warn(f"left out: {TITLES[name]} on {view} windows {how} PCA, which takes too long")
+    table = compare(
+        windows,
+        contenders(names, features, PCA[pca], config, network, dataset.layout, gestures, windows),
+        asked,
+        journal=journal_of(dataset, "baselines"),
+        workers=config.evaluation.processes,
+        cluster=cluster,
+        seed=config.evaluation.seed,
+        progress=progress,
+    )
+    table |= {
+        "dataset": dataset.head.name,
+        "dataset_hash": dataset.hash,
+        "simulated": dataset.head.simulated,
+        "preset": config.preset,
+        "training": config.training.to_dict(),
+        "window_s": config.windows.window_s,
+        "id": identity,
+        "machine": machine("one thread a program", f"Python {platform.python_version()}"),
+        "code_version": __version__,
+    }
+    if out is not None:
+        with dataset.generation.writing():
+            save_baselines(table, Path(out))
+    return table
+
+
+def comparison_id(
+    dataset: Dataset,
+    config: RunConfig,
+    splits: Sequence[str] = SPLITS,
+    models: str | Sequence[str] = "all",
+    features: Sequence[str] = tuple(FEATURES),
+    pca: str = "both",
+) -> str:
+    """Return an identity of 20 hexadecimal digits, equal for equal settings and data.
+
+    Raises:
+        ConfigError: for a setting that cannot be.
+    """
+    if pca not in PCA:
+        raise ConfigError(f"Unknown choice '{pca}' for PCA: accepted are {', '.join(PCA)}.{nearest(pca, PCA)}")
+    outcome = {key: value for key, value in config.outcome().items() if key != "evaluation"}
+    outcome |= {"seed": config.evaluation.seed, "classes": config.evaluation.classes}
+    outcome |= {"splits": [parse_split(text).text for text in splits], "models": chosen(models)}
+    outcome |= {"features": list(features), "pca": pca}
+    return job_id({"settings": outcome, "data": dataset.hash})
+
+
+def save_baselines(table: dict[str, Any], out: Path) -> None:
+    """Write the comparison to a folder: JSON, CSV (a row a program and split), a page and its picture."""
+    from plushsense.experiments.baselines.report import figure, page, score_table
+    from plushsense.reports.figures import png
+
+    out.mkdir(parents=True, exist_ok=True)
+    write_file(out / SHEET, score_table(table).csv())
+    (out / PICTURE).write_bytes(png(figure(table), dpi=130))
+    write_file(out / PAGE, page(table))
+    write_file(out / TABLE, json.dumps(table, ensure_ascii=False, indent=1))
+
+
+def _check_place(out: Path, identity: str, replace: bool) -> None:
+    """Refuse an output folder that cannot be written to or holds another comparison."""
+    need("matplotlib", extra="reports")
+    need("jinja2", extra="reports")
+    check_folder(out, "A comparison")
+    path = out / TABLE
+    if replace or not path.exists():
+        return
+    try:
+        held = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        held = None
+    if not isinstance(held, dict) or held.get("id") != identity:
+        raise ConfigError(
+            f"'{out}' holds a comparison of other settings or other data: choose another --out, or --force to replace "
+            "it."
+        )

@@ -1,0 +1,278 @@
+"""Several programs on the same windows under several splits, side by side: how good each is, how large, how quick.
+
+Every program × split × fold is one job of the journal. What a program is, is handed in as a picklable callable, as in
+``crossval``; nothing here knows of scikit-learn or PyTorch. Sizes and times are taken here, for all programs alike.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import ConfigError, need
+from plushsense.core.gestures import NOBODY
+from plushsense.evaluation.crossval import context_of, fold_fingerprint, windows_fingerprint
+from plushsense.evaluation.folds import WindowFold, fold_windows
+from plushsense.evaluation.scores import FoldRecord, compute_scores, gather_predictions
+from plushsense.jobs.journal import Journal, Result, job_id
+from plushsense.jobs.pool import Job, Report, run_jobs
+from plushsense.scoring.metrics import column_metrics
+from plushsense.scoring.splits import Split, parse_split
+from plushsense.windows.cut import WindowSet
+
+# Part of every job's id: raise it when the meaning of a stored fold changes.
+_VERSION = 2
+# Windows that are read one at a time for a latency; the first few warm caches and do not count.
+_TIMED, _WARM = 20, 3
+# Processor time of this process, which is on one thread: what else runs on the machine lengthens it little.
+_clock = time.process_time
+
+
+class Reader(Protocol):
+    """A fitted program: probabilities (N, K) of windows, and how many bytes it would take up."""
+
+    @property
+    def size_bytes(self) -> int: ...
+
+    def __call__(self, windows: WindowSet, /) -> NDArray[np.float32]: ...
+
+
+class Fit(Protocol):
+    """Fits a program to the first windows, may watch the second; picklable, the same for the same input.
+
+    One that has something to do once a process, such as compiling, has a method ``prepare(train)``.
+    """
+
+    def __call__(self, train: WindowSet, validation: WindowSet, /) -> Reader: ...
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A program in the comparison: its name, what it reads of a window, and how it is fitted.
+
+    ``key`` says everything that ``fit`` depends on beside name, features and PCA.
+    """
+
+    name: str
+    title: str
+    features: str
+    pca: bool
+    fit: Fit
+    key: Mapping[str, Any]
+
+    @property
+    def words(self) -> str:
+        """One line that tells it from the others."""
+        return f"{self.title}, {self.features}{', PCA' if self.pca else ''}"
+
+
+class CompareProgress(NamedTuple):
+    """Where a comparison stands: ``what`` was just done."""
+
+    done: int
+    jobs: int
+    what: str
+    resumed: int
+
+
+@dataclass(frozen=True)
+class _Task:
+    contender: Contender
+    fold: WindowFold
+
+
+def compare(
+    windows: WindowSet,
+    contenders: Sequence[Contender],
+    splits: Sequence[str],
+    *,
+    journal: Journal | None = None,
+    workers: int = 1,
+    cluster: str | None = None,
+    seed: int = 0,
+    progress: Callable[[CompareProgress], None] | None = None,
+) -> dict[str, Any]:
+    """Fit and score every contender in every fold of every split, all on the same windows.
+
+    Everybody trains on the training windows of a fold only; those that validate are there for who stops early.
+
+    Returns:
+        ``context``, ``splits``, ``windows``, ``recordings``, ``subjects``, ``labels``, ``seed``, ``jobs``,
+        ``resumed``; ``models``, one row a contender and split; ``gaps``, one a contender and pair of a leaky split and
+        one that keeps people apart.
+
+    Raises:
+        ConfigError, BadInput: for a split that is unknown, asked twice or cannot be made.
+        MissingExtraError: without threadpoolctl, which comes with scikit-learn.
+    """
+    need("threadpoolctl", extra="baselines")
+    if not contenders:
+        raise ConfigError("No program is left to compare: name one or more, such as  --models forest,knn")
+    asked = _parsed(splits)
+    folds = {split.text: fold_windows(windows, windows, split, seed) for split in asked}
+    base = {"version": _VERSION, "windows": windows_fingerprint(windows), "rate_hz": windows.rate_hz}
+    names = [(c.name, c.features, c.pca) for c in contenders]
+    if len(set(names)) < len(names):
+        raise ConfigError("A program stands twice in the comparison: name each once.")
+    prints = {text: [fold_fingerprint(fold) for fold in made] for text, made in folds.items()}
+    jobs: dict[tuple[int, str], list[Job]] = {}
+    for i, contender in enumerate(contenders):
+        key = {**base, "model": names[i], "key": dict(contender.key)}
+        for text, made in folds.items():
+            jobs[i, text] = [
+                Job(job_id({**key, "fold": mark}), _Task(contender, fold))
+                for fold, mark in zip(made, prints[text], strict=True)
+            ]
+    everything = [job for some in jobs.values() for job in some]
+    told = _Teller(len(everything), progress)
+    results = run_jobs(
+        everything, _work, shared=windows, workers=workers, journal=journal, cluster=cluster, on_done=told.done
+    )
+    rows = [
+        _row(contenders[i], split, folds[split.text], [results[job.id] for job in jobs[i, split.text]], windows)
+        for i in range(len(contenders))
+        for split in asked
+    ]
+    return {
+        "context": context_of(windows),
+        "splits": [{"split": split.text, "leaky": split.leaky, "folds": len(folds[split.text])} for split in asked],
+        "windows": len(windows),
+        "recordings": len(np.unique(windows.recording)),
+        "subjects": len(set(windows.subject.tolist()) - {NOBODY}),
+        "labels": list(windows.labels),
+        "seed": seed,
+        "jobs": len(everything),
+        "resumed": told.resumed,
+        "models": rows,
+        "gaps": gaps(rows),
+    }
+
+
+def gaps(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return by how much each leaky split flatters each program, against each split that keeps people apart."""
+    found = []
+    for honest in (row for row in rows if row["apart"]):
+        for leaky in (row for row in rows if row["leaky"]):
+            if any(honest[name] != leaky[name] for name in ("name", "features", "pca")):
+                continue
+            found.append(
+                {
+                    **{name: honest[name] for name in ("name", "title", "features", "pca")},
+                    "split": honest["split"],
+                    "leaky_split": leaky["split"],
+                    **{m: leaky[m]["mean"] - honest[m]["mean"] for m in column_metrics()},
+                }
+            )
+    return found
+
+
+def _parsed(splits: Sequence[str]) -> list[Split]:
+    if not splits:
+        raise ConfigError("No split is given: name one or more, such as  --split leave-one-subject-out,windows:5")
+    found = [parse_split(text) for text in splits]
+    for i, split in enumerate(found):
+        if split in found[:i]:
+            raise ConfigError(f"The split {split.text} is asked for twice: name each once.")
+    return found
+
+
+def _work(windows: WindowSet, task: _Task, report: Report, /) -> Result:
+    """Fit, time and score one program in one fold."""
+    fit, fold = task.contender.fit, task.fold
+    train, test = windows.take(fold.train), windows.take(fold.test)
+    with _one_thread():
+        prepare = getattr(fit, "prepare", None)
+        if prepare is not None:
+            prepare(train)
+        began = _clock()
+        reader = fit(train, windows.take(fold.validation))
+        train_s = _clock() - began
+        single = _latency(reader, test)
+        began = _clock()
+        probabilities = np.asarray(reader(test), dtype=np.float32)
+        batch_s = _clock() - began
+    wanted = (len(test), len(windows.labels))
+    if probabilities.shape != wanted:
+        raise ConfigError(
+            f"{task.contender.words} gave probabilities of the shape {probabilities.shape}; {wanted} (windows, "
+            "classes) is expected."
+        )
+    return {
+        "probabilities": probabilities,
+        "size_bytes": int(reader.size_bytes),
+        "train_s": train_s,
+        "predict_ms": 1000.0 * single,
+        "predict_batch_ms": 1000.0 * batch_s / len(test),
+    }
+
+
+def _latency(reader: Reader, test: WindowSet) -> float:
+    """Return the median time of reading one window alone, in seconds."""
+    ones = [test.take(np.array([i % len(test)])) for i in range(_WARM + _TIMED)]
+    times = []
+    for one in ones:
+        began = _clock()
+        reader(one)
+        times.append(_clock() - began)
+    return float(np.median(times[_WARM:]))
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Limit the numeric libraries to one thread, for comparable times and sums in one order."""
+    with need("threadpoolctl", extra="baselines").threadpool_limits(limits=1):
+        yield
+
+
+def _row(
+    contender: Contender, split: Split, folds: list[WindowFold], outcomes: list[Result], windows: WindowSet
+) -> dict[str, Any]:
+    records = [
+        FoldRecord(f.name, f.subjects, (len(f.train), len(f.validation), len(f.test)), 0, float(o["train_s"]))
+        for f, o in zip(folds, outcomes, strict=True)
+    ]
+    predictions = gather_predictions(windows, [(f.name, f.test) for f in folds], [o["probabilities"] for o in outcomes])
+    table = compute_scores(predictions, records, windows.affects, split.apart)
+
+    def middle(name: str) -> float:
+        return float(np.median([o[name] for o in outcomes]))
+
+    return {
+        "name": contender.name,
+        "title": contender.title,
+        "features": contender.features,
+        "pca": contender.pca,
+        "split": split.text,
+        "leaky": split.leaky,
+        "apart": split.apart,
+        "over": table["over"],
+        "folds": len(folds),
+        **{name: table[name] for name in (*column_metrics(), "pooled")},
+        "by_recording": table["by_recording"],
+        "size_bytes": round(middle("size_bytes")),
+        "predict_ms": middle("predict_ms"),
+        "predict_batch_ms": middle("predict_batch_ms"),
+        "train_s": middle("train_s"),
+        "train_s_in_all": float(sum(o["train_s"] for o in outcomes)),
+    }
+
+
+class _Teller:
+    """Turns finished jobs into `CompareProgress`."""
+
+    def __init__(self, jobs: int, progress: Callable[[CompareProgress], None] | None) -> None:
+        self._jobs, self._progress = jobs, progress
+        self._done = self.resumed = 0
+
+    def done(self, job: Job, result: Result, resumed: bool) -> None:
+        self._done += 1
+        self.resumed += resumed
+        if self._progress is not None:
+            what = f"{job.task.contender.words}, {job.task.fold.name}"
+            self._progress(CompareProgress(self._done, self._jobs, what, self.resumed))

@@ -1,0 +1,355 @@
+"""Tables, figure and page of the real-time protocol: groups of gestures by system, beside the paper's figures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from plushsense.reports.figures import data_uri, new_figure
+from plushsense.reports.page import render_page
+from plushsense.reports.table import DASH, Column, Table, number
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+SOURCE = (
+    "The paper, section 4.6: five new people, 17 gestures, three times each, with the real toy. Times were taken by "
+    "hand, when the output first was stable (± 0.3 s). It gives most figures as ranges or approximations (here a dash "
+    "where it gives none), and it proposes the hybrid without building it."
+)
+
+
+@dataclass(frozen=True)
+class Printed:
+    """Figures as printed in the paper: share answered, reaction time, likelihood; "" where it prints none.
+
+    ``reaction_s``: the reaction time as a range (low, high).
+    """
+
+    activation: str = ""
+    reaction: str = ""
+    likelihood: str = ""
+    reaction_s: tuple[float, float] | None = None
+
+
+PAPER: dict[tuple[str, str], Printed] = {
+    ("broad", "rules"): Printed("≈ 90 %", "≈ 3 s", "", (3.0, 3.0)),
+    ("broad", "cnn"): Printed("“consistently”", "2.0–2.2 s", "", (2.0, 2.2)),
+    ("fine", "rules"): Printed("≈ 6 %"),
+    ("fine", "cnn"): Printed("all trials", "2.3–2.4 s", "0.75–0.88, up to 0.98", (2.3, 2.4)),
+    ("energetic", "rules"): Printed("all trials", "0.1–0.2 s", "", (0.1, 0.2)),
+    ("energetic", "cnn"): Printed("“reliably”", "2.0–2.5 s", "more variable", (2.0, 2.5)),
+    ("neutral", "rules"): Printed("none: not processed"),
+    ("neutral", "cnn"): Printed("“consistently”", "≈ 2.4 s", "≈ 0.83", (2.4, 2.4)),
+}
+CONFUSED = (
+    "The paper's network took about 13 % of the Tail scratches for Tail taps, and no other fine scratch for something "
+    "of another family."
+)
+"""The paper counts both as one family; in our gesture set a scratch and a tap are two families."""
+
+
+SIMULATION = "SIMULATION: virtual people touched a virtual toy. These figures say nothing about a real one."
+# Okabe and Ito's; the mark says the same without colour.
+_LOOKS = {"rules": ("#d55e00", "s"), "cnn": ("#0072b2", "o"), "hybrid": ("#009e73", "D")}
+_SHORT = {"rules": "Rules", "cnn": "Network", "hybrid": "Hybrid"}
+_JUDGED = {
+    "right": "right",
+    "family": "other of its family",
+    "affect": "other of its affect",
+    "wrong": "wrong",
+    "unnamed": "not named",
+}
+
+
+def percent(part: int, of: int) -> str:
+    """Return ``98 % (44/45)``, with one decimal close to 0 % and 100 %."""
+    if not of:
+        return DASH
+    share = 100.0 * part / of
+    digits = 0 if share in (0.0, 100.0) or 1.0 <= share <= 97.0 else 1
+    return f"{share:.{digits}f} % ({part}/{of})"
+
+
+def seconds(value: float | None) -> str:
+    """Return seconds with two decimals."""
+    return DASH if value is None else f"{round(value, 2) + 0.0:.2f}"
+
+
+_CELLS = (
+    Column("answered", "Answered\n(right affect)", "right", plain="answered"),
+    Column("named", "Right gesture\nnamed", "right", plain="right gesture named"),
+    Column("median", "median", "right", group="Reaction time, s", plain="median s"),
+    Column("p90", "p90", "right", group="Reaction time, s", plain="p90 s"),
+    Column("quick", "≤ 0.2 s", "right", group="Reaction time, s", plain="in 0.2 s"),
+    Column("likelihood", "Likelihood", "right", plain="likelihood"),
+    Column("negative", "Called\nnegative", "right", plain="called negative"),
+)
+_PAPER_CELLS = tuple(
+    Column(f"paper_{key}", key, group="The paper, real toy", plain=f"paper: {key}", style="paper")
+    for key in ("answered", "time", "likelihood")
+)
+
+
+def _cells(row: Mapping[str, Any], energetic: bool) -> dict[str, str]:
+    n = row["trials"]
+    return {
+        "answered": percent(row["activated"], n),
+        "named": DASH if row["system"] == "rules" else percent(row["named"], n),
+        "median": seconds(row["reaction_s"]["median"]),
+        "p90": seconds(row["reaction_s"]["p90"]),
+        "quick": percent(row["within_200_ms"], n) if energetic else "",
+        "likelihood": number(row["likelihood"], 2),
+        "negative": percent(row["called_negative"], row["gentle"]) if row["gentle"] else "",
+    }
+
+
+def group_table(result: Mapping[str, Any]) -> Table:
+    """Return one row for each group and system, beside the paper's figures where it has any of these groups."""
+    rows: list[dict[str, Any]] = []
+    last = None
+    for row in result["rows"]:
+        paper = PAPER.get((row["group"], row["system"]), Printed())
+        first = row["group"] != last
+        rows.append(
+            {
+                "title": row["title"] if first else "",
+                "trials": str(row["trials"]) if first else "",
+                "system": _SHORT[row["system"]],
+                **_cells(row, row["group"] in ("energetic", "fast")),
+                "paper_answered": paper.activation or DASH,
+                "paper_time": paper.reaction or DASH,
+                "paper_likelihood": paper.likelihood or DASH,
+                "class": "top" if first else "",
+            }
+        )
+        last = row["group"]
+    columns = (
+        Column("title", "Gestures", plain="gesture"),
+        Column("trials", "Trials", "right", plain="trials"),
+        Column("system", "System", plain="system"),
+        *_CELLS,
+        *(_PAPER_CELLS if has_paper(result) else ()),
+    )
+    return Table("groups", "By group of gestures", columns, tuple(rows))
+
+
+def gesture_table(result: Mapping[str, Any]) -> Table:
+    """Return one row for each gesture and system."""
+    rows: list[dict[str, Any]] = []
+    energetic = {o["gesture"] for o in result["outcomes"] if o["group"] in ("energetic", "fast")}
+    last = None
+    for row in result["by_gesture"]:
+        first = row["gesture"] != last
+        rows.append(
+            {
+                "title": row["gesture"] if first else "",
+                "system": _SHORT[row["system"]],
+                **_cells(row, row["gesture"] in energetic),
+                "called": DASH if row["system"] == "rules" else _judgements(row["called"]),
+                "class": "top" if first else "",
+            }
+        )
+        last = row["gesture"]
+    heads = ("Answered", "Named right", "Median, s", "p90, s", "≤ 0.2 s", "Likelihood", "Called negative")
+    cells = (replace(c, head=head, group="") for c, head in zip(_CELLS, heads, strict=True))
+    columns: tuple[Column, ...] = (Column("title", "Gesture"), Column("system", "System"), *cells)
+    return Table(
+        "gestures", "Gesture by gesture", (*columns, Column("called", "Said first", style="words")), tuple(rows)
+    )
+
+
+def _judgements(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{n} {_JUDGED[judged]}" for judged, n in counts.items() if n) or DASH
+
+
+def judged_table(result: Mapping[str, Any]) -> Table:
+    """Return one row for each group and network system: how the first naming compares with the gesture."""
+    rows = tuple(
+        {"title": row["title"], "system": _SHORT[row["system"]]}
+        | {judged: percent(row["called"][judged], row["trials"]) for judged in _JUDGED}
+        for row in result["rows"]
+        if row["system"] != "rules"
+    )
+    columns: tuple[Column, ...] = (Column("title", "Gestures"), Column("system", "System"))
+    columns += tuple(Column(judged, head, "right") for judged, head in _JUDGED.items())
+    return Table("judged", "What was said first", columns, rows)
+
+
+def confusion_table(result: Mapping[str, Any]) -> Table:
+    """Return one row for each family and network system: what it was called, most often first."""
+    called: dict[tuple[str, str], list[str]] = {}
+    for entry in result["confusions"]:
+        if entry["system"] != "rules":
+            name = entry["called"] or "not named"
+            called.setdefault((entry["did"], entry["system"]), []).append(f"{name} {100 * entry['share']:.0f} %")
+    rows = tuple(
+        {"did": did, "system": _SHORT[system], "called": ", ".join(called[did, system])}
+        for did in dict.fromkeys(did for did, _ in called)
+        for system in _SHORT
+        if (did, system) in called
+    )
+    columns = (
+        Column("did", "Family that was made"),
+        Column("system", "System"),
+        Column("called", "Called", style="words"),
+    )
+    return Table("confusions", "Confusions of families", columns, rows)
+
+
+def between_table(result: Mapping[str, Any]) -> Table:
+    """Return one row for each system: its events while nobody made a gesture."""
+    rows = tuple(
+        {
+            **row,
+            "system": _SHORT[row["system"]],
+            "minutes": f"{60 * row['hours']:.0f}",
+            "reactions": number(row["reactions_per_hour"], 1),
+            "negatives": number(row["negative_per_hour"], 1),
+        }
+        for row in result["between"]
+    )
+    columns = (
+        Column("system", "System"),
+        Column("minutes", "Minutes", "right"),
+        Column("positive", "Positive events", "count"),
+        Column("negative", "Negative events", "count"),
+        Column("none", "Without affect", "count"),
+        Column("neutral", "Neutral events", "count"),
+        Column("reactions", "All but neutral,\nan hour", "right"),
+        Column("negatives", "Negative,\nan hour", "right"),
+    )
+    return Table("between", "Between the gestures", columns, rows)
+
+
+def aim_table(result: Mapping[str, Any]) -> Table:
+    """Return one row for each aim: what was measured, and whether it is met."""
+    rows = []
+    for aim in result["aims"]:
+        measured = seconds(aim["measured"]) + " s" if aim["unit"] == "s" else percent(aim["part"], aim["of"])
+        met = {None: "not measured", True: "met", False: "NOT met"}[aim["met"]]
+        rows.append(
+            {
+                "aim": aim["aim"],
+                "measured": DASH if aim["met"] is None else measured,
+                "met": met,
+                "class": "unmet" if aim["met"] is False else "",
+            }
+        )
+    columns = (Column("aim", "Aim"), Column("measured", "Measured", "right"), Column("met", "\N{NO-BREAK SPACE}"))
+    return Table("aims", "What we aim at", columns, tuple(rows))
+
+
+def figure_table(result: Mapping[str, Any]) -> Table:
+    """Return the figures of every group and gesture by each system as numbers, with the paper's, for CSV."""
+    rows = []
+    for kind, key in (("rows", "group"), ("by_gesture", "gesture")):
+        for row in result[kind]:
+            paper = PAPER.get((row[key], row["system"]), Printed())
+            rows.append(
+                {
+                    "of": key,
+                    "name": row["title"] if key == "group" else row["gesture"],
+                    "system": row["system"],
+                    **{k: row[k] for k in ("trials", "activated", "activation", "named", "gesture_activation")},
+                    "reaction_median_s": row["reaction_s"]["median"],
+                    "reaction_p90_s": row["reaction_s"]["p90"],
+                    **{k: row[k] for k in ("within_200_ms", "likelihood", "gentle", "called_negative")},
+                    **{f"said_first_{judged}": n for judged, n in row["called"].items()},
+                    "paper_answered": paper.activation,
+                    "paper_time": paper.reaction,
+                    "paper_likelihood": paper.likelihood,
+                    "simulated": "yes" if result["simulated"] else "no",
+                }
+            )
+    return Table.from_rows("table", "Figures of every group and gesture", rows)
+
+
+def has_paper(result: Mapping[str, Any]) -> bool:
+    """Return whether the paper has figures of any group of the result."""
+    return any((row["group"], row["system"]) in PAPER for row in result["rows"])
+
+
+def figure(result: Mapping[str, Any]) -> Figure:
+    """Draw reaction times by group and system with medians, the number not answered, and the paper's ranges."""
+    rows = [row for row in result["rows"] if row["group"] != "all"]
+    picture = new_figure(10.0, 1.6 + 0.42 * len(rows))
+    axes = picture.add_subplot()
+    rng = np.random.default_rng(0)
+    places, names = [], []
+    y, last = 0.0, None
+    drawn: set[str] = set()
+    longest = max((o["reaction_s"] for o in result["outcomes"] if o["reaction_s"] is not None), default=1.0)
+    right = max(3.4, longest) + 0.2
+    for row in rows:
+        y += 1.6 if last not in (None, row["group"]) else 1.0
+        last = row["group"]
+        colour, mark = _LOOKS[row["system"]]
+        times = [
+            o["reaction_s"]
+            for o in result["outcomes"]
+            if o["group"] == row["group"] and o["system"] == row["system"] and o["reaction_s"] is not None
+        ]
+        paper = PAPER.get((row["group"], row["system"]), Printed()).reaction_s
+        if paper is not None:
+            low, high = paper
+            axes.plot(
+                [low - 0.02, high + 0.02], [y, y], color="#bbbbbb", linewidth=11, solid_capstyle="butt", zorder=1,
+                label=None if "paper" in drawn else "the paper, section 4.6",
+            )  # fmt: skip
+            drawn.add("paper")
+        spread = y + rng.uniform(-0.26, 0.26, len(times))
+        axes.scatter(
+            times, spread, s=13, marker=mark, facecolor=colour, edgecolor="none", alpha=0.45, zorder=2,
+            label=None if row["system"] in drawn else _SHORT[row["system"]],
+        )  # fmt: skip
+        drawn.add(row["system"])
+        if times:
+            middle = float(np.median(times))
+            axes.plot([middle, middle], [y - 0.38, y + 0.38], color="#000000", linewidth=1.8, zorder=3)
+        missed = row["trials"] - len(times)
+        axes.text(
+            right + 0.08, y, f"{missed} of {row['trials']} not answered" if missed else "all answered",
+            va="center", fontsize=8, color="#b3261e" if missed else "#57606a",
+        )  # fmt: skip
+        places.append(y)
+        names.append(f"{row['title']}: {_SHORT[row['system']].lower()}")
+    axes.axvline(0.0, color="#57606a", linewidth=0.8)
+    axes.set_yticks(places, names, fontsize=8.5, parse_math=False)
+    axes.set_ylim(y + 0.8, 0.2)
+    axes.set_xlim(-0.6, right)
+    axes.set_xlabel("Reaction time after the onset, seconds (black: median; only answered trials)")
+    axes.grid(axis="x", color="#dddddd", linewidth=0.5)
+    axes.spines[["top", "right"]].set_visible(False)
+    picture.legend(loc="outside upper right", ncols=4, fontsize=8, frameon=False)
+    axes.set_title("SIMULATION" if result["simulated"] else "", fontsize=10, loc="left")
+    return picture
+
+
+def page(result: Mapping[str, Any]) -> str:
+    """Return the protocol as one self-contained HTML page."""
+    return render_page(
+        "protocol.html.j2",
+        title=result["heading"],
+        simulated=result["simulated"],
+        simulated_title="This is a simulation.",
+        simulated_words="Virtual people touched a virtual toy: these figures say nothing about a real toy.",
+        about=result["about"],
+        remarks=result["said"],
+        aims=aim_table(result),
+        groups=group_table(result),
+        gestures=gesture_table(result),
+        judged=judged_table(result),
+        confusions=confusion_table(result),
+        between=between_table(result),
+        left=result["left"],
+        with_paper=has_paper(result),
+        source=SOURCE,
+        confused=CONFUSED,
+        counted=result["counted"],
+        picture=data_uri(figure(result)),
+    )

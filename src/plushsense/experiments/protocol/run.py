@@ -1,0 +1,285 @@
+"""The paper's real-time protocol with a bundle: on virtual strangers, or on recorded sessions of real ones."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Collection, Sequence
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+from plushsense.core.errors import ConfigError
+from plushsense.core.files import write_file
+from plushsense.core.gestures import NOBODY, GestureSet
+from plushsense.core.layouts import Layout
+from plushsense.core.recorder_csv import Frames
+from plushsense.dataset.importing.importers import import_recordings
+from plushsense.dataset.index import as_dataset
+from plushsense.dataset.store import Dataset
+from plushsense.deploy.quantize import integer_model
+from plushsense.experiments.protocol import score as scoring
+from plushsense.experiments.protocol.score import Heuristic
+from plushsense.experiments.protocol.sittings import (
+    FIRST_STRANGER,
+    Left,
+    Progress,
+    known_people,
+    recorded_people,
+    recorded_sittings,
+    virtual_numbers,
+    virtual_sittings,
+)
+from plushsense.models.bundle import Bundle
+from plushsense.recording.simulate import simulate
+from plushsense.runtime.classifier import GestureEvent
+from plushsense.runtime.decisions import DecideSpec
+from plushsense.tuning.rule_baseline import BaselineSettings, baseline_events, fit_rule_baseline
+from plushsense.workflow.reporting import check_folder
+
+OTHERS = 4
+_ELSEWHERE = 1_000_003  # added to the seed: another population
+
+
+def virtual_rules(seed: int, layout: Layout, gestures: GestureSet, people: int = OTHERS) -> tuple[Heuristic, str]:
+    """Return the rule baseline tuned on virtual people of another population, and a sentence that says so."""
+    with tempfile.TemporaryDirectory() as work:
+        raw, folder = Path(work) / "raw", Path(work) / "ds"
+        simulate(raw, people, (seed + _ELSEWHERE) % 2**31, 2, at_rest=0, layout=layout)
+        dataset = import_recordings(raw, folder, layout=layout, gestures=gestures, name="others").dataset
+        plan, _ = fit_rule_baseline(dataset, gestures, dataset.subjects)
+    return _asks(plan, layout), f"Tuned on {people} other virtual people, of another population."
+
+
+def recorded_rules(dataset: Dataset, gestures: GestureSet, scored: Collection[str]) -> tuple[Heuristic | None, str]:
+    """Return the rule baseline tuned on the people who are not scored, or None, and a sentence on it."""
+    others: Sequence[str] = [code for code in dataset.subjects if code not in scored]
+    if not others:
+        return None, "Everybody is scored here, so nobody is left to tune the old rules on: there are no rules only."
+    try:
+        plan, _ = fit_rule_baseline(dataset, gestures, others)
+    except ConfigError as cause:
+        return None, f"The old rules cannot be tuned: {cause}"
+    return _asks(plan, dataset.layout), f"Tuned on people who are not scored here: {len(others)}."
+
+
+def _asks(plan: BaselineSettings, layout: Layout) -> Heuristic:
+    def ask(frames: Frames) -> Sequence[GestureEvent]:
+        return baseline_events(frames, layout, plan)
+
+    return ask
+
+
+RESULT, TRIALS, TABLE, PAGE = "protocol.json", "trials.csv", "table.csv", "protocol.html"
+ENGINES = ("float", "int8")
+
+NO_GATE = (
+    "This bundle has no gate, so there is no hybrid: network and hybrid would be the same. Blows wait for the network."
+)
+NO_AFFECT = "These gestures have no affect: any event counts as an answer, and nothing can be called negative."
+NO_RULES = "The old heuristic was not asked: there are no figures of rules only."
+_ANSWERED = (
+    "Answered: an event of the gesture's affect began between 0.3 s before the hand touched and 2 s after it left. "
+    "Named: an event of the trial, also one that began before it, was called rightly. Shares are of all trials, times "
+    "of those that were answered."
+)
+_LIKELIHOOD = (
+    "Likelihood: mean over the trials of the highest smoothed probability of what was said first. Called negative: an "
+    "event of negative affect began while the hand worked or within 0.3 s after; blows and pulls are not counted there."
+)
+COUNTED = (
+    _ANSWERED,
+    "Reaction time counts from the onset: when the hand touches, and of a blow or pull when the blow or jerk itself "
+    "comes, 0.15 to 0.6 s after the hand began. A sooner answer has a negative time: a tail that is grasped can be "
+    "felt before the jerk.",
+    _LIKELIHOOD,
+)
+COUNTED_RECORDED = (
+    _ANSWERED,
+    "Reaction time counts from the recording's start mark, as it was trimmed; untrimmed recordings begin with some "
+    "waiting, which makes reactions look slower than they were.",
+    _LIKELIHOOD,
+)
+
+
+def protocol(
+    model: Bundle | str | os.PathLike[str],
+    *,
+    people: int = 5,
+    first: int = FIRST_STRANGER,
+    seed: int = 1,
+    repetitions: int = 3,
+    dataset: Dataset | str | os.PathLike[str] | None = None,
+    session: str | os.PathLike[str] | None = None,
+    subjects: Sequence[str] | None = None,
+    engine: str = "float",
+    rules: bool = True,
+    out: str | os.PathLike[str] | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Run the protocol, score rules, network and hybrid, and write table, trials and page.
+
+    Args:
+        model: a bundle; its own decision settings, gate and all, are used.
+        people, first, seed, repetitions: of the virtual people: numbers from ``first`` on, of the population ``seed``.
+        dataset, session: recorded sessions instead: a data set, or a folder as a recorder leaves it.
+        subjects: some of its people; default: all whom the network never met.
+        engine: ``float``, or ``int8``: the deployed network's own arithmetic.
+        rules: ask the old heuristic, too; it is tuned first, on people who are not scored.
+        out: folder for the JSON, two CSV and the HTML page; None: nothing is written.
+
+    Raises:
+        ConfigError: for people on whom the network was trained, sizes that cannot be, a folder that is taken.
+        DatasetError: where nobody has a session stream with recordings in it.
+    """
+    bundle = model if isinstance(model, Bundle) else Bundle.load(Path(model))
+    if engine not in ENGINES:
+        raise ConfigError(f"The engine is '{engine}'; accepted are {', '.join(ENGINES)}.")
+    if dataset is not None and session is not None:
+        raise ConfigError("A data set and a session were given: give one of them.")
+    if subjects is not None and dataset is None and session is None:
+        raise ConfigError("Subjects are people of a data set or session; of virtual people give their number.")
+    place = None if out is None else _place(Path(out))
+    asked = integer_model(bundle) if engine == "int8" else bundle
+    made: dict[str, Any]
+    if dataset is not None:
+        dataset = as_dataset(dataset)
+        made = _recorded(dataset, bundle, asked, subjects, rules, progress)
+    elif session is not None:
+        with tempfile.TemporaryDirectory() as work:
+            folder = Path(work) / "session"
+            import_recordings(
+                Path(session), folder, layout=bundle.layout, gestures=bundle.gestures, name=Path(session).resolve().name
+            )
+            made = _recorded(as_dataset(folder), bundle, asked, subjects, rules, progress)
+    else:
+        numbers = virtual_numbers(people, first, bundle.provenance)
+        sittings = virtual_sittings(numbers, seed, repetitions, bundle.layout)
+        heuristic, tuned = virtual_rules(seed, bundle.layout, bundle.gestures) if rules else (None, NO_RULES)
+        made = scoring.run(sittings, asked, heuristic, progress, len(numbers))
+        whom = f"{people} virtual, number {numbers[0]} to {numbers[-1]} of the population of seed {seed}"
+        made |= {
+            "heading": "The paper's real-time protocol, SIMULATED",
+            "simulated": True,
+            "left": [],
+            "people_said": whom,
+            "rules_said": tuned,
+            "aims": scoring.aims(made),
+            "counted": list(COUNTED),
+        }
+    result = _with_notes(made, bundle, engine)
+    if place is not None:
+        with nullcontext() if dataset is None else as_dataset(dataset).generation.writing():
+            result["files"] = _write(result, place)
+    return result
+
+
+def _recorded(
+    dataset: Dataset,
+    bundle: Bundle,
+    asked: Any,
+    subjects: Sequence[str] | None,
+    rules: bool,
+    progress: Progress | None,
+) -> dict[str, Any]:
+    """Return the result on recorded sessions."""
+    if dataset.layout.channels != bundle.layout.channels:
+        raise ConfigError(
+            f"'{dataset.head.name}' was recorded with layout '{dataset.layout.name}', but the network reads "
+            f"'{bundle.layout.name}': take a network that was made for it."
+        )
+    people = recorded_people(dataset, subjects, bundle.provenance)
+    sittings, left = recorded_sittings(dataset, people, bundle.gestures)
+    heuristic, tuned = recorded_rules(dataset, bundle.gestures, people) if rules else (None, NO_RULES)
+    made = scoring.run(sittings, asked, heuristic, progress, len(sittings))
+    virtual = dataset.head.simulated
+    what = "recorded sessions of a simulation" if virtual else "recorded sessions"
+    return made | {
+        "heading": f"The paper's real-time protocol on {what}: {dataset.head.name}",
+        "simulated": virtual,
+        "codes": people,
+        "left": [_left(entry) for entry in left],
+        "people_said": f"{len({s.who.partition(',')[0] for s in sittings})} of {len(dataset.subjects)}: "
+        + ", ".join(s.who for s in sittings),
+        "rules_said": tuned,
+        "aims": [],
+        "counted": list(COUNTED_RECORDED),
+    }
+
+
+def _left(entry: Left) -> dict[str, str]:
+    return {"who": entry.who, "why": entry.why}
+
+
+def _with_notes(made: dict[str, Any], bundle: Bundle, engine: str) -> dict[str, Any]:
+    """Return the result with what a reader has to know of the network and the settings."""
+    settings = DecideSpec.from_dict(bundle.decision)
+    provenance = bundle.provenance
+    said = []
+    if not settings.gate.rules:
+        said.append(NO_GATE)
+    ruled = any(row["system"] == "rules" for row in made["systems"])
+    tuned = made.pop("rules_said")
+    if not ruled:
+        said.append(tuned)
+    if not bundle.gestures.has_affect:
+        said.append(NO_AFFECT)
+    if not settings.fitted:
+        said.append("The event settings of this bundle were not fitted: they are the defaults.")
+    if not known_people(provenance):
+        said.append("This bundle does not say on whom it was trained: that it never met these people is not known.")
+    known = known_people(provenance) | ({bundle.adapted_to} if bundle.adapted_to is not None else set())
+    met = sorted(known & set(made.pop("codes", ())))
+    if met:
+        said.append(
+            f"This bundle was trained on, or adapted to, people of the codes {', '.join(met)}: if they are the same "
+            "people, their figures flatter."
+        )
+    if provenance.get("simulated") is True and not made["simulated"]:
+        said.append("This network was trained on a virtual toy: on a real one its figures mean nothing yet.")
+    said += [f"{entry['who']} {entry['why']}, and was left out." for entry in made["left"]]
+    filters = "/".join(map(str, bundle.arch.filters))
+    subjects = provenance.get("subjects", ())
+    who = subjects if isinstance(subjects, int) else len(set(subjects) - {NOBODY})
+    trained = f"{provenance['dataset']}, {who} people" if provenance.get("dataset") else "not told by the bundle"
+    times = [o["repetition"] for o in made["outcomes"]]
+    about = [
+        ["People", made.pop("people_said")],
+        ["Trials", f"{made['trials']}: {made['gestures']} gestures, up to {max(times, default=0)} times each a person"],
+        ["Network", f"{bundle.arch.symbol}, filters {filters}, {bundle.arch.padding}; span {_span(bundle):.2f} s"],
+        ["Trained on", trained],
+        ["Arithmetic", "8 bits, the toy's own" if engine == "int8" else "floating point"],
+        ["Gate", {0: "none", 1: "1 rule"}.get(len(settings.gate.rules), f"{len(settings.gate.rules)} rules")],
+        ["Event settings", "fitted" if settings.fitted else "defaults, not fitted"],
+    ]
+    if ruled:
+        about.append(["Old rules", tuned])
+    return made | {"said": said, "about": about, "engine": engine}
+
+
+def _span(bundle: Bundle) -> float:
+    return bundle.arch.span / bundle.layout.rate_hz
+
+
+def _place(out: Path) -> Path:
+    """Return the output folder: a new or empty one, or one that holds an older protocol."""
+    check_folder(out, "A protocol")
+    if out.is_dir() and any(out.iterdir()) and not (out / RESULT).is_file():
+        raise ConfigError(f"'{out}' holds something that is not a protocol: give a new or empty folder.")
+    return out
+
+
+def _write(result: dict[str, Any], out: Path) -> list[str]:
+    from plushsense.experiments.protocol.report import figure_table, page
+    from plushsense.reports.page import write_page
+    from plushsense.reports.table import Table
+
+    html = page(result)  # before any file, as it may lack an extra
+    out.mkdir(parents=True, exist_ok=True)
+    trials = Table.from_rows("trials", "Every trial by each system", result["outcomes"])
+    write_file(out / TRIALS, trials.csv({"simulated": "yes" if result["simulated"] else "no"}))
+    write_file(out / TABLE, figure_table(result).csv())
+    write_page(out / PAGE, html)
+    write_file(out / RESULT, json.dumps(result, ensure_ascii=False, indent=1, allow_nan=False) + "\n")
+    return [str(out / name) for name in (PAGE, TABLE, TRIALS, RESULT)]

@@ -1,0 +1,430 @@
+"""Scores of rules, network and both together on the trials of recorded or virtual sessions.
+
+`evaluation/protocol` adds it up.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from statistics import mean, median
+from typing import Any
+
+import numpy as np
+
+from plushsense.core.gestures import Gesture, GestureSet
+from plushsense.core.recorder_csv import Frames
+from plushsense.experiments.protocol.sittings import GestureTrial, Progress, Sitting
+from plushsense.models.bundle import Bundle
+from plushsense.runtime.classifier import GestureEvent, events_of
+from plushsense.runtime.decisions import DecideSpec
+from plushsense.runtime.events import AFFECTS, ONE
+from plushsense.runtime.fixed import smoothing_weight
+from plushsense.runtime.gate import GateSettings
+from plushsense.runtime.image import IntegerModel
+from plushsense.runtime.trace import replay, trace_of
+
+SYSTEMS = {"rules": "Rules only", "cnn": "Network only", "hybrid": "Hybrid: rules and network"}
+GROUPS = {
+    "broad": "Broad strokes",
+    "fine": "Fine scratches",
+    "taps": "Taps",
+    "hug": "Hug",
+    "energetic": "Blows and pulls",
+    "neutral": "Holding",
+    "fast": "Energetic gestures",
+    "other": "Other gestures",
+}
+_GROUP_OF = {
+    "back stroke": "broad",
+    "head stroke": "broad",
+    "ear scratch": "fine",
+    "neck scratch": "fine",
+    "tail scratch": "fine",
+    "tail tap": "taps",
+    "tail hit": "energetic",
+    "tail pull": "energetic",
+    "hold strong": "hug",
+    "hold in hands": "neutral",
+}
+
+EARLY_S = 0.3
+"""An answer may come so long before the hand touches: it is felt when it comes near."""
+LATE_S = 2.0
+"""An answer counts until so long after the hand has left: a network that looks back 2.5 s names a blow of 1 s late."""
+AFTER_S = 0.3
+"""A gentle gesture that is called negative until so long after its end was called so; later it is something else."""
+QUICK_S = 0.2
+"""The paper's rules answered blows within 0.1 to 0.2 s."""
+
+JUDGED = ("right", "family", "affect", "wrong", "unnamed")
+
+Heuristic = Callable[[Frames], Sequence[GestureEvent]]
+
+
+def group_of(gesture: Gesture) -> str:
+    """Return the protocol's group of a gesture (paper, section 4.6); gestures of other toys have two groups."""
+    return _GROUP_OF.get(gesture.family.casefold(), "fast" if gesture.energetic else "other")
+
+
+@dataclass(frozen=True, eq=False)
+class SystemOutput:
+    """Output of a system on a stream: ``events`` in order; a network's steps as (time in s, best class, share)."""
+
+    events: tuple[GestureEvent, ...]
+    answers: tuple[tuple[float, int, float], ...] = ()
+
+
+def hear(frames: Frames, model: Bundle | IntegerModel, heuristic: Heuristic | None = None) -> dict[str, SystemOutput]:
+    """Return the events of each system on a stream, by the keys of `SYSTEMS`.
+
+    The network's settings, and the gate's, are the model's own; a model without a gate makes no hybrid. ``heuristic``
+    are the old rules; None: they are not asked.
+    """
+    trace = trace_of(frames, model)
+    if isinstance(model, IntegerModel):
+        rules, weight = model.rules, model.smoothing
+    else:
+        spec = DecideSpec.from_dict(model.decision)
+        step_s = model.arch.step * model.layout.period_us / 1e6
+        rules, weight = spec.rules(step_s), smoothing_weight(spec.smoothing_s, step_s)
+    heard = {} if heuristic is None else {"rules": SystemOutput(tuple(heuristic(frames)))}
+    ways = {"cnn": replace(rules, gate=GateSettings())}
+    if rules.gate.rules:
+        ways["hybrid"] = rules
+    for key, way in ways.items():
+        done = replay(trace, way, weight)
+        answers = tuple((now / 1e6, answer.best, answer.share / ONE) for now, answer in done.answers)
+        heard[key] = SystemOutput(events_of(done.updates, trace.gestures), answers)
+    return heard
+
+
+@dataclass
+class _Spell:
+    """One event from its beginning to its end; ``gesture`` since ``named_s``."""
+
+    affect: str
+    source: str
+    begun_s: float
+    gesture: str | None
+    named_s: float
+    ended_s: float = math.inf
+
+
+def _spells(events: Sequence[GestureEvent]) -> list[_Spell]:
+    spells: dict[int, _Spell] = {}
+    for event in events:
+        if event.what == "begun":
+            spells[event.number] = _Spell(event.affect, event.source, event.t_s, event.gesture, event.t_s)
+        elif event.what == "named":
+            spells[event.number].gesture, spells[event.number].named_s = event.gesture, event.t_s
+            spells[event.number].affect = event.affect
+        else:
+            spells[event.number].ended_s = event.t_s
+    return list(spells.values())
+
+
+@dataclass(frozen=True)
+class TrialOutcome:
+    """Outcome of one trial for a system; times in seconds after the onset, None where nothing came.
+
+    Attributes:
+        reaction_s: when an event of the right affect began.
+        gesture_s: when the right gesture was named, in an event that began in the trial or before.
+        called: the gesture of the first event that began, or without one of that which stood; None: it was not named.
+        judged: ``right``; ``family``, another of its family; ``affect``, another of its affect; ``wrong``; ``unnamed``.
+        likelihood: highest smoothed probability of ``called`` while it was the best class; of networks only.
+        negative: an event of negative affect began while the hand worked, or right after.
+        already: an event of the right affect stood when the trial began, so that none could begin.
+        source: who began the right event, ``gate`` or ``cnn``.
+    """
+
+    who: str
+    system: str
+    gesture: str
+    family: str
+    group: str
+    affect: str
+    repetition: int
+    onset_s: float
+    reaction_s: float | None
+    gesture_s: float | None
+    called: str | None
+    called_family: str | None
+    judged: str
+    likelihood: float | None
+    negative: bool
+    already: bool
+    source: str | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON or CSV."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Between:
+    """Events of one stream that began outside every trial, by affect, over ``hours``."""
+
+    hours: float
+    positive: int
+    neutral: int
+    negative: int
+    none: int
+
+
+def windows_of(trials: Sequence[GestureTrial]) -> list[tuple[float, float]]:
+    """Return the interval in which an answer belongs to each trial; they overlap only where the gestures do."""
+    found = []
+    for n, trial in enumerate(trials):
+        before = trials[n - 1].stop_s if n else -math.inf
+        after = trials[n + 1].start_s if n + 1 < len(trials) else math.inf
+        first = max(trial.start_s - EARLY_S, min(before, trial.start_s))
+        found.append((first, max(trial.stop_s, min(trial.stop_s + LATE_S, after - EARLY_S))))
+    return found
+
+
+def score(
+    sitting: Sitting, system: str, heard: SystemOutput, gestures: GestureSet
+) -> tuple[list[TrialOutcome], Between]:
+    """Return every trial's outcome, and the events between the trials; an idle gesture is no trial."""
+    trials = [t for t in sitting.trials if not gestures.get(t.label).idle]
+    windows = windows_of(trials)
+    spells = _spells(heard.events)
+    outcomes = [
+        _outcome(sitting.who, system, trial, window, spells, heard, gestures)
+        for trial, window in zip(trials, windows, strict=True)
+    ]
+    stray = [s for s in spells if not any(a <= s.begun_s <= b for a, b in windows)]
+    ms = sitting.frames.device_ms.astype(np.int64)
+    steps = np.diff(ms)
+    whole_s = float(steps[(steps > 0) & (steps < 1000)].sum()) / 1000.0
+    hours = max(0.0, whole_s - sum(b - a for a, b in windows)) / 3600.0
+    by_affect = {affect: sum(s.affect == affect for s in stray) for affect in AFFECTS}
+    return outcomes, Between(hours, *(by_affect[a] for a in ("positive", "neutral", "negative", "none")))
+
+
+def _outcome(
+    who: str,
+    system: str,
+    trial: GestureTrial,
+    window: tuple[float, float],
+    spells: Sequence[_Spell],
+    heard: SystemOutput,
+    gestures: GestureSet,
+) -> TrialOutcome:
+    gesture = gestures.get(trial.label)
+    first, last = window
+    here = [s for s in spells if s.ended_s > first and s.begun_s <= last]
+    begun = [s for s in here if s.begun_s >= first]
+    right = next((s for s in begun if s.affect == gesture.affect), None)
+    named = next((s for s in here if s.gesture == gesture.label and first <= s.named_s <= last), None)
+    # What the toy says first is what the person sees; where nothing began, what it went on saying.
+    said = begun[0] if begun else here[0] if here else None
+    called = said.gesture if said is not None and said.named_s <= last else None
+    likelihood = None
+    if called is not None and heard.answers:
+        best = gestures.index(called)
+        shares = [share for t, k, share in heard.answers if k == best and first <= t <= last]
+        likelihood = max(shares, default=None)
+    return TrialOutcome(
+        who,
+        system,
+        gesture.label,
+        gesture.family,
+        group_of(gesture),
+        gesture.affect,
+        trial.repetition,
+        round(trial.onset_s, 3),
+        None if right is None else round(right.begun_s - trial.onset_s, 3),
+        None if named is None else round(named.named_s - trial.onset_s, 3),
+        called,
+        None if called is None else gestures.get(called).family,
+        _judged(gesture, None if called is None else gestures.get(called)),
+        None if likelihood is None else round(likelihood, 4),
+        any(s.affect == "negative" and s.begun_s <= trial.stop_s + AFTER_S for s in begun),
+        any(s.affect == gesture.affect and s.begun_s < first for s in here),
+        None if right is None else right.source,
+    )
+
+
+def _judged(made: Gesture, called: Gesture | None) -> str:
+    if called is None:
+        return "unnamed"
+    if called == made:
+        return "right"
+    if called.family == made.family:
+        return "family"
+    return "affect" if called.affect == made.affect != "none" else "wrong"
+
+
+def run(
+    sittings: Iterable[Sitting],
+    model: Bundle | IntegerModel,
+    heuristic: Heuristic | None = None,
+    progress: Progress | None = None,
+    of: int = 0,
+) -> dict[str, Any]:
+    """Let every system hear every sitting, and add up.
+
+    Args:
+        of: how many sittings there are, for the progress.
+
+    Returns:
+        ``people``, ``trials``, ``systems``, ``rows`` (a group each, and all of them: `summary`), ``by_gesture``,
+        ``confusions`` (a system, what was done, what it was called, how often), ``between`` and ``outcomes``.
+    """
+    gestures = model.gestures
+    outcomes: list[TrialOutcome] = []
+    between: dict[str, list[Between]] = {}
+    people: list[str] = []
+    for done, sitting in enumerate(sittings, 1):
+        people.append(sitting.who)
+        for system, heard in hear(sitting.frames, model, heuristic).items():
+            made, stray = score(sitting, system, heard, gestures)
+            outcomes += made
+            between.setdefault(system, []).append(stray)
+        if progress is not None:
+            progress(done, of or done)
+    systems = [key for key in SYSTEMS if key in between]
+    kept = {key: [o for o in outcomes if o.system == key] for key in systems}
+    groups = [g for g in GROUPS if any(o.group == g for o in outcomes)]
+    labels = [g for g in gestures.labels if any(o.gesture == g for o in outcomes)]
+    return {
+        "people": people,
+        "trials": len(kept[systems[0]]),
+        "gestures": len(labels),
+        "systems": [{"system": key, "title": SYSTEMS[key]} for key in systems],
+        "rows": [
+            {"group": group, "title": GROUPS[group], "system": key}
+            | summary([o for o in kept[key] if o.group == group])
+            for group in groups
+            for key in systems
+        ]
+        + [{"group": "all", "title": "All gestures", "system": key} | summary(kept[key]) for key in systems],
+        "by_gesture": [
+            {"gesture": label, "system": key} | summary([o for o in kept[key] if o.gesture == label])
+            for label in labels
+            for key in systems
+        ],
+        "confusions": [c for key in systems for c in confusions(kept[key])],
+        "between": [{"system": key} | _strays(between[key]) for key in systems],
+        "outcomes": [o.to_dict() for o in outcomes],
+    }
+
+
+def summary(outcomes: Sequence[TrialOutcome]) -> dict[str, Any]:
+    """Summarise the trials of one system; shares are of all ``trials``, times of those that were answered.
+
+    ``called`` counts what was said first, by the words of ``Outcome.judged``.
+    """
+    n = len(outcomes)
+    reactions = sorted(o.reaction_s for o in outcomes if o.reaction_s is not None)
+    named = sorted(o.gesture_s for o in outcomes if o.gesture_s is not None)
+    likely = [o.likelihood for o in outcomes if o.likelihood is not None]
+    quick = sum(r <= QUICK_S for r in reactions)
+    gentle = [o for o in outcomes if o.affect != "negative"]
+    return {
+        "trials": n,
+        "activated": len(reactions),
+        "activation": _share(len(reactions), n),
+        "already": sum(o.already and o.reaction_s is None for o in outcomes),
+        "reaction_s": _times(reactions),
+        "within_200_ms": quick,
+        "quick": _share(quick, n),
+        "named": len(named),
+        "gesture_activation": _share(len(named), n),
+        "gesture_s": _times(named),
+        "likelihood": round(mean(likely), 4) if likely else None,
+        "gentle": len(gentle),
+        "called_negative": sum(o.negative for o in gentle),
+        "negative": _share(sum(o.negative for o in gentle), len(gentle)),
+        "called": {word: sum(o.judged == word for o in outcomes) for word in JUDGED},
+        "from_gate": sum(o.source == "gate" for o in outcomes),
+    }
+
+
+def _share(part: int, of: int) -> float | None:
+    return round(part / of, 4) if of else None
+
+
+def _times(values: Sequence[float]) -> dict[str, float | None]:
+    if not values:
+        return {"median": None, "p90": None}
+    return {"median": round(median(values), 3), "p90": round(float(np.percentile(values, 90)), 3)}
+
+
+def confusions(outcomes: Sequence[TrialOutcome]) -> list[dict[str, Any]]:
+    """Return the families that each family was called, most often first: itself, another one, or none."""
+    counts: dict[tuple[str, str | None], int] = {}
+    for o in outcomes:
+        counts[o.family, o.called_family] = counts.get((o.family, o.called_family), 0) + 1
+    order = list(dict.fromkeys(o.family for o in outcomes))
+    totals = {family: sum(n for (did, _), n in counts.items() if did == family) for family in order}
+    return [
+        {"system": outcomes[0].system, "did": did, "called": called, "trials": n, "share": _share(n, totals[did])}
+        for (did, called), n in sorted(counts.items(), key=lambda item: (order.index(item[0][0]), -item[1]))
+    ]
+
+
+def _strays(between: Sequence[Between]) -> dict[str, Any]:
+    """Return the events between the trials, summed over all streams; reactions are all but neutral events."""
+    hours = sum(b.hours for b in between)
+    counts = {name: sum(getattr(b, name) for b in between) for name in ("positive", "neutral", "negative", "none")}
+    reactions = counts["positive"] + counts["negative"] + counts["none"]
+    return {
+        "hours": round(hours, 4),
+        **counts,
+        "reactions_per_hour": round(reactions / hours, 2) if hours else None,
+        "negative_per_hour": round(counts["negative"] / hours, 2) if hours else None,
+    }
+
+
+def aims(result: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return this project's aims for the protocol beside the measured values; without its system an aim is open.
+
+    Each has ``aim``, ``measured`` (a share, or seconds), ``part`` and ``of`` where it is a share, ``met`` (or None).
+    """
+    outcomes = result["outcomes"]
+
+    def of(system: str, **wanted: Any) -> list[dict[str, Any]]:
+        return [o for o in outcomes if o["system"] == system and all(o[k] in v for k, v in wanted.items())]
+
+    blows = of("hybrid", group=("energetic",))
+    kind = of("hybrid", affect=("positive", "neutral"))
+    answered = [o["reaction_s"] for o in kind if o["reaction_s"] is not None]
+    fine = of("rules", group=("fine",))
+    quick = sum(o["reaction_s"] is not None and o["reaction_s"] <= QUICK_S for o in blows)
+    time_s = round(median(answered), 3) if answered else None
+    return [
+        _aim("Hybrid: blows and pulls answered within 0.2 s in at least 98 % of the trials", quick, len(blows), 0.98),
+        _aim(
+            "Hybrid: gentle gestures called negative in at most 1 % of the trials",
+            sum(o["negative"] for o in kind),
+            len(kind),
+            0.01,
+            most=True,
+        ),
+        {
+            "aim": "Hybrid: median reaction to gentle gestures under 1.5 s",
+            "measured": time_s,
+            "unit": "s",
+            "part": None,
+            "of": len(answered),
+            "met": None if time_s is None else time_s < 1.5,
+        },
+        _aim(
+            "Rules only: fine scratches answered in at most 20 % of the trials (the paper: about 6 %)",
+            sum(o["reaction_s"] is not None for o in fine),
+            len(fine),
+            0.2,
+            most=True,
+        ),
+    ]
+
+
+def _aim(words: str, part: int, of: int, line: float, most: bool = False) -> dict[str, Any]:
+    share = part / of if of else None
+    met = None if share is None else share <= line if most else share >= line
+    return {"aim": words, "measured": _share(part, of), "unit": "share", "part": part, "of": of, "met": met}

@@ -1,0 +1,232 @@
+"""Streams with known gestures on which the real-time protocol runs, of virtual people or recorded."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import ConfigError, DatasetError, nearest
+from plushsense.core.gestures import NOBODY, GestureSet
+from plushsense.core.layouts import Layout
+from plushsense.core.recorder_csv import Frames
+from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
+from plushsense.devices.virtual.session import GESTURES, GestureMark, VirtualSession
+from plushsense.devices.virtual.stream import channel_columns
+from plushsense.devices.virtual.world import WORLD, World, draw_person
+
+FIRST_STRANGER = 1001
+"""Number of the first virtual person; data sets of virtual people count from 1."""
+_SESSION = 46  # no other use of the virtual toy has this session number
+_IDLE_S = (1.0, 3.0)
+_VIRTUAL_CODE = re.compile(r"P0*(\d{1,9})")
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class GestureTrial:
+    """One gesture that somebody made; seconds since the stream's first frame.
+
+    The hand works from ``start_s`` to ``stop_s``; ``onset_s`` is when there is something to react to: the same, but
+    of a virtual person's blow the blow itself.
+    """
+
+    label: str
+    repetition: int
+    start_s: float
+    onset_s: float
+    stop_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class Sitting:
+    """One person's session: the whole stream, and what was done in it, in order."""
+
+    who: str
+    frames: Frames
+    trials: tuple[GestureTrial, ...]
+
+
+def virtual_numbers(people: int, first: int, provenance: Mapping[str, Any]) -> list[int]:
+    """Return numbers of virtual people who are not among those that a network was trained on.
+
+    A bundle does not say which seed its virtual people came from, so a number that it was trained, or stopped, on is
+    refused whatever the seed.
+
+    Raises:
+        ConfigError: for a number that is out of range or known to the bundle.
+    """
+    for name, value, low, high in (("people", people, 1, 1000), ("first", first, 1, 2**31)):
+        if not low <= value <= high:
+            raise ConfigError(f"{name} is {value}; a whole number from {low} to {high} is accepted.")
+    numbers = list(range(first, first + people))
+    if provenance.get("simulated") is not True:
+        return numbers
+    met = {int(m[1]) for code in known_people(provenance) if (m := _VIRTUAL_CODE.fullmatch(code)) is not None}
+    if known := [n for n in numbers if n in met]:
+        raise ConfigError(
+            f"Virtual person {known[0]} is one of the {len(met)} that this network was trained on or chosen by: take "
+            f"strangers, for instance --first {max(met) + 1}."
+        )
+    return numbers
+
+
+def known_people(provenance: Mapping[str, Any]) -> set[str]:
+    """Return the codes of the people that a bundle was trained on or chosen by, without nobody."""
+    listed = [provenance.get(key) for key in ("subjects", "validation_subjects")]
+    codes = {str(code) for each in listed if isinstance(each, list | tuple) for code in each}
+    return codes - {NOBODY, UNKNOWN_SUBJECT}
+
+
+def virtual_sittings(
+    numbers: Sequence[int],
+    seed: int,
+    repetitions: int,
+    layout: Layout,
+    *,
+    gestures: Sequence[str] = GESTURES,
+    world: World = WORLD,
+) -> Iterator[Sitting]:
+    """Play the paper's protocol with virtual people: 17 gestures, each some times in a row.
+
+    Between two gestures the toy stands idle, is taken up and turned by somebody who means nothing by it, and stands
+    idle again; between two repetitions the person waits for the recorder's countdown.
+
+    Raises:
+        ConfigError: for a size that cannot be, or a layout that the virtual toy does not speak.
+    """
+    for name, value, low, high in (("repetitions", repetitions, 1, 100), ("seed", seed, 0, 2**31)):
+        if not low <= value <= high:
+            raise ConfigError(f"{name} is {value}; a whole number from {low} to {high} is accepted.")
+    return _play(numbers, seed, repetitions, channel_columns(layout), gestures, world)
+
+
+def _play(
+    numbers: Sequence[int], seed: int, repetitions: int, columns: list[int], gestures: Sequence[str], world: World
+) -> Iterator[Sitting]:
+    for number in numbers:
+        session = VirtualSession(draw_person(number, seed, world), seed, _SESSION, world)
+        rng = np.random.default_rng([seed, number, _SESSION])
+        episodes = [session.idle(4.0)]
+        for label in gestures:
+            episodes.append(session.handle())
+            episodes.append(session.idle(float(rng.uniform(*_IDLE_S))))
+            episodes.append(session.perform(label, repetitions))
+            episodes.append(session.idle(float(rng.uniform(*_IDLE_S))))
+        device_ms = np.concatenate([e.device_ms for e in episodes])
+        values = np.concatenate([e.values for e in episodes])[:, columns]
+        kept = rng.random(len(values)) >= world.lost + world.garbled
+        frames = Frames(values[kept], device_ms[kept])
+        first_ms = int(frames.device_ms[0])
+        marks = [m for e in episodes for m in e.marks]
+        yield Sitting(f"virtual {number}", frames, tuple(_trials(marks, device_ms, first_ms, repetitions)))
+
+
+def _trials(
+    marks: Sequence[GestureMark], device_ms: NDArray[np.int64], first_ms: int, repetitions: int
+) -> Iterator[GestureTrial]:
+    def at(sample: int) -> float:
+        return (int(device_ms[min(sample, len(device_ms) - 1)]) - first_ms) / 1000.0
+
+    for n, mark in enumerate(marks):
+        onset = mark.start if mark.struck is None else mark.struck
+        yield GestureTrial(mark.label, n % repetitions + 1, at(mark.start), at(onset), at(mark.stop))
+
+
+def row_times_s(frames: Frames, layout: Layout) -> NDArray[np.float64]:
+    """Return the seconds (T,) of each row since the first; over a clock reset time goes on."""
+    steps = np.diff(frames.device_ms.astype(np.int64))
+    steps = np.where(steps < 0, layout.period_us // 1000, steps)
+    return np.concatenate(([0.0], np.cumsum(steps) / 1000.0))
+
+
+@dataclass(frozen=True)
+class Left:
+    """Somebody who could not be scored, and why."""
+
+    who: str
+    why: str
+
+
+def recorded_people(dataset: Dataset, asked: Sequence[str] | None, provenance: Mapping[str, Any]) -> list[str]:
+    """People of a data set whom a network never met: those asked for, or all of them.
+
+    Raises:
+        ConfigError: for somebody who is not in the data set, or on whom the network was trained or chosen.
+    """
+    same = provenance.get("dataset_hash") == dataset.hash or provenance.get("dataset") == dataset.head.name
+    met = known_people(provenance) if same else set()
+    if asked is None:
+        strangers = [code for code in dataset.subjects if code not in met]
+        if not strangers:
+            raise ConfigError(
+                f"This network was trained on, or chosen by, everybody in '{dataset.head.name}': take one that was "
+                "trained without some of them."
+            )
+        return strangers
+    for code in asked:
+        if code not in dataset.subjects:
+            raise ConfigError(
+                f"There is no '{code}' in '{dataset.head.name}', which holds {', '.join(dataset.subjects)}."
+                f"{nearest(code, dataset.subjects)}"
+            )
+        if code in met:
+            raise ConfigError(
+                f"'{code}' is among the people that this network was trained on or chosen by: leave that person out."
+            )
+    return list(dict.fromkeys(asked))
+
+
+def recorded_sittings(
+    dataset: Dataset, people: Sequence[str], gestures: GestureSet
+) -> tuple[list[Sitting], list[Left]]:
+    """Return each person's streams with the located recordings of ``gestures``, onset at the start mark.
+
+    The toy at rest is no trial. A person with several streams has a sitting for each. Who has none, or none with such
+    a recording in it, is left out with a reason.
+
+    Raises:
+        DatasetError: when nobody is left.
+    """
+    sittings: list[Sitting] = []
+    left: list[Left] = []
+    for who in people:
+        streams = [s for s in dataset.streams if s.subject == who]
+        if not streams:
+            left.append(Left(who, "has no session stream, only single recordings"))
+            continue
+        found = 0
+        for stream in streams:
+            mine = [r for r in dataset.used if r.stream == stream.id and r.stream_row >= 0]
+            known = [r for r in mine if (g := gestures.find(r.gesture)) is not None and not g.idle]
+            mine = sorted(known, key=lambda r: r.stream_row)
+            if not mine:
+                continue
+            frames = dataset.read_stream(stream.id)
+            times = row_times_s(frames, dataset.layout)
+            made: dict[str, int] = {}
+            trials = []
+            for r in mine:
+                label = gestures.get(r.gesture).label
+                made[label] = made.get(label, 0) + 1
+                first, last = (min(r.stream_row + row, len(times) - 1) for row in (r.start, r.stop - 1))
+                trials.append(
+                    GestureTrial(label, made[label], float(times[first]), float(times[first]), float(times[last]))
+                )
+            found += len(trials)
+            name = who if len(streams) == 1 else f"{who}, {stream.session}"
+            sittings.append(Sitting(name, frames, tuple(trials)))
+        if not found:
+            left.append(Left(who, "has a session stream, but none of the recordings was found in it"))
+    if not sittings:
+        why = f" ('{left[0].who}' {left[0].why})" if left else ""
+        raise DatasetError(
+            f"Nobody in '{dataset.head.name}' has a session stream with recordings in it{why}: the protocol needs "
+            "fulldatastream.csv beside the recordings, from the recorder or from  plushsense record."
+        )
+    return sittings, left

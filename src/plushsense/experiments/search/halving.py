@@ -1,0 +1,427 @@
+"""A search by successive halving: all networks for a few epochs, the better ones for more, the last to the end.
+
+Jamieson and Talwalkar, "Non-stochastic best arm identification and hyperparameter optimization", AISTATS 2016. Theirs
+is the halving; ours that costs differ by network, that the whole cost is bounded before anything runs, and that who
+is within one standard error of the cut goes on while there is money for it. What is spent on a training is never
+lost: it goes on from where it stopped, and one that goes to the end has cost what it costs in the grid.
+
+Cost is in multiply-accumulates (MAC): of a window × windows × epochs, forward and backward.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import ConfigError, TrainingError
+from plushsense.models.arch import MAX_LAYERS, Arch, slashed
+from plushsense.trials.grid import GRIDS, GridSpec, grid_tables, over
+
+Scores = NDArray[np.float64]
+
+# Of the grid's cost, where nothing is said.
+QUARTER = 0.25
+
+# Sums in another order differ by less.
+_SLACK = 1 + 1e-9
+
+# What a search may bound: the key, the property of a network, its unit.
+LIMITS: dict[str, tuple[str, str]] = {
+    "max_parameters": ("parameters", "parameters"),
+    "max_state_bytes": ("state_bytes_int8", "bytes of state"),
+    "max_macs_per_step": ("macs_per_step", "MAC a step"),
+}
+
+
+@dataclass(frozen=True)
+class SearchSpec:
+    """Settings of a search. Nothing is checked when it is made: `problems` finds everything at once.
+
+    Args:
+        rungs: epochs after which networks are compared; those of the last are trained to the end.
+        folds: how many folds the rungs before the last look at, one number each; empty: all of them.
+        share: of the cost of the whole grid (every allowed network, last rung, all folds and seeds): at most this.
+            None: a quarter; where so few networks are allowed that not even one could be paid to the end, as much as
+            the first rung and two of them take.
+        eta: of each rung one in so many goes on, and two at least, where cost allows.
+        max_parameters, max_state_bytes, max_macs_per_step: networks beyond are left out before anything runs; the
+            state is that of int8 streaming, a step 50 ms.
+    """
+
+    rungs: tuple[int, ...] = (4, 15, 60)
+    folds: tuple[int, ...] = ()
+    share: float | None = None
+    eta: float = 2.0
+    max_parameters: int | None = None
+    max_state_bytes: int | None = None
+    max_macs_per_step: int | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        return asdict(self)
+
+    def over(self, arch: Arch) -> dict[str, tuple[int, int]]:
+        """Return each limit that a network breaks: (its value, the limit)."""
+        found = {}
+        for key, (name, _) in LIMITS.items():
+            limit = getattr(self, key)
+            if limit is not None and getattr(arch, name) > limit:
+                found[key] = (getattr(arch, name), limit)
+        return found
+
+
+def problems(spec: SearchSpec, folds: int | None = None) -> list[str]:
+    """Return everything that keeps a search from running, one sentence each."""
+    found = []
+    rungs = spec.rungs
+    if not rungs or min(rungs) < 1 or list(rungs) != sorted(set(rungs)):
+        found.append(f"The rungs {_listed(rungs)} cannot be used: accepted are whole numbers from 1 that ascend.")
+    if spec.folds:
+        if len(spec.folds) != len(rungs) - 1:
+            found.append(
+                f"The folds {_listed(spec.folds)} do not fit {len(rungs)} rungs: give one number for each rung but the "
+                "last, which looks at all folds."
+            )
+        elif min(spec.folds) < 1 or list(spec.folds) != sorted(spec.folds):
+            found.append(f"The folds {_listed(spec.folds)} cannot be used: whole numbers from 1 that do not fall.")
+        elif folds is not None and spec.folds[-1] > folds:
+            found.append(f"The folds {_listed(spec.folds)} are more than the split has: it has {folds}.")
+    if spec.share is not None and not 0.0 < spec.share <= 1.0:
+        found.append(f"The share {spec.share:g} cannot be used: accepted is above 0, up to 1.")
+    if not (math.isfinite(spec.eta) and spec.eta > 1.0):
+        found.append(f"eta is {spec.eta:g}: accepted is above 1.")
+    for key in LIMITS:
+        value = getattr(spec, key)
+        if value is not None and value < 1:
+            found.append(f"{key} is {value}: accepted are whole numbers from 1.")
+    return found
+
+
+def limits_text(over: Mapping[str, tuple[int, int]]) -> str:
+    """Return the limits that a network breaks as text."""
+    return ", ".join(f"{has:,} {LIMITS[key][1]}, {has - may:,} over {may:,}" for key, (has, may) in over.items())
+
+
+def none_left(spec: SearchSpec, archs: Sequence[Arch]) -> str:
+    """Return why no network is left, and by how much the nearest misses."""
+
+    def excess(arch: Arch) -> float:
+        return max(has / may for has, may in spec.over(arch).values())
+
+    near = min(archs, key=excess)
+    return (
+        f"None of the {len(archs)} networks is within the limits; the nearest, {near.symbol} with "
+        f"{slashed(near.filters)}, has {limits_text(spec.over(near))}: allow more, or give smaller networks."
+    )
+
+
+class Rung(NamedTuple):
+    """What is to be trained next: ``entered`` (indices of networks) on the first ``folds`` folds, to ``epochs``."""
+
+    number: int
+    epochs: int
+    folds: int
+    entered: tuple[int, ...]
+    cost: float
+
+
+@dataclass(frozen=True)
+class FinishedRung:
+    """A rung that is done.
+
+    ``scores`` (entered, seeds × folds); ``means`` by network (NaN: its training failed); ``error`` the standard error
+    of the difference of two means, None from a single score each; ``kept`` goes on, best first (after the last rung:
+    who stands at the end); ``left`` says of each other why: below the cut, too dear, failed.
+    """
+
+    rung: Rung
+    scores: Scores
+    means: dict[int, float]
+    error: float | None
+    kept: tuple[int, ...]
+    left: dict[int, Literal["score", "cost", "failed"]]
+
+
+@dataclass(frozen=True)
+class Halved:
+    """A search that is done: its rungs, the best network, those within one standard error of it, and the cost."""
+
+    rungs: tuple[FinishedRung, ...]
+    best: int
+    equals: tuple[int, ...]
+    spent: float
+    bound: float
+    whole: float
+
+
+class Costs:
+    """What networks cost: MAC of one epoch (networks, folds), over the rungs of a search."""
+
+    def __init__(self, epoch: Scores, spec: SearchSpec, seeds: int = 1) -> None:
+        self.spec = spec
+        self.epoch = epoch
+        folds = [*spec.folds, *[epoch.shape[1]] * (len(spec.rungs) - len(spec.folds))]
+        self.folds = tuple(folds)
+        # (networks, rungs): all that a network has cost once it is done with a rung.
+        self.until = np.stack(
+            [seeds * e * epoch[:, :f].sum(axis=1) for e, f in zip(spec.rungs, folds, strict=True)], axis=1
+        )
+        self.whole = float(self.until[:, -1].sum())
+        self.share = self._usual() if spec.share is None else spec.share
+        self.bound = self.share * self.whole
+
+    def _usual(self) -> float:
+        if self.least <= QUARTER:
+            return QUARTER
+        two = np.sort(self.rest(0))[-2:].sum()
+        return min(1.0, _up(float(self.step(0).sum() + two) / self.whole))
+
+    def step(self, rung: int) -> Scores:
+        """Return the cost from the rung before to this one, by network."""
+        before = self.until[:, rung - 1] if rung else 0.0
+        found: Scores = self.until[:, rung] - before
+        return found
+
+    def rest(self, rung: int) -> Scores:
+        """Return the cost from this rung to the end, by network."""
+        found: Scores = self.until[:, -1] - self.until[:, rung]
+        return found
+
+    @property
+    def least(self) -> float:
+        """The smallest share with which the first rung and any one network to the end can be paid."""
+        return float(self.step(0).sum() + self.rest(0).max()) / self.whole
+
+    def check(self) -> None:
+        """Check that the bound can be kept.
+
+        Raises:
+            ConfigError: with the share that suffices.
+        """
+        if self.least > self.share * _SLACK:
+            raise ConfigError(
+                f"A share of {self.share:g} of the grid's cost is too small: all {len(self.until)} networks up to "
+                f"epoch {self.spec.rungs[0]} and one of them to the end may take {self.least:.3f}; allow a share of "
+                f"{_up(self.least):g}, or begin with fewer epochs."
+            )
+
+
+def halving(costs: Costs, train: Callable[[Rung], Scores]) -> Halved:
+    """Search. ``train`` gives the scores (entered, seeds × folds) of a rung, more is better, NaN for what failed.
+
+    At no time is more spent than the bound: whoever may lead the next rung can be paid to the end.
+
+    Raises:
+        ConfigError: when the bound does not suffice for any search; TrainingError: when every training failed.
+    """
+    costs.check()
+    spec, alive, spent = costs.spec, tuple(range(len(costs.until))), 0.0
+    done: list[FinishedRung] = []
+    for level, epochs in enumerate(spec.rungs):
+        cost = float(costs.step(level)[list(alive)].sum())
+        rung = Rung(level, epochs, costs.folds[level], alive, cost)
+        scores = np.asarray(train(rung), dtype=np.float64)
+        spent += cost
+        # A network that failed on one fold has no mean: those that are left would flatter it.
+        means = {network: float(scores[i].mean()) for i, network in enumerate(alive)}
+        well = [network for network in alive if math.isfinite(means[network])]
+        if not well:
+            raise TrainingError(
+                f"Every training failed by epoch {epochs}: try a lower learning_rate, such as a tenth of it."
+            )
+        error = standard_error(scores[[i for i, network in enumerate(alive) if network in well]])
+        order = sorted(well, key=lambda network: (-means[network], costs.until[network, -1]))
+        left: dict[int, Literal["score", "cost", "failed"]] = dict.fromkeys(set(alive) - set(well), "failed")
+        kept = tuple(order)
+        if level + 1 < len(spec.rungs):
+            kept = _go_on(costs, level + 1, order, means, error or 0.0, costs.bound - spent, len(alive), left)
+        done.append(FinishedRung(rung, scores, means, error, kept, left))
+        alive = kept
+    last = done[-1]
+    reach = last.means[alive[0]] - (last.error or 0.0)
+    equals = tuple(network for network in alive[1:] if last.means[network] >= reach)
+    return Halved(tuple(done), alive[0], equals, spent, costs.bound, costs.whole)
+
+
+def _go_on(
+    costs: Costs,
+    rung: int,
+    order: Sequence[int],
+    means: Mapping[int, float],
+    error: float,
+    money: float,
+    entered: int,
+    left: dict[int, Literal["score", "cost", "failed"]],
+) -> tuple[int, ...]:
+    """Return the networks that are trained for the next rung, the best first."""
+    allowed = money / (len(costs.spec.rungs) - rung)
+    step, rest = costs.step(rung), costs.rest(rung)
+    # Two at least: who comes out of the end should have beaten somebody there.
+    wanted = max(2, math.ceil(entered / costs.spec.eta))
+    cut = means[order[min(len(order), wanted) - 1]]
+    kept: list[int] = []
+    paid, dearest = 0.0, 0.0
+    for network in order:
+        if means[network] < cut - error:
+            left[network] = "score"
+            continue
+        total, end = paid + step[network], max(dearest, rest[network])
+        if kept and (total > allowed * _SLACK or total + end > money * _SLACK):
+            left[network] = "cost"
+            continue
+        kept.append(network)
+        paid, dearest = total, end
+    return tuple(kept)
+
+
+def standard_error(scores: Scores) -> float | None:
+    """Return the standard error of the difference of two networks' means; None where it cannot be told.
+
+    All networks were scored on the same folds with the same seeds, so that what is hard for all does not count: the
+    spread is that of the residuals of network + fold, pooled over the networks.
+    """
+    networks, units = scores.shape
+    if networks < 2 or units < 2:
+        return None
+    residuals = scores - scores.mean(axis=1, keepdims=True) - scores.mean(axis=0, keepdims=True) + scores.mean()
+    variance = float((residuals**2).sum()) / ((networks - 1) * (units - 1))
+    return math.sqrt(2 * variance / units)
+
+
+def _up(share: float) -> float:
+    return math.ceil(share * 1000) / 1000
+
+
+def _listed(values: Sequence[int]) -> str:
+    return ", ".join(map(str, values)) or "(none)"
+
+
+# Draws for each network that is asked for, until the space is taken as used up.
+_TRIES = 2000
+
+
+@dataclass(frozen=True)
+class Space:
+    """Space of networks that a search may draw from.
+
+    ``layers``, ``kernels`` and ``dilations`` are drawn from; dilations never fall from layer to layer, as in all of
+    the paper's networks. ``receptive_field``: the shortest and the longest, in samples; the paper keeps to about its
+    window of 250. ``networks`` are drawn with ``seed``.
+    """
+
+    layers: tuple[int, ...] = (2, 3, 4)
+    kernels: tuple[int, ...] = (1, 5, 9, 14, 19, 24, 29, 39, 59, 84)
+    dilations: tuple[int, ...] = (1, 2, 3, 4, 8, 9)
+    receptive_field: tuple[int, ...] = (100, 260)
+    networks: int = 26
+    seed: int = 0
+
+
+def problems_space(space: Space) -> list[str]:
+    """Return everything that keeps networks from being drawn, one sentence each."""
+    found = []
+    for key, high in (("layers", MAX_LAYERS), ("kernels", None), ("dilations", None)):
+        values = getattr(space, key)
+        if not values or min(values) < 1 or (high is not None and max(values) > high):
+            to = "" if high is None else f" to {high}"
+            found.append(f"{key} of the space are {list(values)}: accepted are whole numbers from 1{to}.")
+    field = space.receptive_field
+    if len(field) != 2 or not 1 <= field[0] <= field[1]:
+        found.append(f"receptive_field of the space is {list(field)}: accepted are two numbers, as [100, 260].")
+    for key, low in (("networks", 2), ("seed", 0)):
+        if getattr(space, key) < low:
+            found.append(f"{key} of the space is {getattr(space, key)}: accepted are whole numbers from {low}.")
+    if not found and len(drawn(space)) < 2:
+        found.append(
+            f"The space holds no two networks with a receptive field of {field[0]} to {field[1]} samples: give other "
+            "kernels or dilations."
+        )
+    return found
+
+
+def drawn(space: Space) -> tuple[str, ...]:
+    """Return the symbols of ``networks`` different networks, equal for equal spaces; fewer where there are no more."""
+    chance = random.Random(space.seed)
+    found: dict[str, None] = {}
+    for _ in range(_TRIES * space.networks):
+        if len(found) == space.networks:
+            break
+        layers = chance.choice(space.layers)
+        kernels = [chance.choice(space.kernels) for _ in range(layers)]
+        # A kernel of one tap has no dilation to speak of.
+        widths = sorted(chance.choice(space.dilations) for _ in range(layers))
+        dilations = [1 if k == 1 else d for k, d in zip(kernels, widths, strict=True)]
+        field = 1 + sum((k - 1) * d for k, d in zip(kernels, dilations, strict=True))
+        if space.receptive_field[0] <= field <= space.receptive_field[1]:
+            dilated = max(dilations) > 1
+            layers_said = (f"{k}d{d}" if dilated else f"{k}" for k, d in zip(kernels, dilations, strict=True))
+            found["_".join(layers_said)] = None
+    return tuple(found)
+
+
+DEFAULTS: dict[str, Any] = {
+    "split": "by-subject:5",
+    "preset": "people",
+    "padding": "stream",
+    "context": "stream",
+    "classes": "shared",
+    "batches": (64,),
+}
+
+
+def load_search(
+    name_or_path: str | Path, changes: Mapping[str, Any] | None = None, search: Mapping[str, Any] | None = None
+) -> tuple[GridSpec, SearchSpec, list[str]]:
+    """Grid and search by a grid's name or from a TOML file, with ``changes`` and ``search`` over them (None: none).
+
+    The grid's epochs are the rungs.
+
+    Returns:
+        both, and one sentence for each key or value that cannot be read; those are as if they were not there.
+
+    Raises:
+        ConfigError: for an unknown name, or a file that is missing or not TOML.
+    """
+    if str(name_or_path) in GRIDS:
+        base, table, asked, found = GRIDS[str(name_or_path)], dict[str, Any](), dict[str, Any](), list[str]()
+    else:
+        tables, found = grid_tables(name_or_path)
+        base, table, asked = GridSpec(name=Path(name_or_path).stem), dict(tables["grid"]), dict(tables["search"])
+    where = f"[search] in '{name_or_path}'"
+    space = asked.pop("space", None)
+    spec, more = over(SearchSpec(), asked, where)
+    found += more
+    spec, more = asked_of(spec, search)
+    found += more
+    if space is not None:
+        symbols, more = _symbols(space, f"[search.space] in '{name_or_path}'")
+        found += more
+        table |= {"architectures": symbols} if symbols else {}
+    grid, more = over(base, DEFAULTS | table, f"[grid] in '{name_or_path}'")
+    found += more
+    grid, more = over(grid, _given(changes) | {"epochs": spec.rungs}, "the grid")
+    return grid, spec, found + more
+
+
+def asked_of(spec: SearchSpec, search: Mapping[str, Any] | None) -> tuple[SearchSpec, list[str]]:
+    """Return a search with some keys changed, as in `load_search`."""
+    return over(spec, _given(search), "the search")
+
+
+def _symbols(space: Any, where: str) -> tuple[tuple[str, ...], list[str]]:
+    if not isinstance(space, Mapping):
+        return (), [f"space of {where.replace('.space', '')} is a single value; it is a table: write  [search.space]"]
+    made, found = over(Space(), space, where)
+    found += problems_space(made)
+    return (() if found else drawn(made)), found
+
+
+def _given(changes: Mapping[str, Any] | None) -> dict[str, Any]:
+    return {key: value for key, value in (changes or {}).items() if value is not None}

@@ -1,0 +1,1 @@
+"""The continuous benchmark: events in whole streams of people left out. Read run, score, report."""

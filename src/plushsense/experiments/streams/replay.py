@@ -1,0 +1,334 @@
+"""One person's streams as a model reads them, beside the true gestures, so that any setting can be scored."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.gestures import NOBODY, GestureSet
+from plushsense.core.recorder_csv import Frames
+from plushsense.dataset.quality.measurements import NEVER_STOPPED_FACTOR
+from plushsense.dataset.store import RECORDINGS, UNKNOWN_SUBJECT, Dataset, RecordingInfo, StreamInfo
+from plushsense.models.bundle import Bundle
+from plushsense.runtime.decisions import DecideSpec
+from plushsense.runtime.events import AFFECTS, NO_GESTURE
+from plushsense.runtime.image import IntegerModel
+from plushsense.runtime.trace import ReportedEvent, TraceReplayer, trace_of
+from plushsense.scoring.events import (
+    LATE_S,
+    UNNAMED,
+    ErrorCosts,
+    Interval,
+    Tallies,
+    Tally,
+    cost,
+    outside_insertions,
+    overlaps,
+    pooled,
+    tally,
+    uncovered_s,
+)
+
+Stretch = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class StreamTruth:
+    """One stream: ``truths`` are its gestures, idle ones are ``rest``, gestures that the model does not know
+    ``other``. ``doubtful`` are recordings that a mark excludes or that nobody stopped: what happens there is not
+    counted at all. ``labelled``: every sample has a label, so that nothing happened unseen.
+    """
+
+    stream: str
+    subject: str
+    labelled: bool
+    truths: tuple[Interval, ...]
+    rest: tuple[Stretch, ...]
+    other: tuple[Stretch, ...]
+    doubtful: tuple[Stretch, ...]
+
+
+def row_times_s(frames: Frames, period_us: int) -> NDArray[np.float64]:
+    """Return the seconds (T,) of every row as a `plushsense.runtime.trace.Trace` counts them."""
+    ms = frames.device_ms.astype(np.int64)
+    if not len(ms):
+        return np.zeros(0)
+    step = np.diff(ms)
+    # The clock that was set back goes on one sample after the last.
+    step_us = np.where(step < 0, period_us, step * 1000)
+    return np.asarray(np.concatenate([[0], np.cumsum(step_us)]) / 1e6)
+
+
+def usual_rows(dataset: Dataset) -> dict[str, float]:
+    """Return the median number of rows of each gesture, by which `truth_of` finds recordings nobody stopped."""
+    rows: dict[str, list[int]] = {}
+    for r in dataset.used:
+        rows.setdefault(r.gesture, []).append(r.stop - r.start)
+    return {gesture: float(np.median(found)) for gesture, found in rows.items()}
+
+
+def truth_of(
+    dataset: Dataset, stream: StreamInfo, frames: Frames, gestures: GestureSet, usual: dict[str, float]
+) -> StreamTruth:
+    """Return the true gestures in ``stream``, whose rows are ``frames``, by the labels of a model's ``gestures``."""
+    times = row_times_s(frames, dataset.layout.period_us)
+    truths: list[Interval] = []
+    rest: list[Stretch] = []
+    other: list[Stretch] = []
+    doubtful: list[Stretch] = []
+    for r in located(dataset, stream):
+        first = r.stream_row + r.start
+        last = min(r.stream_row + r.stop, len(times)) - 1
+        if last <= first:
+            continue
+        stretch = (float(times[first]), float(times[last]))
+        gesture = gestures.find(r.gesture)
+        if r.excluded or _never_stopped(r, usual):
+            doubtful.append(stretch)
+        elif gesture is None:
+            known = dataset.gestures.find(r.gesture)
+            (rest if known is not None and known.idle else other).append(stretch)
+        elif gesture.idle:
+            rest.append(stretch)
+        else:
+            truths.append(Interval(*stretch, gesture.label))
+    return StreamTruth(
+        stream.id, stream.subject, dataset.layout.is_labelled, tuple(truths), tuple(rest), tuple(other), tuple(doubtful)
+    )
+
+
+def located(dataset: Dataset, stream: StreamInfo) -> list[RecordingInfo]:
+    """Return the recordings that lie in a stream, in its order."""
+    mine = [r for r in dataset.recordings if r.stream == stream.id and r.stream_row >= 0]
+    return sorted(mine, key=lambda r: r.stream_row)
+
+
+def streams_of(dataset: Dataset, subjects: Sequence[str]) -> list[StreamInfo]:
+    """Return the streams of some people in which there is any recording."""
+    with_truth = {r.stream for r in dataset.recordings if r.stream_row >= 0}
+    return [s for s in dataset.streams if s.subject in subjects and s.id in with_truth]
+
+
+def people_with_streams(dataset: Dataset) -> list[str]:
+    """Return the people whose streams can be scored, sorted, without nobody and the unknown."""
+    with_truth = {r.stream for r in dataset.recordings if r.stream_row >= 0}
+    return sorted({s.subject for s in dataset.streams if s.id in with_truth} - {NOBODY, UNKNOWN_SUBJECT})
+
+
+def _never_stopped(r: RecordingInfo, usual: dict[str, float]) -> bool:
+    # Runs of labels are as long as they are.
+    own_file = r.file.startswith(f"{RECORDINGS}/")
+    return own_file and r.stop - r.start > NEVER_STOPPED_FACTOR * usual.get(r.gesture, float("inf"))
+
+
+# Of what an event is asked: its gesture, the family, the affect, and whether anything was said at all.
+LEVELS = ("gesture", "family", "affect", "anything")
+PLACES = ("rest", "other", "unmarked")
+
+
+@dataclass(frozen=True, eq=False)
+class StreamTrace:
+    """One stream with its truth. ``hours`` that the model heard; ``free_hours`` of these without any truth;
+    ``rest_hours`` in recordings of rest.
+    """
+
+    truth: StreamTruth
+    listener: TraceReplayer
+    hours: float
+    free_hours: float
+    rest_hours: float
+
+
+def hear(dataset: Dataset, model: Bundle | IntegerModel, subjects: Sequence[str]) -> list[StreamTrace]:
+    """Read every stream of some people once."""
+    usual = usual_rows(dataset)
+    found = []
+    for stream in streams_of(dataset, subjects):
+        frames = dataset.read_stream(stream.id)
+        trace = trace_of(frames, model)
+        truth = truth_of(dataset, stream, frames, model.gestures, usual)
+        parts = [(p.start_us / 1e6, p.ends_us / 1e6) for p in trace.parts]
+        marked = [(t.start_s, t.stop_s) for t in truth.truths]
+        left = uncovered_s(parts, truth.doubtful)
+        free = uncovered_s(parts, [*marked, *truth.doubtful])
+        rest = uncovered_s(parts, []) - uncovered_s(parts, truth.rest)
+        found.append(StreamTrace(truth, TraceReplayer(trace), left / 3600, free / 3600, rest / 3600))
+    return found
+
+
+@dataclass
+class StreamScore:
+    """Scores of one setting on some streams.
+
+    ``levels`` holds the tallies of each of `LEVELS` by label; ``places`` where the events outside of any truth were:
+    in recordings of rest, in recordings of gestures that the model does not know, anywhere else (``unmarked``, where
+    people may have practised).
+    """
+
+    levels: dict[str, Tallies] = field(default_factory=lambda: {level: {} for level in LEVELS})
+    places: dict[str, int] = field(default_factory=lambda: dict.fromkeys(PLACES, 0))
+    cost: float = 0.0
+    hours: float = 0.0
+    free_hours: float = 0.0
+    rest_hours: float = 0.0
+    gate_events: int = 0
+
+    def add(self, other: StreamScore) -> None:
+        """Count other streams in."""
+        for level, tallies in other.levels.items():
+            for label, counts in tallies.items():
+                self.levels[level].setdefault(label, Tally()).add(counts)
+        for place, n in other.places.items():
+            self.places[place] += n
+        for name in ("cost", "hours", "free_hours", "rest_hours", "gate_events"):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+
+    def total(self, level: str = "gesture") -> Tally:
+        """Return the pooled tally of all labels of a level."""
+        return pooled(self.levels[level].values())
+
+    def kept(self) -> dict[str, Any]:
+        """Return plain values, as a journal stores them."""
+        levels = {level: {k: t.kept() for k, t in tallies.items()} for level, tallies in self.levels.items()}
+        return {**vars(self), "levels": levels, "places": dict(self.places)}
+
+    @classmethod
+    def from_kept(cls, table: Mapping[str, Any]) -> StreamScore:
+        """Return the score that `kept` gave as plain values."""
+        levels = {level: {k: Tally(**t) for k, t in rows.items()} for level, rows in table["levels"].items()}
+        return cls(**{**table, "levels": levels})
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the figures of reports, ready for JSON."""
+        gesture = self.total()
+        said = gesture.to_dict()
+        names = ("events", "hits", "deletions", "insertions", "fragmentations", "merges")
+        return {
+            "truths": said["truths"],
+            **{name: said[name] for name in names},
+            "recall": said["recall"],
+            "precision": said["precision"],
+            "f1": said["f1"],
+            "confused": said["confused"],
+            "outside": self.places | {"all": said["outside"]},
+            "false_events_per_hour": rate(gesture.insertions, self.hours),
+            "outside_per_uncovered_hour": rate(gesture.outside, self.free_hours),
+            "at_rest_per_hour": rate(self.places["rest"], self.rest_hours),
+            "hours": round(self.hours, 4),
+            "uncovered_hours": round(self.free_hours, 4),
+            "rest_hours": round(self.rest_hours, 4),
+            "latency_s": said["latency_s"],
+            "cost_per_truth": self.cost / gesture.truths if gesture.truths else None,
+            "gate_events": self.gate_events,
+            "levels": {level: pooled(rows.values()).to_dict() for level, rows in self.levels.items() if rows},
+            "per_class": {label: row.to_dict() for label, row in sorted(self.levels["gesture"].items()) if label},
+        }
+
+
+def rate(count: float, hours: float) -> float | None:
+    """Return a count per hour; None where there was no time."""
+    return count / hours if hours > 0 else None
+
+
+def kept_events(heard: StreamTrace, spec: DecideSpec) -> list[ReportedEvent]:
+    """Return the events of a setting, without those that begin in a doubtful stretch."""
+    doubtful = heard.truth.doubtful
+    return [e for e in heard.listener.events(spec) if not any(a <= e.start_s < b for a, b in doubtful)]
+
+
+def gesture_intervals(events: Sequence[ReportedEvent], gestures: GestureSet) -> list[Interval]:
+    """Return events as intervals of gestures, each from when the gesture was named."""
+    labels = gestures.labels
+    return [Interval(e.named_s, e.stop_s, UNNAMED if e.gesture == NO_GESTURE else labels[e.gesture]) for e in events]
+
+
+@dataclass
+class Quick:
+    """All that most tuning asks of a setting: gestures hit and events matched, of how many, in how many hours."""
+
+    hits: int = 0
+    truths: int = 0
+    matched: int = 0
+    insertions: int = 0
+    hours: float = 0.0
+
+    @property
+    def recall(self) -> float:
+        """Hits of the truths; 0 without any."""
+        return self.hits / self.truths if self.truths else 0.0
+
+    @property
+    def false_per_hour(self) -> float:
+        """Insertions an hour of stream."""
+        return self.insertions / self.hours if self.hours else 0.0
+
+    @property
+    def f1(self) -> float:
+        """Harmonic mean of recall and precision."""
+        said = self.matched + self.insertions
+        precision = self.matched / said if said else 0.0
+        both = precision + self.recall
+        return 2 * precision * self.recall / both if both else 0.0
+
+
+def quick(heard: Sequence[StreamTrace], spec: DecideSpec, late_s: float = LATE_S) -> Quick:
+    """Return the counts of gestures alone, as `score` would count them."""
+    found = Quick()
+    for h in heard:
+        gestures, truths = h.listener.trace.gestures, h.truth.truths
+        events = gesture_intervals(kept_events(h, spec), gestures)
+        found.hours += h.hours
+        found.truths += len(truths)
+        over = overlaps(truths, events, late_s)
+        number = {label: n for n, label in enumerate(gestures.labels)}
+        said = np.array([number.get(e.label, -1) for e in events], dtype=np.int64)
+        same = over & (np.array([number[t.label] for t in truths], dtype=np.int64)[:, None] == said)
+        matched = same.any(axis=0)
+        found.hits += int(same.any(axis=1).sum())
+        found.matched += int(matched.sum())
+        found.insertions += int((~matched & ~((said < 0) & over.any(axis=0))).sum())
+    return found
+
+
+def score(
+    heard: StreamTrace, spec: DecideSpec, weights: ErrorCosts | None = None, late_s: float = LATE_S
+) -> StreamScore:
+    """Return the scores of one setting on one stream."""
+    gestures = heard.listener.trace.gestures
+    events = kept_events(heard, spec)
+    families = dict(zip(gestures.labels, gestures.families, strict=True))
+    affects = dict(zip(gestures.labels, gestures.affects, strict=True))
+    by_gesture = gesture_intervals(events, gestures)
+    truths = heard.truth.truths
+    out = StreamScore(hours=heard.hours, free_hours=heard.free_hours, rest_hours=heard.rest_hours)
+    out.gate_events = sum(bool(e.source) for e in events)
+    out.levels["gesture"] = tally(truths, by_gesture, late_s)
+    out.levels["family"] = tally(_called(truths, families), _called(by_gesture, families), late_s)
+    if gestures.has_affect:
+        said = [
+            Interval(e.start_s, e.stop_s, AFFECTS[e.affect] if e.affect or e.gesture != NO_GESTURE else UNNAMED)
+            for e in events
+        ]
+        out.levels["affect"] = tally(_called(truths, affects), said, late_s)
+    whole = [Interval(e.start_s, e.stop_s, "anything") for e in events]
+    out.levels["anything"] = tally([Interval(t.start_s, t.stop_s, "anything") for t in truths], whole, late_s)
+    for event in outside_insertions(truths, by_gesture, late_s):
+        out.places[_place(event, heard.truth)] += 1
+    told = [AFFECTS[e.affect] for e in events]
+    out.cost = cost(truths, by_gesture, told, families, affects, weights, late_s)
+    return out
+
+
+def _called(intervals: Sequence[Interval], names: Mapping[str, str]) -> list[Interval]:
+    return [Interval(i.start_s, i.stop_s, names.get(i.label, UNNAMED)) for i in intervals]
+
+
+def _place(event: Interval, truth: StreamTruth) -> str:
+    for name, stretches in (("rest", truth.rest), ("other", truth.other)):
+        if any(a <= event.start_s < b for a, b in stretches):
+            return name
+    return "unmarked"

@@ -1,0 +1,402 @@
+"""The continuous benchmark from Python: one bundle on whole streams, or every system on people left out."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from plushsense.core.errors import BadInput, BundleError, ConfigError, DatasetError, nearest, need
+from plushsense.core.files import write_file
+from plushsense.core.gestures import NOBODY, GestureSet
+from plushsense.core.version import __version__
+from plushsense.dataset.files import CACHE
+from plushsense.dataset.importing.importers import import_recordings
+from plushsense.dataset.index import as_dataset
+from plushsense.dataset.store import HEAD, Dataset
+from plushsense.deploy.quantize import calibration
+from plushsense.evaluation.crossval import FoldProgress
+from plushsense.experiments.streams.replay import people_with_streams
+from plushsense.experiments.streams.score import (
+    Fitted,
+    PeopleFold,
+    Settings,
+    crossvalidated_streams,
+    people_folds,
+    pooled_scores,
+    scored_people,
+    summed,
+)
+from plushsense.experiments.streams.systems import ANYWHERE, SYSTEMS, WINDOWS
+from plushsense.jobs.journal import job_id
+from plushsense.models.arch import Arch
+from plushsense.models.bundle import Bundle
+from plushsense.runtime.decisions import DecideSpec
+from plushsense.scoring.events import LATE_S
+from plushsense.training.spec import TrainSpec
+from plushsense.tuning.gate import GateSpec, fit_gate
+from plushsense.windows.anywhere import AnywhereSpec
+from plushsense.windows.cut import WindowSpec
+from plushsense.workflow.config import RunConfig, from_settings
+from plushsense.workflow.preparation import Warn, choose_classes, classes_for, outside_streams, silent, windows_for
+from plushsense.workflow.reporting import check_folder, journal_of
+
+EpochProgress = Callable[[int, int, dict[str, Any]], None]
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """One of a fold's networks: how it is trained, on which windows."""
+
+    arch: Arch
+    training: TrainSpec
+    windows: WindowSpec
+    gestures: GestureSet
+    anywhere: AnywhereSpec | None = None
+
+    def key(self) -> dict[str, Any]:
+        """Return what a network depends on, beside the data and the fold."""
+        return {
+            "arch": self.arch.to_dict(),
+            "training": self.training.key(),
+            "windows": vars(self.windows),
+            "gestures": self.gestures.to_dict(),
+            "anywhere": None if self.anywhere is None else vars(self.anywhere),
+        }
+
+
+@dataclass(frozen=True)
+class TrainStreams:
+    """Fits what a fold of the benchmark needs; a network that was trained once is kept in ``folder``."""
+
+    recipes: Mapping[str, Recipe]
+    gate: bool
+    folder: Path
+
+    def __call__(self, dataset: Dataset, fold: PeopleFold, progress: EpochProgress, /) -> Fitted:
+        networks = {name: self._network(recipe, dataset, fold, progress) for name, recipe in self.recipes.items()}
+        if not self.gate:
+            return Fitted(networks)
+        fitted = fit_gate(dataset, next(iter(networks.values())).gestures, fold.train)
+        return Fitted(networks, fitted.plan, {"gate": fitted.report, "plan": fitted.plan.to_dict()})
+
+    def _network(self, recipe: Recipe, dataset: Dataset, fold: PeopleFold, progress: EpochProgress) -> Bundle:
+        path = self.folder / f"{job_id({**recipe.key(), 'data': dataset.hash, 'fold': vars(fold)})}.plush"
+        if path.is_file():
+            return Bundle.load(path)
+        from plushsense.training.fit import fit
+
+        arch, gestures = recipe.arch, recipe.gestures
+        cut = scored = windows_for(dataset, arch, recipe.windows, gestures, anywhere=recipe.anywhere)
+        if recipe.anywhere is not None:
+            scored = windows_for(dataset, arch, replace(recipe.windows, context="stream"), gestures)
+        # What nobody made (the toy at rest) belongs to no fold, and is trained on in every one.
+        mine = np.isin(cut.subject, [*fold.train, NOBODY])
+        train = cut.take(np.flatnonzero(mine & outside_streams(cut, dataset, {*fold.validation, *fold.test})))
+        watch = scored.take(np.flatnonzero(np.isin(scored.subject, fold.validation)))
+        fitted = fit(train, watch, arch, recipe.training, progress)
+        kept = calibration(arch, fitted.weights, fitted.scaler, train.x)
+        people = {"subjects": list(fold.train), "validation_subjects": list(fold.validation)}
+        told = {"dataset": dataset.head.name, "dataset_hash": dataset.hash, "code_version": __version__, **people}
+        bundle = Bundle(
+            arch, fitted.weights, dataset.layout, fitted.scaler, gestures, dict(vars(recipe.windows)), {}, told, kept
+        )
+        with dataset.generation.writing():
+            self.folder.mkdir(parents=True, exist_ok=True)
+            bundle.save(path)
+        return bundle
+
+    def key(self) -> dict[str, Any]:
+        """Return what all networks depend on, beside the data and the fold."""
+        return {
+            "gate": str(GateSpec()) if self.gate else None,
+            **{name: recipe.key() for name, recipe in self.recipes.items()},
+        }
+
+
+def recipes_for(
+    dataset: Dataset, config: RunConfig, networks: Collection[str], anywhere_pool_s: float | None, warn: Warn = silent
+) -> dict[str, Recipe]:
+    """Return how each network is trained: alike but for the windows, the epochs and, where it is given, the pool.
+
+    There are several times as many windows anywhere in a stream, so half the epochs are more steps all the same.
+    """
+    from plushsense.training.fit import resolve_device
+
+    if config.padding != "stream":
+        raise ConfigError(f"A network with {config.padding} padding cannot follow a stream: use --padding stream.")
+    training = resolve_device(config.training)
+    wanted, found = config.evaluation.classes, {}
+    if WINDOWS in networks:
+        gestures = choose_classes(dataset, wanted, warn)
+        windows = replace(
+            config.windows, context="stream" if config.windows.context == "anywhere" else config.windows.context
+        )
+        arch = config.model.build(dataset.layout, len(gestures), windows.window_s, config.padding)
+        found[WINDOWS] = Recipe(arch, training, windows, gestures)
+    if ANYWHERE in networks:
+        gestures = classes_for(dataset, wanted, "anywhere", warn if WINDOWS not in networks else silent)
+        model = config.model if anywhere_pool_s is None else replace(config.model, pool_s=anywhere_pool_s)
+        arch = model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
+        halved = replace(training, epochs=-(-training.epochs // 2))
+        if training.halve_every:
+            halved = replace(halved, halve_every=-(-training.halve_every // 2))
+        found[ANYWHERE] = Recipe(arch, halved, replace(config.windows, context="anywhere"), gestures, config.anywhere)
+    return found
+
+
+TABLE, SHEET, PAGE, CURVES, LATENCIES = "streams.json", "streams.csv", "streams.html", "curves.png", "latencies.png"
+SPLIT = "by-subject:5"
+
+
+UPPER_BOUND = (
+    "Events outside of marked recordings count as false, and that is an upper bound: between recordings these people "
+    "also practised and handled the device. Stretches at rest are where an event was certainly for no reason."
+)
+TRUE_RATES = "Every sample of these streams is labelled, so the false events are true ones."
+DONE_AS_TOLD = (
+    "The people of these streams are simulated and do only what is recorded, so the false events are true ones."
+)
+
+
+def truth_words(dataset: Dataset) -> str:
+    """Explain what a false event means on this data."""
+    return TRUE_RATES if dataset.layout.is_labelled else DONE_AS_TOLD if dataset.head.simulated else UPPER_BOUND
+
+
+@contextmanager
+def streams_at(path: str | os.PathLike[str], bundle: Bundle) -> Iterator[Dataset]:
+    """Open the data set at a path, or a temporary one made of a folder that the GestureRecorder left."""
+    place = Path(path)
+    if (place / HEAD).is_file() or not place.is_dir():
+        yield as_dataset(place)
+        return
+    with tempfile.TemporaryDirectory(prefix="plushsense-") as folder:
+        made = import_recordings(place, Path(folder) / "DS", layout=bundle.layout, gestures=bundle.gestures)
+        yield made.dataset
+
+
+def stream_eval(
+    path: str | os.PathLike[str],
+    model: Bundle | str | os.PathLike[str],
+    *,
+    subjects: Sequence[str] | None = None,
+    late_s: float = LATE_S,
+    warn: Warn = silent,
+) -> dict[str, Any]:
+    """Replay whole streams through one bundle with its own decision settings, against what really happened.
+
+    Args:
+        path: a data set, or a folder of recordings with their stream.
+        subjects: whose; by default everybody on whom the bundle was not trained. Somebody on whom it was is scored
+            when named here, and marked.
+        late_s: how long after its end a gesture may be answered.
+        warn: called with one sentence for everybody who is left out or was trained on.
+
+    Returns:
+        ``events, hits, deletions, insertions, fragmentations, merges, false_events_per_hour, latency_s`` and more of
+        all together (see `plushsense.experiments.streams.replay.StreamScore`), ``per_class``, ``people``,
+        ``trained_on``.
+
+    Raises:
+        DatasetError, BadInput: where there is no stream with a recording in it, or nobody is left to score.
+    """
+    bundle = model if isinstance(model, Bundle) else Bundle.load(Path(model))
+    with streams_at(path, bundle) as dataset:
+        _same_sensors(dataset, bundle)
+        there = people_with_streams(dataset)
+        if not there:
+            raise DatasetError(
+                f"'{path}' has no stream in which a recording is located: give a folder with fulldatastream.csv and "
+                "the recordings of that session, or a data set with such streams."
+            )
+        trained = trained_people(bundle, dataset)
+        wanted = list(there) if subjects is None else list(dict.fromkeys(subjects))
+        for person in wanted:
+            if person not in there:
+                raise BadInput(
+                    f"'{person}' has no stream in '{path}'; there are those of: {', '.join(there)}."
+                    f"{nearest(person, there)}"
+                )
+        if subjects is None:
+            wanted = [p for p in there if p not in trained]
+            left_out = [p for p in there if p in trained]
+            if left_out:
+                warn(f"left out, since the model was TRAINED ON them: {', '.join(left_out)}")
+            if not wanted:
+                raise BadInput(
+                    "The model was trained on everybody who has a stream here, so a score would only flatter: use "
+                    "--split by-subject:5, or name people with --subjects to see it all the same."
+                )
+        met = [p for p in wanted if p in trained]
+        if met:
+            warn(f"TRAINED ON: the model has met {', '.join(met)}; their figures flatter and are no result")
+        if alike := [p for p in wanted if p not in trained and p in _codes(bundle)]:
+            warn(
+                f"the model was trained on people of the same codes in '{bundle.provenance.get('dataset')}': if "
+                f"{', '.join(alike)} are the same people, their figures flatter"
+            )
+        if not _codes(bundle):
+            warn("the bundle does not say on whom it was trained: if on these people, the figures flatter")
+        spec = DecideSpec.from_dict(bundle.decision)
+        scores = scored_people(dataset, bundle, wanted, spec, Settings((), late_s=late_s))
+        table = pooled_scores(scores)
+        for person, row in table["people"].items():
+            row["trained_on"] = person in met
+        return {
+            **table,
+            "dataset": dataset.head.name,
+            "simulated": dataset.head.simulated,
+            "trained_on": met,
+            "settings": {k: v for k, v in spec.to_dict().items() if k not in ("gate", "health", "fitted")},
+            "gate_rules": len(spec.gate.rules),
+            "late_s": late_s,
+            "note": truth_words(dataset),
+        }
+
+
+def trained_people(bundle: Bundle, dataset: Dataset) -> set[str]:
+    """Codes on whom a bundle was trained, or who were held back and tuned it, or to whom it was adapted. Those of
+    another data set, of another name and other content, are other people; what it was adapted to, it does not say.
+    """
+    told = bundle.provenance
+    known = told.get("dataset") is None or told.get("dataset") == dataset.head.name
+    known = known or told.get("dataset_hash") == dataset.hash
+    adapted = set() if bundle.adapted_to is None else {bundle.adapted_to}
+    return adapted | (_codes(bundle) if known else set())
+
+
+def _codes(bundle: Bundle) -> set[str]:
+    people: set[str] = set()
+    for key in ("subjects", "validation_subjects"):
+        if isinstance(each := bundle.provenance.get(key, ()), list | tuple):
+            people |= set(map(str, each))
+    return people - {NOBODY}
+
+
+def _same_sensors(dataset: Dataset, bundle: Bundle) -> None:
+    if dataset.layout.inputs != bundle.layout.inputs:
+        raise BundleError(
+            f"The model reads {', '.join(bundle.layout.inputs)}, and '{dataset.head.name}' has "
+            f"{', '.join(dataset.layout.inputs)}: give streams of the same sensors."
+        )
+
+
+def stream_benchmark(
+    dataset: Dataset | str | os.PathLike[str],
+    config: RunConfig | None = None,
+    *,
+    split: str = SPLIT,
+    systems: Sequence[str] | None = None,
+    out: str | os.PathLike[str] | None = None,
+    overwrite: bool = False,
+    late_s: float = LATE_S,
+    anywhere_pool_s: float | None = None,
+    progress: Callable[[FoldProgress], None] | None = None,
+    warn: Warn = silent,
+    **settings: Any,
+) -> dict[str, Any]:
+    """Score every system on the streams of people left out, with settings tuned on other people.
+
+    In each fold networks are trained on its training people; its validation people tune every system; those who are
+    left are scored. Finished folds and networks are kept in the data set's ``cache`` folder.
+
+    Args:
+        config, settings, warn: as for `train`, and ``workers``.
+        split: "by-subject:5" or "leave-one-subject-out".
+        systems: names of `plushsense.experiments.streams.systems.SYSTEMS`; by default all.
+        out: a folder for the table as JSON and CSV, a page, and its figures.
+        late_s: how long after its end a gesture may be answered.
+        anywhere_pool_s: over how long the networks of stream training pool (default: as the others).
+
+    Returns:
+        what `plushsense.experiments.streams.score.summed` returns, with ``dataset``, ``simulated``,
+        ``split``, ``note``.
+    """
+    dataset = as_dataset(dataset)
+    config = config or from_settings(**settings)
+    names = _named(systems)
+    if out is not None:
+        _check_place(Path(out), overwrite)
+    people_folds(dataset, split, config.evaluation.seed)  # refused before anything is trained
+    recipes = recipes_for(dataset, config, {SYSTEMS[n].network for n in names}, anywhere_pool_s, warn)
+    networks = dataset.path / CACHE / "stream-networks"
+    fit = TrainStreams(recipes, any(SYSTEMS[n].gate_to for n in names), networks)
+    asked = Settings(names, late_s=late_s)
+    folds = crossvalidated_streams(
+        dataset,
+        split,
+        fit,
+        settings=asked,
+        journal=journal_of(dataset, "streams"),
+        key=fit.key(),
+        workers=config.evaluation.processes,
+        seed=config.evaluation.seed,
+        progress=progress,
+    )
+    table = benchmark_table(dataset, folds, split, late_s) | {
+        "seed": config.evaluation.seed,
+        "networks": {name: recipe.arch.title for name, recipe in recipes.items()},
+        "anywhere": {"pool_s": anywhere_pool_s, **vars(config.anywhere)},
+        "preset": config.preset,
+        "training": config.training.to_dict(),
+    }
+    if out is not None:
+        with dataset.generation.writing():
+            save_benchmark(table, Path(out))
+    return table
+
+
+def benchmark_table(dataset: Dataset, folds: Sequence[dict[str, Any]], split: str, late_s: float) -> dict[str, Any]:
+    """Return finished folds as the table that is printed and kept."""
+    people = sorted({person for fold in folds for person in fold["test"]} & set(people_with_streams(dataset)))
+    return {
+        "split": split,
+        "dataset": dataset.head.name,
+        "dataset_hash": dataset.hash,
+        "simulated": dataset.head.simulated,
+        "labelled": dataset.layout.is_labelled,
+        "note": truth_words(dataset),
+        "late_s": late_s,
+        "subjects": people,
+        "code_version": __version__,
+        **summed(folds),
+    }
+
+
+def _named(systems: Sequence[str] | None) -> tuple[str, ...]:
+    if systems is None:
+        return tuple(SYSTEMS)
+    for name in systems:
+        if name not in SYSTEMS:
+            raise ConfigError(f"Unknown system '{name}': accepted are {', '.join(SYSTEMS)}.{nearest(name, SYSTEMS)}")
+    return tuple(name for name in SYSTEMS if name in systems)
+
+
+def _check_place(out: Path, replace: bool) -> None:
+    """Check that a benchmark can be written to a folder, before the work rather than after."""
+    need("matplotlib", extra="reports")
+    need("jinja2", extra="reports")
+    check_folder(out, "A benchmark")
+    if (out / TABLE).exists() and not replace:
+        raise ConfigError(f"'{out}' holds a benchmark already: choose another --out, or --force to replace it.")
+
+
+def save_benchmark(table: dict[str, Any], out: Path) -> None:
+    """Write a benchmark to a folder: JSON, CSV (a row a point of a curve), a page and its figures."""
+    from plushsense.experiments.streams.report import curves, latencies, page, point_table
+    from plushsense.reports.figures import png
+
+    out.mkdir(parents=True, exist_ok=True)
+    write_file(out / SHEET, point_table(table).csv())
+    (out / CURVES).write_bytes(png(curves(table), dpi=130))
+    (out / LATENCIES).write_bytes(png(latencies(table), dpi=130))
+    write_file(out / PAGE, page(table))
+    write_file(out / TABLE, json.dumps(table, ensure_ascii=False, indent=1))

@@ -1,0 +1,442 @@
+"""The continuous benchmark: whole streams of people left out, systems tuned on others, everything pooled.
+
+What fits is handed in: a picklable callable that gives a fold its networks and its gate, so that this room needs no
+PyTorch. A finished fold is kept in the journal as counts, some kilobytes; streams and traces are not.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import BadInput, ConfigError
+from plushsense.core.gestures import GestureSet
+from plushsense.dataset.store import Dataset
+from plushsense.evaluation.crossval import FoldProgress
+from plushsense.experiments.streams.replay import StreamScore, StreamTrace, hear, people_with_streams, quick
+from plushsense.experiments.streams.systems import (
+    ANYWHERE,
+    REFERENCE,
+    SMOOTHINGS,
+    SYSTEMS,
+    TARGETS,
+    WINDOWS,
+    System,
+    TunedPoint,
+    balanced,
+    cheapest,
+    fewest,
+    gated,
+    searched,
+    total,
+)
+from plushsense.jobs.journal import Journal, Result, job_id
+from plushsense.jobs.pool import Job, Report, run_jobs
+from plushsense.models.bundle import Bundle
+from plushsense.runtime.decisions import DecideSpec, argmax_spec
+from plushsense.runtime.gate import GateSettings
+from plushsense.scoring.events import LATE_S, ErrorCosts, at_recall
+from plushsense.scoring.metrics import BOOTSTRAP_SEED, summary
+from plushsense.scoring.splits import make_folds, parse_split
+
+# Part of every job's id: raise it when the meaning of a stored fold changes.
+_VERSION = 2
+SMOOTHING_S = 0.3
+
+
+@dataclass(frozen=True)
+class PeopleFold:
+    """People of a fold: who trains, who tunes (and stops the training, where anybody does), who is scored."""
+
+    name: str
+    train: tuple[str, ...]
+    validation: tuple[str, ...]
+    test: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """Models of a fold's training people: ``networks`` by name (`WINDOWS`, `ANYWHERE`) and a gate.
+
+    A gate of None was not asked for: the systems that have one are left out.
+    """
+
+    networks: Mapping[str, Bundle]
+    gate: GateSettings | None = None
+    said: Mapping[str, Any] = field(default_factory=dict)
+
+
+class FitStreams(Protocol):
+    """Fits networks and gate to ``train``; ``validation`` may stop the training. Picklable, the same for the same
+    input; ``test`` is for it to leave alone.
+    """
+
+    def __call__(
+        self, dataset: Dataset, fold: PeopleFold, progress: Callable[[int, int, dict[str, Any]], None], /
+    ) -> Fitted:
+        """Fit the networks and the gate; ``progress`` gets (epoch, epochs at most, the epoch's row)."""
+        ...
+
+
+def people_folds(dataset: Dataset, split: str, seed: int = 0) -> list[PeopleFold]:
+    """Return the folds of a split by person, with the same people as `evaluate`.
+
+    Raises:
+        ConfigError: for a split that does not keep people apart.
+        BadInput: where there are too few people, or nobody has a stream.
+    """
+    asked = parse_split(split)
+    if not asked.apart:
+        raise ConfigError(
+            f"Split '{split}' does not keep people apart, and a stream is one person's: accepted are by-subject:5 and "
+            "leave-one-subject-out."
+        )
+    people = np.array(dataset.subjects, dtype=np.str_)
+    with_streams = set(people_with_streams(dataset))
+    if not with_streams:
+        raise BadInput(
+            f"Data set '{dataset.head.name}' has no stream in which a recording is located: there is nothing to replay."
+        )
+    folds = []
+    for fold in make_folds(asked, people, np.zeros(len(people), dtype=np.int64), seed):
+        train, validation, test = (tuple(people[i].tolist()) for i in (fold.train, fold.validation, fold.test))
+        if not with_streams & set(test):
+            continue
+        if not with_streams & set(validation):
+            raise BadInput(
+                f"In {fold.name} nobody of those who tune ({', '.join(validation)}) has a stream: use another --seed, "
+                "or fewer folds."
+            )
+        folds.append(PeopleFold(fold.name, train, validation, test))
+    return folds
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of every fold."""
+
+    systems: tuple[str, ...]
+    targets: tuple[float, ...] = TARGETS
+    late_s: float = LATE_S
+    weights: ErrorCosts = field(default_factory=ErrorCosts)
+
+    def key(self, gestures: GestureSet) -> dict[str, Any]:
+        """Return what a stored fold depends on, the settings that are tried among it."""
+        grids = {}
+        for name in self.systems:
+            system = SYSTEMS[name]
+            tried_first = [str(spec) for spec in system.grid(gestures)]
+            grids[name] = [system.network, system.rounds, system.gate_to, tried_first]
+        return {"systems": grids, "targets": self.targets, "late_s": self.late_s, "weights": vars(self.weights)}
+
+
+def crossvalidated_streams(
+    dataset: Dataset,
+    split: str,
+    fit: FitStreams,
+    *,
+    settings: Settings | None = None,
+    journal: Journal | None = None,
+    key: Mapping[str, Any] | None = None,
+    workers: int = 1,
+    seed: int = 0,
+    progress: Callable[[FoldProgress], None] | None = None,
+) -> list[dict[str, Any]]:
+    """Fit, tune and score once a fold; what `plushsense.experiments.streams.score.summary` makes figures of.
+
+    Args:
+        split: "by-subject:5", "leave-one-subject-out".
+        journal: where finished folds are kept, and looked for first.
+        key: with a journal, everything that ``fit`` depends on. Data, folds and settings go into a job's id by
+            themselves.
+        workers: folds at a time, each in a process of its own.
+
+    Raises:
+        ConfigError, BadInput: for a split that cannot be made; PlushSenseError: what ``fit`` raises.
+    """
+    if journal is not None and key is None:
+        raise ConfigError(
+            "A journal needs a key that says what was fitted: give crossvalidated_streams(..., key={...})."
+        )
+    settings = settings or Settings(tuple(SYSTEMS))
+    folds = people_folds(dataset, split, seed)
+    base = {
+        "streams": _VERSION,
+        "key": dict(key or {}),
+        "data": dataset.hash,
+        "gestures": dataset.gestures.to_dict(),
+        "asked": settings.key(dataset.gestures),
+    }
+    jobs = [Job(job_id({**base, "fold": vars(fold)}), fold) for fold in folds]
+    done = resumed = 0
+
+    def tell(job: Job, epoch: int, epochs: int) -> None:
+        if progress is not None:
+            progress(FoldProgress(done, len(folds), job.task.name, epoch, epochs, resumed))
+
+    def finished(job: Job, _: Result, again: bool) -> None:
+        nonlocal done, resumed
+        done, resumed = done + 1, resumed + again
+        tell(job, 0, 0)
+
+    results = run_jobs(
+        jobs,
+        _FoldWork(fit, settings),
+        shared=dataset,
+        workers=workers,
+        journal=journal,
+        on_done=finished,
+        on_report=lambda job, message: tell(job, *message),
+    )
+    return [dict(results[job.id]) for job in jobs]
+
+
+@dataclass(frozen=True)
+class _FoldWork:
+    """One fold as a job."""
+
+    fit: FitStreams
+    settings: Settings
+
+    def __call__(self, shared: Any, task: PeopleFold, report: Report, /) -> Result:
+        began = time.perf_counter()
+
+        def progress(epoch: int, epochs: int, row: dict[str, Any]) -> None:
+            report((epoch, epochs))
+
+        fitted = self.fit(shared, task, progress)
+        fitted_s = time.perf_counter() - began
+        table = scored_fold(shared, task, fitted, self.settings)
+        seconds = {"fit": round(fitted_s, 1), "score": round(time.perf_counter() - began - fitted_s, 1)}
+        return {**table, "fitted": dict(fitted.said), "seconds": seconds}
+
+
+def scored_fold(dataset: Dataset, fold: PeopleFold, fitted: Fitted, settings: Settings) -> dict[str, Any]:
+    """Tune every system on a fold's validation people and score it on those left out: counts, ready for JSON."""
+    found: dict[str, Any] = {}
+    for network in (WINDOWS, ANYWHERE):
+        if network not in fitted.networks:
+            continue
+        names = [n for n in settings.systems if SYSTEMS[n].network == network]
+        names = [n for n in names if fitted.gate is not None or SYSTEMS[n].gate_to is None]
+        if not names:
+            continue
+        tuning = hear(dataset, fitted.networks[network], fold.validation)
+        testing = hear(dataset, fitted.networks[network], fold.test)
+        searches: dict[str, list[TunedPoint]] = {}
+        for name in names:
+            system = SYSTEMS[name]
+            base = system.gate_to or name
+            if base not in searches:
+                searches[base] = searched(tuning, SYSTEMS[base], settings.late_s)
+            points = searches[base]
+            if system.gate_to is not None:
+                points = gated(tuning, points, fitted.gate or GateSettings(), settings.late_s)
+            found[name] = _scored(system, points, tuning, testing, settings)
+    people = {"train": list(fold.train), "validation": list(fold.validation), "test": list(fold.test)}
+    return {"name": fold.name, **people, "systems": {n: found[n] for n in settings.systems if n in found}}
+
+
+def _scored(
+    system: System,
+    points: Sequence[TunedPoint],
+    tuning: Sequence[StreamTrace],
+    testing: Sequence[StreamTrace],
+    settings: Settings,
+) -> dict[str, Any]:
+    """Return one system of one fold, with the settings that were tried on the people who tune."""
+    late_s = settings.late_s
+    by_person: dict[str, list[StreamTrace]] = {}
+    for h in testing:
+        by_person.setdefault(h.truth.subject, []).append(h)
+
+    def outcome(spec: DecideSpec) -> dict[str, Any]:
+        return {person: total(heard, spec, settings.weights, late_s).kept() for person, heard in by_person.items()}
+
+    curve: list[dict[str, Any]] = []
+    of_spec: dict[int, dict[str, Any]] = {}
+    for target in settings.targets:
+        point = fewest(points, target)
+        if id(point) not in of_spec:
+            of_spec[id(point)] = _curve_counts(by_person, point.spec, settings)
+        curve.append({"target": target, "tuned": _tuned_setting(point), "people": of_spec[id(point)]})
+    chosen = {"balanced": balanced(points), "cheapest": cheapest(tuning, points, settings.weights, late_s)}
+    table: dict[str, Any] = {
+        "tried": len(points),
+        "reach": max(p.recall for p in points),
+        "curve": curve,
+        **{how: {"tuned": _tuned_setting(point), "people": outcome(point.spec)} for how, point in chosen.items()},
+    }
+    if not system.rounds:
+        # As it is without any threshold; smoothed as a bundle is by default.
+        smoothing_s = SMOOTHING_S if any(p.spec.smoothing_s in SMOOTHINGS for p in points) else 0.0
+        table["plain"] = {"tuned": None, "people": outcome(argmax_spec(smoothing_s))}
+    for h in (*tuning, *testing):
+        h.listener.clear_cache()
+    return table
+
+
+def _curve_counts(
+    by_person: Mapping[str, Sequence[StreamTrace]], spec: DecideSpec, settings: Settings
+) -> dict[str, Any]:
+    """Return hits, truths, insertions and hours of one setting for each person."""
+    found = {}
+    for person, heard in by_person.items():
+        n = quick(heard, spec, settings.late_s)
+        found[person] = [n.hits, n.truths, n.insertions, n.hours]
+    return found
+
+
+def _tuned_setting(point: TunedPoint) -> dict[str, Any]:
+    """Return a chosen setting and its scores on the people who tune; the gate stands in ``fitted``."""
+    spec = {k: v for k, v in vars(point.spec).items() if k not in ("gate", "health", "fitted")}
+    return {"spec": spec, "recall": point.recall, "false_events_per_hour": point.false_per_hour, "f1": point.f1}
+
+
+def scored_people(
+    dataset: Dataset, model: Bundle, subjects: Sequence[str], spec: DecideSpec, settings: Settings | None = None
+) -> dict[str, StreamScore]:
+    """Return the scores of one model under one setting, person by person; nothing is tuned."""
+    settings = settings or Settings(())
+    found: dict[str, StreamScore] = {}
+    for person in subjects:
+        heard = hear(dataset, model, [person])
+        if heard:
+            found[person] = total(heard, spec, settings.weights, settings.late_s)
+    return found
+
+
+HITS, TRUTHS, FALSE, HOURS = range(4)
+RECALLS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.85, 0.9)
+_RESAMPLES = 500
+LATENCY_SHARES = tuple(n / 20 for n in range(21))
+
+Folds = Sequence[Mapping[str, Any]]
+
+
+def summed(folds: Folds) -> dict[str, Any]:
+    """Return the benchmark's table, ready for JSON.
+
+    ``systems``: of each the ``curve`` (a point a target: recall and false events an hour over all people left out),
+    ``balanced`` and ``cheapest`` (the setting of the highest F1, and of the lowest cost, on those who tune) with all
+    figures, ``plain`` where there is one, ``people``; ``at_recall``: false events an hour of every system at the same
+    recall, and the ratio to smoothed argmax with a 95 % bootstrap interval over people.
+    """
+    names = [n for n in SYSTEMS if all(n in fold["systems"] for fold in folds)]
+    counts = {n: _counts(folds, n) for n in names}
+    systems = {}
+    for n in names:
+        parts: dict[str, Any] = {"title": SYSTEMS[n].title, "curve": _curve(folds, n, counts[n])}
+        for how in ("plain", "balanced", "cheapest"):
+            if all(how in fold["systems"][n] for fold in folds):
+                parts[how] = _outcome(folds, n, how)
+        systems[n] = parts
+    return {
+        "systems": systems,
+        "reference": REFERENCE if REFERENCE in names else None,
+        "at_recall": _at_recall(counts) if REFERENCE in names else [],
+        "folds": [
+            {k: v for k, v in fold.items() if k != "systems"}
+            | {
+                "settings": {
+                    n: {how: fold["systems"][n][how]["tuned"] for how in ("balanced", "cheapest")} for n in names
+                }
+            }
+            for fold in folds
+        ],
+    }
+
+
+def _counts(folds: Folds, name: str) -> NDArray[np.float64]:
+    """Return (targets, people, 4): hits, truths, insertions, hours."""
+    rows = []
+    for fold in folds:
+        curve = fold["systems"][name]["curve"]
+        rows += [[point["people"][person] for point in curve] for person in sorted(curve[0]["people"])]
+    return np.array(rows, dtype=np.float64).transpose(1, 0, 2)
+
+
+def _points(counts: NDArray[np.float64]) -> list[tuple[float, float]]:
+    """Return (recall, false events an hour) of each target over the people of (targets, people, 4)."""
+    sums = counts.sum(axis=1)
+    return [(float(s[HITS] / max(s[TRUTHS], 1)), float(s[FALSE] / s[HOURS])) for s in sums]
+
+
+def _curve(folds: Folds, name: str, counts: NDArray[np.float64]) -> list[dict[str, Any]]:
+    """Return the points of a curve; targets that no fold's tuning people reach are left out."""
+    found = []
+    targets = [point["target"] for point in folds[0]["systems"][name]["curve"]]
+    reach = max(fold["systems"][name]["reach"] for fold in folds)
+    for target, (recall, false) in zip(targets, _points(counts), strict=True):
+        if target <= reach:
+            found.append({"target": target, "recall": recall, "false_events_per_hour": false})
+    return found
+
+
+def _outcome(folds: Folds, name: str, how: str) -> dict[str, Any]:
+    """Return one choice of setting over everybody, and person by person."""
+    whole, people = StreamScore(), []
+    for fold in folds:
+        for person, kept in sorted(fold["systems"][name][how]["people"].items()):
+            mine = StreamScore.from_kept(kept)
+            whole.add(mine)
+            said = mine.to_dict()
+            people.append(
+                {"subject": person, "fold": fold["name"]}
+                | {k: said[k] for k in ("truths", "events", "recall", "precision", "f1", "false_events_per_hour")}
+                | {"latency_s": said["latency_s"]["median"]}
+            )
+    latencies = {level: _shares(whole.total(level).latencies) for level in whole.levels if whole.levels[level]}
+    return {
+        **whole.to_dict(),
+        "latency_shares": latencies,
+        "f1_people": summary([p["f1"] for p in people if p["f1"] is not None]),
+        "recall_people": summary([p["recall"] for p in people if p["recall"] is not None]),
+        "people": sorted(people, key=lambda p: p["subject"]),
+    }
+
+
+def _shares(latencies: Sequence[float]) -> list[float]:
+    """Return the latencies' quantiles at `LATENCY_SHARES`."""
+    return [round(float(q), 3) for q in np.quantile(latencies, LATENCY_SHARES)] if latencies else []
+
+
+def _at_recall(counts: Mapping[str, NDArray[np.float64]]) -> list[dict[str, Any]]:
+    """Return every system beside the reference at equal recall, interpolated between the points of its curve."""
+    people = counts[REFERENCE].shape[1]
+    drawn = np.random.default_rng(BOOTSTRAP_SEED).integers(0, people, size=(_RESAMPLES, people))
+    curves = {name: _points(table) for name, table in counts.items()}
+    again = {name: [_points(table[:, draw]) for draw in drawn] for name, table in counts.items()}
+    found = []
+    for recall in RECALLS:
+        base = at_recall(curves[REFERENCE], recall)
+        row: dict[str, Any] = {"recall": recall, "systems": {}}
+        for name in counts:
+            false = at_recall(curves[name], recall)
+            ratio = ci = None
+            if false is not None and base:
+                ratio = false / base
+                ratios = []
+                for mine, reference in zip(again[name], again[REFERENCE], strict=True):
+                    one, other = at_recall(mine, recall), at_recall(reference, recall)
+                    if one is not None and other:
+                        ratios.append(one / other)
+                # Of too few resamples that reach the recall an interval would say too little.
+                if len(ratios) >= 0.9 * _RESAMPLES:
+                    ci = [float(q) for q in np.percentile(ratios, [2.5, 97.5])]
+            row["systems"][name] = {"false_events_per_hour": false, "ratio": ratio, "ci95": ci}
+        found.append(row)
+    return found
+
+
+def pooled_scores(scores: Mapping[str, StreamScore]) -> dict[str, Any]:
+    """Return several people's `StreamScore` as one table, with a row for each person."""
+    whole = StreamScore()
+    for mine in scores.values():
+        whole.add(mine)
+    return {**whole.to_dict(), "people": {person: mine.to_dict() for person, mine in scores.items()}}

@@ -1,0 +1,200 @@
+"""The systems that the continuous benchmark compares, the settings that each may choose from, and how it chooses.
+
+Every choice is made on people on whom nothing is scored: for a recall the setting with the fewest false events that
+reaches it there, and for a single figure the one whose errors cost least.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from plushsense.core.gestures import GestureSet
+from plushsense.experiments.streams.replay import StreamScore, StreamTrace, quick, score
+from plushsense.runtime.decisions import DecideSpec, argmax_spec
+from plushsense.runtime.gate import GateSettings
+from plushsense.scoring.events import LATE_S, ErrorCosts, front
+
+WINDOWS, ANYWHERE = "windows", "anywhere"
+ENTERS = (0.0, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98)
+SMOOTHINGS = (0.15, 0.3, 0.6, 1.0)
+# Recalls that are asked of the people who tune; on those who are scored another one may come out.
+TARGETS = tuple(round(0.2 + 0.05 * n, 2) for n in range(16))
+
+Grid = Callable[[GestureSet], list[DecideSpec]]
+
+
+def _argmax(_: GestureSet) -> list[DecideSpec]:
+    """Return each step's best class where its share is at least ``enter``; 0 takes every step."""
+    return [replace(argmax_spec(), enter=enter, leave=enter) for enter in ENTERS]
+
+
+def _smoothed(_: GestureSet) -> list[DecideSpec]:
+    return [replace(argmax_spec(s), enter=enter, leave=enter) for s in SMOOTHINGS for enter in ENTERS]
+
+
+def _hysteresis(gestures: GestureSet) -> list[DecideSpec]:
+    """Enter above leave, an end that waits: where the search for the rest begins."""
+    return [
+        DecideSpec(
+            smoothing_s=smoothing_s,
+            enter=enter,
+            leave=enter / 2,
+            # Where gestures tell an affect, it may be said before the gesture.
+            enter_affect=max(enter, 0.8) if gestures.has_affect else 2.0,
+            leave_affect=enter / 2,
+            least_s=0.0,
+            switch_s=0.3,
+            end_s=end_s,
+            hold_s=0.3,
+            rest_s=0.2,
+            wait_s=1.0,
+        )
+        for smoothing_s in (0.1, 0.3, 0.6)
+        for enter in (0.25, 0.35, 0.45, 0.55, 0.65, 0.75, 0.85, 0.95)
+        for end_s in (0.3, 0.8)
+    ]
+
+
+# One setting at a time is changed, from the best that were found so far.
+_STEPS: dict[str, tuple[Any, ...]] = {
+    "least_s": (0.0, 0.2, 0.5),
+    "switch_s": (0.3, 0.6, 1.0),
+    "end_s": (0.3, 0.8, 1.5),
+    "rest_s": (0.2, 1.0, 2.0),
+}
+
+
+_WAITS = (0.5, 1.5)
+
+
+def _beside(spec: DecideSpec) -> list[DecideSpec]:
+    """Return the settings that differ from one in a single value."""
+    found = [replace(spec, **{name: value}) for name, values in _STEPS.items() for value in values]
+    found += [replace(spec, leave=share * spec.enter, leave_affect=share * spec.enter) for share in (0.3, 0.5, 0.8)]
+    return [each for each in found if each != spec]
+
+
+@dataclass(frozen=True)
+class System:
+    """``network``: which of a fold's networks it listens with; ``rounds`` of looking beside the best settings of the
+    ``grid``; ``gate_to``: the system to whose best settings a gate is added instead.
+    """
+
+    title: str
+    network: str
+    grid: Grid
+    rounds: int = 0
+    gate_to: str | None = None
+
+
+SYSTEMS: dict[str, System] = {
+    "argmax": System("plain argmax", WINDOWS, _argmax),
+    "smoothed": System("smoothed argmax", WINDOWS, _smoothed),
+    "hysteresis": System("hysteresis", WINDOWS, _hysteresis, 1),
+    "hybrid": System("hybrid (with gate)", WINDOWS, _hysteresis, 1, "hysteresis"),
+    "anywhere-smoothed": System("stream training, smoothed argmax", ANYWHERE, _smoothed),
+    "anywhere": System("stream training, hysteresis", ANYWHERE, _hysteresis, 1),
+    "full": System("stream training, hybrid", ANYWHERE, _hysteresis, 1, "anywhere"),
+}
+REFERENCE = "smoothed"
+
+
+@dataclass(frozen=True)
+class TunedPoint:
+    """A setting, and the recall, false events an hour and F1 that it had where it was tried."""
+
+    spec: DecideSpec
+    recall: float
+    false_per_hour: float
+    f1: float = 0.0
+
+
+def tried(heard: Sequence[StreamTrace], specs: Sequence[DecideSpec], late_s: float = LATE_S) -> list[TunedPoint]:
+    """Return every setting on these streams, those of one smoothing together."""
+    points: dict[int, TunedPoint] = {}
+    order = sorted(range(len(specs)), key=lambda i: specs[i].smoothing_s)
+    for _, group in itertools.groupby(order, key=lambda i: specs[i].smoothing_s):
+        for i in group:
+            n = quick(heard, specs[i], late_s)
+            points[i] = TunedPoint(specs[i], n.recall, n.false_per_hour, n.f1)
+        for h in heard:
+            h.listener.clear_cache()
+    return [points[i] for i in range(len(specs))]
+
+
+def searched(heard: Sequence[StreamTrace], system: System, late_s: float = LATE_S) -> list[TunedPoint]:
+    """Return all settings of a system that were tried on these streams, without a gate."""
+    points = tried(heard, system.grid(heard[0].listener.trace.gestures), late_s)
+    for _ in range(system.rounds):
+        known = {_key(p.spec) for p in points}
+        more = {_key(s): s for spec in _best_specs(points) for s in _beside(spec)}
+        points += tried(heard, [s for key, s in more.items() if key not in known], late_s)
+    return points
+
+
+def gated(
+    heard: Sequence[StreamTrace], points: Sequence[TunedPoint], gate: GateSettings, late_s: float = LATE_S
+) -> list[TunedPoint]:
+    """Return the best of these settings with a gate, and how long its events wait for the network.
+
+    A gate without rules changes nothing, the choice among the settings included.
+    """
+    if not gate.rules:
+        return list(points)
+    # All that a choice without the gate could fall on: else the two would differ by more than the gate.
+    base = {_key(spec): spec for spec in (*_best_specs(points), *(p.spec for p in best_of(points)))}
+    specs = [replace(spec, gate=gate, wait_s=wait_s) for spec in base.values() for wait_s in _WAITS]
+    return tried(heard, specs, late_s)
+
+
+def _best_specs(points: Sequence[TunedPoint]) -> list[DecideSpec]:
+    """Return the chosen setting of every target, and that of the highest F1."""
+    best = (*(fewest(points, target) for target in TARGETS), balanced(points))
+    return list({_key(p.spec): p.spec for p in best}.values())
+
+
+def _key(spec: DecideSpec) -> tuple[object, ...]:
+    return tuple(value for name, value in vars(spec).items() if name not in ("gate", "health", "fitted"))
+
+
+def best_of(points: Sequence[TunedPoint]) -> list[TunedPoint]:
+    """Return the settings that no other beats in recall and false events, by rising recall."""
+    return [points[i] for i in front([(p.recall, p.false_per_hour) for p in points])]
+
+
+def fewest(points: Sequence[TunedPoint], recall: float) -> TunedPoint:
+    """Return the setting with the fewest false events at a recall; if none reaches it, that of the highest recall."""
+    reach = [p for p in points if p.recall >= min(recall, max(p.recall for p in points))]
+    return min(reach, key=lambda p: (p.false_per_hour, -p.recall))
+
+
+def cheapest(
+    heard: Sequence[StreamTrace],
+    points: Sequence[TunedPoint],
+    weights: ErrorCosts | None = None,
+    late_s: float = LATE_S,
+) -> TunedPoint:
+    """Return the setting of the lowest cost, the first of equal ones."""
+
+    def price(point: TunedPoint) -> float:
+        return sum(score(h, point.spec, weights, late_s).cost for h in heard)
+
+    return min(best_of(points), key=price)
+
+
+def balanced(points: Sequence[TunedPoint]) -> TunedPoint:
+    """Return the setting of the highest F1."""
+    return max(points, key=lambda p: (p.f1, p.recall))
+
+
+def total(
+    heard: Sequence[StreamTrace], spec: DecideSpec, weights: ErrorCosts | None = None, late_s: float = LATE_S
+) -> StreamScore:
+    """Return one setting over several streams."""
+    found = StreamScore()
+    for h in heard:
+        found.add(score(h, spec, weights, late_s))
+    return found

@@ -1,0 +1,386 @@
+"""The figures of a sweep, in the order of the paper's; each is returned, and says below what its scores are of."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from plushsense.core.errors import need
+from plushsense.experiments.sweep.results import SweepResults, finite, name_of
+from plushsense.experiments.sweep.tables import (
+    COSTS,
+    acr_ranking,
+    architectures,
+    batches,
+    effect,
+    epochs,
+    pareto_points,
+    table4,
+)
+from plushsense.reports import figures
+from plushsense.reports.labels import LabelledPoint, place_labels
+from plushsense.reports.table import Row, count
+from plushsense.reports.wording import describe_runs
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Okabe and Ito's colours; shape says the same as colour, and dark against light prints in grey.
+MAX, MEAN, SIZE = "#0072b2", "#a6cfe8", "#d55e00"
+CLASSES = (
+    ("o", "#56b4e9"),
+    ("s", "#e69f00"),
+    ("^", "#009e73"),
+    ("D", "#cc79a7"),
+    ("v", "#0072b2"),
+    ("P", "#d55e00"),
+    ("X", "#f0e442"),
+    ("h", "#7f7f7f"),
+)
+_STYLES = ("-", "--", ":", "-.")
+BARS = 30
+"""Architectures that a figure of bars shows, the best; more could not be read."""
+_LETTERS_AN_INCH = 13
+_NARROWEST_IN = 5.2
+NAMED = 14
+"""Points of a front that are named."""
+
+
+def about(sweep: SweepResults) -> str:
+    """Return what the scores of a sweep are of, as one line below a figure."""
+    parts = [
+        f"data: {sweep.head.get('dataset')}",
+        f"split {sweep.head.get('split')}" + (" (LEAKY)" if sweep.leaky else ""),
+        describe_runs(sweep.trials),
+    ]
+    if len(sweep.done) < sweep.total:
+        parts.append(f"{len(sweep.done)} of {sweep.total} trials done")
+    if sweep.simulated:
+        parts.insert(0, "SIMULATION, says nothing about a real toy")
+    return " · ".join(parts)
+
+
+def _figure(sweep: SweepResults, width: float, height: float, title: str) -> Figure:
+    figure = figures.new_figure(width, height)
+    figure.suptitle(title, fontsize=11, x=0.01, ha="left").set_parse_math(False)
+    _describe_below(figure, sweep)
+    return figure
+
+
+def _describe_below(figure: Figure, sweep: SweepResults) -> None:
+    warned = sweep.leaky or sweep.simulated
+    colour, weight = ("#b3261e", "bold") if warned else ("#57606a", "normal")
+    lines = textwrap.fill(about(sweep), round(_LETTERS_AN_INCH * figure.get_figwidth()), break_on_hyphens=False)
+    said = figure.supxlabel(lines, fontsize=7.5, color=colour, fontweight=weight)
+    said.set_parse_math(False)
+
+
+def score_label(sweep: SweepResults, measure: str) -> str:
+    marks = ["leaky"] * sweep.leaky + ["simulation"] * sweep.simulated
+    return f"{measure}{', ' + ', '.join(marks) if marks else ''}"
+
+
+def by_architecture(sweep: SweepResults) -> Figure:
+    """Draw Figure 7: highest and mean accuracy of each architecture, and its size with the largest filter set."""
+    rows = _bars(architectures(sweep))
+    figure = _figure(sweep, 9.2, 1.9 + 0.42 * len(rows), "Accuracy of each architecture, and its size")
+    axes = figure.add_subplot()
+    _accuracy_bars(axes, rows, "epochs, batch and filters")
+    axes.set_xlabel(score_label(sweep, "Accuracy (% of test windows)"), fontsize=9)
+    top = axes.twiny()
+    sizes = [row["parameters"] / 1000 for row in rows]
+    top.plot(sizes, np.arange(len(rows)) - 0.2, "D", color=SIZE, markeredgecolor="black", markersize=5.5)
+    top.set_xlim(0, max(sizes) * 1.08)
+    largest = sweep.filter_sets[-1].replace("/", " ")
+    top.set_xlabel(f"◆ learnable parameters with the largest filters, [{largest}] (thousands)", fontsize=9, color=SIZE)
+    top.tick_params(labelsize=8, colors=SIZE)
+    top.spines[["right", "bottom"]].set_visible(False)
+    _legend(figure, axes)
+    return figure
+
+
+def by_filters(sweep: SweepResults) -> Figure:
+    """Draw Figure 8: as Figure 7, a panel for each filter set, the largest first."""
+    sets = sweep.filter_sets[::-1]
+    shown = [row["arch"] for row in _bars(architectures(sweep))]
+    rows_of_panels = -(-len(sets) // 2)
+    figure = _figure(
+        sweep, 9.6, 1.2 + rows_of_panels * (1.0 + 0.33 * len(shown)), "Accuracy of each architecture by filter set"
+    )
+    panels = figure.subplots(rows_of_panels, 2, sharex=True, squeeze=False).flatten()
+    for i, (axes, filter_set) in enumerate(zip(panels, sets, strict=False)):
+        found = {row["arch"]: row for row in architectures(sweep, filter_set)}
+        lacking = {"highest": None, "mean": None, "sd": None}
+        rows = [found.get(arch, {"arch": arch, **lacking}) for arch in shown]
+        _accuracy_bars(axes, rows, "epochs and batch")
+        axes.set_title(f"({chr(97 + i % 26)})  [{filter_set.replace('/', ' ')}]", fontsize=9.5, loc="left")
+        axes.set_xlabel(score_label(sweep, "Accuracy (% of test windows)"), fontsize=8.5)
+        if i % 2:
+            axes.set_yticklabels([])
+    for axes in panels[len(sets) :]:
+        axes.set_visible(False)
+    _legend(figure, panels[0])
+    return figure
+
+
+def _bars(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the rows to draw in their order: all, or where they are too many the best."""
+    best = sorted(rows, key=lambda r: -(r["highest"] or 0.0))[:BARS]
+    return [row for row in rows if row in best]
+
+
+def _accuracy_bars(axes: Axes, rows: Sequence[Row], over: str) -> None:
+    at = np.arange(len(rows))
+    high, mean, sd = (
+        np.array([100 * r[k] if finite(r[k]) else np.nan for r in rows]) for k in ("highest", "mean", "sd")
+    )
+    axes.barh(at - 0.2, high, 0.38, color=MAX, label="highest")
+    axes.barh(at + 0.2, mean, 0.38, color=MEAN, edgecolor=MAX, linewidth=0.6, label=f"mean over {over} ± sd")
+    some = sd > 0
+    if some.any():
+        rows_at = at[some] + 0.2
+        axes.errorbar(mean[some], rows_at, xerr=sd[some], fmt="none", ecolor="#333333", elinewidth=0.9, capsize=1.8)
+    for y, value in enumerate(high):
+        if np.isfinite(value):
+            axes.text(1.2, y - 0.19, f"{value:.1f}", va="center", fontsize=7.5, color="white")
+        else:
+            axes.text(1.2, y, "no trial done", va="center", fontsize=7.5, color="#57606a")
+    axes.set_yticks(at, [str(r["arch"]) for r in rows], parse_math=False)
+    axes.tick_params(labelsize=8)
+    axes.set_xlim(0, 100)
+    axes.set_ylim(len(rows) - 0.4, -0.6)
+    axes.xaxis.grid(color="#dddddd", linewidth=0.5)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _legend(figure: Figure, axes: Axes) -> None:
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper right", ncols=2, fontsize=8, frameon=False)
+
+
+def size_and_accuracy(sweep: SweepResults) -> Figure:
+    """Figure 9: accuracy against size, of the networks in Table 4."""
+    rows = table4(sweep).rows
+    figure = _figure(sweep, 9.2, 5.2, "Accuracy and size of the best of each size class")
+    axes = figure.add_subplot()
+    points = []
+    for filter_set, (marker, colour) in _by_class(sweep):
+        mine = [r for r in rows if r["filter_set"] == filter_set]
+        x, y = [r["parameters"] for r in mine], [100 * r["accuracy"] for r in mine]
+        if mine:
+            axes.plot(x, y, marker, color=colour, markeredgecolor="black", markersize=8, label=_bracket(filter_set))
+        points += [LabelledPoint(a, b, str(r["arch"])) for a, b, r in zip(x, y, mine, strict=True)]
+    _log_x(axes, [p.x for p in points], "Learnable parameters")
+    _room(axes, [p.y for p in points])
+    axes.set_ylabel(score_label(sweep, "Highest accuracy (% of test windows)"), fontsize=9)
+    axes.legend(
+        title="filters", fontsize=8, title_fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5), frameon=False
+    )
+    place_labels(figure, axes, points)
+    return figure
+
+
+def pareto(sweep: SweepResults, cost: str) -> Figure:
+    """Draw the best macro-F1 of each network against a cost, the front as a line and its members named."""
+    rows = pareto_points(sweep, cost)
+    label = COSTS[cost]
+    figure = _figure(sweep, 9.2, 5.2, f"Macro-F1 against {label[0].lower()}{label[1:]}")
+    axes = figure.add_subplot()
+    edge = [r for r in rows if r["front"]]
+    steps = sorted({(r["value"], r["macro_f1"]) for r in edge})
+    _log_x(axes, [r["value"] for r in rows], f"{label}, log scale")
+    _room(axes, [r["macro_f1"] for r in rows])
+    right = axes.get_xlim()[1]
+    axes.plot(
+        [*(x for x, _ in steps), right],
+        [*(y for _, y in steps), steps[-1][1]],
+        color="#333333",
+        linewidth=1.2,
+        drawstyle="steps-post",
+        zorder=1,
+        label="front",
+    )
+    for filter_set, (marker, colour) in _by_class(sweep):
+        for on in (False, True):
+            mine = [r for r in rows if r["filter_set"] == filter_set and r["front"] is on]
+            if mine:
+                axes.plot(
+                    [r["value"] for r in mine],
+                    [r["macro_f1"] for r in mine],
+                    marker,
+                    color=colour,
+                    alpha=1.0 if on else 0.55,
+                    markeredgecolor="black" if on else "#777777",
+                    markeredgewidth=1.3 if on else 0.5,
+                    markersize=9 if on else 5.5,
+                    zorder=3 if on else 2,
+                )
+        axes.plot([], [], marker, color=colour, markeredgecolor="black", markersize=7, label=_bracket(filter_set))
+    axes.set_ylabel(score_label(sweep, "Best macro-F1 (0 to 1)"), fontsize=9)
+    axes.legend(
+        title="filters", fontsize=8, title_fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5), frameon=False
+    )
+    named = sorted(edge, key=lambda r: -r["macro_f1"])[:NAMED]
+    others = [LabelledPoint(r["value"], r["macro_f1"], "") for r in rows if r not in named]
+    labels = [LabelledPoint(r["value"], r["macro_f1"], f"{r['arch']}\n{r['filters']}") for r in named]
+    corners = [*steps, (right, steps[-1][1])]
+    flat = [(x, y, after, y) for (x, y), (after, _) in pairwise(corners)]
+    upright = [(after, y, after, high) for (_, y), (after, high) in pairwise(corners)]
+    place_labels(figure, axes, labels + others, avoid=flat + upright)
+    return figure
+
+
+def acr_bars(sweep: SweepResults, top: int = 15) -> Figure:
+    """Draw the networks with the highest accuracy–complexity ratio."""
+    rows = acr_ranking(sweep).rows[:top]
+    figure = _figure(sweep, 9.2, 1.4 + 0.3 * len(rows), "Accuracy–complexity ratio of the best networks")
+    axes = figure.add_subplot()
+    at = np.arange(len(rows))
+    values = [100 * (r["acr"] or 0.0) for r in rows]
+    axes.barh(at, values, 0.62, color=MAX)
+    for y, (value, row) in enumerate(zip(values, rows, strict=True)):
+        said = f"{value:.1f}   accuracy {100 * row['accuracy']:.1f} %, {count(row['parameters'])} parameters"
+        # Inside a bar where it has the room.
+        inside = value > 0.5 * max(values)
+        at_x, ink = (0.01 * max(values), "white") if inside else (value + 0.01 * max(values), "black")
+        axes.text(at_x, y, said, va="center", fontsize=7.5, color=ink)
+    axes.set_yticks(at, [f"{r['arch']}  {r['filters']}" for r in rows], parse_math=False)
+    axes.tick_params(labelsize=8)
+    axes.set_ylim(len(rows) - 0.4, -0.6)
+    axes.set_xlabel(score_label(sweep, "ACR = accuracy (%) / log10(parameters)"), fontsize=9)
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def schedules(sweep: SweepResults) -> Figure:
+    """Draw mean accuracy and macro-F1 over the networks by epochs and batch; bars are standard deviations."""
+    rows = effect(sweep).rows
+    lengths, sizes = epochs(sweep), batches(sweep)
+    # What varies goes along the axis; where both do, epochs, and a line for each batch.
+    along, lines = (lengths, sizes) if len(lengths) > 1 else (sizes, lengths)
+    keys = ("epochs", "batch_asked") if len(lengths) > 1 else ("batch_asked", "epochs")
+    what, each = ("Epochs", "batch") if len(lengths) > 1 else ("Batch", "epochs")
+    figure = _figure(sweep, 9.2, 4.0, "Effect of epochs and batch: means over the networks, bars ± 1 sd")
+    for axes, measure, label, scale in zip(
+        figure.subplots(1, 2),
+        ("accuracy", "macro_f1"),
+        ("Mean accuracy (% of test windows)", "Mean macro-F1 (0 to 1)"),
+        (100.0, 1.0),
+        strict=True,
+    ):
+        for i, line in enumerate(lines):
+            marker, colour = CLASSES[i % len(CLASSES)]
+            mine = {r[keys[0]]: r for r in rows if r[keys[1]] == line}
+            at = [k for k, value in enumerate(along) if value in mine and finite(mine[value][measure])]
+            mean = [scale * mine[along[k]][measure] for k in at]
+            sd = [scale * (mine[along[k]][f"{measure}_sd"] or 0.0) for k in at]
+            shift = (i - (len(lines) - 1) / 2) * 0.09
+            axes.errorbar(
+                np.array(at) + shift,
+                mean,
+                yerr=sd,
+                marker=marker,
+                linestyle=_STYLES[i % len(_STYLES)],
+                color=colour,
+                markeredgecolor="black",
+                capsize=3,
+                label=f"{each} {line}",
+            )
+        axes.set_xticks(range(len(along)), [str(value) for value in along])
+        axes.set_xlim(-0.5, len(along) - 0.5)
+        axes.set_xlabel(what, fontsize=9)
+        axes.set_ylabel(score_label(sweep, label), fontsize=9)
+        axes.tick_params(labelsize=8)
+        axes.grid(axis="y", color="#dddddd", linewidth=0.5)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.legend(fontsize=8, frameon=False)
+    return figure
+
+
+def curves(sweep: SweepResults, trial: Row) -> Figure | None:
+    """Draw the learning curves of a trial, training against validation; None where none were kept."""
+    histories = sweep.histories(trial)
+    if not histories:
+        return None
+    figure = figures.training_curves(histories, title=f"Learning curves of {name_of(trial)}", of="runs")
+    _describe_below(figure, sweep)
+    return figure
+
+
+def confusion(sweep: SweepResults, trial: Row) -> Figure | None:
+    """Draw Figures 10 and 11: the confusions of a trial, classes by affect, a frame around each affect."""
+    counts = sweep.confusion(str(trial["trial"]))
+    if counts is None:
+        return None
+    order = affect_order(sweep.affects)
+    labels, affects = [sweep.labels[i] for i in order], [sweep.affects[i] for i in order]
+    table = np.asarray(counts)[np.ix_(order, order)]
+    figure = figures.confusion(labels, table, title=f"Confusions of {name_of(trial).replace(', ', chr(10), 1)}")
+    figure.set_figwidth(max(figure.get_figwidth(), _NARROWEST_IN))
+    axes = figure.axes[0]
+    rectangle = need("matplotlib.patches", "reports").Rectangle
+    for affect in dict.fromkeys(affects):
+        first, size = affects.index(affect), affects.count(affect)
+        if size == len(affects):
+            break
+        frame = rectangle((first - 0.5, first - 0.5), size, size, fill=False, edgecolor=SIZE, linewidth=2.4, zorder=5)
+        frame.set_clip_on(False)
+        axes.add_patch(frame)
+        at = first + (size - 1) / 2
+        said = axes.text(
+            len(labels) - 0.35, at, affect, rotation=270, va="center", ha="left", fontsize=9, color="#9c4400"
+        )
+        said.set_parse_math(False)
+    axes.set_xlabel("Read as   (windows; shade: share of the row)")
+    _describe_below(figure, sweep)
+    return figure
+
+
+def affect_order(affects: Sequence[str]) -> list[int]:
+    """Return the classes with equal affects beside each other: positive, neutral, negative, then others."""
+    ranks = {affect: i for i, affect in enumerate(dict.fromkeys(("positive", "neutral", "negative", *affects)))}
+    return sorted(range(len(affects)), key=lambda i: (ranks[affects[i]], i))
+
+
+def _by_class(sweep: SweepResults) -> list[tuple[str, tuple[str, str]]]:
+    """Return each filter set with its marker and colour."""
+    return [(s, CLASSES[i % len(CLASSES)]) for i, s in enumerate(sweep.filter_sets)]
+
+
+def _bracket(filter_set: str) -> str:
+    return f"[{filter_set.replace('/', ' ')}]"
+
+
+def _log_x(axes: Axes, values: Sequence[float], label: str) -> None:
+    axes.set_xscale("log")
+    axes.set_xlim(min(values) / 1.6, max(values) * 1.9)
+    ticker = need("matplotlib.ticker", "reports")
+    few = max(values) / min(values) < 30
+    axes.xaxis.set_major_locator(ticker.LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0, 3.0)))
+    axes.xaxis.set_major_formatter(ticker.FuncFormatter(lambda value, _: short(value)))
+    axes.xaxis.set_minor_formatter(ticker.NullFormatter())
+    axes.set_xlabel(label, fontsize=9)
+    axes.tick_params(labelsize=8)
+    axes.grid(color="#dddddd", linewidth=0.5)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def short(value: float) -> str:
+    """Return ``13k`` for 13 000, ``3.2M`` for 3 200 000."""
+    for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if value >= size:
+            return f"{value / size:g}{letter}"
+    return f"{value:g}"
+
+
+def _room(axes: Axes, values: Sequence[float]) -> None:
+    low, high = min(values), max(values)
+    more = 0.12 * (high - low) or 0.05 * (abs(high) or 1.0)
+    axes.set_ylim(max(0.0, low - more), high + 1.6 * more)

@@ -1,0 +1,394 @@
+"""The report of a sweep: its sections in the paper's order, as a page and as files."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from plushsense.experiments.sweep import figures as draw
+from plushsense.experiments.sweep import tables
+from plushsense.experiments.sweep.results import SweepResults, name_of, read_sweep
+from plushsense.reports import wording
+from plushsense.reports.figures import png, svg, svg_uri
+from plushsense.reports.page import check_page_path, earlier_files, render_page, write_files, write_page
+from plushsense.reports.table import DASH, Row, Table, count, number, text
+from plushsense.trials import paper
+from plushsense.trials.tables import SUMMARY
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A figure with its file name, and what it shows in words for who cannot see it."""
+
+    name: str
+    figure: Figure
+    alt: str
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the page: tables, figures, and sentences; ``dropped`` says what makes no sense here, and why."""
+
+    key: str
+    title: str
+    tables: tuple[Table, ...] = ()
+    drawings: tuple[Drawing, ...] = ()
+    dropped: tuple[str, ...] = ()
+    scores: bool = True
+
+
+def sections_of(sweep: SweepResults) -> Iterator[Section]:
+    """Yield all sections of the report in the paper's order; one without any score is a sentence."""
+    if not sweep.done:
+        yield Section("best", "The best trials", dropped=("No trial is done yet: there is no score to show.",))
+        yield Section("table-3", "Table 3: parameters", (tables.table3(sweep),), scores=False)
+        return
+    best = sweep.best
+    assert best is not None
+    yield Section("best", "The best trials", (tables.best_trials(sweep),))
+    yield _overview(sweep)
+    yield Section("table-3", "Table 3: parameters", (tables.table3(sweep),), scores=False)
+    yield _by_filters(sweep)
+    yield _top(sweep)
+    yield Section("acr", "ACR ranking", (tables.acr_ranking(sweep),), (_acr(sweep),))
+    yield _effect(sweep)
+    shown = _looked_at(sweep, best)
+    yield _confusions(sweep, shown)
+    yield _curves(sweep, shown)
+    yield _fronts(sweep)
+
+
+def _overview(sweep: SweepResults) -> Section:
+    rows = sorted(tables.architectures(sweep), key=lambda r: -(r["highest"] or 0.0))
+    alt = (
+        f"Bars: highest and mean accuracy of {len(rows)} architectures. The first: {_bar_words(rows[:3])}. "
+        "Diamonds: parameters."
+    )
+    dropped = _only_best(len(rows))
+    return Section(
+        "figure-7",
+        "Figure 7: accuracy of each architecture",
+        (tables.architecture_table(sweep),),
+        (Drawing("figure-7-architectures", draw.by_architecture(sweep), alt),),
+        dropped,
+    )
+
+
+def _by_filters(sweep: SweepResults) -> Section:
+    title = "Figure 8: accuracy by filter set"
+    if len(sweep.filter_sets) < 2:
+        return Section("figure-8", title, dropped=("There is one filter set only: it would be Figure 7 again.",))
+    said = []
+    for filter_set in sweep.filter_sets[::-1]:
+        rows = sorted(tables.architectures(sweep, filter_set), key=lambda r: -(r["highest"] or 0.0))
+        said.append(f"{filter_set}: {_bar_words(rows[:1])}")
+    alt = f"A panel of bars a filter set: highest and mean accuracy of each architecture. The best: {'; '.join(said)}."
+    drawing = Drawing("figure-8-filter-sets", draw.by_filters(sweep), alt)
+    return Section("figure-8", title, drawings=(drawing,), dropped=_only_best(len(sweep.archs)))
+
+
+def _only_best(architectures: int) -> tuple[str, ...]:
+    if architectures <= draw.BARS:
+        return ()
+    return (f"Drawn are the best {draw.BARS} of {architectures} architectures; the CSV has all.",)
+
+
+def _bar_words(rows: Sequence[Row]) -> str:
+    return ", ".join(
+        f"{r['arch']} {100 * r['highest']:.1f} % (mean {100 * r['mean']:.1f} %)"
+        if r["highest"] is not None
+        else f"{r['arch']} not done"
+        for r in rows
+    )
+
+
+def _top(sweep: SweepResults) -> Section:
+    table = tables.table4(sweep)
+    title = "Table 4 and Figure 9: the best of each size class"
+    if len(table.rows) < 2:
+        return Section(
+            "table-4", title, (table,), dropped=("One network only is scored: Figure 9 would be one point.",)
+        )
+    said = ", ".join(
+        f"{r['arch']} {r['filters']} {100 * r['accuracy']:.1f} % at {count(r['parameters'])}" for r in table.rows[:3]
+    )
+    alt = f"Points: accuracy against parameters of {len(table.rows)} networks. The most accurate: {said} parameters."
+    return Section("table-4", title, (table,), (Drawing("figure-9-size", draw.size_and_accuracy(sweep), alt),))
+
+
+def _acr(sweep: SweepResults) -> Drawing:
+    first = tables.acr_ranking(sweep).rows[0]
+    name = f"{first['arch']} {first['filters']}"
+    alt = f"Bars: the networks with the highest ACR. The first: {name}, {100 * (first['acr'] or 0):.1f} %."
+    return Drawing("acr", draw.acr_bars(sweep), alt)
+
+
+def _effect(sweep: SweepResults) -> Section:
+    title = "Effect of epochs and batch"
+    if len(tables.epochs(sweep)) * len(tables.batches(sweep)) < 2:
+        return Section(
+            "effect", title, dropped=("All trials have the same epochs and batch: there is nothing to compare.",)
+        )
+    table = tables.effect(sweep)
+    if len(table.rows) < 2:
+        return Section(
+            "effect", title, (table,), dropped=("One schedule only is scored yet: there is nothing to compare.",)
+        )
+    means = ", ".join(
+        f"{r['epochs']} epochs, batch {r['batch_asked']}: {100 * r['accuracy']:.1f} %" for r in table.rows
+    )
+    alt = f"Lines: mean accuracy and macro-F1 over the networks. {means}."
+    return Section("effect", title, (table,), (Drawing("effect", draw.schedules(sweep), alt),))
+
+
+def _looked_at(sweep: SweepResults, best: Row) -> list[Row]:
+    """Return the trials with confusions and curves: the paper's two networks if in the grid, and the best."""
+    found = [sweep.chosen, sweep.best_of(*paper.SECOND), best]
+    return list({t["trial"]: t for t in found if t}.values())
+
+
+def _confusions(sweep: SweepResults, shown: Sequence[Row]) -> Section:
+    title = "Figures 10 and 11: confusions"
+    if len(sweep.labels) < 2:
+        return Section("confusion", title, dropped=("The sweep names no classes: there is nothing to confuse.",))
+    drawings, kept, dropped = [], [], []
+    for trial in shown:
+        figure = draw.confusion(sweep, trial)
+        if figure is None:
+            dropped.append(f"The confusions of {name_of(trial)} were not kept.")
+            continue
+        drawings.append(Drawing(f"confusion-{_file_name(trial)}", figure, confusion_words(sweep, trial)))
+        kept += [table for table in (tables.per_class(sweep, trial),) if table]
+    if kept and set(sweep.affects) == {"none"}:
+        dropped.append("The gestures of this data set have no affect: there are no blocks.")
+    return Section("confusion", title, tuple(kept), tuple(drawings), tuple(dropped))
+
+
+def confusion_words(sweep: SweepResults, trial: Row) -> str:
+    """Describe a confusion matrix: right, mistaken for the same affect, mistaken for another affect."""
+    counts = sweep.confusion(str(trial["trial"])) or []
+    total = sum(map(sum, counts))
+    right = sum(row[i] for i, row in enumerate(counts))
+    affects = sweep.affects
+    across = sum(n for i, row in enumerate(counts) for j, n in enumerate(row) if affects[i] != affects[j])
+    share = 100 * right / max(total, 1)
+    said = f"Confusion matrix of {name_of(trial)}: {right} of {count(total)} windows right ({share:.1f} %)"
+    if len(set(affects)) > 1:
+        inside = total - right - across
+        said += (
+            f"; {100 * inside / max(total, 1):.1f} % read as another gesture of the same affect, "
+            f"{100 * across / max(total, 1):.1f} % as one of another affect"
+        )
+    pairs = [(n, i, j) for i, row in enumerate(counts) for j, n in enumerate(row) if i != j and n]
+    if pairs:
+        n, i, j = max(pairs, key=lambda p: p[0])
+        said += f". Most often mistaken: {sweep.labels[i]} for {sweep.labels[j]} ({n} windows)"
+    return said + "."
+
+
+def _curves(sweep: SweepResults, shown: Sequence[Row]) -> Section:
+    drawings, dropped = [], []
+    for trial in shown:
+        figure = draw.curves(sweep, trial)
+        if figure is None:
+            dropped.append(f"No learning curves of {name_of(trial)} were kept.")
+            continue
+        alt = f"Learning curves of {name_of(trial)}: loss and accuracy by epoch, training and validation."
+        drawings.append(Drawing(f"curves-{_file_name(trial)}", figure, alt))
+    return Section("curves", "Learning curves", drawings=tuple(drawings), dropped=tuple(dropped))
+
+
+def _fronts(sweep: SweepResults) -> Section:
+    drawings, dropped = [], []
+    for cost, label in tables.COSTS.items():
+        points = tables.pareto_points(sweep, cost)
+        values = {p["value"] for p in points}
+        if len(values) < 2:
+            same = f": {count(next(iter(values)))} for all" if values else ""
+            dropped.append(f"No front of macro-F1 against “{label.lower()}”, which does not differ{same}.")
+            continue
+        edge = [p for p in points if p["front"]]
+        said = "; ".join(f"{p['arch']} {p['filters']} ({count(p['value'])}, {p['macro_f1']:.3f})" for p in edge)
+        alt = f"Points: macro-F1 against {label.lower()} of {len(points)} networks, log scale. On the front: {said}."
+        drawings.append(Drawing(f"pareto-{cost.replace('_', '-')}", draw.pareto(sweep, cost), alt))
+    return Section("pareto", "Pareto fronts", (tables.pareto(sweep),), tuple(drawings), tuple(dropped))
+
+
+def _file_name(trial: Row) -> str:
+    return f"{trial['arch']}-{str(trial['filters']).replace('/', '-')}-{trial['trial']}"
+
+
+PAGE, FILES = "report.html", "report-files"
+_DPI = 120
+
+
+@dataclass(frozen=True)
+class WrittenReport:
+    """Files of a report: the page, and the tables and figures."""
+
+    page: Path
+    folder: Path
+    files: tuple[Path, ...]
+    done: int
+    trials: int
+
+
+def write_report(folder: str | Path, page: str | Path | None = None, *, title: str | None = None) -> WrittenReport:
+    """Write the page of a sweep and, in a folder beside it, each table as CSV and each figure as PNG and SVG.
+
+    Args:
+        folder: the results folder that ``plushsense sweep`` wrote; it may still be filling.
+        page: the .html file (default: ``report.html`` in the folder); an older report there is replaced.
+
+    Raises:
+        BadInput: where there is no sweep; ConfigError: where the page or its files would replace something else.
+        MissingExtraError: when polars, jinja2 or matplotlib is not installed.
+    """
+    sweep = read_sweep(folder)
+    target = check_page_path(Path(page) if page is not None else sweep.folder / PAGE)
+    beside = target.parent / (FILES if target.name == PAGE else f"{target.stem}-files")
+    before = earlier_files(beside)
+    sections = list(sections_of(sweep))
+    drawings = [d for section in sections for d in section.drawings]
+    for d in drawings:
+        # Laid out once for both formats.
+        d.figure.draw_without_rendering()
+        d.figure.set_layout_engine("none")
+    pictures = {d.name: svg(d.figure) for d in drawings}
+    made = dict(_contents(sweep, sections, pictures))
+    page_text = render(sweep, sections, pictures, title=title, files=beside.name)
+    write_files(beside, made, before)
+    write_page(target, page_text)
+    return WrittenReport(target, beside, tuple(beside / name for name in made), len(sweep.done), sweep.total)
+
+
+def render(
+    sweep: SweepResults,
+    sections: Sequence[Section],
+    pictures: Mapping[str, bytes],
+    *,
+    title: str | None = None,
+    files: str = FILES,
+) -> str:
+    """Return the page as one self-contained HTML text; ``pictures`` are the drawings as SVG by name."""
+    return render_page(
+        "sweep.html.j2",
+        title=title or f"Sweep {sweep.name}: {len(sweep.done)} of {sweep.total} trials",
+        simulated=sweep.simulated,
+        leaky=sweep.leaky,
+        leaky_words=wording.LEAKY_WORDS,
+        done=len(sweep.done),
+        total=sweep.total,
+        over=wording.describe_runs(sweep.trials),
+        about=about_rows(sweep),
+        sections=[_template_values(sweep, section, pictures) for section in sections],
+        files=files,
+    )
+
+
+def about_rows(sweep: SweepResults) -> list[tuple[str, str]]:
+    """Return grid, data and split as (name, value) pairs."""
+    head = sweep.head
+    how, who = wording.describe_split(str(head.get("split")))
+    schedules = f"epochs {', '.join(map(str, tables.epochs(sweep)))}; batch {', '.join(tables.batches(sweep))}"
+    grid = (
+        f"{len(sweep.archs)} architecture{'s' * (len(sweep.archs) != 1)}, "
+        f"{len(sweep.filter_sets)} filter set{'s' * (len(sweep.filter_sets) != 1)}; {schedules}"
+    )
+    waiting = sweep.total - len(sweep.done)
+    seconds = head.get("seconds")
+    tested = {(r.get("seed"), r.get("fold")): int(r["test_windows"]) for r in sweep.runs if r.get("test_windows")}
+    scored = sum(tested.values()) // max(1, len({seed for seed, _ in tested}))
+    return [
+        ("Data set", text(head.get("dataset"))),
+        ("Hash (SHA-256)", text(head.get("dataset_hash"))),
+        ("Split", f"{how} (“{head.get('split')}”{', leaky' if sweep.leaky else ''})"),
+        ("Who validates", who),
+        ("Windows scored", count(scored) if scored else DASH),
+        ("Context", wording.CONTEXT_WORDS.get(str(head.get("context")), text(head.get("context")))),
+        ("Training preset", text(head.get("preset"))),
+        ("Padding", ", ".join(sorted({str(t.get("padding")) for t in sweep.trials})) or DASH),
+        ("Grid", f"{grid} (the paper's has {paper.TRIALS} trials)"),
+        ("Seeds and folds", wording.describe_runs(sweep.trials)),
+        (
+            "Trials",
+            f"{len(sweep.done)} of {sweep.total} done" + (f", {waiting} waiting or partial" if waiting else ""),
+        ),
+        ("Classes", text(sweep.labels)),
+        ("Time", f"{number(seconds, 0)} s" if number(seconds) != DASH else DASH),
+        ("Machine", text(head.get("machine"))),
+        ("Code version", text(head.get("code_version"))),
+    ]
+
+
+def _template_values(sweep: SweepResults, section: Section, pictures: Mapping[str, bytes]) -> dict[str, Any]:
+    return {
+        "key": section.key,
+        "title": section.title,
+        "scores": section.scores and bool(section.tables or section.drawings),
+        "dropped": section.dropped,
+        "tables": [replace(table, leaky=sweep.leaky, simulated=sweep.simulated) for table in section.tables],
+        "drawings": [{"src": svg_uri(pictures[d.name]), "alt": d.alt, "name": d.name} for d in section.drawings],
+    }
+
+
+def _contents(
+    sweep: SweepResults, sections: Sequence[Section], pictures: Mapping[str, bytes]
+) -> Iterator[tuple[str, bytes]]:
+    """Yield each file's name and content; in each table what the scores are of."""
+    source = {"dataset": sweep.head.get("dataset"), "split": sweep.head.get("split")}
+    source |= {"leaky": "yes" if sweep.leaky else "no", "simulated": "yes" if sweep.simulated else "no"}
+    for section in sections:
+        for table in section.tables:
+            yield f"{table.name}.csv", table.csv(source).encode()
+        for d in section.drawings:
+            yield f"{d.name}.png", png(d.figure, dpi=_DPI)
+            yield f"{d.name}.svg", pictures[d.name]
+
+
+def is_sweep(folder: str | os.PathLike[str]) -> bool:
+    """Return whether this is the results folder of a sweep."""
+    return (Path(folder) / SUMMARY).is_file()
+
+
+def write_sweep_report(
+    folder: str | os.PathLike[str],
+    page: str | os.PathLike[str] | None = None,
+    *,
+    title: str | None = None,
+    mlflow: str | os.PathLike[str] | None = None,
+) -> dict[str, Any]:
+    """Write the page of a sweep with its tables and figures as files, and log its trials to MLflow on request.
+
+    Args:
+        folder: what ``plushsense sweep`` wrote; it may still be filling.
+        page: the .html file (default: ``report.html`` in the folder); its files go into a folder beside it.
+        mlflow: a folder or a tracking URI; trials that are there already are not logged again.
+
+    Returns:
+        ``report``, ``files`` (the folder), ``trials``, ``done``, ``mlflow`` ({uri, new, before} or None), and
+        ``said``, the same in words.
+    """
+    made = write_report(Path(folder), None if page is None else Path(page), title=title)
+    said = [f"{len(made.files)} tables and figures in {made.folder}"]
+    exported = None
+    if mlflow is not None:
+        from plushsense.experiments.sweep.mlflow import export_trials
+
+        there = export_trials(read_sweep(Path(folder)), mlflow)
+        exported = {"uri": there.uri, "experiment": there.experiment, "new": there.new, "before": there.before}
+        said.append(f"MLflow: {there.new} trials logged, {there.before} were there already ({there.uri})")
+    return {
+        "report": str(made.page),
+        "files": str(made.folder),
+        "trials": made.trials,
+        "done": made.done,
+        "mlflow": exported,
+        "said": said,
+    }

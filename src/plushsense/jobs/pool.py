@@ -1,0 +1,374 @@
+"""Jobs in several processes of this machine, each started fresh (the same on every system).
+
+A worker writes its result to the journal before it reports it, so that a run killed at any moment continues from
+there. A worker whose parent is gone ends at its next message. One that dies is replaced and its job is tried again.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import pickle
+import signal
+import threading
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing import connection
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from typing import Any
+
+from plushsense.core.errors import ConfigError, PlushSenseError
+from plushsense.jobs.journal import (
+    Claim,
+    Engine,
+    Job,
+    JobEvent,
+    JobWork,
+    Journal,
+    Report,
+    Result,
+    Take,
+    portable,
+    thread_settings,
+)
+
+__all__ = ["Job", "JobWork", "Report", "run_jobs"]
+
+# How often a job is started in all when its worker dies.
+_TRIES = 2
+
+
+def run_jobs(
+    jobs: Sequence[Job],
+    work: JobWork,
+    *,
+    shared: Any = None,
+    workers: int = 1,
+    threads: int = 1,
+    journal: Journal | None = None,
+    cluster: str | None = None,
+    gpus: float = 0.0,
+    on_start: Callable[[Job], None] | None = None,
+    on_report: Callable[[Job, Any], None] | None = None,
+    on_done: Callable[[Job, Result, bool], None] | None = None,
+    on_failed: Callable[[Job, Exception], None] | None = None,
+) -> dict[str, Result]:
+    """Run every job that the journal does not hold yet. Every callback is called in the caller's thread.
+
+    Args:
+        shared: given to every job, and sent to each process once. A job must leave it as it is.
+        workers: processes at a time; 1 works in this one. A cluster does as many as its processors hold.
+        threads: that each process computes on; has no effect on this one (``workers=1``).
+        cluster: do the jobs as Ray tasks there: "auto", "host:6379", "ray://host:10001", or "local" to start Ray here.
+        gpus: of a cluster, the share of a graphics processor that each job takes.
+        on_start: called with the job when it is begun; twice for one whose process or node was lost.
+        on_report: called with (job, what its work reported); on a cluster some reports may be left out.
+        on_done: called with (job, result, whether it came from the journal), in the order of completion.
+        on_failed: called with (job, the exception that it raised); the other jobs go on, and this one is in neither
+            the journal nor the answer. Without it the first failure ends the run.
+
+    Returns:
+        the result of each job by its id.
+
+    Raises:
+        PlushSenseError: what the work raised, as itself; or a process that died twice at the same job; a result that
+            cannot be kept; a cluster that does not answer. Finished jobs are kept.
+        KeyboardInterrupt: on Ctrl-C, after the workers have been ended. Finished jobs are kept.
+    """
+    if workers < 1:
+        raise ConfigError(f"{workers} workers cannot do anything: give 1 or more.")
+    if threads < 1:
+        raise ConfigError(f"{threads} threads cannot do anything: give 1 or more.")
+    results: dict[str, Result] = {}
+
+    def done(job: Job, result: Result, resumed: bool) -> None:
+        results[job.id] = result
+        if on_done is not None:
+            on_done(job, result, resumed)
+
+    with ExitStack() as stack:
+        left = _Left(jobs, journal, done, stack)
+        engine: Engine
+        if not left.jobs:
+            return results
+        if cluster is not None:
+            from plushsense.jobs.cluster import on_cluster
+
+            engine = on_cluster(left.take, (work, shared), cluster, threads=threads, gpus=gpus)
+        elif workers == 1:
+            engine = _here(left.take, work, shared, on_report)
+        else:
+            # Also for a single job: what it computes may depend on the threads of its process.
+            setup = pickle.dumps((work, shared, journal))
+            engine = in_processes(left.take, setup, min(workers, len(left.jobs)), threads)
+        saved = cluster is None and workers > 1
+        # Closed at once, not when it is collected: an engine ends its processes.
+        with closing(engine):  # type: ignore[type-var]
+            for job, kind, what in engine:
+                if kind == "started" and on_start is not None:
+                    on_start(job)
+                elif kind == "report" and on_report is not None:
+                    on_report(job, what)
+                elif kind == "done":
+                    if journal is not None and not saved:
+                        journal.save(job.id, what)
+                    left.release(job)
+                    done(job, what, False)
+                elif kind == "failed":
+                    left.release(job)
+                    if on_failed is None:
+                        raise what
+                    on_failed(job, what)
+    return results
+
+
+def _here(take: Take, work: JobWork, shared: Any, on_report: Callable[[Job, Any], None] | None) -> Engine:
+    """Run the jobs in this process, one after the other."""
+
+    def report(job: Job, message: Any) -> None:
+        if on_report is not None:
+            on_report(job, message)
+
+    while (job := take()) is not None:
+        yield JobEvent(job, "started")
+        try:
+            result = work(shared, job.task, partial(report, job))
+        except Exception as error:  # noqa: BLE001, RUF100
+            yield JobEvent(job, "failed", error)
+        else:
+            yield JobEvent(job, "done", result)
+
+
+class _Left:
+    """The jobs still to be handed out, and the claims on those that are."""
+
+    def __init__(
+        self,
+        jobs: Sequence[Job],
+        journal: Journal | None,
+        done: Callable[[Job, Result, bool], None],
+        stack: ExitStack,
+    ) -> None:
+        self.jobs: deque[Job] = deque()
+        self._journal = journal
+        self._done = done
+        self._claims: dict[str, Claim] = {}
+        stack.callback(self._release_all)
+        for job in jobs:
+            if not self._found(job):
+                self.jobs.append(job)
+
+    def take(self) -> Job | None:
+        """Return the next job that is neither done nor claimed; when others claimed all that are left, one of these."""
+        elsewhere: deque[Job] = deque()
+        try:
+            while self.jobs:
+                job = self.jobs.popleft()
+                claim = None if self._journal is None else self._journal.claim(job.id)
+                if self._journal is not None and claim is None:
+                    elsewhere.append(job)
+                    continue
+                # Checked again after the claim: the process that had it before may have done the job.
+                if self._found(job):
+                    if claim is not None:
+                        claim.release()
+                    continue
+                if claim is not None:
+                    self._claims[job.id] = claim
+                return job
+            while elsewhere:
+                job = elsewhere.popleft()
+                # Not waited for: the other run may take long, may stop, and the result is the same.
+                if not self._found(job):
+                    return job
+            return None
+        finally:
+            self.jobs.extendleft(reversed(elsewhere))
+
+    def release(self, job: Job) -> None:
+        claim = self._claims.pop(job.id, None)
+        if claim is not None:
+            claim.release()
+
+    def _found(self, job: Job) -> bool:
+        kept = None if self._journal is None else self._journal.find(job.id)
+        if kept is None:
+            return False
+        self._done(job, kept, True)
+        return True
+
+    def _release_all(self) -> None:
+        while self._claims:
+            self._claims.popitem()[1].release()
+
+
+@dataclass
+class _Worker:
+    """A process, the pipe to it, and its current job; it is ready once it has read what all jobs share."""
+
+    process: BaseProcess
+    pipe: Connection
+    job: Job | None = None
+    ready: bool = False
+
+
+def in_processes(take: Take, setup: bytes, workers: int, threads: int) -> Engine:
+    """Run the jobs that ``take`` gives in so many processes, each on so many threads.
+
+    Args:
+        setup: the pickled (work, shared, journal or None).
+
+    Raises:
+        PlushSenseError: a worker that dies before it can begin, or a result that cannot be kept.
+    """
+    pool: list[_Worker] = []
+    try:
+        for _ in range(workers):
+            pool.append(_start(threads))
+        for worker in pool:
+            _send(worker, setup)
+        yield from _conduct(pool, take, setup, threads)
+        for worker in pool:
+            _send(worker, None)
+            worker.process.join(5)
+    finally:
+        for worker in pool:
+            if worker.process.is_alive():
+                worker.process.kill()
+            worker.process.join()
+            worker.pipe.close()
+
+
+def _start(threads: int) -> _Worker:
+    spawn = multiprocessing.get_context("spawn")
+    here, there = spawn.Pipe()
+    process = spawn.Process(target=_serve, args=(there,), daemon=True)
+    with _inherited(threads):
+        process.start()
+    # Only the worker may hold its end: then each side notices when the other is gone.
+    there.close()
+    return _Worker(process, here)
+
+
+@contextmanager
+def _inherited(threads: int) -> Iterator[None]:
+    """Set what a process started in this context inherits: its number of threads, and that it ignores Ctrl-C."""
+    settings = thread_settings(threads)
+    before = {name: os.environ.get(name) for name in settings}
+    # Only the main thread may set a signal's handler.
+    ours = threading.current_thread() is threading.main_thread()
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN) if ours else None
+    os.environ.update(settings)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name, None)
+            if value is not None:
+                os.environ[name] = value
+        if ours:
+            signal.signal(signal.SIGINT, signal.SIG_DFL if handler is None else handler)
+
+
+def _conduct(pool: list[_Worker], take: Take, setup: bytes, threads: int) -> Engine:
+    """Hand out the jobs and pass on what comes back, until nothing is left and nobody is busy."""
+    again: list[Job] = []
+    tries: Counter[str] = Counter()
+    finished = False
+    while True:
+        for worker in pool:
+            if worker.ready and worker.job is None and not (finished and not again):
+                worker.job = again.pop() if again else take()
+                if worker.job is None:
+                    finished = True
+                else:
+                    tries[worker.job.id] += 1
+                    _send(worker, (worker.job.id, worker.job.task))
+                    yield JobEvent(worker.job, "started")
+        busy = {worker.pipe: worker for worker in pool if worker.job is not None or not worker.ready}
+        if finished and not again and all(worker.job is None for worker in busy.values()):
+            return
+        for pipe in connection.wait(list(busy)):
+            worker = busy[pipe]  # type: ignore[index]
+            job = worker.job
+            try:
+                kind, message = worker.pipe.recv()
+            except (EOFError, OSError):
+                worker.process.join(5)
+                if job is None or not worker.ready:
+                    raise _stillborn(worker.process.exitcode) from None
+                worker.pipe.close()
+                # In the same place, so that whoever ends the pool ends this one too.
+                pool[pool.index(worker)] = replaced = _start(threads)
+                _send(replaced, setup)
+                if tries[job.id] < _TRIES:
+                    again.append(job)
+                else:
+                    yield JobEvent(job, "failed", _gone(worker.process.exitcode))
+                continue
+            if kind == "ready":
+                worker.ready = True
+            elif kind == "lost":
+                raise message
+            else:
+                assert job is not None
+                if kind != "report":
+                    worker.job = None
+                yield JobEvent(job, kind, message)
+
+
+def _send(worker: _Worker, message: Any) -> None:
+    # Reading from the pipe shows that the worker is gone.
+    with suppress(OSError):
+        worker.pipe.send(message)
+
+
+def _stillborn(code: int | None) -> PlushSenseError:
+    return PlushSenseError(
+        f"A worker process ended unexpectedly while it started (exit code {code}), perhaps for lack of memory: "
+        "run again, finished jobs are kept; try fewer workers. In a script of your own, more than one worker needs "
+        "the code under  if __name__ == '__main__':"
+    )
+
+
+def _gone(code: int | None) -> PlushSenseError:
+    return PlushSenseError(
+        f"This job was given up: the worker process at it ended unexpectedly {_TRIES} times (exit code {code}), "
+        "perhaps for lack of memory: run again, finished jobs are kept; try fewer workers."
+    )
+
+
+def _serve(pipe: Connection) -> None:
+    """Run jobs in a worker until it is sent None or the other side is gone."""
+    # Ctrl-C reaches every process of the terminal: the parent decides.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    journal: Journal | None
+    with suppress(EOFError, BrokenPipeError, ConnectionResetError):
+        try:
+            work, shared, journal = pickle.loads(pipe.recv())
+        except (EOFError, BrokenPipeError, ConnectionResetError):
+            return
+        except Exception as error:  # noqa: BLE001, RUF100
+            pipe.send(("lost", portable(error)))
+            return
+        pipe.send(("ready", None))
+        while (message := pipe.recv()) is not None:
+            job, task = message
+            try:
+                result = work(shared, task, lambda message: pipe.send(("report", message)))
+            except (EOFError, BrokenPipeError, ConnectionResetError):
+                raise
+            except Exception as error:  # noqa: BLE001, RUF100
+                pipe.send(("failed", portable(error)))
+                continue
+            try:
+                if journal is not None:
+                    journal.save(job, result)
+            except Exception as error:  # noqa: BLE001, RUF100
+                pipe.send(("lost", portable(error)))
+                return
+            pipe.send(("done", result))

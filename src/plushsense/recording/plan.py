@@ -1,0 +1,216 @@
+"""Recording protocols: which gestures a session records, in which order, with which prompts (TOML files)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from plushsense.core.errors import ConfigError, nearest
+from plushsense.core.gestures import GestureSet, load_gestures, plain_label
+from plushsense.core.recorder_csv import parse_name, recording_filename
+from plushsense.core.toml import builtin_names, load_table, read_named
+
+ORDERS = {
+    "gesture": "all repetitions of a gesture one after another, as in the paper",
+    "round": "every gesture once, then every gesture again",
+}
+DEFAULT = "default"
+"""The wording used where the chosen one is missing; without it, the gesture's description is used."""
+
+_LIMITS = {"countdown_s": (0.0, 60.0), "shortest_s": (0.0, 60.0), "longest_s": (1.0, 36_000.0)}
+
+
+@dataclass(frozen=True)
+class Step:
+    """One planned recording: its number in the session from 0, its gesture and its prompt."""
+
+    number: int
+    gesture: str
+    repetition: int
+    prompt: str
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """The plan of a session, in which every gesture has its prompt.
+
+    Attributes:
+        gestures: labels in the order of recording.
+        prompts: text that the person reads, for each gesture.
+        repetitions: recordings of each gesture.
+        order: see `ORDERS`.
+        countdown_s: time from the first press of the space bar to the first row.
+        shortest_s: a second press within this time does not stop the recording.
+        longest_s: a recording ends automatically after this time; its rows are kept.
+        words: the chosen wording.
+        nobody: gestures that are recorded without a person.
+    """
+
+    name: str
+    title: str
+    gesture_set: str
+    gestures: tuple[str, ...]
+    prompts: dict[str, str]
+    repetitions: int = 3
+    order: str = "gesture"
+    countdown_s: float = 3.0
+    shortest_s: float = 0.5
+    longest_s: float = 60.0
+    words: str = DEFAULT
+    nobody: tuple[str, ...] = ()
+
+    @property
+    def needs_nobody(self) -> bool:
+        """Return whether all gestures of the session are recorded without a person."""
+        return set(self.nobody) >= set(self.gestures)
+
+    def steps(self) -> tuple[Step, ...]:
+        """Return all planned recordings of the session, in order."""
+        times = range(1, self.repetitions + 1)
+        if self.order == "round":
+            pairs = [(g, r) for r in times for g in self.gestures]
+        else:
+            pairs = [(g, r) for g in self.gestures for r in times]
+        return tuple(Step(n, g, r, self.prompts[g]) for n, (g, r) in enumerate(pairs))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON, from which `from_dict` builds the same protocol without other files."""
+        return asdict(self) | {"gestures": list(self.gestures), "nobody": list(self.nobody)}
+
+    @classmethod
+    def from_dict(
+        cls, table: Mapping[str, Any], where: str = "protocol", words: str | None = None, beside: Path | None = None
+    ) -> Protocol:
+        """Return the protocol that plain values describe: a TOML file, or the result of `to_dict`.
+
+        Args:
+            where: to quote in messages.
+            words: the wording to read; None: the one that the table names, else "default".
+            beside: a folder in which the gesture set's file is looked for, too.
+
+        Raises:
+            ConfigError: for an unknown key, or a value that does not fit.
+            GestureError: for a gesture that is not in the set.
+        """
+        file = load_table(table, _ProtocolFile, where, ConfigError)
+        if not file.name.strip():
+            raise ConfigError(f"The {where} has an empty name: give it one.")
+        if file.order not in ORDERS:
+            raise ConfigError(
+                f"The {where}: order is '{file.order}'; accepted are {', '.join(ORDERS)}.{nearest(file.order, ORDERS)}"
+            )
+        if not 1 <= file.repetitions <= 1000:
+            raise ConfigError(f"The {where}: repetitions is {file.repetitions}; accepted are 1 to 1000.")
+        for key, (low, high) in _LIMITS.items():
+            if not low <= (value := getattr(file, key)) <= high:
+                raise ConfigError(f"The {where}: {key} is {value:g}; {low:g} to {high:g} seconds are accepted.")
+        if file.shortest_s >= file.longest_s:
+            raise ConfigError(
+                f"The {where}: shortest_s is {file.shortest_s:g} and longest_s {file.longest_s:g}; "
+                "the shortest must be below the longest."
+            )
+        gestures, prompts, nobody, chosen = _resolved(file, where, words or file.words or DEFAULT, beside)
+        return cls(
+            name=file.name,
+            title=file.title or file.name,
+            gesture_set=file.gesture_set,
+            gestures=gestures,
+            prompts=prompts,
+            repetitions=file.repetitions,
+            order=file.order,
+            countdown_s=file.countdown_s,
+            shortest_s=file.shortest_s,
+            longest_s=file.longest_s,
+            words=chosen,
+            nobody=nobody,
+        )
+
+
+@dataclass(frozen=True)
+class _ProtocolFile:
+    """The keys of a protocol in a file, or of `Protocol.to_dict`, where every gesture has its prompt."""
+
+    name: str
+    gesture_set: str
+    title: str = ""
+    gestures: tuple[str, ...] | None = None
+    prompts: dict[str, str | dict[str, str]] = field(default_factory=dict)
+    repetitions: int = 3
+    order: str = "gesture"
+    countdown_s: float = 3.0
+    shortest_s: float = 0.5
+    longest_s: float = 60.0
+    words: str = DEFAULT
+    nobody: tuple[str, ...] | None = None
+
+
+def _resolved(
+    file: _ProtocolFile, where: str, words: str, beside: Path | None
+) -> tuple[tuple[str, ...], dict[str, str], tuple[str, ...], str]:
+    """Return the gestures in order, the prompt of each, those recorded without a person, and the wording."""
+    given, labels = file.prompts, file.gestures or ()
+    if file.nobody is not None and labels and all(isinstance(given.get(label), str) for label in labels):
+        # From `to_dict`: the file of the gesture set may be gone.
+        return labels, {label: str(given[label]) for label in labels}, file.nobody, words
+    gesture_set = _gesture_set(file.gesture_set, beside)
+    found = [gesture_set.get(label) for label in labels] or [g for g in gesture_set.gestures if not g.nobody]
+    if len({g.label for g in found}) < len(found) or not found or file.gestures == ():
+        raise ConfigError(f"The {where} must name every gesture once, and at least one: see its gestures.")
+    wordings = {DEFAULT, *(w for text in given.values() if isinstance(text, Mapping) for w in text)}
+    if words not in wordings:
+        raise ConfigError(
+            f"The {where} has no wording '{words}'; it has {', '.join(sorted(wordings))}.{nearest(words, wordings)}"
+        )
+    prompts = {}
+    texts = {gesture_set.get(label).label: text for label, text in given.items()}
+    for gesture in found:
+        text = texts.get(gesture.label, {})
+        if isinstance(text, Mapping):
+            text = text.get(words) or text.get(DEFAULT) or gesture.description or gesture.label
+        if not text.strip():
+            raise ConfigError(f"The {where}: the prompt of '{gesture.label}' is {text!r}; it must be a text.")
+        named = parse_name(recording_filename(gesture.label, 0, 0))
+        if named is None or plain_label(named.label) != plain_label(gesture.label):
+            raise ConfigError(
+                f"The {where}: '{gesture.label}' cannot stand in a file name; "
+                'take a label without  \\ / : * ? " < > | ( )  and without a point at its end.'
+            )
+        prompts[gesture.label] = text.strip()
+    return tuple(prompts), prompts, tuple(g.label for g in found if g.nobody), words
+
+
+def _gesture_set(name: str, beside: Path | None) -> GestureSet:
+    if beside is not None and name.endswith(".toml") and (beside / name).is_file():
+        return load_gestures(beside / name)
+    return load_gestures(name)
+
+
+def protocol_names() -> tuple[str, ...]:
+    """Return the names of the built-in protocols."""
+    return builtin_names("protocols")
+
+
+def wordings(name_or_path: str | Path) -> tuple[str, ...]:
+    """Return the wordings of a protocol's prompts, `DEFAULT` first.
+
+    Raises:
+        ConfigError: for an unknown name or an unusable file.
+    """
+    table, _ = read_named(name_or_path, "protocols", "protocol", ConfigError)
+    prompts = table.get("prompts")
+    texts = prompts.values() if isinstance(prompts, Mapping) else ()
+    others = {str(w) for text in texts if isinstance(text, Mapping) for w in text}
+    return (DEFAULT, *sorted(others - {DEFAULT}))
+
+
+def load_protocol(name_or_path: str | Path, words: str | None = None) -> Protocol:
+    """Load a built-in protocol by name, or one of the user's own by the path of its TOML file.
+
+    Raises:
+        ConfigError: for an unknown name or an unusable file.
+    """
+    table, source = read_named(name_or_path, "protocols", "protocol", ConfigError)
+    beside = None if source in protocol_names() else Path(source).parent
+    return Protocol.from_dict(table, f"protocol '{source}'", words, beside)

@@ -1,0 +1,118 @@
+"""The files of a session's folder: head, event log, stream and recordings, which survive a crash.
+
+session.json                     person, protocol and toy: `SessionHead`, replaced atomically
+session.jsonl                    one `SessionEvent` a line, append-only
+fulldatastream.csv               everything the toy sent, in the format of the authors' recorder
+<label>_<epoch ms>_<rows>.csv    one recording each, and beside it a sidecar of the same name that ends in .json
+
+The folder of a person holds one folder a session: ``OUT/<subject>/<session>/``.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from plushsense.core.errors import DatasetError
+from plushsense.core.files import write_file
+from plushsense.core.toml import load_table
+
+SESSION_HEAD = "session.json"
+SESSION_LOG = "session.jsonl"
+SIDECAR = ".json"
+FORMAT_VERSION = 1
+
+
+@dataclass(frozen=True)
+class SessionHead:
+    """The description of a session. ``subject`` is a code, never a name; ``protocol`` and ``layout`` are complete.
+
+    ``consent`` is a reference to the signed form, not the form. ``simulated``: the toy was the virtual one.
+    """
+
+    subject: str
+    session: str
+    started_ms: int
+    layout: dict[str, Any]
+    protocol: dict[str, Any]
+    age_group: str = ""
+    gender: str = ""
+    consent: str = ""
+    device: str = ""
+    software: str = ""
+    simulated: bool = False
+
+    def write(self, folder: Path) -> None:
+        """Write the head to ``folder``, whole or not at all."""
+        text = json.dumps({"format": FORMAT_VERSION} | asdict(self), ensure_ascii=False, indent=1) + "\n"
+        write_file(folder / SESSION_HEAD, text)
+
+    @classmethod
+    def read(cls, folder: Path) -> SessionHead | None:
+        """Read the head of the session in ``folder``; return None where there is none.
+
+        Raises:
+            DatasetError: for a head that is damaged or of another format.
+        """
+        path = folder / SESSION_HEAD
+        try:
+            table = json.loads(path.read_text(encoding="utf-8"))
+        except (FileNotFoundError, NotADirectoryError):
+            return None
+        except (OSError, ValueError, RecursionError) as cause:
+            raise DatasetError(f"'{path}' cannot be read ({cause}): bring it back from a copy.") from None
+        if not isinstance(table, dict) or table.pop("format", None) != FORMAT_VERSION:
+            raise DatasetError(f"'{path}' is no session head of format {FORMAT_VERSION}: check which version wrote it.")
+        return load_table(table, cls, f"'{path}'", DatasetError)
+
+
+@dataclass(frozen=True)
+class SessionEvent:
+    """An event of a session: ``what`` in a word, ``at_ms`` by the computer's clock, and its details.
+
+    ``open`` and ``close`` (a program opened and closed the session), ``countdown`` (``gesture``, ``repetition``,
+    ``countdown_s``), ``start`` (the first row), ``take`` (finished: ``file``, ``gesture``, ``repetition``),
+    ``abandon`` (stopped on purpose, ``why``: redo, pause or quit; its rows are in the stream only), ``unfinished``
+    (stopped by a crash), ``redo`` (``file``: that recording is discarded), ``keep`` (``file``: it is used again),
+    ``skip``, ``go`` (to another step), ``note``, ``pause``, ``resume``, ``gap``, ``mended`` (repaired after a crash),
+    ``failed``, ``finished``. A reader ignores other words.
+    """
+
+    what: str
+    at_ms: int
+    details: dict[str, Any] = field(default_factory=dict)
+
+    def to_line(self) -> str:
+        """Return the event as a line of the log."""
+        return json.dumps({"what": self.what, "at_ms": self.at_ms} | self.details, ensure_ascii=False) + "\n"
+
+
+def read_events(folder: Path) -> Iterator[SessionEvent]:
+    """Yield the events of the log in ``folder``, in order; skip a line that a crash cut off."""
+    try:
+        lines = (folder / SESSION_LOG).read_bytes().split(b"\n")
+    except FileNotFoundError:
+        return
+    except OSError as cause:
+        raise DatasetError(f"'{folder / SESSION_LOG}' cannot be read: {cause.strerror or cause}.") from None
+    for line in filter(None, lines):
+        try:
+            table = json.loads(line.decode("utf-8"))
+            yield SessionEvent(str(table.pop("what")), int(table.pop("at_ms")), table)
+        except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
+            continue
+
+
+def discarded_recordings(folder: Path) -> dict[str, str]:
+    """Return the discarded recordings of a session, by file name, with the reason."""
+    discarded: dict[str, str] = {}
+    for event in read_events(folder):
+        file = str(event.details.get("file") or "")
+        if event.what == "redo" and file:
+            discarded[file] = str(event.details.get("why") or "recorded again")
+        elif event.what == "keep":
+            discarded.pop(file, None)
+    return discarded

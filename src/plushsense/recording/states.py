@@ -1,0 +1,459 @@
+"""The state machine of a recording session, driven by commands and by the toy's frames.
+
+`plushsense.recording.recorder` adds the commands. One thread reads the toy's frames, the threads of the background
+writer write them; none waits for another. All times of a session run on the toy's own clock, so that a virtual toy at
+twenty times the speed counts down in a twentieth of the time, and a toy that is unplugged during the countdown does
+not start an empty recording.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from plushsense.core.errors import DatasetError, PlushSenseError
+from plushsense.devices.base import Counters, Device, Frame, now_ms
+from plushsense.recording.plan import Step
+from plushsense.recording.session import Key, OpenSession, SessionProgress
+from plushsense.recording.session_files import SessionEvent
+from plushsense.recording.status import RecorderState, RecorderStatus
+from plushsense.recording.takes import AWAY_S, Ended, FrameReceiver, RecordingTake, gap_entry, sidecar
+from plushsense.recording.writer import BackgroundWriter, lacks_descriptor, save_take, to_frames
+
+
+def store_take(
+    session: OpenSession,
+    take: RecordingTake,
+    counters: Counters,
+    ended: Ended,
+    saved_ms: int,
+    earlier: str,
+    **more: Any,
+) -> tuple[str, str]:
+    """Write a recording, its sidecar and its line in the log; ``earlier`` is the file that it replaces, or "".
+
+    Returns:
+        The file's name, and a message for the person, or "".
+
+    Raises:
+        OSError: when the files cannot be written; no partial file is left.
+    """
+    layout, step = session.layout, take.step
+    frames = to_frames(take.frames, layout.n_channels)
+    beside = sidecar(take, frames, layout, session.head, counters, ended, saved_ms=saved_ms, **more)
+    path = save_take(session.folder, frames, layout, step.gesture, saved_ms, beside)
+    key = {"gesture": step.gesture, "repetition": step.repetition}
+    says = {"rows": len(frames), "lost": take.lost, "gaps": len(take.gaps), "ended": ended}
+    events = [SessionEvent("take", saved_ms, {"file": path.name} | key | says)]
+    if earlier:
+        events.append(SessionEvent("redo", saved_ms, {"file": earlier} | key))
+    session.log.write(events)
+    message = ""
+    if ended == "longest":
+        longest_s = session.protocol.longest_s
+        message = f"Nobody stopped it: it ended by itself after {longest_s:g} s; r makes it again."
+    elif take.gaps:
+        longest = max(gap["missing_ms"] for gap in take.gaps) / 1000.0
+        what = f"has a hole of {longest:.1f} s" if longest >= 0.05 else "has a jump in the toy's clock"
+        message = f"This recording {what}; it is kept, r makes it again."
+    return path.name, message
+
+
+def write_error(session: OpenSession, recordings: int, cause: Exception) -> DatasetError:
+    """Return the error with which a session stops that cannot be written any more."""
+    why = getattr(cause, "strerror", None) or cause
+    remedy = "close other programs" if lacks_descriptor(cause) else "make room"
+    return DatasetError(
+        f"'{session.folder}' cannot be written any more ({why}): the session has stopped. "
+        f"What was recorded until then is kept ({recordings} recordings); "
+        f"{remedy}, and go on with the same session."
+    )
+
+
+def key_of(step: Step) -> Key:
+    """Return the key of a planned recording: its gesture and repetition."""
+    return step.gesture, step.repetition
+
+
+class PlanProgress:
+    """The steps of a session and the recordings made of each.
+
+    Attributes:
+        steps: all steps, in order.
+        takes: file of the recording in use of each step; the newest comes last.
+        skipped: steps that were skipped.
+        discarded: files of a step that are not used.
+        at: number of the current step.
+    """
+
+    def __init__(self, steps: tuple[Step, ...], progress: SessionProgress) -> None:
+        self.steps = steps
+        self.takes = dict(progress.takes)
+        self.skipped = set(progress.skipped)
+        self.discarded = {key: list(files) for key, files in progress.discarded.items()}
+        self.at = 0
+        self._last: Key | None = next(reversed(self.takes), None)
+
+    @property
+    def step(self) -> Step:
+        """The current step."""
+        return self.steps[self.at]
+
+    @property
+    def last(self) -> Key | None:
+        """The step of the last recording in use; None when there is none, or it is to be made again."""
+        return self._last if self._last in self.takes else None
+
+    @property
+    def last_file(self) -> str:
+        """The file of the last recording in use; "" when there is none."""
+        return self.takes[self.last] if self.last is not None else ""
+
+    @property
+    def redone(self) -> int:
+        """Number of discarded files."""
+        return sum(map(len, self.discarded.values()))
+
+    def _left(self, order: tuple[Step, ...]) -> Step | None:
+        return next((s for s in order if key_of(s) not in self.takes and key_of(s) not in self.skipped), None)
+
+    def next_step(self) -> Step | None:
+        """Return the step to record after the current one; None when it is the last."""
+        return self._left(self.steps[self.at + 1 :] + self.steps[: self.at])
+
+    def advance(self, from_start: bool = False) -> bool:
+        """Go to the next step to record, wrapping around at the end; return False when none is left."""
+        at = 0 if from_start else self.at + 1
+        left = self._left(self.steps[at:] + self.steps[:at])
+        self.at = left.number if left is not None else len(self.steps) - 1
+        return left is not None
+
+    def discard(self, key: Key) -> str:
+        """Discard the recording of a step, so that it is to be made again; return its file."""
+        file = self.takes.pop(key)
+        self.discarded.setdefault(key, []).append(file)
+        self.at = next(s.number for s in self.steps if key_of(s) == key)
+        return file
+
+    def keep(self, key: Key) -> str:
+        """Use the newest discarded file of a step again; return it, or "" when there is none or another is used."""
+        if key in self.takes or not self.discarded.get(key):
+            return ""
+        file = self.takes[key] = self.discarded[key].pop()
+        self._last = key
+        return file
+
+    def record(self, key: Key, file: str) -> None:
+        """Store the file of a finished recording; discard an earlier one of the same step."""
+        earlier = self.takes.pop(key, "")
+        if earlier:
+            self.discarded.setdefault(key, []).append(earlier)
+        self.takes[key] = file
+        self.skipped.discard(key)
+        self._last = key
+
+
+Listener = Callable[[str, RecorderStatus], None]
+
+
+@dataclass(frozen=True)
+class AutoRecording:
+    """Automatic recording: start ``rest_s`` after the recorder is ready, stop ``take_s`` after a recording began."""
+
+    take_s: float = 5.0
+    rest_s: float = 1.0
+
+
+class RecordingMachine:
+    """The state machine of a session; `Recorder` adds the commands and describes the arguments."""
+
+    def __init__(
+        self,
+        session: OpenSession,
+        device: Device,
+        *,
+        speed: float = 1.0,
+        auto: AutoRecording | None = None,
+        software: str = "",
+    ) -> None:
+        self.session = session
+        self.device = device
+        self.protocol = session.protocol
+        self._speed = speed
+        self._auto = auto
+        self._software = software
+        self._changed = threading.Condition(threading.RLock())
+        self._listeners: list[Listener] = []
+        self._changes: list[str] = []
+        progress = session.progress
+        self._plan = PlanProgress(self.protocol.steps(), progress)
+        self._receiver = FrameReceiver(device, session.layout, speed, progress.rows, progress.host_ms)
+        self._take: RecordingTake | None = None
+        self._since_ms = 0.0
+        self._state: RecorderState = "idle"
+        self._paused = False
+        self._message = ""
+        self._over = ""
+        self._failed = ""
+        self._closing = False
+        self._received: list[Frame] = []
+        self._writer: BackgroundWriter | None = None
+        self._reader = threading.Thread(target=self._read, name="plushsense-reader", daemon=True)
+
+    # Status --------------------------------------------------------------------------------------------------
+
+    def subscribe(self, listener: Listener) -> None:
+        """Call ``listener(what, status)`` at every change, in the thread that made it; the listener must not block."""
+        self._listeners.append(listener)
+
+    def unsubscribe(self, listener: Listener) -> None:
+        """Stop calling a listener."""
+        with contextlib.suppress(ValueError):
+            self._listeners.remove(listener)
+
+    def status(self) -> RecorderStatus:
+        """Return a snapshot of the session."""
+        with self._changed:
+            plan = self._plan
+            counters = self.device.counters
+            quality = self._receiver.quality()
+            passed = self._passed_s()
+            counting, running = self._state == "countdown", self._state == "recording"
+            return RecorderStatus(
+                state=self._state,
+                step=plan.step,
+                steps=len(plan.steps),
+                repetitions=self.protocol.repetitions,
+                next_step=plan.next_step(),
+                done=len(plan.takes),
+                skipped=len(plan.skipped),
+                redone=plan.redone,
+                existing=plan.takes.get(key_of(plan.step), ""),
+                countdown_s=max(0.0, self.protocol.countdown_s - passed) if counting else 0.0,
+                elapsed_s=max(passed, self._wall_s()) if running else 0.0,
+                left_s=max(0.0, self.protocol.longest_s - passed) if running else 0.0,
+                rate_hz=quality.rate_hz,
+                jitter_ms=quality.jitter_ms,
+                signal=quality.signal,
+                away=self._receiver.away,
+                lost=self._receiver.lost,
+                malformed=counters.malformed,
+                garbage=counters.garbage,
+                reconnects=counters.reconnects,
+                gaps=len(self._receiver.gaps),
+                rows=self._receiver.rows,
+                file=plan.last_file,
+                message=self._message,
+                failed=self._failed,
+                folder=str(self.session.folder),
+                frames=counters.frames,
+                bad_share=quality.bad_share,
+            )
+
+    # State changes (with the lock) ----------------------------------------------------------------------------
+
+    @contextlib.contextmanager
+    def _notifying(self) -> Iterator[None]:
+        """Hold the lock; notify the listeners after its release, so that they may give commands."""
+        with self._changed:
+            yield
+        self._notify()
+
+    def _notify(self) -> None:
+        with self._changed:
+            changes, self._changes = self._changes, []
+        for what in changes:
+            for listener in tuple(self._listeners):
+                # A listener that fails must not end a recording.
+                with contextlib.suppress(Exception):
+                    listener(what, self.status())
+
+    def _log(self, what: str, **more: Any) -> None:
+        if self._writer is not None:
+            self._writer.submit(SessionEvent(what, self._receiver.now_ms(), more))
+        self._changes.append(what)
+
+    def _log_step(self, what: str, **more: Any) -> None:
+        step = self._plan.step
+        self._log(what, gesture=step.gesture, repetition=step.repetition, **more)
+
+    def _show_message(self, text: str) -> None:
+        self._message = text
+        self._changes.append("message")
+        self._changed.notify_all()
+
+    def _enter(self, state: RecorderState, message: str) -> None:
+        if self._failed:
+            # Also when a recording was still being saved while writing the stream failed.
+            state, message = "stopped", self._failed
+        self._state = state
+        self._since_ms = self._receiver.toy_ms
+        self._message = message
+        self._changes.append(state)
+        self._changed.notify_all()
+
+    def _wall_s(self) -> float:
+        return time.monotonic() - self._take.from_s if self._take is not None else 0.0
+
+    def _passed_s(self) -> float:
+        """Seconds since the state was entered, by the toy's clock."""
+        return (self._receiver.toy_ms - self._since_ms) / 1000.0
+
+    def _advance(self, message: str = "", from_start: bool = False) -> None:
+        """Go to the next step to record, or to the end."""
+        if self._plan.advance(from_start):
+            self._ready(message)
+        else:
+            self._log("finished", recordings=len(self._plan.takes), skipped=len(self._plan.skipped))
+            self._paused = False
+            self._enter("stopped" if self._over else "finished", message)
+
+    def _ready(self, message: str) -> None:
+        if self._over:
+            self._enter("stopped", self._over)
+        else:
+            self._enter("paused" if self._paused else "idle", message)
+
+    def _begin(self) -> None:
+        now = self._receiver.last.device_ms if self._receiver.last else None
+        self._log_step("countdown", countdown_s=self.protocol.countdown_s, device_ms=now)
+        self._enter("countdown", "")
+
+    def _cancel(self, message: str) -> None:
+        self._log_step("cancel")
+        self._enter("idle", message)
+
+    def _first_row(self, frame: Frame, row: int) -> None:
+        counters = Counters(**self.device.counters.to_dict())
+        self._take = RecordingTake(self._plan.step, row, time.monotonic(), counters)
+        self._log_step("start", row=row, host_ms=frame.host_ms, device_ms=frame.device_ms)
+        self._enter("recording", "")
+
+    def _abandon(self, why: str, message: str) -> None:
+        take = self._take
+        assert take is not None
+        self._take = None
+        self._log_step("abandon", why=why, rows=len(take.frames))
+        self._ready(message)
+
+    def _stop(self, ended: Ended) -> None:
+        take = self._take
+        assert take is not None
+        # A recording that a frame has ended has its gap, if any, already.
+        waiting = self._receiver.away or (self._speed == 1.0 and self._receiver.silent)
+        if waiting and ended in ("space", "toy"):
+            silent_ms = self._receiver.silent_ms
+            take.gaps.append(gap_entry(len(take.frames), take.frames[-1], None, silent_ms, "nothing came any more"))
+        self._take = None
+        counters = Counters(**self.device.counters.to_dict())
+        self._enter("saving", "")
+        self._flush()
+        if self._writer is not None:
+            self._writer.submit(lambda: self._save(take, ended, counters))
+
+    # Reading --------------------------------------------------------------------------------------------------
+
+    def _read(self) -> None:
+        """Process frames as they come, in the reader's thread, independently of display and disk."""
+        over = "The toy's data have ended."
+        try:
+            while not self._closing:
+                frames = self.device.read()
+                if frames is None:
+                    break
+                with self._notifying():
+                    for frame in frames:
+                        self._receive(frame)
+                    self._receiver.check_malformed()
+                    if frames:
+                        self._flush()
+                        self._receiver.end_reading()
+                if self._writer is not None:
+                    self._writer.wait_written()
+        except PlushSenseError as cause:
+            over = str(cause)
+        except Exception as cause:  # noqa: BLE001, RUF100
+            over = f"Reading the toy failed ({type(cause).__name__}: {cause}): what came until then is kept."
+        with self._notifying():
+            if self._closing:
+                return
+            self._over = over
+            if self._state == "recording":
+                self._stop("toy")
+            elif self._state not in ("saving", "stopped"):
+                self._enter("stopped", over)
+
+    def _receive(self, frame: Frame) -> None:
+        """Process one frame."""
+        row = self._receiver.rows
+        frame, missing, gap = self._receiver.receive(frame)
+        if gap is not None:
+            self._gap(gap)
+        if self._state == "countdown" and self._passed_s() >= self.protocol.countdown_s:
+            self._first_row(frame, row)
+        elif self._take is not None:
+            self._take.lost += missing
+        self._received.append(frame)
+        if self._take is not None:
+            self._take.frames.append(frame)
+        if self._state == "recording":
+            if self._auto is not None and self._passed_s() >= self._auto.take_s:
+                self._stop("auto")
+            elif self._passed_s() >= self.protocol.longest_s:
+                self._stop("longest")
+        elif self._state == "idle" and self._auto is not None and self._passed_s() >= self._auto.rest_s:
+            self._begin()
+
+    def _flush(self) -> None:
+        """Pass the received frames to the background writer, before anything that must be written after them."""
+        if self._writer is not None and self._received:
+            self._writer.add_frames(self._received, self._receiver.toy_ms)
+        self._received = []
+
+    def _gap(self, gap: dict[str, Any]) -> None:
+        """Store a gap of the stream with the session and the recording, and report it."""
+        (self._log_step if self._take is not None else self._log)("gap", **gap)
+        if self._take is not None:
+            self._take.gaps.append(gap | {"after_row": len(self._take.frames)})
+        if gap["missing_ms"] >= 1000.0 * AWAY_S:
+            message = f"The toy was away for {gap['missing_ms'] / 1000.0:.1f} s"
+            if self._state == "countdown":
+                self._cancel(f"{message}: press space again.")
+            elif self._state == "recording":
+                self._show_message(f"{message}: this recording has a hole; r makes it again.")
+            else:
+                self._show_message(f"{message}.")
+
+    # Writing --------------------------------------------------------------------------------------------------
+
+    def _save(self, take: RecordingTake, ended: Ended, counters: Counters) -> None:
+        """Save one recording (in the background writer's thread), then go to the next step."""
+        key = key_of(take.step)
+        with self._changed:
+            saved_ms = self._receiver.now_ms()
+            earlier = self._plan.takes.get(key, "")
+        more = {"device": self.device.url, "speed": self._speed, "software": self._software}
+        file, message = store_take(self.session, take, counters, ended, saved_ms, earlier, **more)
+        with self._notifying():
+            self._plan.record(key, file)
+            self._changes.append("take")
+            self._advance(message)
+
+    def _wait_for_descriptor(self) -> None:
+        with self._notifying():
+            self._show_message(
+                "Too many files are open on this computer: saving waits until some are closed. Nothing is lost."
+            )
+
+    def _fail(self, cause: Exception) -> None:
+        with contextlib.suppress(OSError):
+            self.session.log.write([SessionEvent("failed", now_ms(), {"why": str(cause)})])
+        with self._notifying():
+            self._failed = str(write_error(self.session, len(self._plan.takes), cause))
+            self._closing = True
+            self._take = None
+            self._enter("stopped", self._failed)

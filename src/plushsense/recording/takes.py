@@ -1,0 +1,299 @@
+"""Receive a toy's frames: time stamps, signal quality, losses and gaps."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from plushsense.core.layouts import Layout
+from plushsense.core.recorder_csv import Frames
+from plushsense.devices.base import Counters, Device, Frame, LossCounter, now_ms
+from plushsense.recording.plan import Step
+from plushsense.recording.session_files import FORMAT_VERSION, SessionHead
+
+SPAN_MS = 2_000
+LOSS_SPAN_MS = 10_000
+SILENT_S = 1.0
+FAIR, POOR = 0.005, 0.05
+RATE_OFF = 0.2
+_READINGS = 4096
+
+SIGNAL = {
+    "good": "almost nothing is lost",
+    "fair": "over 0.5 % of the lines of the last 10 s were lost, malformed or out of range",
+    "poor": "over 5 % were, or the rate is over 20 % off, or the toy's clock stands still",
+    "none": "no frame arrived for a second, or the toy is disconnected",
+    "unreadable": "lines arrive, but none of them is a frame of the layout",
+}
+
+
+@dataclass(frozen=True)
+class SignalQuality:
+    """The signal quality of the last seconds.
+
+    ``rate_hz`` in frames a second; ``jitter_ms`` is the standard deviation of the time between frames, ``signal`` a
+    key of `SIGNAL`, ``bad_share`` the share of lines that were lost, malformed or out of range.
+    """
+
+    rate_hz: float = 0.0
+    jitter_ms: float = 0.0
+    signal: str = "none"
+    bad_share: float = 0.0
+
+
+class SignalMonitor:
+    """Measure rate, jitter and losses of a stream of frames."""
+
+    def __init__(self, layout: Layout, silent_s: float = SILENT_S) -> None:
+        self._rate_hz = layout.rate_hz
+        self._silent_s = silent_s
+        # Limited by count, too: a clock that stands still never leaves the time span.
+        self._clock: deque[int] = deque(maxlen=max(64, round(2 * layout.rate_hz * SPAN_MS / 1000)))
+        self._losses: deque[tuple[int, int, int]] = deque(maxlen=_READINGS)
+        self._last_read_s = float("-inf")
+
+    def push(self, device_ms: int) -> None:
+        """Add a frame; start again after a clock that went back, or after a pause."""
+        clock = self._clock
+        if clock and not 0 <= device_ms - clock[-1] <= SPAN_MS:
+            clock.clear()
+            self._losses.clear()
+        clock.append(device_ms)
+        while device_ms - clock[0] > SPAN_MS:
+            clock.popleft()
+
+    def update_losses(self, counters: Counters, at_s: float) -> None:
+        """Store the counters after a reading at ``at_s`` of a monotonic clock."""
+        self._last_read_s = at_s
+        if self._clock:
+            now = self._clock[-1]
+            self._losses.append((now, counters.frames, counters.lost + counters.malformed + counters.garbage))
+            while now - self._losses[0][0] > LOSS_SPAN_MS:
+                self._losses.popleft()
+
+    def quality(self, at_s: float, away: bool = False) -> SignalQuality:
+        """Return the signal quality at this moment of the monotonic clock."""
+        if away or at_s - self._last_read_s > self._silent_s or len(self._clock) < 3:
+            return SignalQuality()
+        steps = np.diff(np.array(self._clock))
+        passed = float(steps.sum())
+        rate = 1000.0 * len(steps) / passed if passed > 0 else 0.0
+        frames, bad = (b - a for a, b in zip(self._losses[0][1:], self._losses[-1][1:], strict=True))
+        share = bad / max(1, frames + bad)
+        stands = passed <= 0 and len(steps) > self._rate_hz
+        off = stands or (passed > SPAN_MS / 2 and abs(rate - self._rate_hz) > RATE_OFF * self._rate_hz)
+        word = "poor" if share > POOR or off else "fair" if share > FAIR else "good"
+        return SignalQuality(round(rate, 1), round(float(steps.std()), 2), word, share)
+
+
+Ended = Literal["space", "auto", "longest", "toy", "cut"]
+"""Why a recording ended: the space bar, automatic recording (--auto), the protocol's longest_s, the end of the toy's
+data, or ("cut") it was cut out of a longer stream afterwards."""
+
+
+@dataclass
+class RecordingTake:
+    """A recording in progress.
+
+    Attributes:
+        row: row of the session's stream at which it begins.
+        from_s: the computer's monotonic clock at its first row.
+        before: the counters at that time; malformed lines since then belong to this recording.
+        lost: frames that are missing between its rows.
+        gaps: see `gap_entry`.
+    """
+
+    step: Step
+    row: int
+    from_s: float
+    before: Counters
+    frames: list[Frame] = field(default_factory=list)
+    lost: int = 0
+    gaps: list[dict[str, Any]] = field(default_factory=list)
+
+
+def gap_entry(rows: int, last: Frame, now: Frame | None, missing_ms: float, reason: str) -> dict[str, Any]:
+    """Return the description of a gap: rows before it, both clocks before and after it, length and reason."""
+    return {
+        "after_row": rows,
+        "device_ms": [last.device_ms, now.device_ms if now else None],
+        "host_ms": [last.host_ms, now.host_ms if now else None],
+        "missing_ms": round(missing_ms),
+        "reason": reason,
+    }
+
+
+def measured_rate_hz(device_ms: Any) -> float:
+    """Return the frames per second by the toy's clock, without gaps; 0 when it is unknown."""
+    steps = np.diff(device_ms)
+    even = steps[(steps >= 0) & (steps <= 1000)]
+    return round(1000.0 * len(even) / float(even.sum()), 2) if even.sum() > 0 else 0.0
+
+
+def sidecar(
+    take: RecordingTake,
+    frames: Frames,
+    layout: Layout,
+    head: SessionHead,
+    counters: Counters,
+    ended: Ended,
+    **more: Any,
+) -> dict[str, Any]:
+    """Return the metadata file of a recording: subject, gesture, clocks, device and transmission faults."""
+    assert frames.host_ms is not None
+    outside = (frames.values < layout.valid_min_int) | (frames.values > layout.valid_max_int)
+    step = take.step
+    return {
+        "format": FORMAT_VERSION,
+        "subject": head.subject,
+        "session": head.session,
+        "gesture": step.gesture,
+        "repetition": step.repetition,
+        "prompt": step.prompt,
+        "protocol": head.protocol["name"],
+        "words": head.protocol["words"],
+        "rows": len(frames),
+        "stream_row": take.row,
+        "device_ms": [int(frames.device_ms[0]), int(frames.device_ms[-1])],
+        "host_ms": [int(frames.host_ms[0]), int(frames.host_ms[-1])],
+        "rate_hz": measured_rate_hz(frames.device_ms),
+        "lost": take.lost,
+        "malformed": counters.malformed - take.before.malformed,
+        "garbage": int(outside.any(axis=1).sum()),
+        "reconnects": counters.reconnects - take.before.reconnects,
+        "gaps": take.gaps,
+        "ended": ended,
+        "auto_stopped": ended == "longest",
+        "layout": layout.name,
+        "wire": list(layout.wire),
+        "device": head.device,
+        "simulated": head.simulated,
+    } | more
+
+
+AWAY_S = 1.0
+"""A toy that sends nothing for this long is disconnected; the user is informed."""
+
+JUMP_MS = 1000
+"""A toy's clock that advances by this much more than the elapsed time was misread or set: the step is not counted."""
+
+
+class ReceivedFrame(NamedTuple):
+    """A frame as it is written to the files, the number of frames missing before it, and the gap if there is one."""
+
+    frame: Frame
+    missing: int
+    gap: dict[str, Any] | None
+
+
+class FrameReceiver:
+    """Time-stamp a toy's frames and track its clock, losses and gaps. Not thread-safe: the recorder's lock guards it.
+
+    Attributes:
+        rows: rows of the session's stream.
+        toy_ms: time during which the toy has sent frames, by its own clock. Gaps count, the time goes on when the clock
+            restarts, and an impossible time stamp does not end a countdown or a recording.
+        last: the newest frame.
+        lost: frames that are missing by the toy's clock.
+        gaps: gaps, with ``after_row`` in rows of the stream.
+    """
+
+    def __init__(self, device: Device, layout: Layout, speed: float, rows: int, host_ms: int) -> None:
+        """Continue a stream of ``rows`` rows that ends at ``host_ms``; ``speed`` is that of the `Recorder`."""
+        self.rows = rows
+        self.toy_ms = 0.0
+        self.last: Frame | None = None
+        self.lost = 0
+        self.gaps: list[dict[str, Any]] = []
+        self._device = device
+        self._layout = layout
+        self._real = speed == 1.0
+        self._base_ms = now_ms() if self._real else max(now_ms(), host_ms + 1000)
+        self._last_read_s = float("-inf")
+        self._reconnects = device.counters.reconnects
+        self._last_malformed_s = float("-inf")
+        self._malformed = device.counters.malformed
+        self._loss = LossCounter()
+        self._monitor = SignalMonitor(layout, AWAY_S)
+
+    @property
+    def away(self) -> bool:
+        """Return whether the connection was lost and is being restored."""
+        return getattr(self._device, "state", "connected") == "waiting"
+
+    @property
+    def silent_ms(self) -> float:
+        """Time since the last frame, by the computer's clock."""
+        return 1000.0 * (time.monotonic() - self._last_read_s)
+
+    @property
+    def silent(self) -> bool:
+        """Return whether no frames arrive now."""
+        return self.away or self.silent_ms > 1000.0 * AWAY_S
+
+    def quality(self) -> SignalQuality:
+        """Return the current signal quality."""
+        now_s = time.monotonic()
+        quality = self._monitor.quality(now_s, self.away)
+        if quality.signal == "none" and not self.away and now_s - self._last_malformed_s <= AWAY_S:
+            return SignalQuality(signal="unreadable")
+        return quality
+
+    def now_ms(self) -> int:
+        """Return the current time on the clock of the rows' time stamps."""
+        return now_ms() if self._real else self._base_ms + round(self.toy_ms)
+
+    def receive(self, came: Frame) -> ReceivedFrame:
+        """Time-stamp a frame, count missing frames and detect a gap before it."""
+        last = self.last
+        step_ms = came.device_ms - last.device_ms if last else 0
+        on_host = came.host_ms - last.host_ms if last and self._real else 0
+        possible_ms = self._possible_ms(on_host)
+        odd = not 0 <= step_ms <= possible_ms + JUMP_MS
+        self.toy_ms += max(min(step_ms, possible_ms), on_host, 1000.0 / self._layout.rate_hz) if odd else step_ms
+        host = came.host_ms if self._real else self._base_ms + round(self.toy_ms)
+        frame = Frame(host, came.device_ms, came.values)
+        counted = self._loss.push(came.device_ms)
+        missing = 0 if odd else counted
+        self.lost += missing
+        returned = self._device.counters.reconnects > self._reconnects
+        self._reconnects = self._device.counters.reconnects
+        gap = None
+        if last is not None and (odd or step_ms > self._layout.gap_ms or returned):
+            missing_ms = max(on_host, 0 if odd else step_ms)
+            gap = gap_entry(self.rows, last, frame, missing_ms, self._reason(step_ms, odd, returned))
+            self.gaps.append(gap)
+        self._monitor.push(came.device_ms)
+        self.last = frame
+        self.rows += 1
+        return ReceivedFrame(frame, missing, gap)
+
+    def check_malformed(self) -> None:
+        """Record the time of new malformed lines, which also show that the toy sends something."""
+        if self._device.counters.malformed != self._malformed:
+            self._malformed = self._device.counters.malformed
+            self._last_malformed_s = time.monotonic()
+
+    def end_reading(self) -> None:
+        """Update time and counters after all frames of a reading."""
+        self._last_read_s = time.monotonic()
+        self._monitor.update_losses(self._device.counters, self._last_read_s)
+
+    def _possible_ms(self, on_host: int) -> float:
+        """Return how far the toy's clock can have advanced since the last reading, by the computer's clocks."""
+        if not self._real or math.isinf(self._last_read_s):
+            return math.inf
+        return max(on_host, self.silent_ms)
+
+    def _reason(self, step_ms: int, odd: bool, returned: bool) -> str:
+        if returned:
+            known = [gap.reason for gap in getattr(self._device, "gaps", ())]
+            return known[-1] if known and known[-1] else "the toy was away and came back"
+        if odd:
+            return "the toy's clock began anew" if step_ms < 0 else "the toy's clock jumped"
+        return "nothing came"

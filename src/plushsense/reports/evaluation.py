@@ -1,0 +1,378 @@
+"""The report of evaluations: protocol, scores, people, gestures, confusions, training curves and model cards."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from plushsense.reports import wording
+from plushsense.reports.figures import data_uri, row_shares, shade, training_curves
+from plushsense.reports.page import check_page_path, render_page, write_page
+from plushsense.reports.table import DASH, Column, Table, count, interval, mean_sd, number, text
+from plushsense.scoring.metrics import METRICS, column_metrics
+
+AFFECT_MARKS = {"positive": "+ positive", "neutral": "o neutral", "negative": "− negative", "none": "none"}
+
+
+def write_evaluation_report(
+    path: str | Path,
+    *,
+    title: str,
+    dataset: Mapping[str, Any],
+    evaluations: Sequence[Mapping[str, Any]],
+    models: Sequence[Mapping[str, Any]],
+    simulated: bool,
+) -> Path:
+    """Write one self-contained HTML report and return its path; an older report is replaced in one step.
+
+    Args:
+        path: the .html file to write; its folder is made.
+        title: the heading of the page.
+        dataset: name, subjects, recordings, gestures, streams, layout, licence, hash, warnings (numbers or
+            lists).
+        evaluations: ``Evaluation.to_dict()`` each; ``title`` and ``model`` may be added to name it, ``simulated``
+            and ``dataset`` (name, hash) to say what it was made on.
+        models: one model card each (symbol, filters, …, provenance); ``title`` may be added.
+        simulated: whether the data set is a simulation. It, or any evaluation or model that says so, puts a
+            banner on top; every table of simulated scores is marked.
+
+    Every key may be missing: the report prints a dash. All texts are escaped.
+
+    Raises:
+        ConfigError: when the file cannot be written, or exists and is no report.
+        MissingExtraError: when jinja2 or matplotlib is not installed.
+    """
+    target = check_page_path(path)
+    page = render(title=title, dataset=dataset, evaluations=evaluations, models=models, simulated=simulated)
+    return write_page(target, page)
+
+
+def render(
+    *,
+    title: str,
+    dataset: Mapping[str, Any],
+    evaluations: Sequence[Mapping[str, Any]],
+    models: Sequence[Mapping[str, Any]],
+    simulated: bool,
+) -> str:
+    """Return the report as one HTML text; arguments as for `write_evaluation_report`."""
+    named = [
+        {
+            **evaluation,
+            "title": wording.evaluation_title(evaluation),
+            "simulated": wording.is_simulated(evaluation, simulated),
+            "foreign": wording.describe_other_data(evaluation, dataset),
+        }
+        for evaluation in evaluations
+    ]
+    cards = [_model(model) for model in models]
+    # Where all scores are simulated, one banner says so; otherwise every simulated row bears a mark.
+    wholly = simulated and all(evaluation["simulated"] for evaluation in named)
+    any_simulated = simulated or any(part["simulated"] for part in (*named, *cards))
+    return render_page(
+        "report.html.j2",
+        title=title,
+        simulated=any_simulated,
+        wholly_simulated=wholly,
+        simulated_title=wording.SIMULATED_TITLE if wholly else wording.PARTLY_SIMULATED_TITLE,
+        simulated_words=wording.SIMULATED_WORDS if wholly else wording.PARTLY_SIMULATED_WORDS,
+        leaky_words=wording.LEAKY_WORDS,
+        any_leaky=any(evaluation.get("leaky") for evaluation in named),
+        dataset=dataset_rows(dataset),
+        metrics=column_metrics(),
+        comparison=comparison_rows(named),
+        subjects=subject_rows(named),
+        evaluations=[_evaluation(f"E{i}", evaluation) for i, evaluation in enumerate(named, start=1)],
+        models=cards,
+    )
+
+
+def _evaluation(key: str, evaluation: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of one evaluation in the template."""
+    nobody = evaluation.get("nobody")
+    histories = [history for history in evaluation.get("histories") or () if history]
+    return {
+        "key": key,
+        "title": evaluation["title"],
+        "leaky": bool(evaluation.get("leaky")),
+        "simulated": bool(evaluation["simulated"]),
+        "foreign": evaluation["foreign"],
+        "protocol": wording.describe_protocol(evaluation),
+        "spread": wording.describe_spread(evaluation),
+        "metrics": metric_table(evaluation),
+        "contexts": context_table(evaluation),
+        "deployed": deployed_values(evaluation),
+        "nobody": None
+        if not nobody
+        else {name: count(nobody.get(name)) for name in ("recordings", "windows")}
+        | {"accuracy": number(nobody.get("accuracy"))},
+        "classes": class_rows(evaluation),
+        "confusions": [
+            (name, table)
+            for name, table in (
+                ("by gesture", confusion_rows(evaluation.get("confusion"))),
+                ("by affect", confusion_rows(evaluation.get("confusion_affect"))),
+            )
+            if table and len(table["labels"]) > 1
+        ],
+        "curves": data_uri(training_curves(histories)) if histories else None,
+        "predictions": evaluation.get("predictions"),
+    }
+
+
+def _model(model: Mapping[str, Any]) -> dict[str, Any]:
+    symbol, filters = text(model.get("symbol")), text(model.get("filters"))
+    return {
+        "title": str(model.get("title") or f"{symbol}, filters {filters}"),
+        "rows": model_rows(model),
+        "simulated": (model.get("provenance") or {}).get("simulated") is True,
+        "streams": model.get("padding") == "stream",
+        "padding": text(model.get("padding")),
+    }
+
+
+def comparison_rows(evaluations: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return one row for each evaluation: contexts and scores."""
+    rows = []
+    for i, evaluation in enumerate(evaluations, start=1):
+        recordings, pooled = evaluation.get("by_recording") or {}, evaluation.get("pooled") or {}
+        rows.append(
+            {
+                "key": f"E{i}",
+                "title": evaluation["title"],
+                "leaky": bool(evaluation.get("leaky")),
+                "split": text(evaluation.get("split")),
+                "trained": text(evaluation.get("train_context") or evaluation.get("context")),
+                "scored": text(evaluation.get("context")),
+                "scores": [(mean_sd(evaluation.get(key)), interval(evaluation.get(key))) for key in column_metrics()],
+                "recording": number(recordings.get("accuracy")),
+                "pooled": number(pooled.get("accuracy")),
+                "over": wording.count_of(evaluation, wording.averaged_over(evaluation)),
+                "simulated": bool(evaluation.get("simulated")),
+                "foreign": bool(evaluation.get("foreign")),
+            }
+        )
+    return rows
+
+
+def metric_table(evaluation: Mapping[str, Any]) -> Table:
+    """Return one row for each metric; the mean over all classes, as the paper has it, is always over folds."""
+    names = {key: f"{m.title} ({m.note})" if m.note else m.title for key, m in METRICS.items()}
+    folds = wording.count_of(evaluation, "folds")
+    names["macro_f1_all_classes"] = f"Macro-F1, all classes (as the paper), over {folds}"
+    pooled, recordings = evaluation.get("pooled") or {}, evaluation.get("by_recording") or {}
+    columns = (
+        Column("name", "Metric"),
+        Column("mean_sd", "Mean ± sd\nby windows", "right"),
+        Column("interval", "95 % interval\nof the mean", "right"),
+        Column("pooled", "Pooled\nwindows", "share"),
+        Column("by_recording", "Vote by\nrecording", "share"),
+    )
+    rows = tuple(
+        {
+            "name": name,
+            "mean_sd": mean_sd(evaluation.get(key)),
+            "interval": interval(evaluation.get(key)),
+            "pooled": pooled.get(key),
+            "by_recording": recordings.get(key),
+        }
+        for key, name in names.items()
+        if evaluation.get(key) is not None or pooled.get(key) is not None
+    )
+    return Table("metrics", "Scores", columns, rows)
+
+
+def context_table(evaluation: Mapping[str, Any]) -> Table | None:
+    """Return one row for each kind of context among the scored windows; None where it is not known."""
+    columns = (
+        Column("context", "Context of the window"),
+        Column("windows", "Windows", "count"),
+        Column("recordings", "Recordings", "count"),
+        Column("accuracy", "Accuracy", "share"),
+    )
+    rows = tuple(
+        {**row, "context": f"{name} – {wording.CONTEXT_WORDS[name]}" if name in wording.CONTEXT_WORDS else str(name)}
+        for name, row in (evaluation.get("by_context") or {}).items()
+    )
+    return Table("contexts", "By context", columns, rows) if rows else None
+
+
+def deployed_values(evaluation: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return the scores of the 8-bit networks, means and a table by person or fold; None where not evaluated."""
+    found = evaluation.get("int8")
+    if not isinstance(found, Mapping):
+        return None
+    unit = "subject" if found.get("over") == "subjects" else "fold"
+    columns = (
+        Column(unit, "Person" if unit == "subject" else "Fold"),
+        *(
+            Column(f"{key}{part}", f"{metric.title}\n{engine}", "share")
+            for key, metric in column_metrics().items()
+            for part, engine in (("", "float"), ("_int8", "8 bits"))
+        ),
+        Column("macro_f1_loss", "Macro-F1\nlost", "share"),
+        Column("agreement", "Same\nanswer", "share"),
+    )
+    loss = found.get("loss") or {}
+    return {
+        "table": Table("deployed", "Deployed in 8 bits", columns, tuple(found["rows"])),
+        "macro_f1": mean_sd(found.get("macro_f1")),
+        "loss": mean_sd(loss.get("macro_f1")),
+        "interval": interval(loss.get("macro_f1")),
+        "agreement": number(found.get("agreement")),
+    }
+
+
+def subject_rows(evaluations: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return one row for each person with the scores in each evaluation; dashes where one lacks the person."""
+    tables = [{str(row.get("subject")): row for row in evaluation.get("subjects") or []} for evaluation in evaluations]
+    names = sorted({name for table in tables for name in table}, key=_natural)
+    return [
+        {
+            "subject": name,
+            "cells": [
+                {key: number(table.get(name, {}).get(key), 2) for key in (*column_metrics(), "by_recording_accuracy")}
+                for table in tables
+            ],
+        }
+        for name in names
+    ]
+
+
+def _natural(name: str) -> tuple[tuple[int, int, str], ...]:
+    """Return a sort key that puts P2 before P10."""
+    pieces: list[str] = []
+    for letter in name:
+        if pieces and pieces[-1][-1].isdecimal() == letter.isdecimal():
+            pieces[-1] += letter
+        else:
+            pieces.append(letter)
+    return tuple((0, int(p), "") if p.isdecimal() else (1, 0, p) for p in pieces)
+
+
+def class_rows(evaluation: Mapping[str, Any]) -> list[dict[str, str]]:
+    """Return one row for each gesture: affect, precision, recall, F1, windows."""
+    return [
+        {
+            "label": text(row.get("label")),
+            "affect": AFFECT_MARKS.get(str(row.get("affect")), text(row.get("affect"))),
+            "precision": number(row.get("precision")),
+            "recall": number(row.get("recall")),
+            "f1": number(row.get("f1")),
+            "bar": f"{100 * row['f1']:.0f}" if number(row.get("f1")) != DASH else "0",
+            "support": count(row.get("support")),
+        }
+        for row in evaluation.get("per_class") or []
+    ]
+
+
+def confusion_rows(confusion: Any) -> dict[str, Any] | None:
+    """Return a confusion matrix ({labels, counts}) as rows of cells with count, percent and shade; None without one."""
+    if not isinstance(confusion, Mapping) or not confusion.get("labels"):
+        return None
+    labels = [str(label) for label in confusion["labels"]]
+    counts = np.asarray(confusion["counts"])
+    if counts.shape != (len(labels), len(labels)):
+        return None
+    rows = []
+    for i, share in enumerate(row_shares(counts)):
+        cells = []
+        for j, part in enumerate(share):
+            background, ink = shade(float(part))
+            title = f"{labels[i]} read as {labels[j]}: {int(counts[i, j])} windows, {100 * part:.1f} %"
+            cells.append(
+                {
+                    "count": count(int(counts[i, j])) if counts[i, j] else "·",
+                    "percent": f"{100 * part:.0f}" if part >= 0.005 else "<1",
+                    "bg": background,
+                    "ink": ink,
+                    "right": i == j,
+                    "title": title,
+                }
+            )
+        rows.append({"label": labels[i], "cells": cells, "total": count(int(counts[i].sum()))})
+    return {"labels": labels, "rows": rows}
+
+
+def dataset_rows(dataset: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return the data set as (name, value) pairs: the known keys in order, then the others as they are."""
+    gestures = dataset.get("gestures")
+    named = f" ({text(gestures)})" if isinstance(gestures, Sequence) and not isinstance(gestures, str) else ""
+    rows = [
+        ("Name", text(dataset.get("name"))),
+        ("People", count(dataset.get("subjects", dataset.get("people")))),
+        ("Recordings", count(dataset.get("recordings"))),
+        ("Gestures", count(gestures) + named),
+        ("Session streams", count(dataset.get("streams"))),
+        ("Layout", text(dataset.get("layout"))),
+        ("Licence", text(dataset.get("licence"))),
+        ("Hash (SHA-256)", text(dataset.get("hash"))),
+        ("Warnings at import", count(dataset.get("warnings"))),
+    ]
+    known = {"name", "subjects", "people", "recordings", "gestures", "streams"}
+    known |= {"layout", "licence", "hash", "warnings"}
+    return rows + [
+        (key.replace("_", " ").capitalize(), text(value)) for key, value in dataset.items() if key not in known
+    ]
+
+
+def model_rows(model: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return the card of a model as (name, value) pairs; a missing value is a dash."""
+    rate = model.get("rate_hz")
+
+    def samples(key: str) -> str:
+        value = model.get(key)
+        if count(value) == DASH:
+            return DASH
+        seconds = f" = {value / rate:.2f} s" if isinstance(rate, int | float) and rate > 0 and value is not None else ""
+        return f"{count(value, 'samples')}{seconds}"
+
+    sampled = f" at {rate:g} Hz" if isinstance(rate, int | float) else ""
+    provenance: Mapping[str, Any] = model.get("provenance") or {}
+    state = model.get("state_bytes_int8")
+    rows = [
+        ("Symbol", text(model.get("symbol"))),
+        ("Filters", text(model.get("filters"))),
+        ("Padding", text(model.get("padding"))),
+        ("Normalisation", text(model.get("norm"))),
+        ("Parameters", count(model.get("parameters"))),
+        ("Input", count(model.get("channels"), "channels") + sampled),
+        ("Classes", count(model.get("classes"))),
+        ("Receptive field", samples("receptive_field")),
+        ("Pooling", samples("pool")),
+        ("Span (past a decision sees)", samples("span")),
+        ("Multiply-accumulates a window", count(model.get("macs_per_window"))),
+        ("Multiply-accumulates a step", count(model.get("macs_per_step"))),
+        ("State on the chip (int8)", count(state, "bytes") if state else DASH),
+    ]
+    return rows + [
+        (_PROVENANCE.get(key, key.replace("_", " ").capitalize()), _provenance(provenance.get(key)))
+        for key in _provenance_keys(provenance)
+    ]
+
+
+_PROVENANCE = {
+    "dataset": "Trained on",
+    "dataset_hash": "Data hash",
+    "data_hash": "Data hash",
+    "subjects": "Training people",
+    "preset": "Training preset",
+    "code_version": "Code version",
+}
+
+
+def _provenance_keys(provenance: Mapping[str, Any]) -> list[str]:
+    """Return provenance keys: the known ones first (data, people, preset, code), then the others as they are."""
+    hash_key = "data_hash" if "data_hash" in provenance else "dataset_hash"
+    first = ["dataset", hash_key, "subjects", "preset", "code_version"]
+    return first + [key for key in provenance if key not in first and key != "scores"]
+
+
+def _provenance(value: Any) -> str:
+    if isinstance(value, Iterable) and not isinstance(value, str | Mapping):
+        items = [text(item) for item in value]
+        return f"{len(items)}: {', '.join(items)}" if items else DASH
+    return text(value)

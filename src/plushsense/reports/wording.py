@@ -1,0 +1,191 @@
+"""Sentences that several reports share: splits, contexts, spread, leaks and simulations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from plushsense.reports.table import DASH, count, text
+
+CONTEXT_WORDS = {
+    "stream": "real context: what the session's stream held before the gesture",
+    "loop": "looped windows: a short recording repeated until the window is full, which no toy ever sends",
+    "inside": "windows that lie wholly inside a recording",
+}
+CONTEXT_SHORT = {"stream": "real context", "loop": "loops", "inside": "windows inside the recording"}
+
+_NO_LEAK = "No training or validation window overlaps a recording that is scored."
+_PEOPLE_VALIDATE = "Whole other people validate{role}; in that fold they are neither trained on nor scored."
+# Of each kind of split: how the data are divided, and who validates.
+_SPLITS = {
+    "leave-one-subject-out": (
+        "Leave one subject out: each person in turn is held out, and the network is trained anew on the "
+        "others; it never saw the person it is scored on.",
+        _PEOPLE_VALIDATE,
+    ),
+    "by-subject": (
+        "By subject, {k} folds: the people are dealt into groups; each group in turn is held out whole, and "
+        "the network never saw the people it is scored on.",
+        _PEOPLE_VALIDATE,
+    ),
+    "by-recording": (
+        "By recording, {k} folds: each recording stands whole on one side, but the people are known: other "
+        "recordings of the same person are trained on. It answers how well the network reads people it was "
+        "trained for.",
+        "Other recordings validate{role}.",
+    ),
+    "windows": (
+        "Random windows, {k} folds: windows are dealt at random, without regard to recording or person.",
+        "Other random windows validate{role}.",
+    ),
+    "holdout": (
+        "Hold-out, as in the paper: windows are dealt at random, even over the gestures: 70 % train, 15 % validate, "
+        "15 % are scored, without regard to recording or person.",
+        "Other random windows validate{role}.",
+    ),
+}
+_ROLES = {
+    True: " (they decide when training stops)",
+    False: " (they are only watched: training runs its full length)",
+    None: "",
+}
+
+LEAKY_WORDS = (
+    "Windows of the same recording, which overlap, and recordings of the same person stand on both sides of "
+    "the split. The figures tell how well the network recognises what it has partly seen; they say little "
+    "about a person it never met, and cannot be compared with a split by person."
+)
+SIMULATED_TITLE = "These scores are of a simulation."
+SIMULATED_RECORDINGS_TITLE = "These recordings are of a simulation."
+SIMULATED_WORDS = "They were made on a virtual toy with virtual people and say nothing about a real toy."
+PARTLY_SIMULATED_TITLE = "A part of this page is of a simulation."
+PARTLY_SIMULATED_WORDS = (
+    "What bears the mark SIMULATION was made on a virtual toy with virtual people and says nothing about a real toy."
+)
+# Splits by person, for evaluations that do not say what their mean is taken over.
+_SPLITS_BY_PERSON = ("leave-one-subject-out", "by-subject")
+
+
+def describe_split(split: str, folds: int | None = None, decides: bool | None = None) -> tuple[str, str]:
+    """Return two sentences: how the data were divided, and who validates. An unknown split is quoted.
+
+    ``decides``: whether validation ends the training (True) or is only watched (False); None: not known.
+    """
+    kind, _, given_folds = split.partition(":")
+    if split == "windows:holdout":
+        kind = "holdout"
+    if kind not in _SPLITS:
+        return f"Split “{split}”.", "Who validates is not recorded."
+    how, who = _SPLITS[kind]
+    k = given_folds or (str(folds) if folds else "several")
+    return how.format(k=k), who.format(role=_ROLES[decides])
+
+
+def describe_contexts(evaluation: Mapping[str, Any]) -> tuple[str, str]:
+    """Return what came before the gesture in training and in scoring, as two texts."""
+    scored = evaluation.get("context")
+    trained = evaluation.get("train_context") or scored
+    return CONTEXT_WORDS.get(str(trained), text(trained)), CONTEXT_WORDS.get(str(scored), text(scored))
+
+
+def describe_protocol(evaluation: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return the protocol of an evaluation as (question, answer) pairs."""
+    folds = evaluation.get("folds") or []
+    how, who = describe_split(
+        str(evaluation.get("split", DASH)), len(folds) or None, evaluation.get("validation_decides")
+    )
+    trained, scored = describe_contexts(evaluation)
+    seeds = evaluation.get("seeds")
+    runs = f"{len(seeds)} runs averaged" if isinstance(seeds, list) and len(seeds) > 1 else "one run"
+    sizes = [fold.get("test_windows") for fold in folds if isinstance(fold.get("test_windows"), int)]
+    answers = [
+        ("Split", how),
+        ("Who validates", who),
+        ("Trained on", trained),
+        ("Scored on", scored),
+        ("Seeds", f"{text(seeds)} ({runs})"),
+        ("Folds", count(folds) + (f", {count(sum(sizes))} windows scored" if sizes else "")),
+    ]
+    if evaluation.get("nobody"):
+        rest = "Recordings of nobody (at rest) are spread over the folds by recording and reported apart."
+        answers.append(("At rest", rest))
+    if not evaluation.get("leaky"):
+        answers.insert(2, ("Leak", _NO_LEAK))
+    return answers
+
+
+def averaged_over(evaluation: Mapping[str, Any]) -> str:
+    """Return "subjects" or "folds": what the means of an evaluation have one value each of."""
+    stored = evaluation.get("over")
+    if stored in ("subjects", "folds"):
+        return str(stored)
+    return "subjects" if str(evaluation.get("split")).partition(":")[0] in _SPLITS_BY_PERSON else "folds"
+
+
+def count_of(evaluation: Mapping[str, Any], units: str) -> str:
+    """Return the number of ``units`` ("subjects" or "folds") of an evaluation: "25 people", "1 fold"."""
+    n = len(evaluation.get(units) or [])
+    one, many = ("person", "people") if units == "subjects" else ("fold", "folds")
+    return f"{n or 'the'} {one if n == 1 else many}"
+
+
+def describe_spread(evaluation: Mapping[str, Any]) -> str:
+    """Return what mean, deviation and interval are taken over, and how far the interval can be trusted."""
+    units = averaged_over(evaluation)
+    number = count_of(evaluation, units)
+    pooled = "Pooled: over all windows at once."
+    if len(evaluation.get(units) or []) == 1:
+        return f"Of {number}: there is no spread and no interval. {pooled}"
+    sentences = (
+        f"Mean ± standard deviation over {number}; the 95 % interval is of the mean (percentile bootstrap over "
+        f"{'people' if units == 'subjects' else 'folds'}). {pooled}"
+    )
+    if units == "folds":
+        sentences += (
+            f" These are folds, not people: an interval over so few ({number}), which share most of what they were "
+            "trained on, is too narrow, and says nothing about another person."
+        )
+    return sentences
+
+
+def describe_runs(trials: Sequence[Mapping[str, Any]]) -> str:
+    """Return the seeds and folds that the scores of a sweep's trials are means of."""
+    seeds, folds = (max((int(t.get(key) or 1) for t in trials), default=1) for key in ("seeds", "folds"))
+    if seeds * folds == 1:
+        return "one seed, no spread"
+    if seeds == 1:
+        return f"one seed, mean of {folds} folds"
+    return f"mean of {seeds} seeds" + (f" × {folds} folds" if folds > 1 else "")
+
+
+def is_simulated(evaluation: Mapping[str, Any], default: bool) -> bool:
+    """Return whether an evaluation's scores are of a simulation; ``default`` where it does not say."""
+    for table in (evaluation, evaluation.get("dataset")):
+        if isinstance(table, Mapping) and isinstance(table.get("simulated"), bool):
+            return bool(table["simulated"])
+    return default
+
+
+def describe_other_data(evaluation: Mapping[str, Any], dataset: Mapping[str, Any]) -> str | None:
+    """Return a warning for an evaluation of other data than the page's data set; None for the same data."""
+    source = evaluation.get("dataset")
+    theirs, ours = (table.get("hash") if isinstance(table, Mapping) else None for table in (source, dataset))
+    if not theirs or not ours or theirs == ours:
+        return None
+    return (
+        f"This evaluation was made on “{text(source.get('name') if isinstance(source, Mapping) else None)}” with the "
+        f"hash {str(theirs)[:12]}…; the data set of this page has the hash {str(ours)[:12]}…. Its scores are not of "
+        "the data described here."
+    )
+
+
+def evaluation_title(evaluation: Mapping[str, Any]) -> str:
+    """Return the title of an evaluation: its own ``title``, or one of model, split and contexts."""
+    if evaluation.get("title"):
+        return str(evaluation["title"])
+    scored = str(evaluation.get("context", DASH))
+    trained = str(evaluation.get("train_context") or scored)
+    on, of = CONTEXT_SHORT.get(scored, scored), CONTEXT_SHORT.get(trained, trained)
+    context = f"trained and scored on {on}" if trained == scored else f"trained on {of}, scored on {on}"
+    parts = [str(evaluation["model"])] if evaluation.get("model") else []
+    return ", ".join([*parts, str(evaluation.get("split", DASH)), context])

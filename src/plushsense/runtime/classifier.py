@@ -1,0 +1,352 @@
+"""Classify a live stream: frames in, a `Decision` every step out.
+
+A `StreamReader` drives the one `plushsense.runtime.machine.ToyMachine` and puts its moments in words and seconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from plushsense.core.errors import ConfigError
+from plushsense.core.gestures import GestureSet
+from plushsense.core.layouts import Layout
+from plushsense.devices.base import Frame
+from plushsense.models.bundle import Bundle
+from plushsense.runtime.decisions import DecideSpec, Rules
+from plushsense.runtime.events import AFFECTS, ANSWERS, KINDS, NO_GESTURE, ONE, SOURCES, Update
+from plushsense.runtime.fixed import PROBABILITY_BITS, SMOOTH_EXTRA_BITS, smoothing_weight
+from plushsense.runtime.image import IntegerModel
+from plushsense.runtime.machine import FloatLogits, LogitStream, Moment, ToyMachine
+
+_DECIMALS = 4
+_SMOOTH = float(1 << (PROBABILITY_BITS + SMOOTH_EXTRA_BITS))
+
+
+@dataclass(frozen=True, slots=True)
+class GestureEvent:
+    """Change of an event: there is one event for each gesture, with a beginning and an end.
+
+    Attributes:
+        what: ``begun``, ``named`` (its gesture became sure) or ``ended``.
+        number: counts the events of a stream, from 1.
+        affect: ``positive``, ``neutral``, ``negative`` or ``none``.
+        gesture: the label, or None while only the affect is sure.
+        source: who began it: ``gate``, the threshold rules, or ``cnn``, the network.
+        since_s: when it first was the candidate; of an end, when it was first missed.
+        t_s: when it is reported.
+    """
+
+    what: Literal["begun", "named", "ended"]
+    number: int
+    affect: str
+    gesture: str | None
+    source: Literal["cnn", "gate"]
+    since_s: float
+    t_s: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        return {
+            "what": self.what,
+            "number": self.number,
+            "affect": self.affect,
+            "gesture": self.gesture,
+            "source": self.source,
+            "since_s": round(self.since_s, _DECIMALS),
+            "t_s": round(self.t_s, _DECIMALS),
+        }
+
+
+State = Literal["warming", "tracking", "no signal", "sensor fault"]
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """Decision at one moment of a stream.
+
+    Attributes:
+        t_s: device time of the newest sample it saw, in seconds since the stream's first frame. A gap counts
+            in full; over a reset of the device clock the time goes on where it was.
+        gesture: the best label, sure or not, or None while there is no answer; of the gate, its rule's, or None.
+        affect: ``positive``, ``neutral``, ``negative`` or ``none`` (None while there is no answer).
+        confidence: smoothed probability of the gesture, 0 to 1, or None.
+        source: who decided; ``cnn``, the network, or ``gate``, the threshold rules, between two steps.
+        state: ``warming`` until the span has been seen since the start or a restart; then ``tracking``; ``no signal``
+            when no frame came; ``sensor fault`` when sensors are at fault.
+        probabilities: smoothed probabilities in class order, or None.
+        answer: ``sure`` (of one gesture), ``affect`` (of an affect only), ``unsure``, ``unknown`` (not a known
+            gesture) or ``idle``; None while there is no answer.
+        events: what happened to events at this moment, in order; mostly nothing.
+    """
+
+    t_s: float
+    gesture: str | None
+    affect: str | None
+    confidence: float | None
+    source: Literal["cnn", "gate"]
+    state: State
+    probabilities: tuple[float, ...] | None
+    answer: str | None = None
+    events: tuple[GestureEvent, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the line that ``plushsense live`` prints."""
+        confidence = None if self.confidence is None else round(self.confidence, _DECIMALS)
+        return {
+            "t_s": round(self.t_s, _DECIMALS),
+            "gesture": self.gesture,
+            "affect": self.affect,
+            "confidence": confidence,
+            "source": self.source,
+            "state": self.state,
+            "answer": self.answer,
+            "events": [event.to_dict() for event in self.events],
+        }
+
+
+class StreamReader:
+    """Reads the frames of one toy and decides.
+
+    Decisions come every ``step`` even samples; between them when the gate fires, when the signal was lost, and when
+    sensors fail. A gap beyond the layout's ``gap_ms`` or a reset of the device clock gives ``no signal`` with the first
+    frame after it, at the time of the last one before. In a sensor fault nothing is decided.
+
+    Args:
+        network: reads the inputs; float or integer.
+        layout: of the frames.
+        gestures: in class order.
+        rules: settings of health, gate and events.
+        smoothing: weight of a new step, in steps of 2^-15.
+    """
+
+    def __init__(
+        self, network: LogitStream, layout: Layout, gestures: GestureSet, rules: Rules, smoothing: int
+    ) -> None:
+        self.layout, self.gestures = layout, gestures
+        self.step_s = network.arch.step * layout.period_us / 1e6
+        self._machine = ToyMachine(network, layout, gestures, rules, smoothing)
+        self._silent = False
+
+    @property
+    def restarts(self) -> int:
+        """Number of gaps and clock resets after which everything began again."""
+        return self._machine.frames.restarts
+
+    @property
+    def invalid(self) -> int:
+        """Number of values outside their channel's valid range, replaced by the last valid one."""
+        return self._machine.frames.invalid
+
+    @property
+    def faults(self) -> int:
+        """Number of sensor faults."""
+        return self._machine.frames.faults
+
+    @property
+    def in_event(self) -> bool:
+        """Whether an event is going on."""
+        return self._machine.samples.in_event
+
+    @property
+    def time_s(self) -> float:
+        """Device time of the newest frame, in seconds since the first frame of the stream."""
+        return self._machine.frames.time_us / 1e6
+
+    def reset(self) -> None:
+        """Begin a new stream at time 0, with every count at 0."""
+        self._machine.reset()
+        self._silent = False
+
+    def silence(self) -> Decision:
+        """End the event that is going on: no frame came for a while.
+
+        The next frame goes on, or restarts after a gap.
+        """
+        self._silent = True
+        return self._decision(self._machine.silence())
+
+    def push(self, frame: Frame) -> list[Decision]:
+        """Read one frame; return the decisions, mostly none or one, that it completes."""
+        silent, self._silent = self._silent, False
+        decisions = [
+            self._decision(moment)
+            for moment in self._machine.push(frame.device_ms, frame.values)
+            if not (silent and moment.cause == "no signal")  # it was reported by `silence`
+        ]
+        if silent and not decisions and self._machine.frames.fault:
+            decisions.append(Decision(self.time_s, None, None, None, "cnn", "sensor fault", None))
+        return decisions
+
+    def _decision(self, moment: Moment) -> Decision:
+        t_s, labels = moment.time_us / 1e6, self.gestures.labels
+        events = events_of(moment.updates, self.gestures)
+        if moment.cause in ("no signal", "sensor fault"):
+            return Decision(t_s, None, None, None, "cnn", moment.cause, None, None, events)
+        if moment.rule is not None:
+            gesture = None if moment.rule.gesture == NO_GESTURE else labels[moment.rule.gesture]
+            state: State = "warming" if self._machine.samples.warming else "tracking"
+            return Decision(t_s, gesture, AFFECTS[moment.rule.affect], None, "gate", state, None, None, events)
+        answer = moment.answer
+        if answer is None or moment.smoothed is None:
+            return Decision(t_s, None, None, None, "cnn", "warming", None, None, events)
+        return Decision(
+            t_s,
+            labels[answer.best],
+            self.gestures.affects[answer.best],
+            answer.share / ONE,
+            "cnn",
+            "tracking",
+            tuple((moment.smoothed / _SMOOTH).tolist()),
+            ANSWERS[answer.kind],
+            events,
+        )
+
+
+def events_of(updates: Iterable[Update], gestures: GestureSet) -> tuple[GestureEvent, ...]:
+    """Return updates with times in microseconds as events with labels and seconds."""
+    return tuple(
+        GestureEvent(
+            KINDS[u.kind],
+            u.number,
+            AFFECTS[u.affect],
+            None if u.gesture == NO_GESTURE else gestures.labels[u.gesture],
+            SOURCES[u.source],
+            u.since / 1e6,
+            u.now / 1e6,
+        )
+        for u in updates
+    )
+
+
+class StreamClassifier(StreamReader):
+    """Classifies the frames of one toy by the float network of a bundle.
+
+    Works with every padding; ``mirror`` and ``causal`` compute the whole window anew at each step. Confidence,
+    probabilities and events come from its logits rounded to steps of 1/256, and are smoothed as in the toy.
+
+    Args:
+        bundle: the model.
+        decide: how decisions are made; the bundle's own settings when left out.
+    """
+
+    def __init__(self, bundle: Bundle, decide: DecideSpec | None = None) -> None:
+        self.bundle = bundle
+        self.spec = decide or DecideSpec.from_dict(bundle.decision)
+        step_s = bundle.arch.step * bundle.layout.period_us / 1e6
+        weight = smoothing_weight(self.spec.smoothing_s, step_s)
+        super().__init__(FloatLogits(bundle), bundle.layout, bundle.gestures, self.spec.rules(step_s), weight)
+
+
+class IntegerClassifier(StreamReader):
+    """Classifies the frames of one toy by a deployed model, as the toy does, to the bit.
+
+    ``confidence`` of a decision is a multiple of 2^-15, its ``probabilities`` of 2^-27; ``t_s`` in microseconds,
+    counted from the first frame of the stream, is the time of the toy's answer.
+    """
+
+    def __init__(self, model: IntegerModel) -> None:
+        super().__init__(model.network.stepper(), model.layout, model.gestures, model.rules, model.smoothing)
+        self.model = model
+
+
+class BothEngines:
+    """The deployed model and its float original on the same frames: decides as the first, counts where they differ."""
+
+    def __init__(self, integer: IntegerClassifier, original: StreamReader) -> None:
+        self.integer, self.original = integer, original
+        self.layout, self.step_s = integer.layout, integer.step_s
+        self._has_affects = any(g.affect != "none" for g in integer.model.gestures.gestures)
+        self.reset()
+
+    @property
+    def restarts(self) -> int:
+        """Number of restarts of the deployed model."""
+        return self.integer.restarts
+
+    @property
+    def invalid(self) -> int:
+        """Number of invalid values, as of the deployed model."""
+        return self.integer.invalid
+
+    @property
+    def faults(self) -> int:
+        """Number of sensor faults, as of the deployed model."""
+        return self.integer.faults
+
+    @property
+    def in_event(self) -> bool:
+        """Whether an event is going on, as of the deployed model."""
+        return self.integer.in_event
+
+    @property
+    def time_s(self) -> float:
+        """Device time of the newest frame, as of the deployed model."""
+        return self.integer.time_s
+
+    def silence(self) -> Decision:
+        """End the event that is going on, as `StreamReader.silence` does; return the deployed model's decision."""
+        self.original.silence()
+        return self.integer.silence()
+
+    def reset(self) -> None:
+        """Begin a new stream, with every count at 0."""
+        self.integer.reset()
+        self.original.reset()
+        self._compared = self._gesture = self._affect = 0
+        self._far = 0.0
+
+    def push(self, frame: Frame) -> list[Decision]:
+        """Read one frame; return the deployed model's decisions that it completes."""
+        decisions = self.integer.push(frame)
+        answered = [d for d in decisions if d.probabilities is not None]
+        others = [d for d in self.original.push(frame) if d.probabilities is not None]
+        for one, other in zip(answered, others, strict=True):
+            if one.probabilities is None or other.probabilities is None:
+                continue
+            self._compared += 1
+            self._gesture += one.gesture == other.gesture
+            self._affect += one.affect == other.affect
+            apart = max(abs(a - b) for a, b in zip(one.probabilities, other.probabilities, strict=True))
+            self._far = max(self._far, apart)
+        return decisions
+
+    def agreement(self) -> dict[str, Any]:
+        """Return how often both engines gave the same answer, of the ``decisions`` with an answer.
+
+        None where there was none, and for affect where no gesture carries one.
+
+        ``gesture`` and ``affect`` are shares, ``largest_difference`` that of any smoothed probability.
+        """
+        n = self._compared
+        return {
+            "decisions": n,
+            "gesture": self._gesture / n if n else None,
+            "affect": self._affect / n if n and self._has_affects else None,
+            "largest_difference": self._far if n else None,
+        }
+
+
+def check_layout(sent: Layout, read: Layout) -> None:
+    """Refuse a device whose frames are not those that a model reads.
+
+    What a frame holds is compared (channels, units, integer steps, valid ranges), not the line format: older
+    firmware of the same toy will do. The model's own rate, gap and inputs hold.
+
+    Raises:
+        ConfigError: naming both layouts and the first channel that differs.
+    """
+    if sent.channels == read.channels:
+        return
+    ask = f"open the device with ?layout={read.name}, or take a model made for '{sent.name}'"
+    if sent.names != read.names:
+        raise ConfigError(
+            f"The device sends layout '{sent.name}' ({', '.join(sent.names)}), but the model reads "
+            f"'{read.name}' ({', '.join(read.names)}): {ask}."
+        )
+    other = next(a.name for a, b in zip(sent.channels, read.channels, strict=True) if a != b)
+    raise ConfigError(
+        f"The device sends layout '{sent.name}', in which channel '{other}' has another unit, scale, step or "
+        f"valid range than in the model's '{read.name}': {ask}."
+    )

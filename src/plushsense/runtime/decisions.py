@@ -1,0 +1,135 @@
+"""Settings of decisions.
+
+In seconds and shares, as a bundle keeps them, and in integers, as a toy computes with them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from plushsense.core.errors import ConfigError
+from plushsense.core.toml import refuse_unknown
+from plushsense.runtime.events import MOST_STEPS, ONE, EventSettings
+from plushsense.runtime.fixed import LOGIT_LIMIT
+from plushsense.runtime.gate import GateSettings
+from plushsense.runtime.health import HealthSettings
+
+
+@dataclass(frozen=True)
+class Rules:
+    """Settings of a deployed toy beside its network; the defaults report the best class of every step."""
+
+    events: EventSettings = field(default_factory=EventSettings)
+    gate: GateSettings = field(default_factory=GateSettings)
+    health: HealthSettings = field(default_factory=lambda: HealthSettings(fault_ms=0))
+
+
+_SHARES = ("enter", "leave", "enter_affect", "leave_affect", "sure")
+_SECONDS = ("smoothing_s", "least_s", "switch_s", "end_s", "hold_s", "rest_s", "wait_s")
+
+
+@dataclass(frozen=True)
+class DecideSpec:
+    """Settings of decisions; `plushsense.runtime.events` states what each does.
+
+    Attributes:
+        smoothing_s: time constant of an exponential mean of the probabilities, in seconds: a change has reached 63 %
+            after it. 0 switches it off.
+        enter, leave: smoothed probability at which a gesture may begin, and below which it is over.
+        enter_affect, leave_affect: the same for all gestures of an affect together; above 1 no affect begins alone.
+        sure: a class of at least this probability is in the conformal set of a step.
+        known: highest logit, smoothed, below which a touch is not a known gesture; None: every touch is.
+        least_s: for how long a gesture or affect must be the candidate before its event begins (minimum duration).
+        switch_s: for how long another one, before it takes an event's place.
+        end_s: for how long it must be missed before its event is over.
+        hold_s: an event lasts at least so long; rest_s: refractory time, none begins sooner after another.
+        wait_s: for how long the gate's event waits for the network to name it.
+        gate: the gate's signals and rules; none: there is no gate.
+        health: when sensors are suspect or at fault.
+        fitted: what the settings were fitted on, for people to read.
+    """
+
+    smoothing_s: float = 0.3
+    enter: float = 0.6
+    leave: float = 0.3
+    enter_affect: float = 0.8
+    leave_affect: float = 0.4
+    sure: float = 0.5
+    known: float | None = None
+    least_s: float = 0.1
+    switch_s: float = 0.3
+    end_s: float = 0.3
+    hold_s: float = 0.2
+    rest_s: float = 0.2
+    wait_s: float = 1.5
+    gate: GateSettings = field(default_factory=GateSettings)
+    health: HealthSettings = field(default_factory=HealthSettings)
+    fitted: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in _SECONDS:
+            if not _number(value := getattr(self, name)) or not 0.0 <= value <= 60.0:
+                off = " (off)" if name == "smoothing_s" else ""
+                raise ConfigError(f"{name} is {value!r}; accepted are 0{off} to 60 seconds.")
+        for name in _SHARES:
+            most = 2.0 if name == "enter_affect" else 1.0
+            if not _number(value := getattr(self, name)) or not 0.0 <= value <= most:
+                raise ConfigError(f"{name} is {value!r}; accepted are probabilities, 0 to 1.")
+        limit = LOGIT_LIMIT / 256
+        if self.known is not None and (not _number(self.known) or not -limit <= self.known <= limit):
+            raise ConfigError(f"known is {self.known!r}; accepted are logits from {-limit:g} to {limit:g}, or none.")
+
+    def rules(self, step_s: float) -> Rules:
+        """Return the settings in steps of ``step_s`` seconds and in integers."""
+        shares = {name: min(round(getattr(self, name) * ONE), ONE + 1) for name in _SHARES}
+
+        def steps(seconds: float, least: int = 0) -> int:
+            return min(max(least, round(seconds / step_s)), MOST_STEPS)
+
+        return Rules(
+            EventSettings(
+                **shares,
+                known=-LOGIT_LIMIT if self.known is None else round(self.known * 256),
+                least=steps(self.least_s, 1),
+                switch=steps(self.switch_s, 1),
+                end=steps(self.end_s, 1),
+                hold=steps(self.hold_s),
+                rest=steps(self.rest_s),
+                wait=steps(self.wait_s),
+            ),
+            self.gate,
+            self.health,
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, table: Mapping[str, Any]) -> DecideSpec:
+        """Return settings from plain values (a bundle, a configuration file); what is left out keeps its default.
+
+        Raises:
+            ConfigError: for an unknown key or a value out of range.
+            BundleError: for a gate or health settings that do not fit.
+        """
+        refuse_unknown(dict(table), cls.__dataclass_fields__, "decision settings", ConfigError)
+        values = dict(table)
+        if "gate" in values:
+            values["gate"] = GateSettings.from_dict(values["gate"])
+        if "health" in values:
+            values["health"] = HealthSettings.from_dict(values["health"])
+        return cls(**values)
+
+
+def argmax_spec(smoothing_s: float = 0.0) -> DecideSpec:
+    """Return settings that report every step's best class: the baseline that events are compared with."""
+    return DecideSpec(
+        smoothing_s, 0.0, 0.0, 2.0, 0.0, least_s=0.0, switch_s=0.0, end_s=0.0, hold_s=0.0, rest_s=0.0, wait_s=0.0
+    )
+
+
+def _number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)

@@ -1,0 +1,333 @@
+"""Events from logits: one event for each gesture, with a beginning and an end, in integers only.
+
+This module defines the events of a toy; ``deploy/c/plushsense.c`` repeats it. A step is one answer of the network.
+Every count is in steps, every share in steps of 2^-15, every logit in steps of 1/256. Times are those of the caller
+(milliseconds in the toy) and are only passed on.
+
+A step, in this order:
+
+1. The probabilities are smoothed (`fixed.smooth`), and so is the highest logit: how *known* the touch looks (the
+   maximum logit score of open-set recognition).
+2. The step's `Answer`: ``unknown`` when that is below ``known``; else ``idle`` when the best class is idle; else the
+   conformal set, every class of at least ``sure``: one class is ``sure``, several of one affect (not ``none``) are
+   ``affect``, anything else is ``unsure``.
+3. The candidate: the best class's gesture when it reaches ``enter``, else an affect whose classes together reach
+   ``enter_affect``; none while idle or unknown.
+4. No event is open: one begins when the candidate was the same for ``least`` steps in a row (the same affect; without
+   one, the same gesture), and not within ``rest`` steps of the last event, the refractory time. It begins with its
+   affect, and with the gesture when that was the candidate for ``least`` steps too.
+5. An event is open: it gets its gesture once, when one of its affect was the candidate for ``least`` steps. Another
+   gesture or affect that was the candidate for ``switch`` steps in a row, after at least ``hold`` steps, ends it and
+   begins the next. It ends after ``end`` steps in a row in which its gesture (without one: its affect's classes
+   together) was below ``leave`` (``leave_affect``), or the best class was an idle one and reached ``enter``; never
+   before its minimum duration of ``hold`` steps.
+
+The gate fires between steps (`EventMachine.gate`): its event begins at once and cannot be ended or replaced for
+``wait`` steps, in which the network may name it. A gate that fires during an event of its own affect, or one that the
+gate began, prolongs that event: ``wait`` begins anew. While the network is warming there are blind steps, without
+evidence for an event (`EventMachine.blind_step`). A suspect step (`plushsense.runtime.health`) neither counts nor
+breaks a row, and begins, names and ends nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Literal
+
+import numpy as np
+
+from plushsense.core.errors import BundleError
+from plushsense.core.gestures import GestureSet
+from plushsense.runtime.fixed import LOGIT_LIMIT, PROBABILITY_BITS, SMOOTH_EXTRA_BITS, Ints, smooth, softmax
+
+ONE = 1 << PROBABILITY_BITS
+NO_GESTURE = 255
+AFFECT_CODES = {"none": 0, "positive": 1, "neutral": 2, "negative": 3}
+AFFECTS = tuple(AFFECT_CODES)
+MOST_STEPS = (1 << 16) - 1
+
+IDLE, UNKNOWN, UNSURE, AFFECT, SURE = range(5)
+ANSWERS = ("idle", "unknown", "unsure", "affect", "sure")
+CNN, GATE = range(2)
+SOURCES: tuple[Literal["cnn", "gate"], ...] = ("cnn", "gate")
+BEGUN, NAMED, ENDED = 1, 2, 3
+KINDS: dict[int, Literal["begun", "named", "ended"]] = {BEGUN: "begun", NAMED: "named", ENDED: "ended"}
+
+
+@dataclass(frozen=True)
+class EventSettings:
+    """Settings of `EventMachine`; the defaults report the best class of every step (argmax).
+
+    Raises:
+        BundleError: for a value out of its range.
+    """
+
+    enter: int = 0
+    leave: int = 0
+    enter_affect: int = ONE + 1  # more than there is: never by affect alone
+    leave_affect: int = 0
+    sure: int = ONE // 2
+    known: int = -LOGIT_LIMIT
+    least: int = 1
+    switch: int = 1
+    end: int = 1
+    hold: int = 0
+    rest: int = 0
+    wait: int = 0
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            low, high = RANGES[field.name]
+            if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+                raise BundleError(f"The event setting {field.name} is {value!r}; accepted are {low} to {high}.")
+
+    def to_dict(self) -> dict[str, int]:
+        """Return plain values, ready for JSON."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+
+RANGES = {
+    **dict.fromkeys(("enter", "leave", "enter_affect", "leave_affect", "sure"), (0, ONE + 1)),
+    "known": (-LOGIT_LIMIT, LOGIT_LIMIT),
+    **dict.fromkeys(("least", "switch", "end"), (1, MOST_STEPS)),
+    **dict.fromkeys(("hold", "rest", "wait"), (0, MOST_STEPS)),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Update:
+    """Change of an event.
+
+    ``number`` counts events from 1; ``affect`` a code of `AFFECT_CODES`; ``gesture`` a class index or `NO_GESTURE`;
+    ``source`` `CNN` or `GATE`, who began it; ``since`` the time of the step in which it first was the candidate (an
+    end: in which it was first missed), ``now`` the time of the change. Where one event takes another's place, and when
+    the signal is lost, both are ``now``.
+    """
+
+    kind: int
+    number: int
+    affect: int
+    gesture: int
+    source: int
+    since: int
+    now: int
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """Answer of one step.
+
+    ``best`` class, its smoothed ``share`` (2^-15), ``kind`` an index into `ANSWERS`, and ``known``, the smoothed
+    highest logit in steps of 1/256.
+    """
+
+    best: int
+    share: int
+    kind: int
+    known: int
+
+
+class EventMachine:
+    """Follows one stream. ``mean`` holds the smoothed probabilities (K,) in steps of 2^-27, and after them the smoothed
+    highest logit in steps of 2^-20; None before the first step.
+    """
+
+    def __init__(self, plan: EventSettings, smoothing: int, gestures: GestureSet) -> None:
+        self.plan, self.smoothing = plan, smoothing
+        self._affects = [AFFECT_CODES[a] for a in gestures.affects]
+        self._idle = [g.idle for g in gestures.gestures]
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin a new stream, with no event counted."""
+        self.number = 0
+        self._clear()
+
+    def _clear(self) -> None:
+        self.mean: Ints | None = None
+        self.open = False
+        self._close(rest=0)
+        self._candidate = -1  # an affect's code, or 4 + gesture where the gesture has no affect
+        self._candidate_steps, self._candidate_since = 0, 0
+        self._gesture, self._gesture_steps = NO_GESTURE, 0
+
+    def _close(self, rest: int) -> None:
+        self.open = False
+        self.affect, self.gesture, self.source = 0, NO_GESTURE, CNN
+        self.since = 0
+        self._lasted = self._away = self._wait = 0
+        self._away_since = 0
+        self._resting = rest
+
+    def lost(self, now: int) -> list[Update]:
+        """End the event that is going on, after a gap, a clock reset or a fault, and forget all but the count of
+        events.
+        """
+        updates = [self._end(now, now)] if self.open else []
+        self._clear()
+        return updates
+
+    def gate(self, affect: int, gesture: int, now: int) -> list[Update]:
+        """Take in a firing of the gate, with its rule's affect and gesture (or `NO_GESTURE`).
+
+        Return what happened to events.
+        """
+        updates: list[Update] = []
+        if self.open and (self.affect == affect or self.source == GATE):
+            self._wait, self._away = self.plan.wait, 0
+            return updates
+        if self.open:
+            updates.append(self._end(now, now))
+        self._wait = 0
+        updates.append(self._begin(affect, gesture, GATE, now, now))
+        self._wait = self.plan.wait
+        return updates
+
+    def step(self, logits: Ints, now: int, suspect: bool = False) -> tuple[Answer, list[Update]]:
+        """Take in one step's logits (K,); return the answer, and what happened to events."""
+        highest = int(logits.max())
+        both = np.append(softmax(logits), highest)
+        self.mean = smooth(self.mean, both, self.smoothing)
+        rows = (self.mean >> SMOOTH_EXTRA_BITS).tolist()
+        shares, known = rows[:-1], rows[-1]
+        # By all bits, as the toy does: the first of equal ones.
+        best = int(self.mean[:-1].argmax())
+        answer = Answer(best, shares[best], self._kind(shares, best, known), known)
+        return answer, self.follow(shares, best, *self._candidate_of(shares, answer), now, suspect)
+
+    def follow(
+        self, shares: list[int], best: int, gesture: int, affect: int, now: int, suspect: bool = False
+    ) -> list[Update]:
+        """Follow one step of known shares, best class and candidate; return what happened to events."""
+        if suspect:
+            gesture, affect = NO_GESTURE, 0
+        else:
+            self._count(gesture, affect, now)
+        if not self.open:
+            return self._closed_step(gesture, affect, now)
+        return self._open_step(shares, best, gesture, affect, now, suspect)
+
+    def skip(self, steps: int, now: int) -> None:
+        """Pass over ``steps`` steps without a candidate while no event is open; they can only end a refractory time."""
+        if steps:
+            self._count(NO_GESTURE, 0, now)
+            self._resting = max(0, self._resting - steps)
+
+    def blind_step(self, now: int) -> list[Update]:
+        """Take in one step without an answer, while the network is warming: the event of the gate ends in its time."""
+        if not self.open:
+            return []
+        self._lasted += 1
+        if self._wait > 0:
+            self._wait -= 1
+            return []
+        return self._miss(now)
+
+    def _miss(self, now: int) -> list[Update]:
+        """Count a step without evidence for the event, and end it after enough of them."""
+        if self._away == 0:
+            self._away_since = now
+        self._away += 1
+        if self._away >= self.plan.end and self._lasted >= self.plan.hold:
+            return [self._end(self._away_since, now)]
+        return []
+
+    def _kind(self, shares: list[int], best: int, known: int) -> int:
+        plan = self.plan
+        if known < plan.known:
+            return UNKNOWN
+        if self._idle[best]:
+            return IDLE
+        members = [k for k, share in enumerate(shares) if share >= plan.sure]
+        if len(members) == 1:
+            return SURE
+        affects = {self._affects[k] for k in members}
+        if len(affects) == 1 and 0 not in affects and not any(self._idle[k] for k in members):
+            return AFFECT
+        return UNSURE
+
+    def _affect_shares(self, shares: list[int]) -> list[int]:
+        """Return the share of each affect's classes together, by its code; idle classes are left out."""
+        totals = [0, 0, 0, 0]
+        for share, affect, idle in zip(shares, self._affects, self._idle, strict=True):
+            if not idle:
+                totals[affect] += share
+        return totals
+
+    def _candidate_of(self, shares: list[int], answer: Answer) -> tuple[int, int]:
+        """Return the candidate of a step: gesture (or `NO_GESTURE`) and affect; (`NO_GESTURE`, 0) for none."""
+        if answer.kind in (UNKNOWN, IDLE):
+            return NO_GESTURE, 0
+        if answer.share >= self.plan.enter:
+            return answer.best, self._affects[answer.best]
+        totals = self._affect_shares(shares)
+        most = max(range(1, 4), key=lambda a: (totals[a], -a))
+        return NO_GESTURE, most if totals[most] >= self.plan.enter_affect else 0
+
+    def _count(self, gesture: int, affect: int, now: int) -> None:
+        """Count the steps in a row that have the same candidate."""
+        candidate = affect if affect else 4 + gesture if gesture != NO_GESTURE else -1
+        if candidate != self._candidate:
+            self._candidate, self._candidate_steps, self._candidate_since = candidate, 0, now
+        if candidate >= 0:
+            self._candidate_steps += 1
+        if gesture != self._gesture:
+            self._gesture, self._gesture_steps = gesture, 0
+        if gesture != NO_GESTURE:
+            self._gesture_steps += 1
+
+    def _closed_step(self, gesture: int, affect: int, now: int) -> list[Update]:
+        if self._resting > 0:
+            self._resting -= 1
+            return []
+        if (gesture != NO_GESTURE or affect) and self._candidate_steps >= self.plan.least:
+            return [self._begin(affect, self._named(gesture), CNN, self._candidate_since, now)]
+        return []
+
+    def _named(self, gesture: int) -> int:
+        return gesture if gesture != NO_GESTURE and self._gesture_steps >= self.plan.least else NO_GESTURE
+
+    def _open_step(
+        self, shares: list[int], best: int, gesture: int, affect: int, now: int, suspect: bool
+    ) -> list[Update]:
+        plan = self.plan
+        self._lasted += 1
+        locked = self._wait > 0
+        if locked:
+            self._wait -= 1
+        if self.gesture == NO_GESTURE and self._named(gesture) != NO_GESTURE and self.affect in (0, affect):
+            self.gesture, self.affect = gesture, affect
+            self._away = 0
+            return [Update(NAMED, self.number, affect, gesture, self.source, self.since, now)]
+        if locked or suspect:
+            return []
+        another = (affect and affect != self.affect) or (gesture not in (NO_GESTURE, self.gesture))
+        if another and self.gesture == NO_GESTURE and affect == self.affect:
+            another = False  # it has no gesture yet: this one may become its own
+        row = self._gesture_steps if gesture != NO_GESTURE and affect == self.affect else self._candidate_steps
+        if another and row >= plan.switch and self._lasted >= plan.hold:
+            ended = self._end(now, now)
+            return [ended, self._begin(affect, self._named(gesture), CNN, now, now)]
+        mine = shares[self.gesture] if self.gesture != NO_GESTURE else self._affect_shares(shares)[self.affect]
+        stays = mine >= (plan.leave if self.gesture != NO_GESTURE else plan.leave_affect)
+        if self.gesture == NO_GESTURE and self.affect == 0:
+            stays = False  # begun by the gate, and nothing to recognise it by
+        if self._idle[best] and shares[best] >= plan.enter:
+            stays = False
+        if stays:
+            self._away = 0
+            return []
+        return self._miss(now)
+
+    def _begin(self, affect: int, gesture: int, source: int, since: int, now: int) -> Update:
+        self.number += 1
+        self.open = True
+        self.affect, self.gesture, self.source, self.since = affect, gesture, source, since
+        self._lasted = self._away = self._wait = 0
+        return Update(BEGUN, self.number, affect, gesture, source, since, now)
+
+    def _end(self, since: int, now: int) -> Update:
+        update = Update(ENDED, self.number, self.affect, self.gesture, self.source, since, now)
+        self._close(self.plan.rest)
+        return update

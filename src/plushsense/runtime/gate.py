@@ -1,0 +1,252 @@
+"""The gate: threshold rules that notice an energetic event within a few samples, in whole numbers only.
+
+This module defines when a toy's gate fires; ``deploy/c/plushsense.c`` repeats it, in 32 bits. It reads the network's
+inputs, raw, one even sample at a time, and works from the first samples on, while the network is still warming.
+
+- Inputs are shifted down by a signal's ``shift`` bits and held within ± 2^20. A *signal* is made of one of them, or of
+  several: ``level`` is the input itself; ``jerk`` the sum over the inputs of the absolute change from ``lag`` samples
+  ago (0 while there are not so many), held within 2^20 again.
+- Its *baseline* is an exponential mean with the weight 2^-baseline, its *noise* that of the deviation from the
+  baseline with the weight 2^-noise; a deviation counts there with at most 4 times noise plus floor, so that one blow
+  does not deafen the gate. Both begin with the signal's first value, and a noise of 0. They are kept with 8 more bits.
+- Its *size* is 16 times the deviation, without its sign, divided by noise plus ``floor`` and rounded down.
+- A *term* of a rule holds when the size was at least ``threshold`` for ``times`` samples in a row (``sign`` 1: above
+  the baseline only, -1: below only, 0: either way), and ``within`` samples longer.
+- A *rule* fires when all its terms hold. The first rule that fires speaks; then the gate is deaf for its ``deaf``
+  samples, while signals and terms go on.
+
+A sample whose inputs all repeat the one before is not read (a hung toy is not hit), nor is a suspect one (see
+`plushsense.runtime.health`); it only shortens the deafness. So a blow that holds a sensor at its end stop for a moment
+goes on counting after it. After `DOUBT` suspect samples in a row everything but the deafness begins anew: a sensor that
+jumps to its end stop and back is broken, not hit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from plushsense.core.errors import BundleError
+
+LEVEL, JERK = 0, 1
+HELD = 1 << 20
+EXTRA_BITS = 8
+THRESHOLD_BITS = 4
+NOISE_CLIP = 4
+DOUBT = 10
+MOST_SIZE = 2 * HELD << THRESHOLD_BITS  # of a deviation of 2^21 over a floor of 1
+MOST_SIGNALS, MOST_RULES, MOST_TERMS, MOST_LAG = 32, 16, 8, 16
+
+
+@dataclass(frozen=True)
+class Signal:
+    """Signal of the gate: ``kind`` `LEVEL` or `JERK` of ``inputs``, and how its baseline and noise follow it."""
+
+    kind: int
+    inputs: tuple[int, ...]
+    lag: int = 1
+    shift: int = 0
+    baseline: int = 7
+    noise: int = 8
+    floor: int = 1
+
+
+@dataclass(frozen=True)
+class Term:
+    """``signal`` (an index) has a size of at least ``threshold``, a sixteenth of noise plus floor each."""
+
+    signal: int
+    threshold: int
+    sign: int = 0
+    times: int = 2
+
+
+@dataclass(frozen=True)
+class Rule:
+    """Rule of the gate: all ``terms`` hold within ``within`` samples.
+
+    It reports ``affect`` and ``gesture`` (a class index, 255: none).
+    """
+
+    terms: tuple[Term, ...]
+    affect: int
+    gesture: int
+    within: int = 5
+    deaf: int = 50
+
+
+@dataclass(frozen=True)
+class GateSettings:
+    """Signals and rules of `Gate`; none at all is a gate that never fires.
+
+    Raises:
+        BundleError: for a number that the toy could not hold, or a signal that there is not.
+    """
+
+    signals: tuple[Signal, ...] = ()
+    rules: tuple[Rule, ...] = ()
+
+    def __post_init__(self) -> None:
+        _within("signals", len(self.signals), 0, MOST_SIGNALS)
+        _within("rules", len(self.rules), 0, MOST_RULES)
+        for s in self.signals:
+            _within("signal kind", s.kind, LEVEL, JERK)
+            _within("inputs of a signal", len(s.inputs), 1, 1 if s.kind == LEVEL else 255)
+            for i in s.inputs:
+                _within("input", i, 0, 254)
+            _within("lag", s.lag, 1, MOST_LAG)
+            _within("shift", s.shift, 0, 24)
+            _within("baseline", s.baseline, 1, 15)
+            _within("noise", s.noise, 1, 15)
+            _within("floor", s.floor, 1, HELD)
+        for rule in self.rules:
+            _within("terms of a rule", len(rule.terms), 1, MOST_TERMS)
+            _within("affect", rule.affect, 0, 3)
+            _within("gesture", rule.gesture, 0, 255)
+            _within("within", rule.within, 0, 255)
+            _within("deaf", rule.deaf, 0, 65535)
+            for term in rule.terms:
+                _within("signal of a term", term.signal, 0, len(self.signals) - 1)
+                _within("threshold", term.threshold, 1, MOST_SIZE)
+                _within("sign", term.sign, -1, 1)
+                _within("times", term.times, 1, 255)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, table: Mapping[str, Any]) -> GateSettings:
+        """Return settings from plain values.
+
+        Raises:
+            BundleError: for values that do not fit.
+        """
+        try:
+            signals = tuple(Signal(**{**s, "inputs": tuple(s["inputs"])}) for s in table.get("signals", ()))
+            rules = tuple(Rule(**{**r, "terms": tuple(Term(**t) for t in r["terms"])}) for r in table.get("rules", ()))
+            return cls(signals, rules)
+        except (KeyError, TypeError, AttributeError) as cause:
+            raise BundleError(f"The gate's plan does not fit ({cause}): train again.") from None
+
+
+def _within(what: str, value: int, low: int, high: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+        raise BundleError(f"The gate's plan has {what} {value!r}; accepted are {low} to {high}.")
+
+
+class Gate:
+    """Follows one stream of inputs; ``sizes`` and ``deviations`` are those of each signal at the last sample read."""
+
+    def __init__(self, plan: GateSettings) -> None:
+        self.plan = plan
+        self._longest = max((s.lag for s in plan.signals if s.kind == JERK), default=1)
+        self._signals = []
+        for at, s in enumerate(plan.signals):
+            several, lag = s.inputs if len(s.inputs) > 1 else (), s.lag if s.kind == JERK else 0
+            self._signals.append((at, s.inputs[0], several, lag, s.shift, s.baseline, s.noise, s.floor))
+        self._rules = [
+            (at, [(t.signal, t.threshold, t.sign, t.times) for t in rule.terms], rule.within + 1)
+            for at, rule in enumerate(plan.rules)
+        ]
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin a new stream: after a gap, a clock reset, a fault."""
+        self._deaf = self._doubt = 0
+        self._forget()
+
+    def _forget(self) -> None:
+        n = len(self.plan.signals)
+        self._past: list[list[int]] = []  # the newest last, as many as the longest lag needs
+        self._baseline = [0] * n
+        self._noise = [0] * n
+        self.deviations, self.sizes = [0] * n, [0] * n
+        self._rows = [[0] * len(rule.terms) for rule in self.plan.rules]
+        self._holds = [[0] * len(rule.terms) for rule in self.plan.rules]
+
+    def push(self, inputs: Sequence[int], suspect: bool = False) -> int:
+        """Read one sample's inputs (I,); return the index of the rule that fires, or -1."""
+        if not self._rules:
+            return -1
+        deaf = self._deaf > 0
+        if deaf:
+            self._deaf -= 1
+        now, past = list(inputs), self._past
+        if suspect:
+            self._doubt += 1
+            if self._doubt == DOUBT:
+                self._forget()
+            return -1
+        self._doubt = 0
+        if past and past[-1] == now:
+            return -1
+        self._follow(now)
+        past.append(now)
+        if len(past) > self._longest:
+            del past[0]
+        fired = self._judge()
+        if deaf or fired < 0:
+            return -1
+        self._deaf = self.plan.rules[fired].deaf
+        return fired
+
+    def _follow(self, now: list[int]) -> None:
+        # Written out, and the usual case first: this runs for every sample of every toy.
+        past, baseline, noise = self._past, self._baseline, self._noise
+        for at, one, several, lag, shift, slow, slower, floor in self._signals:
+            if lag == 0:
+                value = now[one] >> shift
+                if not -HELD <= value <= HELD:
+                    value = _held(value)
+            elif len(past) < lag:
+                value = 0
+            else:
+                before, value = past[-lag], 0
+                for i in several or (one,):
+                    a, b = now[i] >> shift, before[i] >> shift
+                    if -HELD <= a <= HELD and -HELD <= b <= HELD:
+                        value += a - b if a > b else b - a
+                    else:
+                        value += abs(_held(a) - _held(b))
+                if value > HELD:
+                    value = HELD
+            high = value << EXTRA_BITS
+            if not past:
+                baseline[at] = high
+            base = baseline[at]
+            deviation = value - (base >> EXTRA_BITS)
+            size = -deviation if deviation < 0 else deviation
+            level = (noise[at] >> EXTRA_BITS) + floor
+            self.deviations[at] = deviation
+            self.sizes[at] = (size << THRESHOLD_BITS) // level
+            baseline[at] = base + ((high - base) >> slow)
+            if size > NOISE_CLIP * level:
+                size = NOISE_CLIP * level
+            noise[at] += ((size << EXTRA_BITS) - noise[at]) >> slower
+
+    def _judge(self) -> int:
+        sizes, deviations, fired = self.sizes, self.deviations, -1
+        for at, terms, hold in self._rules:
+            rows, holds = self._rows[at], self._holds[at]
+            every = True
+            for n, (signal, threshold, sign, times) in enumerate(terms):
+                if sizes[signal] >= threshold and (sign == 0 or (deviations[signal] > 0) == (sign > 0)):
+                    if rows[n] < times:
+                        rows[n] += 1
+                    if rows[n] == times:
+                        holds[n] = hold
+                else:
+                    rows[n] = 0
+                if holds[n]:
+                    holds[n] -= 1
+                else:
+                    every = False
+            if every and fired < 0:
+                fired = at
+        return fired
+
+
+def _held(value: int) -> int:
+    return value if -HELD <= value <= HELD else HELD if value > 0 else -HELD

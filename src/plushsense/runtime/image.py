@@ -1,0 +1,272 @@
+"""Image of a deployed model: the bytes that the C library reads.
+
+All numbers are little-endian. Fixed head (16 bytes): ``PLSH``, u16 version, u16 0, u32 length of the whole, u32 CRC-32
+of all that follows the head. Then, one after the other:
+
+- u8 layers, u8 measured channels, u8 inputs, u8 classes, u16 step, u16 blocks of the pooling, u32 span (samples),
+  u32 period and u32 gap of the clock in its own units, u32 milliseconds to units, u16 smoothing weight, u16
+  layout check (`layout_check`)
+- a measured channel: i32 lowest and i32 highest valid value
+- an input: u8 kind (0 a channel, 1 a magnitude), u8 n, n × u8 measured channels, then i32 offset, i32 bias,
+  u16 multiplier, u8 before, u8 after
+- a layer: u16 kernel, u16 dilation, u16 channels read, u16 filters; a filter: i32 bias, u16 multiplier, u8 before,
+  u8 after; then the weights, each as weight + 128, for every 4 filters (the last ones filled up), tap and 4 channels
+  (filled up): 4 filters × 4 channels
+- a class: i32 bias, u16 multiplier, u8 before, u8 after; then classes × features weights, each as weight + 128
+- a class: u8 affect (0 none, 1 positive, 2 neutral, 3 negative), with 4 added when it is idle
+- a class: its label in UTF-8 and a 0; then the model's title in UTF-8 and a 0
+- events: u16 enter, leave, enter_affect, leave_affect, sure, i16 known, u16 least, switch, end, hold, rest, wait
+- health: u16 fault_ms, still_ms, recover_ms, u8 whether there are limits, u8 0; with limits, a measured channel: i32
+  low and i32 high
+- gate: u8 signals, u8 rules (without rules neither); a signal: u8 kind, u8 n, n × u8 inputs, u8 lag, u8 shift,
+  u8 baseline, u8 noise, u32 floor; a rule: u8 terms, u8 affect, u8 gesture, u8 within, u16 deaf; a term: u8 signal,
+  i8 sign, u8 times, u8 0, u32 threshold
+
+The C library believes none of it unseen: it refuses an image in which a count, a scale or a setting is out of the
+ranges that `IntegerModel`, `plushsense.runtime.fixed` and the plans of `plushsense.runtime.decisions` accept, a
+section is not whole, or the span is not that of the layers.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+import zlib
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import BundleError
+from plushsense.core.gestures import GestureSet
+from plushsense.core.layouts import Layout
+from plushsense.runtime.decisions import Rules
+from plushsense.runtime.events import AFFECT_CODES, NO_GESTURE
+from plushsense.runtime.fixed import PROBABILITY_BITS, LogitScale, Requantize
+from plushsense.runtime.gate import JERK, GateSettings
+from plushsense.runtime.integer import IntegerNetwork
+
+MAGIC = b"PLSH"
+IMAGE_VERSION = 2  # 2: with the rules of events, gate and health
+HEAD_BYTES = 16
+IDLE_BIT = 4
+GROUP = 4  # filters computed together, and channels read together
+MOST_CLOCK_UNITS = 1 << 22  # of the gap and the period: interpolation then needs no more than 32 bits
+
+
+@dataclass(frozen=True, eq=False)
+class IntegerModel:
+    """Deployed model: network, layout (clock, validity, inputs), gestures, rules and the weight of a new step.
+
+    ``smoothing`` is in steps of 2^-15 (`plushsense.runtime.fixed.smoothing_weight`).
+
+    Raises:
+        BundleError: when the parts do not fit together, or the toy could not hold them.
+    """
+
+    network: IntegerNetwork
+    layout: Layout
+    gestures: GestureSet
+    smoothing: int
+    rules: Rules = field(default_factory=Rules)
+
+    def __post_init__(self) -> None:  # noqa: C901
+        arch = self.network.arch
+        if (self.layout.n_inputs, len(self.gestures)) != (arch.channels, arch.classes):
+            raise BundleError(
+                f"The model does not fit together: {self.layout.n_inputs} inputs and {len(self.gestures)} gestures, "
+                f"{arch.title} needs {arch.channels} and {arch.classes}."
+            )
+        for what, found in (
+            ("measured channels", len(self.layout.channels)),
+            ("inputs", arch.channels),
+            ("gestures", arch.classes),
+        ):
+            if found > 255:
+                raise BundleError(f"The model has {found} {what}: in the toy there may be at most 255.")
+        for n, layer in enumerate(arch.layers, 1):
+            if layer.reach + 1 >= 1 << 16:
+                raise BundleError(
+                    f"Layer {n} of {arch.title} remembers {layer.reach + 1} samples: in the toy there may be at most "
+                    "65535, so take a shorter kernel or a smaller dilation."
+                )
+        if arch.pooled // arch.step >= 1 << 16:
+            raise BundleError(
+                f"{arch.title} pools {arch.pooled // arch.step} steps: in the toy there may be at most 65535, so take "
+                "a smaller pool or a longer step."
+            )
+        if not 1 <= self.smoothing <= 1 << PROBABILITY_BITS:
+            raise BundleError(
+                f"The smoothing weight is {self.smoothing}: accepted are 1 to {1 << PROBABILITY_BITS} (no smoothing)."
+            )
+        if not 1 <= self.layout.gap_ms * self._units_per_ms <= MOST_CLOCK_UNITS:
+            raise BundleError(
+                f"Layout '{self.layout.name}' bridges gaps of {self.layout.gap_ms} ms: at {self.layout.rate_hz:g} Hz "
+                f"the toy accepts 1 to {MOST_CLOCK_UNITS // self._units_per_ms} ms."
+            )
+        for derived in self.layout.derived:
+            if len(derived.of) > 255:
+                raise BundleError(
+                    f"Channel '{derived.name}' is made of {len(derived.of)} others: the toy takes at most 255."
+                )
+        health, gate = self.rules.health, self.rules.gate
+        if health.low and len(health.low) != len(self.layout.channels):
+            raise BundleError(
+                f"The health limits are of {len(health.low)} channels, layout '{self.layout.name}' has "
+                f"{len(self.layout.channels)}: train again."
+            )
+        if any(i >= arch.channels for s in gate.signals for i in s.inputs):
+            raise BundleError(f"The gate reads an input that there is not: the model has {arch.channels}; train again.")
+        if any(arch.classes <= r.gesture != NO_GESTURE for r in gate.rules):
+            raise BundleError(f"The gate says a gesture that there is not: there are {arch.classes}; train again.")
+        for gesture in self.gestures.gestures:
+            if "\0" in gesture.label or gesture.label.encode(errors="replace").decode() != gesture.label:
+                raise BundleError(f"The gesture {gesture.label!r} has a character that the toy cannot keep: rename it.")
+
+    @property
+    def _units_per_ms(self) -> int:
+        """The clock's unit is the largest part of a millisecond of which the period is a whole number."""
+        return 1000 // math.gcd(1000, self.layout.period_us)
+
+    def sections(self) -> list[tuple[str, bytes]]:
+        """Return what follows the head as (description, bytes) pairs."""
+        arch, layout = self.network.arch, self.layout
+        units_per_ms = self._units_per_ms
+        found = [
+            (
+                "layers, channels, inputs, classes; step, blocks; span; period, gap, units a ms; smoothing, layout",
+                struct.pack(
+                    "<BBBBHHIIIIHH",
+                    len(arch.layers),
+                    len(layout.channels),
+                    arch.channels,
+                    arch.classes,
+                    arch.step,
+                    arch.pooled // arch.step,
+                    arch.span,
+                    layout.period_us * units_per_ms // 1000,
+                    layout.gap_ms * units_per_ms,
+                    units_per_ms,
+                    self.smoothing,
+                    layout_check(layout),
+                ),
+            )
+        ]
+        for name, low, high in zip(layout.names, layout.valid_min_int, layout.valid_max_int, strict=True):
+            found.append((f"channel '{name}': valid from {low} to {high}", struct.pack("<ii", low, high)))
+        derived = {d.name: tuple(layout.index(part) for part in d.of) for d in layout.derived}
+        scale = self.network.inputs
+        for i, name in enumerate(layout.inputs):
+            parts = derived.get(name) or (layout.index(name),)
+            row = (int(getattr(scale, n)[i]) for n in ("offset", "bias", "multiplier", "before", "after"))
+            plan = bytes([name in derived, len(parts), *parts])
+            found.append((f"input '{name}': where from; offset, bias, multiplier, shifts", plan))
+            found.append(("", struct.pack("<iiHBB", *row)))
+        for n, (layer, read, part) in enumerate(zip(arch.layers, arch.inputs, self.network.layers, strict=True), 1):
+            shape = struct.pack("<HHHH", layer.kernel, layer.dilation, read, layer.filters)
+            what = f"kernel {layer.kernel}, dilation {layer.dilation}, reads {read} channels, {layer.filters} filters"
+            found.append((f"layer {n}: {what}", shape))
+            found.append((f"layer {n}: bias, multiplier, shifts of each filter", _scales(part.bias, part.scale)))
+            for first, group in enumerate(grouped_weights(part.weights)):
+                last = min(GROUP * first + GROUP, layer.filters)
+                what = f"layer {n}: weights of filters {GROUP * first + 1} to {last}, tap by tap"
+                found.append((what, group.tobytes()))
+        dense = self.network.dense
+        found.append(("dense layer: bias, multiplier, shifts of each class", _scales(dense.bias, dense.scale)))
+        found.append(
+            ("dense layer: weights of each class", (dense.weights.astype(np.int16) + 128).astype(np.uint8).tobytes())
+        )
+        affects = bytes(AFFECT_CODES[g.affect] + (IDLE_BIT if g.idle else 0) for g in self.gestures.gestures)
+        found.append(("affect of each class, 4 more when it is idle", affects))
+        for gesture in self.gestures.gestures:
+            idle = ", idle" if gesture.idle else ""
+            found.append((f"class '{gesture.label}', {gesture.affect}{idle}", gesture.label.encode() + b"\0"))
+        found.append((f"title '{arch.title}'", arch.title.encode() + b"\0"))
+        return found + _rules(self.rules)
+
+    def to_bytes(self) -> bytes:
+        """Return the image."""
+        body = b"".join(piece for _, piece in self.sections())
+        return image_head(body) + body
+
+
+def _rules(rules: Rules) -> list[tuple[str, bytes]]:
+    events, health, gate = rules.events, rules.health, rules.gate
+    row = {"known": "h"}
+    plan = b"".join(struct.pack("<" + row.get(name, "H"), value) for name, value in events.to_dict().items())
+    found = [(f"events: {', '.join(events.to_dict())}", plan)]
+    times = struct.pack("<HHHBB", health.fault_ms, health.still_ms, health.recover_ms, bool(health.low), 0)
+    found.append(("health: fault, still, recover (ms), whether limits follow", times))
+    if health.low:
+        limits = b"".join(struct.pack("<ii", *pair) for pair in zip(health.low, health.high, strict=True))
+        found.append(("health: lowest and highest value of each channel that touches reach", limits))
+    if not gate.rules:
+        return [*found, ("gate: no signals, no rules", bytes(2))]
+    found.append(("gate: signals, rules", bytes([len(gate.signals), len(gate.rules)])))
+    for n, s in enumerate(gate.signals, 1):
+        row_head = bytes([s.kind, len(s.inputs), *s.inputs, s.lag, s.shift, s.baseline, s.noise])
+        what = f"gate: signal {n}, {'jerk' if s.kind == JERK else 'level'}; inputs, lag, shift, baseline, noise, floor"
+        found.append((what, row_head + struct.pack("<I", s.floor)))
+    for n, r in enumerate(gate.rules, 1):
+        row_head = struct.pack("<BBBBH", len(r.terms), r.affect, r.gesture, r.within, r.deaf)
+        found.append((f"gate: rule {n}: terms, affect, gesture, within, deaf", row_head))
+        terms = b"".join(struct.pack("<BbBBI", t.signal, t.sign, t.times, 0, t.threshold) for t in r.terms)
+        found.append((f"gate: rule {n}: signal, sign, times, threshold of each term", terms))
+    return found
+
+
+def layout_check(layout: Layout) -> int:
+    """Return a 16-bit checksum of the order, names, units and steps of a frame's channels."""
+    channels = json.dumps([[c.name, c.unit, c.step] for c in layout.channels])
+    return zlib.crc32(channels.encode()) & 0xFFFF
+
+
+def image_head(body: bytes) -> bytes:
+    """Return the 16 bytes that precede a body of an image."""
+    return MAGIC + struct.pack("<HHII", IMAGE_VERSION, 0, len(body) + HEAD_BYTES, zlib.crc32(body))
+
+
+def memory_bytes(model: IntegerModel) -> int:
+    """Return the bytes of memory that a toy needs beside its ``plush_toy``, as the C's ``plush_memory_bytes`` does."""
+    arch, channels = model.network.arch, len(model.layout.channels)
+    features = arch.filters[-1]
+    pieces = [4 * channels] * 3  # held, before, the sample being made
+    for layer, read in zip(arch.layers, arch.inputs, strict=True):
+        pieces.append((layer.reach + 1) * _filled(read))
+        pieces.append(4 * (layer.dilation if layer.kernel > 1 else 1))  # sums under the taps
+    pieces.append(2 * features * (arch.pooled // arch.step))
+    pieces += [4 * features, 4 * arch.classes, 4 * arch.classes + 4]  # sums, logits, smoothed probabilities and known
+    pieces += [channels, features]  # which channels are valid, the newest features
+    health, gate = model.rules.health, model.rules.gate
+    if health.low or health.still_ms:
+        pieces.append(4 * channels)  # the frame before
+    if gate.rules:
+        pieces.append(4 * arch.channels * (gate_past(gate) + 1))  # inputs
+        pieces.append(12 * len(gate.signals))  # baseline, noise, size
+        terms = sum(len(rule.terms) for rule in gate.rules)
+        pieces += [2 * terms, terms]  # how long each holds, how many in a row
+    return sum(_filled(piece) for piece in pieces)
+
+
+def gate_past(gate: GateSettings) -> int:
+    """Return the number of samples that the gate looks back: the longest lag."""
+    return max((s.lag for s in gate.signals if s.kind == JERK), default=1)
+
+
+def _filled(n: int) -> int:
+    return -(-n // GROUP) * GROUP
+
+
+def _scales(bias: NDArray[np.int64], scale: Requantize | LogitScale) -> bytes:
+    rows = zip(bias, scale.multiplier, scale.before, scale.after, strict=True)
+    return b"".join(struct.pack("<iHBB", *(int(v) for v in row)) for row in rows)
+
+
+def grouped_weights(weights: NDArray[np.int8]) -> NDArray[np.uint8]:
+    """Return weights (F, C, K) as the toy reads them, each + 128 and filled up with 128: (F / 4, K, C / 4, 4, 4)."""
+    f, c, k = weights.shape
+    full = np.zeros((_filled(f), _filled(c), k), dtype=np.int16)
+    full[:f, :c] = weights
+    split = full.reshape(len(full) // GROUP, GROUP, full.shape[1] // GROUP, GROUP, k)
+    return np.ascontiguousarray(split.transpose(0, 4, 2, 1, 3) + 128).astype(np.uint8)

@@ -1,0 +1,210 @@
+"""Integer network.
+
+The exact meaning of a deployed model, with 8-bit weights and activations, 32-bit sums, fixed-point scales.
+
+This module defines the answers; the C in the toy gives the same bits. Only ``stream`` networks are here: batch
+normalisation is folded into the layer that follows it. Sums are computed in float64, which holds every whole number
+that can occur, so that they are exact and fast.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from plushsense.core.errors import BadInput, BundleError
+from plushsense.models.arch import Arch
+from plushsense.models.reference import CHUNK, Floats, Pool, SampleRing, check_windows, taps_of
+from plushsense.runtime.fixed import Bytes, InputScale, Ints, LogitScale, Requantize
+
+_SUM_LIMIT = (1 << 31) - 1
+
+
+def deployable(arch: Arch) -> bool:
+    """Return whether a network can be deployed in integers; `plushsense.deploy.quantize` says why another cannot."""
+    return arch.padding == "stream" and arch.norm == "batch"
+
+
+@dataclass(frozen=True, eq=False)
+class IntegerLayer:
+    """Integer layer: ``weights`` (F, C, K) int8, ``bias`` (F,) int32, and how its sums become 8-bit activations."""
+
+    weights: NDArray[np.int8]
+    bias: Ints
+    scale: Requantize
+
+    @cached_property
+    def matrix(self) -> Floats:
+        """(K · C, F), taps outermost."""
+        f, c, k = self.weights.shape
+        return self.weights.transpose(2, 1, 0).reshape(k * c, f).astype(np.float64)
+
+    def apply(self, taps: Floats) -> Floats:
+        """Return activations (n, F), integers in float64, of taps (n, K · C), taps outermost."""
+        return self.scale.apply((taps @ self.matrix).astype(np.int64) + self.bias).astype(np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class IntegerDense:
+    """The last layer: ``weights`` (K, F) int8 on sums over ``pool`` positions, ``bias`` (K,) int32, logits' scale."""
+
+    weights: NDArray[np.int8]
+    bias: Ints
+    scale: LogitScale
+
+    @cached_property
+    def matrix(self) -> Floats:
+        """(F, K)."""
+        return self.weights.T.astype(np.float64)
+
+    def apply(self, pooled: Floats) -> Ints:
+        """Return logits (N, K) in steps of 1/256 of sums over time (N, F)."""
+        return self.scale.apply((pooled @ self.matrix).astype(np.int64) + self.bias)
+
+
+@dataclass(frozen=True, eq=False)
+class IntegerNetwork:
+    """A network in integers.
+
+    Raises:
+        BundleError: when the parts are not those of ``arch``, or a sum could leave 32 bits.
+    """
+
+    arch: Arch
+    inputs: InputScale
+    layers: tuple[IntegerLayer, ...]
+    dense: IntegerDense
+
+    def __post_init__(self) -> None:
+        arch = self.arch
+        if not deployable(arch):
+            raise BundleError(
+                f"{arch.title} has padding '{arch.padding}' and {arch.norm} normalisation: a network in "
+                "integers needs 'stream' and batch normalisation."
+            )
+        shapes = arch.weight_shapes
+        needed = [shapes[f"conv{i}.weight"] for i in range(len(arch.layers))] + [shapes["dense.weight"]]
+        parts: list[IntegerLayer | IntegerDense] = [*self.layers, self.dense]
+        if len(self.inputs) != arch.channels or len(parts) != len(needed):
+            raise BundleError(
+                f"The integer network is not {arch.title}: it has {len(self.inputs)} inputs and "
+                f"{len(self.layers)} layers."
+            )
+        for n, (part, shape) in enumerate(zip(parts, needed, strict=True), 1):
+            if part.weights.shape != shape or part.bias.shape != shape[:1] or len(part.scale) != shape[0]:
+                raise BundleError(
+                    f"Layer {n} of the integer network has weights {part.weights.shape}; {arch.title} needs {shape}."
+                )
+            if part.weights.dtype != np.int8 or part.bias.dtype.kind != "i":
+                raise BundleError(
+                    f"Layer {n} of the integer network has weights of {part.weights.dtype} and biases of "
+                    f"{part.bias.dtype}: accepted are int8 and whole numbers."
+                )
+            most = 255 * (arch.pooled if part is self.dense else 1)
+            reach = np.abs(part.weights.astype(np.int64)).reshape(len(part.bias), -1).sum(axis=1) * most
+            if part.weights.size and int((np.abs(part.bias) + reach).max()) > _SUM_LIMIT:
+                raise BundleError(f"A sum of layer {n} of {arch.title} could leave 32 bits: use fewer taps or filters.")
+        if arch.step > 257:
+            raise BundleError(
+                f"A step of {arch.step} samples does not fit the 16-bit sums of the pooling: at most 257."
+            )
+
+    def forward(self, x: ArrayLike) -> Ints:
+        """Return logits (N, K) in steps of 1/256 of raw integer windows (N, C, T).
+
+        The last ``arch.span`` samples are read.
+
+        Raises:
+            BadInput: for windows of another shape, shorter than the span, or not of whole numbers.
+        """
+        x = _whole(x)
+        check_windows(self.arch, x.shape)
+        return np.concatenate([self._logits(x[at : at + 64]) for at in range(0, len(x), 64)] or [self._none()])
+
+    def _logits(self, x: NDArray[Any]) -> Ints:
+        z = self.inputs.apply(x[:, :, x.shape[2] - self.arch.span :].transpose(0, 2, 1)).astype(np.float64)
+        for layer, part in zip(self.arch.layers, self.layers, strict=True):
+            taps = taps_of(z, layer)
+            z = np.stack([part.apply(each.reshape(len(each), -1)) for each in taps])
+        return self.dense.apply(z.sum(axis=1))
+
+    def _none(self) -> Ints:
+        return np.empty((0, self.arch.classes), dtype=np.int64)
+
+    def activations(self, x: ArrayLike) -> list[Bytes]:
+        """Return the inputs of each layer and the output of the last, [(N, T', C')] uint8, of windows (N, C, T),
+        to inspect.
+        """
+        seen = [self.inputs.apply(_whole(x).transpose(0, 2, 1))]
+        for layer, part in zip(self.arch.layers, self.layers, strict=True):
+            taps = taps_of(seen[-1].astype(np.float64), layer)
+            seen.append(np.stack([part.apply(each.reshape(len(each), -1)) for each in taps]).astype(np.uint8))
+        return seen
+
+    def stepper(self) -> IntegerStepper:
+        """Return a reader of one stream, in the state ``warming``."""
+        return IntegerStepper(self)
+
+
+def _whole(x: ArrayLike) -> NDArray[Any]:
+    """Raw values: a network in integers does not read scaled ones."""
+    values = np.asarray(x)
+    if values.size and values.dtype.kind not in "iu":
+        raise BadInput(
+            f"A network in integers reads raw whole numbers, not {values.dtype}: give it the samples before scaling."
+        )
+    return values
+
+
+class IntegerStepper:
+    """Reads raw samples as they come; decides when the span has come, then every ``arch.step`` samples."""
+
+    def __init__(self, network: IntegerNetwork) -> None:
+        self.network = network
+        self.arch = network.arch
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the past: after a gap, a clock reset, a reconnection."""
+        arch = self.arch
+        self.seen = 0
+        self._rings = [SampleRing(layer, read) for layer, read in zip(arch.layers, arch.inputs, strict=True)]
+        self._pool = Pool(arch.step, arch.pooled // arch.step, arch.filters[-1])
+
+    @property
+    def state(self) -> Literal["warming", "ready"]:
+        """``warming`` until ``arch.span`` samples have come since the start or the last reset."""
+        return "ready" if self.seen >= self.arch.span else "warming"
+
+    def push(self, samples: ArrayLike) -> Ints:
+        """Read raw integer samples (n, C); return the logits (m, K), in steps of 1/256, of the decisions now due.
+
+        Raises:
+            BadInput: for samples of another shape, or not whole numbers.
+        """
+        block = _whole(samples)
+        if block.ndim != 2 or block.shape[1] != self.arch.channels:
+            raise BadInput(
+                f"Samples of the shape {block.shape} do not fit: {self.arch.symbol} reads "
+                f"(samples, {self.arch.channels} channels)."
+            )
+        due = [self._advance(block[at : at + CHUNK]) for at in range(0, len(block), CHUNK)]
+        return due[0] if len(due) == 1 else np.concatenate([self.network._none(), *due])
+
+    def _advance(self, chunk: NDArray[Any]) -> Ints:
+        self.seen += len(chunk)
+        z = self.network.inputs.apply(chunk).astype(np.float64)
+        for ring, part in zip(self._rings, self.network.layers, strict=True):
+            taps = ring.feed(z)
+            if not len(taps):
+                return self.network._none()
+            z = part.apply(taps)
+        due = self._pool.feed(z)
+        if not len(due):
+            return self.network._none()
+        # The pool gives means; a whole number times pool / pool is that number again, once rounded.
+        return self.network.dense.apply(np.rint(due * self.arch.pooled))

@@ -1,0 +1,467 @@
+"""Access control of the studio: local requests or those with a one-time token; pages load nothing from elsewhere.
+
+`Guard` wraps the whole application, including NiceGUI's own routes and its websocket. `limited_protocol` bounds how
+many connections are open at once and how long a request may take to arrive, since each connection holds a file
+descriptor of the process that records.
+"""
+
+from __future__ import annotations
+
+import hmac
+import io
+import ipaddress
+import secrets
+import zipfile
+from collections.abc import Awaitable, Callable, Iterable, Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from http.cookies import CookieError, SimpleCookie
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qs, quote, urlsplit
+
+from fastapi import APIRouter
+from fastapi.responses import FileResponse, PlainTextResponse, Response, StreamingResponse
+
+from plushsense.core.errors import ConfigError
+from plushsense.dataset.importing.archives import zip_entry
+from plushsense.dataset.publishing.tables import list_package_files
+from plushsense.deploy.emit import FACTS
+from plushsense.studio.app.workspace import EXPORTS, PACKAGES, Workspace
+
+Scope = dict[str, Any]
+Receive = Callable[[], Awaitable[dict[str, Any]]]
+Send = Callable[[dict[str, Any]], Awaitable[None]]
+App = Callable[[Scope, Receive, Send], Awaitable[None]]
+
+COOKIE = "plushsense_visitor"
+TOKEN = "token"
+WELCOME = "welcome"
+UPLOAD_BYTES = 501_000_000
+"""The largest body of a request that brings a file."""
+BODY_BYTES = 4_000_000
+"""The largest body of any other request."""
+HEAD_BYTES = 65_536
+"""The longest head of a request."""
+_UNANSWERED = "No response returned"
+"""Starlette's error message if the visitor disconnected before the response was ready."""
+_LOOPBACK = ("127.0.0.1", "localhost", "[::1]", "::1")
+
+# NiceGUI's Vue templates are compiled in the browser, which needs eval; nothing may come from elsewhere.
+CONTENT_POLICY = (
+    "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; style-src 'self' 'unsafe-inline'; "
+    "img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self'; object-src 'none'; base-uri 'self'; "
+    "form-action 'self'; frame-ancestors 'none'"
+)
+_HEADERS = [
+    (b"content-security-policy", CONTENT_POLICY.encode()),
+    (b"x-content-type-options", b"nosniff"),
+    (b"referrer-policy", b"no-referrer"),
+    (b"permissions-policy", b"camera=(), microphone=(), geolocation=()"),
+]
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether ``host`` is an address of this machine's loopback interface."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+class Visitors:
+    """The browsers that are admitted: all of this machine if the studio listens there alone, else those with a token.
+
+    Args:
+        host: the address that the studio listens on.
+        names: more names under which it may be called, such as the machine's.
+
+    A token is valid once: the browser that presents it gets a cookie.
+    """
+
+    def __init__(self, host: str, names: Iterable[str] = ()) -> None:
+        self.open = is_loopback(host)
+        self._names = {n.lower() for n in (*_LOOPBACK, host, *names)}
+        self._tokens: set[str] = set()
+        self._cookies: set[str] = set()
+
+    def invite(self) -> str:
+        """Return a new token, which admits one browser."""
+        token = secrets.token_urlsafe(24)
+        self._tokens.add(token)
+        return token
+
+    def refusal_of(self, headers: dict[str, str]) -> str:
+        """Return why a request must be refused for its host or origin, or ""."""
+        origin = headers.get("origin")
+        try:
+            host = urlsplit(f"//{headers.get('host', '')}").hostname or ""
+            origin_host = urlsplit(origin or "").netloc
+        except ValueError:
+            return "The address of this request is not valid: use the address that the studio printed."
+        if host.lower() not in self._names and f"[{host.lower()}]" not in self._names:
+            return f"This studio does not answer under the name '{host}': use the address that it printed."
+        # Browsers name the requesting page; following a link to the studio is harmless.
+        if headers.get("sec-fetch-site") == "cross-site" and headers.get("sec-fetch-mode") != "navigate":
+            return "This request came from another web page: open the studio by its own address."
+        if origin and origin_host.lower() != headers.get("host", "").lower():
+            return "This request came from another web page: open the studio by its own address."
+        return ""
+
+    def admits(self, headers: dict[str, str]) -> bool:
+        """Return whether a request comes from an admitted browser."""
+        if self.open:
+            return True
+        try:
+            cookie = SimpleCookie(headers.get("cookie", "")).get(COOKIE)
+        except CookieError:
+            return False
+        return cookie is not None and any(hmac.compare_digest(cookie.value.encode(), v.encode()) for v in self._cookies)
+
+    def admit(self, query: str) -> str:
+        """Return the cookie value for a valid token, which is then used up, or ""."""
+        given = parse_qs(query).get(TOKEN, [""])[0].encode()
+        token = next((t for t in self._tokens if hmac.compare_digest(t.encode(), given)), None)
+        if token is None:
+            return ""
+        self._tokens.discard(token)
+        visitor = secrets.token_urlsafe(24)
+        self._cookies.add(visitor)
+        return visitor
+
+
+class Guard:
+    """ASGI middleware: admits the browsers that `Visitors` knows, bounds request bodies, and sets security headers."""
+
+    def __init__(self, app: App, visitors: Visitors) -> None:
+        self._app, self._visitors = app, visitors
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        headers = {k.decode("latin-1").lower(): v.decode("latin-1") for k, v in scope["headers"]}
+        query = scope.get("query_string", b"").decode("latin-1")
+        if reason := self._visitors.refusal_of(headers):
+            await _refuse(scope, send, 400, reason)
+        elif scope["type"] == "websocket":
+            if self._visitors.admits(headers):
+                await self._app(scope, receive, send)
+            else:
+                await _refuse(scope, send, 401, _TOKEN_NEEDED)
+        elif not self._visitors.open and scope["method"] == "GET" and (visitor := self._visitors.admit(query)):
+            await _to_start(send, "" if self._visitors.admits(headers) else visitor)
+        elif self._visitors.admits(headers):
+            await _bounded(self._app, scope, receive, send, headers)
+        elif scope["path"] == "/" and query == WELCOME:
+            # After a link from another page, a browser does not send the new cookie with the first request.
+            await _answer(send, 200, b'<!doctype html><meta http-equiv="refresh" content="0;url=/">', "text/html")
+        else:
+            await _refuse(scope, send, 401, _TOKEN_NEEDED)
+
+
+_TOKEN_NEEDED = "This studio can only be opened with the address that it printed at start; its token is valid once."
+
+
+async def _bounded(app: App, scope: Scope, receive: Receive, send: Send, headers: dict[str, str]) -> None:
+    """Call ``app`` with a bounded request body, also one of unknown length, and add the security headers."""
+    most = UPLOAD_BYTES if _is_upload(scope) else BODY_BYTES
+    refusal = f"This is larger than the {most / 1e6:g} MB that are accepted here."
+    length = headers.get("content-length", "0")
+    if not length.isdecimal() or int(length) > most:
+        await _refuse(scope, send, 413, refusal)
+        return
+    received, too_large, started, disconnected = 0, False, False, False
+
+    async def receiving() -> dict[str, Any]:
+        nonlocal received, too_large, disconnected
+        if too_large:
+            return {"type": "http.disconnect"}
+        message = await receive()
+        disconnected = disconnected or message["type"] == "http.disconnect"
+        received += len(message.get("body", b""))
+        if received > most:
+            too_large = True
+            return {"type": "http.disconnect"}
+        return message
+
+    async def sending(message: dict[str, Any]) -> None:
+        nonlocal started
+        if too_large and not started:
+            return
+        if message["type"] == "http.response.start":
+            started = True
+            message = {**message, "headers": [*message.get("headers", []), *_HEADERS]}
+        await send(message)
+
+    try:
+        await app(scope, receiving, sending)
+    except Exception as cause:
+        # NiceGUI takes the end of the body for a disconnect; a visitor who left needs no answer.
+        if not too_large and not (disconnected and _UNANSWERED in str(cause)):
+            raise
+    if too_large and not started:
+        await _refuse(scope, send, 413, refusal)
+
+
+def _is_upload(scope: Scope) -> bool:
+    """Return whether this is NiceGUI's route for files: ``/_nicegui/client/<page>/upload/<element>``."""
+    parts: list[str] = scope["path"].split("/")
+    return bool(scope["method"] == "POST" and parts[1:3] == ["_nicegui", "client"] and parts[4:5] == ["upload"])
+
+
+async def _to_start(send: Send, visitor: str) -> None:
+    """Redirect to the first page, without the token in the address."""
+    headers = [(b"location", f"/?{WELCOME}".encode()), (b"cache-control", b"no-store"), *_HEADERS]
+    if visitor:
+        headers.append((b"set-cookie", f"{COOKIE}={visitor}; Path=/; HttpOnly; SameSite=Strict".encode()))
+    await send({"type": "http.response.start", "status": 303, "headers": headers})
+    await send({"type": "http.response.body", "body": b""})
+
+
+async def _refuse(scope: Scope, send: Send, status: int, message: str) -> None:
+    if scope["type"] == "websocket":
+        await send({"type": "websocket.close", "code": 1008, "reason": message[:100]})
+    else:
+        await _answer(send, status, f"{message}\n".encode(), "text/plain")
+
+
+async def _answer(send: Send, status: int, body: bytes, kind: str) -> None:
+    headers = [(b"content-type", f"{kind}; charset=utf-8".encode()), (b"cache-control", b"no-store"), *_HEADERS]
+    if status != 413:
+        # Close the connection; but after 413 a browser reads the answer only once it has sent the whole body.
+        headers.append((b"connection", b"close"))
+    await send({"type": "http.response.start", "status": status, "headers": headers})
+    await send({"type": "http.response.body", "body": body})
+
+
+# Connections ------------------------------------------------------------------------------------------------------
+
+_MOST, _MOST_PER_PEER = 256, 32
+"""Connections at once, and of one peer, where file descriptors do not set a lower bound. A browser has up to six, and a
+websocket for each open page."""
+
+
+@dataclass(frozen=True)
+class ConnectionLimits:
+    """Limits on the number of open connections and on how long each may wait.
+
+    Attributes:
+        total: connections of all peers; ``per_peer`` of them are kept free for this machine's own browser.
+        per_peer: connections of one peer, see `peer_of`.
+        head_s: time until the head of a request is complete, from the connection or the answer before.
+        body_s: time without any data while the body of a request is incomplete.
+        keep_alive_s: time until a connection on which nothing comes after an answer is closed.
+        backlog: connections that wait to be accepted; as many are open for a moment before they can be refused.
+    """
+
+    total: int = _MOST
+    per_peer: int = _MOST_PER_PEER
+    head_s: float = 10.0
+    body_s: float = 30.0
+    keep_alive_s: int = 5
+    backlog: int = 128
+
+    @classmethod
+    def of_process(cls) -> ConnectionLimits:
+        """Return limits that leave three quarters of this process's file descriptors for everything else."""
+        try:
+            import resource
+        except ImportError:  # Windows: sockets do not count as open files
+            return cls()
+        files = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+        total = _MOST if files == resource.RLIM_INFINITY else max(4, min(_MOST, files // 4))
+        return cls(total=total, per_peer=min(_MOST_PER_PEER, total // 2), backlog=total // 2)
+
+
+@lru_cache(maxsize=1024)
+def peer_of(client: str, server: str) -> str:
+    """Return by what name the connections of a client are counted: "" for this machine, whichever of its addresses it
+    uses; else the IPv4 address, or the /64 network of an IPv6 address, whose hosts choose the rest themselves.
+    """
+    try:
+        address = ipaddress.ip_address(client.partition("%")[0])
+    except ValueError:
+        return client
+    if isinstance(address, ipaddress.IPv6Address):
+        address = address.ipv4_mapped or address
+    if address.is_loopback or client == server:
+        return ""
+    return str(ipaddress.ip_network((address, 64), strict=False) if address.version == 6 else address)
+
+
+def limited_protocol(limits: ConnectionLimits) -> type[Any]:  # noqa: C901
+    """Return a protocol class for uvicorn (its setting ``http``) that keeps these limits.
+
+    uvicorn bounds how long a connection is kept *after* an answer and how long a head is, but not how long a request
+    takes to arrive; and its ``limit_concurrency`` answers 503 to whoever has sent a whole request, while those that
+    have sent half of one stay. Here a new connection takes the place of the one that has waited longest for a request.
+    """
+    import h11
+    from uvicorn.protocols.http.h11_impl import H11Protocol
+
+    def peer(connection: Any) -> str:
+        client, server = connection.client, connection.server
+        return peer_of(client[0] if client else "?", server[0] if server else "")
+
+    class LimitedProtocol(H11Protocol):
+        """HTTP connection of a browser until it is closed or becomes a websocket."""
+
+        _idle_since = _data_at = 0.0
+        _timer: Any = None
+
+        def connection_made(self, transport: Any) -> None:
+            super().connection_made(transport)
+            self._idle_since = self.loop.time()
+            if self._find_room():
+                self._timer = self.loop.call_later(limits.head_s, self._expire)
+            else:
+                self._drop()
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            if self._timer is not None:
+                self._timer.cancel()
+            super().connection_lost(exc)
+
+        def data_received(self, data: bytes) -> None:
+            self._data_at = self.loop.time()
+            super().data_received(data)
+
+        def on_response_complete(self) -> None:
+            self._idle_since = self.loop.time()
+            super().on_response_complete()
+
+        @property
+        def _idle(self) -> bool:
+            """True if nothing but the head of a request is outstanding."""
+            if self.conn.their_state is h11.SEND_BODY or self.transport.get_write_buffer_size():
+                return False
+            return self.cycle is None or self.cycle.response_complete
+
+        def _find_room(self) -> bool:
+            """Return whether this connection may stay; an idle one makes room for it where there is none."""
+            mine = peer(self)
+            others = [(peer(c), c) for c in self.connections if c is not self]
+            crowd = [c for name, c in others if name == mine]
+            if len(crowd) < limits.per_peer:
+                # This machine's own share is never given away.
+                crowd = [c for name, c in others if name] if mine else []
+                if len(crowd) < limits.total - limits.per_peer:
+                    return True
+            idle = [c for c in crowd if isinstance(c, LimitedProtocol) and c._idle]
+            if idle:
+                min(idle, key=lambda c: c._idle_since)._drop()
+            return bool(idle)
+
+        def _drop(self) -> None:
+            # Uncount it now: the transport reports its end only in the loop's next round.
+            self.connections.discard(self)
+            self.transport.abort()
+
+        def _expire(self) -> None:
+            """Drop the connection if the rest of a request is overdue, else look again later."""
+            now = self.loop.time()
+            if self not in self.connections:
+                return  # it is a websocket now
+            left = limits.head_s
+            if self.conn.their_state is h11.SEND_BODY:
+                if self.flow.read_paused:
+                    self._data_at = now
+                left = self._data_at + limits.body_s - now
+            elif self._idle:
+                left = self._idle_since + limits.head_s - now
+            if left <= 0.0:
+                self._drop()
+            else:
+                self._timer = self.loop.call_later(min(left, limits.head_s), self._expire)
+
+    return LimitedProtocol
+
+
+_PIECE = 1 << 16
+_LONGEST_NAME = 255
+"""Bytes of a file's name; file systems refuse longer ones in ways of their own."""
+
+
+def address(kind: str, name: str) -> str:
+    """Return the download address of an export or package; ``kind`` is `EXPORTS` or `PACKAGES`."""
+    return f"/download/{kind}/{quote(name, safe='')}.zip"
+
+
+def router(workspace: Workspace) -> APIRouter:
+    """Return the routes for the addresses of `address`."""
+    routes = APIRouter()
+
+    @routes.get(f"/download/{EXPORTS}/{{name}}.zip", include_in_schema=False)
+    def export(name: str) -> Response:
+        try:
+            folder = path_in(workspace, EXPORTS, name)
+        except ConfigError as refusal:
+            return PlainTextResponse(f"{refusal}\n", 404)
+        if not (folder / FACTS).is_file():
+            return PlainTextResponse(f"There is no export '{name}' in this studio.\n", 404)
+        disposition = f"attachment; filename*=UTF-8''{quote(folder.name, safe='')}.zip"
+        return StreamingResponse(
+            zip_chunks(folder), media_type="application/zip", headers={"content-disposition": disposition}
+        )
+
+    @routes.get(f"/download/{PACKAGES}/{{name}}.zip", include_in_schema=False)
+    def package(name: str) -> Response:
+        try:
+            file = path_in(workspace, PACKAGES, f"{name}.zip")
+        except ConfigError as refusal:
+            return PlainTextResponse(f"{refusal}\n", 404)
+        if not file.is_file():
+            return PlainTextResponse(f"There is no package '{name}' in this studio.\n", 404)
+        return FileResponse(file, media_type="application/zip", filename=file.name)
+
+    return routes
+
+
+def path_in(workspace: Workspace, kind: str, name: str) -> Path:
+    """Return the path of ``name`` directly inside the workspace's folder ``kind``.
+
+    Raises:
+        ConfigError: for a name that leads elsewhere, also by way of a link.
+    """
+    place = workspace.inside(workspace.folder / kind / name)
+    if place.parent != workspace.folder / kind or len(place.name.encode()) > _LONGEST_NAME:
+        raise ConfigError(f"'{name}' is no name in '{workspace.folder / kind}'.")
+    return place
+
+
+def zip_chunks(folder: Path) -> Iterator[bytes]:
+    """Yield a zip of a folder, under the folder's name, while it is packed; equal files give equal bytes.
+
+    Links that lead out of the folder are left out.
+    """
+    pipe = _Pipe()
+    with zipfile.ZipFile(pipe, "w", zipfile.ZIP_DEFLATED) as archive:
+        for path in list_package_files(folder):
+            if folder.resolve() not in path.resolve().parents:
+                continue
+            entry = zip_entry(f"{folder.name}/{path.relative_to(folder).as_posix()}")
+            with path.open("rb") as source, archive.open(entry, "w") as target:
+                while piece := source.read(_PIECE):
+                    target.write(piece)
+                    yield pipe.take()
+    yield pipe.take()
+
+
+class _Pipe(io.RawIOBase):
+    """Buffer between `zipfile` and the response; it cannot seek, so that sizes are written after the data."""
+
+    def __init__(self) -> None:
+        self._held = bytearray()
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, piece: object) -> int:
+        taken = bytes(piece)  # type: ignore[call-overload]
+        self._held += taken
+        return len(taken)
+
+    def take(self) -> bytes:
+        held, self._held = bytes(self._held), bytearray()
+        return held

@@ -1,0 +1,256 @@
+"""Long tasks in processes of their own: started, followed, stopped and resumed, independent of open pages."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from plushsense.core.errors import ConfigError
+from plushsense.core.files import write_file
+from plushsense.studio.app.workspace import WORK, ChangeSignal, Workspace
+
+UNFINISHED = ".unfinished-"
+"""Prefix of temporary folders in the work folder; they are removed at the next start."""
+INCOMING = "incoming"
+"""In the work folder: uploaded files until they are imported; orphans are removed at the next start."""
+RUNNING, DONE, REFUSED, STOPPED = "running", "done", "refused", "stopped"
+_MAX_REPORTS = 2000
+# Keys of a spec that are never stored: they may hold people's names.
+_SECRET_KEYS = ("words",)
+_STOP_S = 10.0
+
+
+@dataclass
+class StudioJob:
+    """A task that runs in a process of its own, with its progress and its outcome.
+
+    Attributes:
+        id: unique, in the order of beginning. ``task``: a key of `plushsense.studio.app.worker.TASKS`.
+        spec: what the task is given, plain values. ``title``: for people.
+        state: `RUNNING`, `DONE`, `REFUSED` (``message`` says why), or `STOPPED` (by a person, or with the studio).
+        progress: the newest report of the task; ``reports``: all of them, up to some thousands. Plain values.
+        warnings: sentences. ``result``: what the task returned.
+        begun_s, ended_s: seconds since 1970.
+    """
+
+    id: str
+    task: str
+    spec: dict[str, Any]
+    title: str
+    state: str = RUNNING
+    progress: dict[str, Any] = field(default_factory=dict)
+    reports: list[dict[str, Any]] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    result: dict[str, Any] = field(default_factory=dict)
+    message: str = ""
+    begun_s: float = 0.0
+    ended_s: float = 0.0
+
+
+class Jobs:
+    """All jobs of a studio, stored in ``<workspace>/work/<id>.json``.
+
+    `changed` is notified at every report.
+
+    A job whose spec says ``dry`` is a preview: it is not stored once it has ended.
+    """
+
+    def __init__(self, workspace: Workspace) -> None:
+        self.changed = ChangeSignal()
+        self._folder = workspace.folder / WORK
+        self._processes: dict[str, subprocess.Popen[str]] = {}
+        self._lock = threading.RLock()
+        self._jobs: dict[str, StudioJob] = {}
+        for folder in self._folder.glob(f"{UNFINISHED}*"):
+            shutil.rmtree(folder, ignore_errors=True)
+        for path in sorted(self._folder.glob("*.json")):
+            with contextlib.suppress(OSError, ValueError, TypeError, AttributeError, RecursionError):
+                stored = json.loads(path.read_text(encoding="utf-8"))
+                job = StudioJob(**{"message": stored.pop("said", ""), **stored})
+                if job.id != path.stem:
+                    continue
+                if job.spec.get("dry"):
+                    path.unlink()
+                    continue
+                # A running job ended with the studio that ran it.
+                job.state = STOPPED if job.state == RUNNING else job.state
+                self._jobs[job.id] = job
+        # Keep only uploads that a stopped job would resume with.
+        resumable = {str(job.spec.get("archive")) for job in self._jobs.values() if job.state == STOPPED}
+        for file in self._folder.glob(f"{INCOMING}/*"):
+            if str(file) not in resumable:
+                with contextlib.suppress(OSError):
+                    file.unlink()
+
+    def all(self, *tasks: str) -> list[StudioJob]:
+        """Return the jobs of these tasks, or all, the newest first."""
+        with self._lock:
+            return [job for job in reversed(self._jobs.values()) if not tasks or job.task in tasks]
+
+    def get(self, identity: str) -> StudioJob:
+        """Return the job with this id.
+
+        Raises:
+            ConfigError: for an id that is none.
+        """
+        try:
+            return self._jobs[identity]
+        except KeyError:
+            raise ConfigError(f"There is no job '{identity}': it may have been removed.") from None
+
+    def start(self, task: str, spec: dict[str, Any], title: str) -> StudioJob:
+        """Start a task in a process of its own."""
+        with self._lock:
+            # Ids stay in the order of start even if the clock is set back.
+            last = max((int(i) for i in self._jobs if i.isdecimal()), default=0)
+            identity = str(max(time.time_ns() // 1_000_000, last + 1))
+            job = StudioJob(identity, task, spec, title)
+            self._jobs[identity] = job
+        self._run(job)
+        return job
+
+    def resume(self, identity: str) -> StudioJob:
+        """Start a stopped job again with the same settings; the task continues from what it stored."""
+        job = self.get(identity)
+        with self._lock:
+            if job.state == RUNNING:
+                return job
+            job.state, job.message, job.result, job.reports, job.warnings = RUNNING, "", {}, [], []
+        self._run(job)
+        return job
+
+    def drop(self, identity: str) -> None:
+        """Remove a job that has ended from the list; its results stay.
+
+        Raises:
+            ConfigError: for work that is running, or an id that is none.
+        """
+        job = self.get(identity)
+        with self._lock:
+            if job.state == RUNNING:
+                raise ConfigError(f"'{job.title}' is running: stop it first.")
+            (self._folder / f"{job.id}.json").unlink(missing_ok=True)
+            self._jobs.pop(job.id, None)
+        self.changed.notify()
+
+    def stop(self, identity: str) -> None:
+        """Interrupt a job as Ctrl-C would, without waiting; does nothing if it has ended."""
+        process = self._processes.get(identity)
+        if process is None or process.poll() is not None:
+            return
+        threading.Thread(target=_end, args=(process,), daemon=True).start()
+
+    def close(self) -> None:
+        """Stop all jobs."""
+        processes = [p for p in self._processes.values() if p.poll() is None]
+        for process in processes:
+            threading.Thread(target=_end, args=(process,), daemon=True).start()
+        for process in processes:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(_STOP_S)
+
+    def _run(self, job: StudioJob) -> None:
+        job.begun_s, job.ended_s, job.progress = time.time(), 0.0, {}
+        new_group: dict[str, Any] = (
+            {"creationflags": getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)}
+            if sys.platform == "win32"
+            else {"start_new_session": True}
+        )
+        try:
+            # Store it first: a job that is not stored could not be found again.
+            self._store(job)
+            process = subprocess.Popen(
+                [sys.executable, "-m", "plushsense.studio.app.worker"],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                text=True,
+                encoding="utf-8",
+                **new_group,
+            )
+        except OSError as cause:
+            where = cause.filename or self._folder
+            job.state, job.message = REFUSED, f"The work cannot begin: '{where}': {cause.strerror or cause}."
+            job.ended_s = time.time()
+            self.changed.notify()
+            return
+        self._processes[job.id] = process
+        assert process.stdin is not None
+        with contextlib.suppress(OSError):
+            # Standard input stays open: the worker ends when the studio closes it.
+            process.stdin.write(json.dumps({"task": job.task, "spec": job.spec}, default=str) + "\n")
+            process.stdin.flush()
+        self.changed.notify()
+        threading.Thread(target=self._follow, args=(job, process), daemon=True).start()
+
+    def _follow(self, job: StudioJob, process: subprocess.Popen[str]) -> None:
+        assert process.stdout is not None
+        outcome: dict[str, Any] = {}
+        for line in process.stdout:
+            try:
+                message = json.loads(line)
+            except ValueError:
+                continue
+            if not isinstance(message, dict):
+                continue
+            if "progress" in message:
+                job.progress = message["progress"]
+                if len(job.reports) >= _MAX_REPORTS:
+                    del job.reports[::2]
+                job.reports.append(job.progress)
+            elif "warning" in message:
+                job.warnings.append(str(message["warning"]))
+            else:
+                outcome = message
+            self.changed.notify()
+        process.wait()
+        for end in (process.stdin, process.stdout):
+            with contextlib.suppress(OSError):
+                if end is not None:
+                    end.close()
+        job.ended_s = time.time()
+        # Under the lock: a job dropped as soon as its state says that it ended must not be stored after that.
+        with self._lock:
+            if "result" in outcome:
+                job.state, job.result = DONE, outcome["result"]
+            elif "refused" in outcome:
+                job.state, job.message = REFUSED, str(outcome["refused"])
+            else:
+                job.state = STOPPED
+            with contextlib.suppress(OSError):
+                # The outcome stands even if it cannot be stored.
+                if job.spec.get("dry"):
+                    self.drop(job.id)
+                else:
+                    self._store(job)
+        self.changed.notify()
+
+    def _store(self, job: StudioJob) -> None:
+        self._folder.mkdir(parents=True, exist_ok=True)
+        stored = asdict(job)
+        stored["said"] = stored.pop("message")
+        for key in _SECRET_KEYS:
+            stored["spec"].pop(key, None)
+        write_file(self._folder / f"{job.id}.json", json.dumps(stored, default=str))
+
+
+def _end(process: subprocess.Popen[str]) -> None:
+    """Interrupt a process as Ctrl-C would; kill it if it does not end in time."""
+    for gentle in (True, False):
+        with contextlib.suppress(OSError, ValueError):
+            if sys.platform == "win32":
+                process.terminate()
+            else:
+                os.killpg(process.pid, signal.SIGINT if gentle else signal.SIGKILL)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(_STOP_S / 2)
+            return

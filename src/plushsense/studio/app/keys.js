@@ -1,0 +1,41 @@
+// The keys of a page: each press goes out once, as `press`, with what the page showed at that moment.
+export default {
+  template: '<span hidden :data-seen="seen"></span>',
+  props: { seen: String, keys: String, fields: Object },
+  mounted() {
+    this.listener = (event) => this.hear(event);
+    // Before any button hears of it: a space must not also press the button that has the focus.
+    for (const type of ["keydown", "keypress", "keyup"]) window.addEventListener(type, this.listener, true);
+  },
+  beforeUnmount() {
+    for (const type of ["keydown", "keypress", "keyup"]) window.removeEventListener(type, this.listener, true);
+  },
+  methods: {
+    hear(event) {
+      if (event.ctrlKey || event.altKey || event.metaKey || event.isComposing) return;
+      const at = event.target;
+      if (at && at.matches && (at.isContentEditable || at.matches("input, textarea, select"))) return;
+      if (event.key === "Enter" && event.repeat) {
+        // A held Enter presses a button once.
+        event.preventDefault();
+        event.stopImmediatePropagation();
+        return;
+      }
+      const key = event.code === "Space" ? " " : event.key.toLowerCase();
+      if (this.fields[key]) {
+        event.preventDefault();
+        event.stopImmediatePropagation();
+        // At once, here: the next letter is typed already.
+        if (event.type === "keydown") document.querySelector(this.fields[key])?.focus();
+        return;
+      }
+      if (key.length !== 1 || !this.keys.includes(key)) return;
+      event.preventDefault();
+      event.stopImmediatePropagation();
+      if (event.type !== "keydown" || event.repeat) return;
+      // Nobody hears it now, and later it would mean something else.
+      if (!window.socket || !window.socket.connected || document.body.classList.contains("ps-unknown")) return;
+      this.$emit("press", { key, seen: this.seen });
+    },
+  },
+};

@@ -1,0 +1,188 @@
+"""Run the web application: its pages, access control and address."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import inspect
+import logging
+import os
+import socket
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+from plushsense.core.errors import ConfigError, need
+from plushsense.studio.app.guard import (
+    HEAD_BYTES,
+    TOKEN,
+    ConnectionLimits,
+    Guard,
+    Visitors,
+    is_loopback,
+    limited_protocol,
+)
+from plushsense.studio.app.workspace import WORK, Workspace
+
+PORT = 8137
+_OPENING_S = 30.0
+_EVERYWHERE = ("0.0.0.0", "::")
+_ICON = (
+    '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 32 32"><g fill="#b07a4a"><circle cx="8" cy="8" r="5"/>'
+    '<circle cx="24" cy="8" r="5"/><circle cx="16" cy="18" r="12"/></g><circle cx="11.5" cy="16" r="1.8"/>'
+    '<circle cx="20.5" cy="16" r="1.8"/><ellipse cx="16" cy="21" rx="3" ry="2"/></svg>'
+)
+
+
+def run(
+    workspace: Workspace,
+    *,
+    host: str = "127.0.0.1",
+    port: int | None = None,
+    names: tuple[str, ...] = (),
+    show: bool = True,
+    on_ready: Callable[[str], None],
+) -> None:
+    """Serve a workspace until interrupted.
+
+    Args:
+        host: where to listen; any other than 127.0.0.1 asks visitors for a token.
+        port: `PORT`, or the next free one, by default; 0: any.
+        names: further names under which browsers may call the machine.
+        show: whether to open a browser.
+        on_ready: called with the address when it answers.
+
+    Raises:
+        MissingExtraError: without the extra ``studio``.
+        ConfigError: for an address that cannot be listened on, and a folder that another studio serves.
+    """
+    need("nicegui", "studio")
+    # Else NiceGUI stores files in the working directory or in Redis.
+    os.environ["NICEGUI_STORAGE_PATH"] = str(workspace.folder / WORK / "nicegui")
+    os.environ.pop("NICEGUI_REDIS_URL", None)
+    from nicegui import app, ui
+
+    from plushsense.studio.app.guard import router
+    from plushsense.studio.app.shell import PAGES
+
+    lock = _lock_folder(workspace)
+    port = _free_port(host, port)
+    for name, path in PAGES.items():
+        ui.page(path, response_timeout=30.0)(_page(workspace, name))
+    app.include_router(router(workspace))
+    everywhere = host in _EVERYWHERE
+    if everywhere:
+        names = (*names, socket.gethostname(), *_addresses())
+    visitors = Visitors(host, names)
+    inner: Any = app.build_middleware_stack
+    # The guard must be outermost, also around error responses: added middleware runs inside NiceGUI's own.
+    vars(app)["build_middleware_stack"] = lambda: Guard(inner(), visitors)
+    host_name = (_addresses() or [socket.gethostname()])[0] if everywhere else host
+    address = f"http://{f'[{host_name}]' if ':' in host_name else host_name}:{port}/"
+    if not visitors.open:
+        workspace.invite = lambda: f"{address}?{TOKEN}={visitors.invite()}"
+
+    def announce() -> None:
+        # The callback may open a browser at once, but start-up ends before the port is open.
+        _wait_open(host_name, port)
+        on_ready(workspace.invite() if workspace.invite else address)
+
+    limits = ConnectionLimits.of_process()
+    # NiceGUI's own tasks may miss the shutdown; that message is of no use.
+    logging.getLogger("nicegui").addFilter(lambda record: "Could not cancel" not in str(record.msg))
+    # Quasar's loading bar has no accessible name.
+    app.config.quasar_config["loadingBar"] = {"skipHijack": True}
+    app.on_startup(lambda: threading.Thread(target=announce, daemon=True).start())
+    app.on_shutdown(workspace.close)
+    ui.run(
+        host=host,
+        port=port,
+        title="PlushSense",
+        favicon=_ICON,
+        show=show and visitors.open,
+        reload=False,
+        show_welcome_message=False,
+        reconnect_timeout=10.0,
+        uvicorn_logging_level="error",
+        http=limited_protocol(limits),
+        timeout_keep_alive=limits.keep_alive_s,
+        backlog=limits.backlog,
+        h11_max_incomplete_event_size=HEAD_BYTES,
+    )
+    if lock is not None:
+        lock.release()
+
+
+def _lock_folder(workspace: Workspace) -> FileLock | None:
+    """Lock the folder until this process ends: two studios would each remove the other's unfinished work.
+
+    Raises:
+        ConfigError: when another studio has it.
+    """
+    lock = FileLock(workspace.folder / WORK / "studio.lock", timeout=0)
+    try:
+        (workspace.folder / WORK).mkdir(parents=True, exist_ok=True)
+        lock.acquire()
+    except Timeout:
+        raise ConfigError(
+            f"A studio is open on '{workspace.folder}' already: use that one, or give another folder with --home."
+        ) from None
+    except (OSError, NotImplementedError):
+        # Without a writable folder nothing can collide.
+        return None
+    return lock
+
+
+def _page(workspace: Workspace, name: str) -> Callable[[], Any]:
+    """Return the function that builds a page; it imports the page's module at the first visit."""
+
+    async def build() -> None:
+        from plushsense.studio.app.shell import frame
+
+        module = importlib.import_module(f"plushsense.studio.pages.{name}.page")
+        with frame(workspace, name) as page:
+            built = module.show(page)
+            if inspect.isawaitable(built):
+                await built
+
+    return build
+
+
+def _free_port(host: str, port: int | None) -> int:
+    """Return ``port`` if it is free, by default the next free one.
+
+    Raises:
+        ConfigError: for an address that is taken, or not this machine's.
+    """
+    for candidate in (port,) if port is not None else range(PORT, PORT + 20):
+        with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM) as probe:
+            if os.name == "posix":
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind((host, candidate))
+                return int(probe.getsockname()[1])
+            except (OSError, OverflowError) as cause:
+                why = str(getattr(cause, "strerror", None) or cause)
+    raise ConfigError(f"The studio cannot listen on {host}, port {port or PORT}: {why}. Give another --port or --host.")
+
+
+def _wait_open(host: str, port: int) -> None:
+    for _ in range(int(_OPENING_S / 0.05)):
+        with contextlib.suppress(OSError), socket.create_connection((host, port), timeout=1.0):
+            return
+        time.sleep(0.05)
+
+
+def _addresses() -> list[str]:
+    """Return this machine's network addresses, without sending a packet."""
+    found = []
+    with contextlib.suppress(OSError):
+        found = [str(info[4][0]) for info in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)]
+    with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        # A connected datagram socket knows its own address; no packet leaves.
+        probe.connect(("192.0.2.1", 9))
+        found.insert(0, str(probe.getsockname()[0]))
+    return list(dict.fromkeys(a for a in found if not is_loopback(a)))

@@ -1,0 +1,299 @@
+"""The frame of every page (navigation bar, language, colour scheme, messages) and elements that pages share."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from copy import copy
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+from urllib.parse import urlencode
+
+from markupsafe import Markup, escape
+from nicegui import background_tasks, context, ui
+from nicegui.element import Element
+from nicegui.events import GenericEventArguments
+from nicegui.translations import translations
+
+from plushsense.core.errors import PlushSenseError
+from plushsense.studio.app.words import LANGUAGES, Words
+from plushsense.studio.app.workspace import ChangeSignal, Workspace
+
+_CLICKED = "(e) => emit({seen: document.querySelector('[data-seen]').dataset.seen, times: e.detail})"
+
+
+class Keys(Element, component="keys.js"):
+    """Keyboard commands of a page: calls ``on_press(key, seen)`` once for each press; a key that is held counts once.
+
+    Args:
+        keys: the characters that are commands.
+        on_press: gets the key and what `show` had last set in this browser when it was pressed.
+        fields: keys that go to a field to be typed into, and its CSS selector.
+    """
+
+    def __init__(self, keys: str, on_press: Callable[[str, str], Any], fields: Mapping[str, str] | None = None) -> None:
+        super().__init__()
+        self._props["keys"] = keys
+        self._props["seen"] = ""
+        self._props["fields"] = dict(fields or {})
+
+        def pressed(event: GenericEventArguments) -> Any:
+            return on_press(str(event.args["key"]), str(event.args["seen"]))
+
+        self.on("press", pressed)
+
+    def show(self, seen: str) -> None:
+        """Set what the page shows now; it is sent with every press from here on."""
+        if self._props["seen"] != seen:
+            self._props["seen"] = seen
+            self.update()
+
+
+def on_click(button: ui.button, call: Callable[[str], Any], once: bool = False) -> None:
+    """Call ``call(seen)`` at a click, with what the `Keys` of the page showed; ``once``: a double click is one."""
+
+    def clicked(event: GenericEventArguments) -> Any:
+        if not (once and int(event.args["times"] or 0) > 1):
+            return call(str(event.args["seen"]))
+        return None
+
+    button.on("click", clicked, js_handler=_CLICKED)
+
+
+LANGUAGE_COOKIE, LIGHT_COOKIE = "plushsense_language", "plushsense_light"
+PAGES = {
+    "home": "/",
+    "record": "/record",
+    "review": "/review",
+    "train": "/train",
+    "live": "/live",
+    "export": "/export",
+    "publish": "/publish",
+}
+"""The registry of pages: name to path, in the order of the work. A page is a folder ``pages/<name>`` whose module
+``page`` has a function ``show(page)``, one line here, and its texts: ``pages.<name>`` and ``<name>.title``."""
+
+AFFECT_SIGNS = {"positive": "+", "neutral": "○", "negative": "−", "none": "·"}
+"""Affect is never shown by colour alone: a sign and a word stand with it."""
+AFFECT_COLOURS = {"positive": "#00805c", "neutral": "#3a6ea5", "negative": "#b84a00", "none": "#767676"}
+"""After Okabe and Ito's palette for colour-blind eyes, darkened to read as text on white."""
+LINES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8a8a00", "#7f3c8d", "#a06000", "#444444")
+"""Colours of lines in plots (Okabe and Ito, and four more)."""
+
+_QUASAR = {"en": "en-US", "lv": "lv"}
+_LIGHTS = {"system": "brightness_auto", "light": "light_mode", "dark": "dark_mode"}
+# The colour of Quasar's dark page.
+_NIGHT = "#121212"
+_BEAR = Markup(
+    '<svg viewBox="0 0 32 32" width="28" height="28"><g fill="#e0a872"><circle cx="8" cy="8" r="5"/>'
+    '<circle cx="24" cy="8" r="5"/><circle cx="16" cy="18" r="12"/></g><g fill="#3a2410"><circle cx="11.5" cy="16" '
+    'r="1.8"/><circle cx="20.5" cy="16" r="1.8"/><ellipse cx="16" cy="21" rx="3" ry="2"/></g></svg>'
+)
+
+# All fields look alike.
+for _field in (ui.input, ui.number, ui.select, ui.textarea):
+    _field.default_props("outlined dense")
+
+E = TypeVar("E", bound=ui.element)
+Kind = Literal["info", "good", "warning", "error"]
+
+_CSS = Path(__file__).with_name("studio.css")
+
+
+@dataclass
+class Page:
+    """An open page: its workspace, its texts, and the place for messages."""
+
+    workspace: Workspace
+    name: str
+    words: Words
+    dark: bool
+    _messages: Any = None
+
+    def say(self, sentence: str, kind: Kind = "info") -> None:
+        """Show a message at the top, for eyes and screen readers; "" removes it."""
+        self._messages.clear()
+        if not sentence:
+            return
+        with self._messages:
+            role = "alert" if kind == "error" else "status"
+            box = ui.row().classes(f"ps-said ps-said-{kind} w-full items-center no-wrap").props(f'role="{role}"')
+            with tag(box, "said"):
+                ui.label(sentence).classes("flex-grow")
+                close = ui.button(icon="close", on_click=lambda: self.say("")).props("flat round dense color=inherit")
+                close.props(f'aria-label="{self.words("shell.close")}"')
+
+    @contextmanager
+    def show_errors(self) -> Iterator[None]:
+        """Show errors raised in the block as a message on the page."""
+        try:
+            yield
+        except PlushSenseError as refusal:
+            self.say(str(refusal), "error")
+        except OSError as cause:
+            where = f" '{cause.filename}'" if cause.filename else ""
+            self.say(self.words("shell.system_refused", where=where, why=cause.strerror or str(cause)), "error")
+
+
+def visitor() -> tuple[Words, bool | None]:
+    """Return the words and the colour scheme (dark, light, None: the system's) that this visitor chose."""
+    request = context.client.request
+    cookies = request.cookies if request is not None else {}
+    chosen = cookies.get(LANGUAGE_COOKIE) or _preferred(request.headers.get("accept-language", "") if request else "")
+    return Words(chosen), {"dark": True, "light": False}.get(cookies.get(LIGHT_COOKIE, ""))
+
+
+def _preferred(accepted: str) -> str:
+    for part in accepted.split(","):
+        code = part.split(";")[0].strip()[:2].lower()
+        if code in LANGUAGES:
+            return code
+    return next(iter(LANGUAGES))
+
+
+@contextmanager
+def frame(workspace: Workspace, name: str) -> Iterator[Page]:
+    """Build the navigation bar and yield an empty page to fill; ``name`` is a key of `PAGES`."""
+    words, dark = visitor()
+    page = Page(workspace, name, words, bool(dark))
+    _set_appearance(words, dark)
+    ui.page_title(f"{words(f'pages.{name}')} · PlushSense")
+    ui.add_head_html(f"<style>{_CSS.read_text(encoding='utf-8')}</style>")
+    with ui.header().classes("ps-header items-center no-wrap"):
+        # A link of NiceGUI's would load the page once more.
+        html(Markup('<a class="ps-skip" href="#content">{}</a>').format(words("shell.skip")))
+        html(_BEAR, "span").classes("ps-bear").props("aria-hidden=true")
+        ui.label("PlushSense").classes("ps-brand")
+        with ui.element("nav").classes("ps-bar row items-center").props(f'aria-label="{words("shell.pages")}"'):
+            for key, path in PAGES.items():
+                link = ui.link(words(f"pages.{key}"), path)
+                if key == name:
+                    link.props('aria-current="page"')
+        ui.space()
+        _choices(words, dark)
+    with ui.element("div").classes("ps-main column no-wrap items-start").props('id="content" tabindex="-1"'):
+        tag(html(words(f"{name}.title"), "h1"), "title")
+        page._messages = ui.column().classes("w-full ps-sayings")
+        yield page
+
+
+def _set_appearance(words: Words, dark: bool | None) -> None:
+    """Set language and colour scheme in the response itself, so that they are right before scripts run."""
+    client = context.client
+    # The page object is the route's, shared by all visitors: each gets a copy.
+    own = copy(client.page)
+    own.dark, own.language = dark, _QUASAR[words.language]  # type: ignore[assignment]
+    client.page = own
+    translations[own.language] = {  # type: ignore[index]
+        "connection_lost": words("shell.connection_lost"),
+        "trying_to_reconnect": words("shell.trying_to_reconnect"),
+        "message_too_long": words("shell.message_too_long"),
+        "message_too_long_body": words("shell.message_too_long_body"),
+    }
+    night = f":root {{ color-scheme: dark; background: {_NIGHT}; }}"
+    early = night if dark else "" if dark is False else f"@media (prefers-color-scheme: dark) {{ {night} }}"
+    ui.add_head_html(f"<style>{early}</style>")
+    # Announce a lost connection to screen readers, too.
+    ui.add_body_html(
+        "<script>addEventListener('DOMContentLoaded', () => document.querySelectorAll('.nicegui-error-popup')"
+        ".forEach(box => box.setAttribute('role', 'alert')))</script>"
+    )
+
+
+def _choices(words: Words, dark: bool | None) -> None:
+    """Add the choices of language and colour scheme, which are kept as cookies."""
+    language = ui.toggle({code: code.upper() for code in LANGUAGES}, value=words.language)
+    language.props(
+        f"dense unelevated color=blue-grey-9 toggle-color=blue-grey-1 toggle-text-color=black "
+        f'aria-label="{words("shell.language")}"'
+    )
+    tag(language, "language").on_value_change(lambda e: _set_cookie(LANGUAGE_COOKIE, str(e.value)))
+    now = "dark" if dark else "system" if dark is None else "light"
+    button = ui.button(icon=_LIGHTS[now]).props("flat round dense color=white")
+    tag(button, "light").props(f'aria-label="{words("shell.lights")}: {words(f"shell.{now}")}" aria-haspopup="menu"')
+    with button, ui.menu():
+        for light, icon in _LIGHTS.items():
+            item = ui.menu_item(on_click=lambda light=light: _set_cookie(LIGHT_COOKIE, light))
+            tag(item, f"light-{light}").props(f"role=menuitemradio aria-checked={str(light == now).lower()}")
+            with item, ui.row().classes("items-center no-wrap q-gutter-sm"):
+                ui.icon(icon).props("aria-hidden=true")
+                ui.label(words(f"shell.{light}")).classes("text-weight-bold" if light == now else "")
+
+
+def _set_cookie(cookie: str, value: str) -> None:
+    ui.run_javascript(
+        f"document.cookie = '{cookie}={value}; path=/; max-age=31536000; SameSite=Strict'; location.reload()"
+    )
+
+
+def on_change(signal: ChangeSignal, callback: Callable[[], Any]) -> None:
+    """Call ``callback``, which may be async, in this page after each notification of ``signal`` until it is closed."""
+    client = context.client
+
+    async def going_on(result: Awaitable[Any]) -> None:
+        with client:
+            await result
+
+    def called() -> None:
+        with client:
+            result = callback()
+        if inspect.isawaitable(result):
+            background_tasks.create(going_on(result))
+
+    client.on_delete(signal.subscribe(called))
+
+
+def address(page: str, **query: str | Path) -> str:
+    """Return the address of a page that opens with a selection, such as ``address("review", dataset=path)``."""
+    chosen = {key: str(value) for key, value in query.items() if str(value)}
+    return PAGES[page] + (f"?{urlencode(chosen)}" if chosen else "")
+
+
+def query_value(key: str) -> str:
+    """Return the value of ``key`` in this page's address, or "". Check paths with `Workspace.inside`."""
+    request = context.client.request
+    return str(request.query_params.get(key, "")) if request is not None else ""
+
+
+def query_path(workspace: Workspace, key: str, among: Iterable[str]) -> str:
+    """Return the path in this page's address if it is one of ``among``; else the first of them, or ""."""
+    there = list(among)
+    with suppress(PlushSenseError):
+        if (path := str(workspace.inside(query_value(key)))) in there:
+            return path
+    return next(iter(there), "")
+
+
+def html(content: str = "", kind: str = "div") -> ui.html:
+    """Return an HTML element ``kind`` that shows ``content``, now and whenever it is set later.
+
+    A plain string is text: it is escaped. Only `markupsafe.Markup` is HTML; build it with ``Markup("…{}…").format(…)``,
+    which escapes what it fills in. The studio creates no HTML in any other way.
+    """
+    return ui.html(content, sanitize=lambda given: str(escape(given)), tag=kind)
+
+
+def tag(element: E, name: str) -> E:
+    """Give an element a name that browsers see, ``data-test``: for tests and the manual, never for looks."""
+    element.props["data-test"] = name
+    return element
+
+
+def named(element: E, label: str) -> E:
+    """Give an element a name for screen readers, whatever characters that holds."""
+    element.props["aria-label"] = label
+    return element
+
+
+def focus(element: ui.element) -> None:
+    """Give an element the keyboard, as soon as it is shown."""
+    ui.run_javascript(f"setTimeout(() => getHtmlElement({element.id})?.focus())")
+
+
+def affect_badge(words: Words, affect: str | None) -> ui.label:
+    """Return a label that shows an affect as sign, word and colour."""
+    key = affect or "none"
+    badge = ui.label(f"{AFFECT_SIGNS[key]} {words.affect(affect)}").classes("q-px-sm rounded-borders")
+    return badge.style(f"background: {AFFECT_COLOURS[key]}; color: #fff; font-weight: 600")

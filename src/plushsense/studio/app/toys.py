@@ -1,0 +1,261 @@
+"""The toys that can be reached, and a test of the chosen one."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import ConfigError, DeviceError, PlushSenseError
+from plushsense.core.layouts import layout_names
+from plushsense.devices.base import Device, Frame
+from plushsense.devices.listing import SCAN_S, DeviceListing, list_devices
+from plushsense.devices.opening import open_device, parse_url
+from plushsense.devices.reconnect import ConnectionGap
+from plushsense.recording.setup import is_virtual, speed_of, with_speed
+from plushsense.studio.app.workspace import ChangeSignal, Workspace
+
+KEPT_S = 60.0
+
+
+class Samples(NamedTuple):
+    """Samples after a place in the stream: ``seconds`` (N,) on the toy's clock, ``values`` (N, C) in integer steps;
+    ``end``: the position after them.
+    """
+
+    seconds: NDArray[np.float64]
+    values: NDArray[np.float64]
+    end: int
+
+
+class SampleBuffer:
+    """The newest ``size`` samples of ``channels`` values; one thread writes, any thread reads."""
+
+    def __init__(self, channels: int, size: int) -> None:
+        self._seconds = np.zeros(size)
+        self._values = np.zeros((size, channels))
+        self._clocks = np.zeros((size, 2), dtype=np.int64)
+        self._lock = threading.Lock()
+        self._count = 0
+        self._first_ms: int | None = None
+        self._seen_ms = 0
+        self._offset_ms = 0
+
+    @property
+    def count(self) -> int:
+        """Number of samples ever received: the position after the newest."""
+        return self._count
+
+    def add(self, frames: list[Frame]) -> None:
+        """Append frames; a device clock that was reset continues from where it stood."""
+        with self._lock:
+            size = len(self._seconds)
+            for frame in frames:
+                if self._first_ms is None:
+                    self._first_ms = self._seen_ms = frame.device_ms
+                if frame.device_ms < self._seen_ms:
+                    self._offset_ms += self._seen_ms - frame.device_ms
+                self._seen_ms = frame.device_ms
+                at = self._count % size
+                self._seconds[at] = (frame.device_ms - self._first_ms + self._offset_ms) / 1000.0
+                self._values[at] = frame.values
+                self._clocks[at] = frame.host_ms, frame.device_ms
+                self._count += 1
+
+    def since(self, place: int, most: int = 1 << 30) -> Samples:
+        """Return the samples after position ``place``, at most the newest ``most``."""
+        with self._lock:
+            at = self._places(place, most)
+            return Samples(self._seconds[at], self._values[at], self._count)
+
+    def frames(self, seconds: float) -> list[Frame]:
+        """Return the frames of the last ``seconds``, as they were received."""
+        with self._lock:
+            at = self._places(0, len(self._seconds))
+            at = at[self._seconds[at] >= self._seconds[at[-1:]] - seconds] if len(at) else at
+            clocks, values = self._clocks[at].tolist(), self._values[at].astype(np.int64).tolist()
+        return [Frame(host, device, tuple(v)) for (host, device), v in zip(clocks, values, strict=True)]
+
+    def _places(self, place: int, most: int) -> NDArray[np.int64]:
+        size = len(self._seconds)
+        first = max(place, self._count - min(size, most), 0)
+        return np.arange(first, self._count) % size
+
+
+class TappedDevice(Device):
+    """A device whose frames also go into a `SampleBuffer`, for pages beside the reader.
+
+    ``taps``: called with the frames of every reading that brought some, in the thread that reads; they must not wait.
+    """
+
+    def __init__(self, device: Device) -> None:
+        super().__init__(device.url, device.layout)
+        self.device = device
+        self.counters = device.counters
+        self.wait_s = device.wait_s
+        self.buffer = SampleBuffer(len(device.layout.channels), int(KEPT_S * device.layout.rate_hz))
+        self.changed = ChangeSignal()
+        self.taps: list[Callable[[list[Frame]], None]] = []
+
+    @property
+    def inner(self) -> Device:
+        """The device beneath all that is wrapped around it."""
+        return getattr(self.device, "inner", self.device)
+
+    @property
+    def state(self) -> str:
+        """The connection's state, as of a `plushsense.devices.reconnect.ReconnectingDevice`."""
+        return str(getattr(self.device, "state", "connected"))
+
+    @property
+    def gaps(self) -> list[ConnectionGap]:
+        """Times without a connection."""
+        return list(getattr(self.device, "gaps", ()))
+
+    def read(self) -> list[Frame] | None:
+        """Read from the device; new frames go into the buffer and to the taps."""
+        self.device.wait_s = self.wait_s
+        frames = self.device.read()
+        self.arrived_s = self.device.arrived_s
+        if frames:
+            self.buffer.add(frames)
+            for tap in tuple(self.taps):
+                tap(frames)
+            self.changed.notify()
+        return frames
+
+    def _shut(self) -> None:
+        self.device.close()
+
+
+PERSONS = 25
+TEST_S = 1.0
+_TIMEOUT_S = 6.0
+# With a higher share of malformed lines the toy is taken to have another layout.
+_MAX_MALFORMED = 0.2
+_SLOW, _FAST = 0.8, 1.25
+
+
+@dataclass(frozen=True)
+class ConnectionTest:
+    """Result of a connection test: ``frames`` in ``seconds`` of device time, unreadable lines, and the layout's rate.
+
+    ``fits``: enough of the lines were frames. ``on_time``: the frame rate is near that of the layout.
+    """
+
+    url: str
+    layout: str
+    frames: int
+    malformed: int
+    garbage: int
+    seconds: float
+    rate_hz: float
+
+    @property
+    def fits(self) -> bool:
+        return self.frames > 0 and self.malformed <= _MAX_MALFORMED * (self.frames + self.malformed)
+
+    @property
+    def on_time(self) -> bool:
+        return _SLOW <= self.frames / (self.seconds * self.rate_hz) <= _FAST
+
+
+class Toys:
+    """The list of toys, searched in the background; `changed` is notified when it changed."""
+
+    def __init__(self, workspace: Workspace) -> None:
+        self.changed = ChangeSignal()
+        self.listing = DeviceListing()
+        self.searching = False
+        self.searched = False
+        self._workspace = workspace
+        self._lock = threading.Lock()
+
+    def search(self, scan_s: float = SCAN_S) -> None:
+        """Start to search for toys, unless a search is running; does not wait."""
+        with self._lock:
+            if self.searching:
+                return
+            self.searching = True
+        self.changed.notify()
+        threading.Thread(target=self._search, args=(scan_s,), daemon=True).start()
+
+    def _search(self, scan_s: float) -> None:
+        try:
+            self.listing, self.searched = list_devices(scan_s), True
+        finally:
+            self.searching = False
+            self.changed.notify()
+
+    def choose(self, url: str) -> str:
+        """Make this the toy of all pages; return its URL.
+
+        Raises:
+            ConfigError: for a URL that no toy can have, and for files outside the studio's folders.
+        """
+        url = url.strip()
+        if url not in self._workspace.devices:
+            address = parse_url(url)
+            if address.scheme == "replay":
+                self._workspace.inside(address.place)
+            layout = address.query.get("layout")
+            if layout is not None and layout not in layout_names():
+                self._workspace.inside(layout)
+        self._workspace.toy = url
+        self.changed.notify()
+        return url
+
+    def person(self, number: int) -> str:
+        """Choose the virtual toy with this virtual person."""
+        if not 1 <= number <= PERSONS:
+            raise ConfigError(f"There is no virtual person {number}: give 1 to {PERSONS}.")
+        return self.choose(f"virtual://?person={number}")
+
+    @property
+    def simulated(self) -> bool:
+        """True if the chosen toy is a virtual one."""
+        return bool(self._workspace.toy) and is_virtual(self._workspace.toy)
+
+    def test(self, url: str = "") -> ConnectionTest:
+        """Read a toy (the chosen one) for a second; blocks for some seconds.
+
+        Raises:
+            DeviceError: when it cannot be reached, or sends nothing.
+        """
+        url = url or self._workspace.toy
+        if not url:
+            raise ConfigError("No toy is chosen: choose one first.")
+        url = with_speed(url, self._workspace.speed)
+        speed = speed_of(url) or 1.0
+        frames, first, last = 0, None, None
+        until = time.monotonic() + _TIMEOUT_S
+        with open_device(url) as device:
+            while time.monotonic() < until:
+                received = device.read()
+                if received is None:
+                    break
+                if received:
+                    if first is None:
+                        first, until = time.monotonic(), time.monotonic() + TEST_S
+                    frames += len(received)
+                    last = time.monotonic()
+            layout, counters = device.layout, device.counters
+        if first is None or last is None:
+            if counters.malformed:
+                raise DeviceError(
+                    f"'{url}' sends no frames of the layout '{layout.name}' but other lines ({counters.malformed}): "
+                    "name its layout, as in ?layout=plush-14 at the end of the address."
+                )
+            raise DeviceError(f"'{url}' sent nothing within {_TIMEOUT_S:g} s: check that the toy is switched on.")
+        seconds = max(last - first, 1.0 / layout.rate_hz) * speed
+        return ConnectionTest(url, layout.name, frames, counters.malformed, counters.garbage, seconds, layout.rate_hz)
+
+
+def error_text(cause: BaseException) -> str:
+    """Return the message for a connection test that failed."""
+    return str(cause) if isinstance(cause, PlushSenseError) else " ".join(str(cause).split()) or type(cause).__name__

@@ -1,0 +1,65 @@
+"""Texts of the pages: one TOML file a language in ``words/``, with the same keys in each."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterator, Mapping
+from functools import cache
+from importlib import import_module, resources
+from pathlib import Path
+from typing import Any
+
+LANGUAGES = {"en": "English", "lv": "Latviešu"}
+"""Code to name; ``words/<code>.toml`` has the words."""
+
+
+class Words:
+    """Texts in one language: ``words("record.start", n=3)`` is ``start`` of ``[record]``, with ``{n}`` filled in."""
+
+    def __init__(self, language: str) -> None:
+        self.language = language if language in LANGUAGES else next(iter(LANGUAGES))
+        self._texts = _texts(self.language)
+
+    def __call__(self, key: str, **values: Any) -> str:
+        text = self._texts[key]
+        return text.format(**values) if values else text
+
+    def number(self, value: float, digits: int = 0) -> str:
+        """Format a number with this language's decimal point."""
+        text = f"{value:.{digits}f}"
+        return text.replace(".", self._texts["shell.decimal_point"])
+
+    def has(self, key: str) -> bool:
+        """Return whether there is a text with this key."""
+        return key in self._texts
+
+    def gesture(self, label: str) -> str:
+        """Return a gesture's name in this language, or the label itself."""
+        return self._texts.get(f"gestures.{label}", label)
+
+    def unit(self, unit: str) -> str:
+        """Return a unit's name in this language, or the unit itself."""
+        return self._texts.get(f"units.{unit}", unit)
+
+    def affect(self, affect: str | None) -> str:
+        """Return an affect's name; "none" and None read the same."""
+        return self._texts[f"affects.{affect or 'none'}"]
+
+
+@cache
+def _texts(language: str) -> dict[str, str]:
+    text = resources.files(__package__).joinpath(f"words/{language}.toml").read_text(encoding="utf-8")
+    texts = dict(_flat(tomllib.loads(text)))
+    # A page may bring its own texts: ``pages/<name>/<language>.toml``.
+    for folder in import_module("plushsense.studio.pages").__path__:
+        for path in Path(folder).glob(f"*/{language}.toml"):
+            texts |= _flat(tomllib.loads(path.read_text(encoding="utf-8")))
+    return texts
+
+
+def _flat(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    for key, value in table.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", str(value)

@@ -1,0 +1,148 @@
+"""Bundles, export folders, formats and targets as plain values for the export page."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from plushsense.core.errors import PlushSenseError
+from plushsense.core.gestures import NOBODY
+from plushsense.dataset.files import sha256_of
+from plushsense.dataset.publishing.tables import list_package_files
+from plushsense.dataset.store import UNKNOWN_SUBJECT
+from plushsense.deploy.convert import CONVERTERS
+from plushsense.deploy.emit import FACTS, TOY_BYTES, read_facts
+from plushsense.deploy.quantize import integer_model
+from plushsense.deploy.targets import TARGETS, missing_tools
+from plushsense.models.bundle import Bundle
+from plushsense.studio.app.jobs import DONE, Jobs, StudioJob
+from plushsense.studio.app.workspace import EXPORTS, Workspace
+
+_NEEDS = {
+    "onnx": ("onnx", ("onnx", "onnxruntime")),
+    "tflite": ("tflite", ("ai_edge_litert", "flatbuffers")),
+    "espdl": ("espdl", ("onnx", "esp_ppq", "torch")),
+}
+"""Extra and modules needed by the formats, by the first word of their names."""
+
+
+@dataclass(frozen=True)
+class BundleFacts:
+    """Facts of a bundle; ``problem``: why it cannot be read, ``cannot``: why it cannot be exported."""
+
+    path: Path
+    problem: str = ""
+    cannot: str = ""
+    title: str = ""
+    padding: str = ""
+    layout: str = ""
+    gestures: tuple[str, ...] = ()
+    dataset: str = ""
+    people: int = 0
+    simulated: bool = False
+    adapted_to: str = ""
+    scores: dict[str, Any] = field(default_factory=dict)
+    bytes: int = 0
+
+    @classmethod
+    def of(cls, path: Path) -> BundleFacts:
+        """Read a bundle; return an error as its ``problem``."""
+        try:
+            bundle = Bundle.load(path)
+        except PlushSenseError as refusal:
+            return cls(path, problem=str(refusal))
+        try:
+            integer_model(bundle)
+            cannot = ""
+        except PlushSenseError as refusal:
+            cannot = str(refusal)
+        origin = bundle.provenance
+        people = origin.get("subjects")
+        scores = origin.get("scores")
+        return cls(
+            path,
+            cannot=cannot,
+            title=bundle.arch.title,
+            padding=bundle.arch.padding,
+            layout=bundle.layout.name,
+            gestures=tuple(bundle.gestures.labels),
+            dataset=str(origin.get("dataset", "")),
+            people=len(set(people) - {NOBODY, UNKNOWN_SUBJECT}) if isinstance(people, list) else int(people or 0),
+            simulated=bool(origin.get("simulated", False)),
+            adapted_to=bundle.adapted_to or "",
+            scores=dict(scores) if isinstance(scores, dict) and "accuracy" in scores else {},
+            bytes=path.stat().st_size,
+        )
+
+
+@dataclass(frozen=True)
+class ExportFacts:
+    """Facts of an export folder; ``problem``: why it cannot be read, ``digest``: hash of its files."""
+
+    folder: Path
+    problem: str = ""
+    facts: dict[str, Any] = field(default_factory=dict)
+    files: dict[str, int] = field(default_factory=dict)
+    digest: str = ""
+    made_s: float = 0.0
+
+    @property
+    def name(self) -> str:
+        return self.folder.name
+
+    @property
+    def flash_bytes(self) -> int:
+        """Bytes of flash for the data of the model, without the code."""
+        return int(self.facts["model_bytes"])
+
+    @property
+    def ram_bytes(self) -> int:
+        """Bytes of RAM for one toy with 32-bit pointers."""
+        return int(self.facts["memory_bytes"]) + TOY_BYTES
+
+    @classmethod
+    def of(cls, folder: Path) -> ExportFacts:
+        """Read an export folder; return an error as its ``problem``."""
+        try:
+            facts = read_facts(folder)
+            files = {p.relative_to(folder).as_posix(): p.stat().st_size for p in list_package_files(folder)}
+            return cls(folder, "", facts, files, folder_digest(folder), (folder / FACTS).stat().st_mtime)
+        except PlushSenseError as refusal:
+            return cls(folder, problem=str(refusal))
+
+
+def exports_of(workspace: Workspace) -> list[Path]:
+    """List the export folders of a workspace, the newest first."""
+    found = [p.parent for p in (workspace.folder / EXPORTS).glob(f"*/{FACTS}") if not p.parent.name.startswith(".")]
+    return sorted(found, key=lambda p: -(p / FACTS).stat().st_mtime)
+
+
+def folder_digest(folder: Path) -> str:
+    """Return one SHA-256 over the names and the contents of all files of a folder."""
+    total = hashlib.sha256()
+    for path in list_package_files(folder):
+        total.update(f"{path.relative_to(folder).as_posix()}\0{sha256_of(path)}\n".encode())
+    return total.hexdigest()
+
+
+def newest_job(jobs: Jobs, task: str, place: Path) -> StudioJob | None:
+    """Return the newest finished job of a task whose ``spec["place"]`` is ``place``."""
+    return next((j for j in jobs.all(task) if j.state == DONE and j.spec.get("place") == str(place)), None)
+
+
+def formats() -> dict[str, str]:
+    """Map each export format to the extra that it needs, or "" if that is installed."""
+    return {name: _lacks(name) for name in CONVERTERS}
+
+
+def _lacks(name: str) -> str:
+    extra, modules = _NEEDS[name.partition("-")[0]]
+    return "" if all(importlib.util.find_spec(m) for m in modules) else extra
+
+
+def targets() -> dict[str, list[str]]:
+    """Map each target of ``verify`` to the Debian packages that are missing. Runs compilers."""
+    return {name: missing_tools(name) for name in TARGETS}

@@ -1,0 +1,501 @@
+"""The export page: exports a bundle as C, estimates its cost and verifies it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from markupsafe import Markup
+from nicegui import context, run, ui
+
+from plushsense.deploy.convert import CONVERTERS
+from plushsense.deploy.package import ARDUINO, IDF, IDF_EXAMPLE, SKETCH
+from plushsense.deploy.targets import TARGETS
+from plushsense.studio.app.guard import address, path_in
+from plushsense.studio.app.jobs import Jobs, StudioJob
+from plushsense.studio.app.shell import Page, html, tag
+from plushsense.studio.app.words import Words
+from plushsense.studio.app.workspace import EXPORTS
+from plushsense.studio.pages.export.exports import BundleFacts, ExportFacts, exports_of, formats, newest_job, targets
+from plushsense.studio.widgets.work import (
+    WorkPanel,
+    facts,
+    link,
+    moment,
+    scroll_to,
+    size,
+    style,
+    table,
+    text,
+    titles,
+    verdict,
+)
+
+_FITS = {"yes": True, "no": False, "unsure": None}
+
+
+def show_cost(page: Page, work: WorkPanel, export: ExportFacts, counted: StudioJob | None) -> None:
+    """Build the card with the cost of an export; ``counted`` is the job that measured it."""
+    words = page.words
+    found: dict[str, Any] = counted.result.get("profile", {}) if counted else {}
+    fresh = found.get("digest") == export.digest
+
+    async def again() -> None:
+        await work.start("profile", {"place": str(export.folder)})
+
+    with tag(ui.column().classes("ps-card w-full"), "cost"):
+        text(words("export.cost"), "h3")
+        if not found:
+            text(words("export.not_counted"))
+        elif not fresh:
+            text(words("export.counted_before"), classes="ps-said ps-said-warning w-full")
+        elif "refused" in found:
+            tag(text(found["refused"], classes="ps-said ps-said-warning w-full"), "cost-refused")
+        else:
+            assert counted is not None
+            _display_cost(page, found, moment(counted.ended_s))
+        if not fresh or "refused" in found:
+            tag(ui.button(words("export.count"), on_click=again).props("outline no-caps"), "count")
+
+
+def _display_cost(page: Page, found: dict[str, Any], when: str) -> None:
+    words = page.words
+    text(words("export.cost_about", step=f"{found['step_ms']:g}"), classes="ps-dim")
+    rows = [
+        (
+            each["chip"],
+            f"{each['mhz']}",
+            words("export.between", low=f"{each['low']:.2g}", high=f"{each['high']:.2g}"),
+            verdict(_FITS[each["fits"]], words(f"export.fits_{each['fits']}")),
+        )
+        for each in found["estimated_ms"].values()
+    ]
+    if rows:
+        head = [words(f"export.{k}") for k in ("chip", "mhz", "estimate", "fits")]
+        tag(table(words("export.estimate_caption", when=when), head, rows, (1,)), "estimates")
+    counted = [
+        (
+            TARGETS[name].title,
+            *(f"{each[key]:,}" for key in ("instructions_per_step", "flash_bytes", "ram_bytes")),
+            f"{each['stack_push_bytes']:,}" if each["stack_push_bytes"] is not None else "–",
+        )
+        for name, each in found["targets"].items()
+        if each["instructions_per_step"] is not None
+    ]
+    if counted:
+        head = [words(f"export.{k}") for k in ("counted_on", "instructions", "flash_all", "ram_all", "stack")]
+        table(words("export.counted_caption", optimise=found["optimise"]), head, counted, (1, 2, 3, 4))
+    for name, packages in found["missing"].items():
+        message = words("export.target_missing", target=TARGETS[name].title, packages=" ".join(packages))
+        text(message, classes="ps-dim")
+
+
+def show_facts(page: Page, found: ExportFacts, made: StudioJob | None) -> None:
+    """Build the card with facts, files and download of an export; ``made`` is the job that wrote it."""
+    words, card = page.words, found.facts
+    with tag(ui.column().classes("ps-card w-full"), "export-facts"):
+        if card.get("simulated"):
+            text(words("shell.simulation"), classes="ps-said ps-said-warning w-full")
+        for warning in made.warnings if made else ():
+            text(warning, classes="ps-said ps-said-warning w-full")
+        facts(
+            [
+                (words("export.network"), str(card["title"])),
+                (words("export.gestures"), str(card["classes"])),
+                (words("export.layout"), str(card.get("layout", ""))),
+                (words("export.flash"), words("export.flash_value", n=f"{found.flash_bytes:,}")),
+                (words("export.ram"), words("export.ram_value", n=f"{found.ram_bytes:,}")),
+                (
+                    words("export.step"),
+                    words("export.step_value", ms=f"{card['step_ms']:g}", macs=f"{card['macs_per_step']:,}"),
+                ),
+                (words("export.made"), moment(found.made_s)),
+                (words("export.place"), str(found.folder)),
+            ]
+        )
+        for name, each in card.get("conversions", {}).items():
+            apart = each.get("largest_difference")
+            message = words("export.converted", file=each["file"], n=f"{each['bytes']:,}", name=name)
+            text(message if apart is None else f"{message} {words('export.apart', d=f'{apart:.1g}')}")
+        with ui.expansion(words("export.files", n=len(found.files), size=size(sum(found.files.values())))) as files:
+            rows = [(name, f"{bytes_:,}") for name, bytes_ in found.files.items()]
+            table(words("export.files_caption"), (words("export.file"), words("export.bytes")), rows, (1,))
+        tag(files.classes("w-full"), "files")
+        down = ui.link(words("export.download"), address(EXPORTS, found.name)).classes("ps-link")
+        tag(down.props("download"), "download")
+
+
+def show_next(page: Page) -> None:
+    """Build the card with the next steps of a firmware engineer."""
+    words = page.words
+    with tag(ui.column().classes("ps-card w-full"), "next"):
+        text(words("export.next"), "h3")
+        with ui.element("ol").classes("ps-steps"):
+            for key in ("arduino", "idf", "plain", "read"):
+                message = words(f"export.next_{key}", arduino=ARDUINO, sketch=SKETCH, idf=IDF, example=IDF_EXAMPLE)
+                text(message, "li")
+
+
+def verification_verdict(words: Words, export: ExportFacts, proof: StudioJob | None) -> Markup:
+    """Render the last verification as a verdict: equal, unequal, outdated or never run."""
+    if proof is None:
+        return verdict(None, words("export.never_proved"))
+    if proof.result.get("digest") != export.digest:
+        return verdict(None, words("export.proved_before"))
+    good, found = _found(words, proof.result)
+    return verdict(good, f"{found}, {moment(proof.ended_s)}")
+
+
+def _found(words: Words, result: dict[str, Any]) -> tuple[bool | None, str]:
+    """Return the verdict of a proof and its words; None: equal, but of code that is not ours."""
+    if not result["passed"]:
+        return False, words("export.unequal")
+    return (True, words("export.equal")) if result["own"] else (None, words("export.equal_not_own"))
+
+
+class VerificationCard:
+    """The card that verifies one export."""
+
+    def __init__(self, page: Page, work: WorkPanel, export: ExportFacts) -> None:
+        self.page, self.words, self.work, self.export = page, page.words, work, export
+        self._chosen: dict[str, ui.checkbox] = {}
+
+    async def build(self) -> None:
+        words = self.words
+        lacking = await run.io_bound(targets) or {}
+        with tag(ui.column().classes("ps-card w-full"), "proof"):
+            text(words("export.prove"), "h3")
+            text(words("export.prove_about"), classes="ps-dim")
+            with ui.row().classes("w-full"):
+                for name in (n for n, lacks in lacking.items() if not lacks):
+                    self._chosen[name] = ui.checkbox(self._title(name), value=True)
+                    tag(self._chosen[name], f"target-{name}")
+            for name, lacks in lacking.items():
+                if lacks:
+                    message = words("export.target_missing", target=self._title(name), packages=" ".join(lacks))
+                    tag(text(message, classes="ps-dim"), f"missing-{name}")
+            with ui.expansion(words("export.more")).classes("w-full"):
+                options = {"": words("export.recorded_none")} | await titles(self.page.workspace)
+                self._dataset = ui.select(options, value="", label=words("export.recorded")).classes("w-full")
+                self._faults = tag(ui.checkbox(words("export.faults")), "faults")
+                self._trust = tag(ui.checkbox(words("export.trust")), "trust")
+            button = ui.button(words("export.verify"), icon="fact_check", on_click=self._start).props("no-caps")
+            tag(button, "verify").set_enabled(bool(self._chosen))
+            proof = newest_job(self.page.workspace.part(Jobs), "verify", self.export.folder)
+            if proof is not None:
+                self._display(proof)
+
+    def _title(self, name: str) -> str:
+        return self.words("export.host") if name == "host" else TARGETS[name].title
+
+    async def _start(self) -> None:
+        words, chosen = self.words, [name for name, box in self._chosen.items() if box.value]
+        if not chosen:
+            self.page.say(words("export.no_target"), "error")
+            return
+        if self.work.running("verify"):
+            self.page.say(words("export.verify_runs"), "warning")
+            return
+        self.page.say("")
+        with self.page.show_errors():
+            dataset = str(self.page.workspace.inside(self._dataset.value)) if self._dataset.value else ""
+            spec = {
+                "place": str(self.export.folder),
+                "targets": chosen,
+                "dataset": dataset,
+                "faults": bool(self._faults.value),
+                "trust": bool(self._trust.value),
+            }
+            await self.work.start("verify", spec)
+
+    def _display(self, proof: StudioJob) -> None:
+        words, found = self.words, proof.result
+        with tag(ui.column().classes("w-full"), "verdict"):
+            if found["digest"] != self.export.digest:
+                text(
+                    words("export.changed_since", when=moment(proof.ended_s)), classes="ps-said ps-said-warning w-full"
+                )
+            good, message = _found(words, found)
+            with ui.row().classes("items-center"):
+                html(verdict(good, message))
+                text(self._sum(found), "span")
+            for sentence in self._sentences(found):
+                text(sentence, classes=f"ps-said ps-said-{'error' if good is False else 'warning'} w-full")
+            rows = [
+                (
+                    words("export.host_short") if r["target"] == "host" else self._title(r["target"]),
+                    r["compiler"],
+                    r["flags"],
+                    f"{r['vectors']:,}",
+                    f"{r['mismatches']:,}",
+                    f"{r['max_abs_diff']:,}",
+                    verdict(not r["mismatches"], words("export.unequal" if r["mismatches"] else "export.equal")),
+                )
+                for r in found["runs"]
+            ]
+            keys = ("target", "compiler", "flags", "answers", "mismatches", "difference", "verdict")
+            caption = words("export.runs_caption", when=moment(proof.ended_s))
+            tag(table(caption, [words(f"export.{k}") for k in keys], rows, (3, 4, 5)), "runs")
+            fed = [(s["name"], f"{s['samples']:,}", f"{s['frames']:,}", f"{s['answers']:,}") for s in found["streams"]]
+            head = [words(f"export.{k}") for k in ("stream", "samples", "frames", "answers")]
+            tag(table(words("export.streams_caption"), head, fed, (1, 2, 3)), "streams")
+            for each in found["not_run"]:
+                text(words("export.not_run", what=each["what"], why=each["why"]), classes="ps-dim")
+            self._planted(found)
+
+    def _sum(self, found: dict[str, Any]) -> str:
+        settings = len(found["runs"])
+        if not found["mismatches"]:
+            return self.words("export.all_equal", n=f"{found['vectors']:,}", settings=settings)
+        return self.words("export.some_unequal", bad=f"{found['mismatches']:,}", n=f"{found['vectors']:,}")
+
+    def _sentences(self, found: dict[str, Any]) -> list[str]:
+        words, message = self.words, []
+        if found["first"]:
+            message.append(found["first"])
+        elif not found["decisions"]:
+            message.append(words("export.nothing_proved"))
+        elif not found["passed"]:
+            message.append(words("export.fault_missed"))
+        if not found["own"]:
+            message.append(words("export.not_own"))
+        if found["changed_copies"]:
+            message.append(words("export.changed_copies", files=", ".join(found["changed_copies"])))
+        return message
+
+    def _planted(self, found: dict[str, Any]) -> None:
+        words = self.words
+        if not found["faults"]:
+            return
+        kinds = {True: "caught", None: "not_shown", False: "not_caught"}
+        rows = []
+        for each in found["faults"]:
+            state = True if each["caught"] else None if each["silent"] else False
+            cell = verdict(state, words(f"export.{kinds[state]}"))
+            rows.append((each["kind"], each["fault"], self._title(each["target"]), cell))
+        with ui.expansion(words("export.faults_found", n=len(rows))).classes("w-full"):
+            head = [words(f"export.{k}") for k in ("fault_kind", "fault", "target", "verdict")]
+            table(words("export.faults_caption"), head, rows)
+            if any(f["silent"] for f in found["faults"]):
+                text(words("export.not_shown_about"), classes="ps-dim")
+
+
+_TASKS = ("export", "profile", "verify")
+
+
+async def show(page: Page) -> None:
+    """Build the page. ``?model=PATH`` chooses a bundle, ``?name=NAME`` opens an export."""
+    await _Exporting(page).build()
+
+
+class _Exporting:
+    def __init__(self, page: Page) -> None:
+        self.page, self.words, self.workspace = page, page.words, page.workspace
+        request = context.client.request
+        self.asked = dict(request.query_params) if request is not None else {}
+        self.bundle: BundleFacts | None = None
+        self.open = ""
+
+    async def build(self) -> None:
+        style()
+        text(self.words("export.about"), classes="ps-dim")
+        await self._form()
+        self.work = WorkPanel(self.page, _TASKS, self._progress_text, self._ended, self._allow)
+        self._allow()
+        self._detail = tag(ui.column().classes("w-full"), "detail")
+        self._list = tag(ui.column().classes("w-full"), "exports")
+        name = self.asked.get("name", "")
+        if name:
+            await self._show(name)
+        await self._refresh_list()
+
+    # A new export ---------------------------------------------------------------------------------------------
+
+    async def _form(self) -> None:
+        words = self.words
+        bundles = await run.io_bound(self.workspace.bundles) or []
+        with tag(ui.column().classes("ps-card w-full"), "new"):
+            text(words("export.new"), "h2")
+            if not bundles:
+                tag(text(words("export.no_bundle")), "no-bundle")
+                ui.link(words("pages.train"), "/train").classes("ps-link")
+                return
+            named = {str(p): self._named(p) for p in bundles}
+            wanted = self.asked.get("model", "")
+            first = wanted if wanted in named else str(bundles[0])
+            choice = ui.select(
+                named, value=first, label=words("export.bundle"), on_change=lambda e: self._choose(e.value)
+            )
+            tag(choice.classes("w-full"), "bundle")
+            self._about = tag(ui.column().classes("w-full"), "bundle-facts")
+            self._name = tag(ui.input(words("export.name")).props("maxlength=64").classes("w-full"), "name")
+            with ui.expansion(words("export.more")).classes("w-full"):
+                await self._more()
+            self._button = ui.button(words("export.do"), icon="memory", on_click=self._start).props("no-caps")
+            tag(self._button, "do")
+            await self._choose(first)
+
+    def _named(self, path: Path) -> str:
+        inside = self.workspace.folder in path.parents
+        return str(path.relative_to(self.workspace.folder)) if inside else f"{path.name} ({path.parent})"
+
+    async def _more(self) -> None:
+        words = self.words
+        lacking = await run.io_bound(formats) or {}
+        self._formats: dict[str, ui.checkbox] = {}
+        text(words("export.formats"), "h3")
+        text(words("export.formats_about"), classes="ps-dim")
+        for name in (n for n, lacks in lacking.items() if not lacks):
+            self._formats[name] = tag(ui.checkbox(f"{name}: {CONVERTERS[name].holds}"), f"format-{name}")
+        for extra in dict.fromkeys(e for e in lacking.values() if e):
+            missing = ", ".join(n for n, lacks in lacking.items() if lacks == extra)
+            text(words("export.format_missing", names=missing, extra=extra), classes="ps-dim")
+        text(words("export.calibrate"), "h3")
+        options = {"": words("export.calibrate_kept")} | await titles(self.workspace)
+        self._dataset = ui.select(options, value="", label=words("export.calibrate_on")).classes("w-full")
+
+    async def _choose(self, path: str) -> None:
+        words = self.words
+        found = await run.io_bound(lambda: BundleFacts.of(Path(path)))
+        assert found is not None
+        self.bundle = found
+        self._about.clear()
+        with self._about:
+            if found.problem:
+                tag(text(found.problem, classes="ps-said ps-said-error w-full"), "bundle-problem")
+            else:
+                if found.simulated:
+                    text(words("shell.simulation"), classes="ps-said ps-said-warning w-full")
+                facts(self._facts_of(found))
+                if found.cannot:
+                    tag(text(found.cannot, classes="ps-said ps-said-error w-full"), "bundle-cannot")
+        self._name.set_value(self._free(Path(path).stem))
+        self._allow()
+
+    def _free(self, stem: str) -> str:
+        """Return a name that no export uses."""
+        plain = "".join(c if c.isalnum() or c in " ._-" else "-" for c in stem).strip(" .")[:56] or "export"
+        number, name = 2, plain
+        while (self.workspace.folder / EXPORTS / name).exists():
+            number, name = number + 1, f"{plain}-{number}"
+        return name
+
+    def _facts_of(self, found: BundleFacts) -> list[tuple[str, str]]:
+        words, scores = self.words, found.scores
+        trained = words("export.trained_value", dataset=found.dataset, people=found.people)
+        rows = [
+            (words("export.network"), words("export.network_value", title=found.title, padding=found.padding)),
+            (words("export.gestures"), str(len(found.gestures))),
+            (words("export.layout"), found.layout),
+            (words("export.trained_on"), trained if found.dataset else words("export.not_told")),
+            (words("export.adapted_to"), found.adapted_to),
+            (words("export.size"), size(found.bytes)),
+        ]
+        if not scores:
+            return [*rows, (words("export.scores"), words("export.no_scores"))]
+        value = words(
+            "export.scores_value",
+            accuracy=words.number(scores["accuracy"], 2),
+            f1=words.number(scores.get("macro_f1", float("nan")), 2),
+            windows=scores.get("windows", "?"),
+            split=scores.get("split", "?"),
+        )
+        leaky = f" {words('export.leaky')}" if scores.get("leaky") else ""
+        simulated = f" {words('export.simulated_scores')}" if found.simulated else ""
+        return [*rows, (words("export.scores"), f"{value}{leaky}{simulated}")]
+
+    def _allow(self) -> None:
+        """Enable the button while no export runs and the bundle can be read."""
+        if hasattr(self, "_button") and hasattr(self, "work"):
+            whole = self.bundle is not None and not self.bundle.problem
+            self._button.set_enabled(whole and not self.work.running("export"))
+
+    async def _start(self) -> None:
+        self.page.say("")
+        assert self.bundle is not None
+        with self.page.show_errors():
+            bundle = self.workspace.inside(self.bundle.path)
+            place = self.workspace.new(EXPORTS, self._name.value or "")
+            dataset = str(self.workspace.inside(self._dataset.value)) if self._dataset.value else ""
+            also = [name for name, box in self._formats.items() if box.value]
+            spec = {"bundle": str(bundle), "place": str(place), "also": also, "dataset": dataset}
+            await self.work.start("export", spec)
+
+    # What runs ------------------------------------------------------------------------------------------------
+
+    def _progress_text(self, job: StudioJob) -> str:
+        stage, total = str(job.progress.get("stage", "begin")), job.progress.get("total") or 0
+        of = f" {self.words('export.of', done=job.progress.get('done', 0), total=total)}" if total else ""
+        return f"{self.words(f'export.stage_{stage}')}{of}"
+
+    async def _ended(self, job: StudioJob) -> None:
+        name = Path(job.spec["place"]).name
+        if job.task == "export":
+            self.page.say(self.words("export.done", name=name), "good")
+            self._name.set_value(self._free(name))
+        if job.task == "export" or name == self.open:
+            await self._show(name)
+            scroll_to("verdict" if job.task == "verify" else "detail")
+        await self._refresh_list()
+
+    # One export -----------------------------------------------------------------------------------------------
+
+    async def _show(self, name: str) -> None:
+        words = self.words
+        with self.page.show_errors():
+            folder = path_in(self.workspace, EXPORTS, name)
+            found = await run.io_bound(lambda: ExportFacts.of(folder))
+            assert found is not None
+            jobs = self.workspace.part(Jobs)
+            made = newest_job(jobs, "export", folder)
+            counted = max(
+                (j for j in (made, newest_job(jobs, "profile", folder)) if j is not None),
+                key=lambda j: j.ended_s,
+                default=None,
+            )
+            self.open = name
+            ui.run_javascript(f"history.replaceState(null, '', {json.dumps(f'/export?name={quote(name)}')})")
+            self._detail.clear()
+            with self._detail:
+                text(words("export.one", name=name), "h2")
+                if found.problem:
+                    text(found.problem, classes="ps-said ps-said-error w-full")
+                    return
+                show_facts(
+                    self.page,
+                    found,
+                    made if made and made.result.get("profile", {}).get("digest") == found.digest else None,
+                )
+                show_cost(self.page, self.work, found, counted)
+                await VerificationCard(self.page, self.work, found).build()
+                show_next(self.page)
+
+    # All of them ----------------------------------------------------------------------------------------------
+
+    async def _refresh_list(self) -> None:
+        words = self.words
+        folders = await run.io_bound(lambda: exports_of(self.workspace)) or []
+        found = await run.io_bound(lambda: [ExportFacts.of(f) for f in folders]) or []
+        jobs = self.workspace.part(Jobs)
+        rows = []
+        for each in found:
+            proof = newest_job(jobs, "verify", each.folder)
+            rows.append(
+                (
+                    link(each.name, f"/export?name={quote(each.name)}"),
+                    each.problem or str(each.facts["title"]),
+                    words("export.simulation_short") if each.facts.get("simulated") else "",
+                    moment(each.made_s) if each.made_s else "",
+                    verification_verdict(words, each, proof),
+                )
+            )
+        self._list.clear()
+        with self._list:
+            text(words("export.earlier"), "h2")
+            if not rows:
+                text(words("export.none"), classes="ps-dim")
+                return
+            keys = ("name", "network", "data", "made", "last_proof")
+            table(words("export.earlier_caption"), [words(f"export.{k}") for k in keys], rows)

@@ -1,0 +1,269 @@
+"""Contents of the workspace as shown on the home page, and the suggested next step."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import json
+import os
+import threading
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from plushsense.core.errors import PlushSenseError
+from plushsense.core.gestures import NOBODY
+from plushsense.core.recorder_csv import parse_name
+from plushsense.dataset.importing.build import RECORDER
+from plushsense.dataset.marks import MARKS
+from plushsense.dataset.store import HEAD, UNKNOWN_SUBJECT, DatasetHead, RecordingInfo, read_index
+from plushsense.models.bundle import Bundle
+from plushsense.recording.session import is_finished
+from plushsense.recording.session_files import SessionHead
+from plushsense.studio.app.workspace import EXPORTS, Workspace
+
+INDEX = "recordings.csv"
+# Marks set by programs are not a review.
+_NOT_PEOPLE = (RECORDER,)
+# The recordings of one session in the paper; fewer of one person are too few to train on.
+_ENOUGH = 51
+
+
+@dataclass(frozen=True)
+class DatasetEntry:
+    """A data set. ``refused``: the sentence where it cannot be read, and then nothing else is known."""
+
+    path: Path
+    name: str
+    refused: str = ""
+    simulated: bool = False
+    layout: str = ""
+    people: int = 0
+    recordings: int = 0
+    excluded: int = 0
+    bytes: int = 0
+    reviewed: bool = False
+    files: frozenset[str] = frozenset()
+    """The names of the recordings' files, which hold the moment of recording."""
+
+
+@dataclass(frozen=True)
+class SessionEntry:
+    """A session in the recordings folder; ``kept`` names the data sets that hold all of it."""
+
+    path: Path
+    subject: str
+    session: str
+    began_s: float = 0.0
+    recordings: int = 0
+    finished: bool = False
+    simulated: bool = False
+    layout: str = ""
+    refused: str = ""
+    kept: tuple[str, ...] = ()
+
+    @property
+    def waiting(self) -> bool:
+        """True if the session has recordings that no data set holds."""
+        return bool(self.recordings) and not self.kept and not self.refused
+
+
+@dataclass(frozen=True)
+class BundleEntry:
+    """A bundle; ``refused`` is the sentence where it cannot be read."""
+
+    path: Path
+    name: str
+    dataset: str = ""
+    gestures: int = 0
+    simulated: bool = False
+    refused: str = ""
+
+
+@dataclass(frozen=True)
+class WorkspaceSummary:
+    """Contents of the workspace."""
+
+    datasets: tuple[DatasetEntry, ...] = ()
+    sessions: tuple[SessionEntry, ...] = ()
+    bundles: tuple[BundleEntry, ...] = ()
+    exports: int = 0
+
+    def batches(self) -> list[tuple[SessionEntry, ...]]:
+        """Group the sessions that fit into one data set: of one layout, all real or all simulated.
+
+        Real ones first; in each the order of the sessions.
+        """
+        groups: dict[tuple[bool, str], list[SessionEntry]] = {}
+        for s in self.sessions:
+            if s.recordings and not s.refused:
+                groups.setdefault((s.simulated, s.layout), []).append(s)
+        return [tuple(groups[key]) for key in sorted(groups)]
+
+
+@dataclass(frozen=True)
+class NextStep:
+    """The suggested next step.
+
+    Attributes:
+        key: names its text and button. ``page``: where the button leads, "" for nowhere.
+        about: values to fill into the text.
+    """
+
+    key: str
+    page: str = ""
+    about: dict[str, Any] = field(default_factory=dict)
+
+
+def next_step(seen: WorkspaceSummary, *, toy: str = "", virtual: bool = False, making: bool = False) -> NextStep:
+    """Return the suggested next step.
+
+    Args:
+        toy: the toy that is chosen; ``virtual``: it is the virtual one.
+        making: a data set is being made.
+    """
+    if making:
+        return NextStep("making")
+    waiting = [s for s in seen.sessions if s.waiting]
+    bundles = [b for b in seen.bundles if not b.refused]
+    readable = [d for d in seen.datasets if not d.refused and d.recordings]
+    if waiting:
+        return NextStep("collect", "", {"n": len(waiting), "recordings": sum(s.recordings for s in waiting)})
+    if not readable and not bundles:
+        unfinished = [s for s in seen.sessions if not s.finished and not s.refused]
+        if unfinished:
+            return NextStep("go_on", "record", {"subject": unfinished[-1].subject, "session": unfinished[-1].session})
+        return NextStep("record", "record") if toy and not virtual else NextStep("try")
+    unreviewed = [d for d in readable if not d.reviewed and not d.simulated]
+    if not bundles:
+        if unreviewed:
+            return NextStep("review", "review", {"name": unreviewed[0].name})
+        best = max(readable, key=lambda d: (d.people, d.recordings))
+        if best.people == 1 and best.recordings < _ENOUGH:
+            return NextStep("more", "record", {"name": best.name})
+        return NextStep("train", "train", {"name": best.name})
+    if unreviewed and all(b.simulated for b in bundles):
+        # All bundles are simulations: go on with the real data.
+        return NextStep("review", "review", {"name": unreviewed[0].name})
+    return NextStep("live", "live", {"name": bundles[0].name})
+
+
+class Overview:
+    """Reads the contents of the workspace; files that did not change are not read again. Not for the event loop."""
+
+    def __init__(self, workspace: Workspace) -> None:
+        self._workspace = workspace
+        self._known: dict[Path, tuple[Any, Any]] = {}
+        self._lock = threading.Lock()
+
+    def look(self) -> WorkspaceSummary:
+        """Return the current contents of the workspace."""
+        with self._lock:
+            datasets = tuple(self._of(p, _stamp(p, HEAD, INDEX, MARKS), _dataset) for p in self._workspace.datasets())
+            sessions = tuple(_session(p, datasets) for p in self._workspace.sessions())
+            bundles = tuple(self._of(p, _stamp(p), _bundle) for p in self._workspace.bundles())
+        exports = sum(1 for p in (self._workspace.folder / EXPORTS).glob("*") if p.is_dir() and p.name[0] != ".")
+        return WorkspaceSummary(datasets, sessions, bundles, exports)
+
+    def _of(self, path: Path, stamp: Any, read: Any) -> Any:
+        known = self._known.get(path)
+        if known is None or known[0] != stamp:
+            known = self._known[path] = (stamp, read(path))
+        return known[1]
+
+
+def _stamp(path: Path, *names: str) -> tuple[tuple[int, int], ...]:
+    stamps = []
+    for file in [path / n for n in names] or [path]:
+        try:
+            found = file.stat()
+            stamps.append((found.st_mtime_ns, found.st_size))
+        except OSError:
+            stamps.append((0, -1))
+    return tuple(stamps)
+
+
+def _dataset(path: Path) -> DatasetEntry:
+    try:
+        head = DatasetHead.read(path)
+        try:
+            rows = read_index(path / INDEX, RecordingInfo)
+        except FileNotFoundError:
+            # The index is rebuilt when the data set is opened.
+            rows = []
+    except PlushSenseError as refusal:
+        return DatasetEntry(path, path.name, str(refusal))
+    except (OSError, ValueError, csv.Error) as cause:
+        return DatasetEntry(path, path.name, f"'{path}' cannot be read: {getattr(cause, 'strerror', None) or cause}.")
+    return DatasetEntry(
+        path,
+        head.name,
+        "",
+        head.simulated,
+        head.layout.name,
+        people=len({r.subject for r in rows} - {NOBODY, UNKNOWN_SUBJECT}),
+        recordings=len(rows),
+        excluded=sum(r.excluded for r in rows),
+        bytes=_size(path),
+        reviewed=_reviewed(path),
+        files=frozenset(r.file.rpartition("/")[2] for r in rows),
+    )
+
+
+def _size(path: Path) -> int:
+    total = 0
+    for place, _, names in os.walk(path):
+        for name in names:
+            with contextlib.suppress(OSError):
+                total += Path(place, name).lstat().st_size
+    return total
+
+
+def _reviewed(path: Path) -> bool:
+    """Return whether a person has set any mark."""
+    with contextlib.suppress(OSError):
+        for line in (path / MARKS).read_bytes().splitlines():
+            with contextlib.suppress(ValueError, AttributeError, RecursionError):
+                if json.loads(line).get("who") not in _NOT_PEOPLE:
+                    return True
+    return False
+
+
+def _session(path: Path, datasets: Iterable[DatasetEntry]) -> SessionEntry:
+    unread = SessionEntry(path, path.parent.name, path.name)
+    try:
+        head = SessionHead.read(path)
+        if head is None:
+            return unread
+        files = {f.name for f in path.iterdir() if parse_name(f.name) is not None}
+        kept = tuple(d.name for d in datasets if files and d.simulated == head.simulated and files <= d.files)
+        return SessionEntry(
+            path,
+            head.subject,
+            head.session,
+            head.started_ms / 1000.0,
+            len(files),
+            is_finished(path),
+            head.simulated,
+            str(head.layout.get("name", "")),
+            kept=kept,
+        )
+    except PlushSenseError as refusal:
+        return SessionEntry(path, path.parent.name, path.name, refused=str(refusal))
+    except OSError as cause:
+        text = f"'{path}' cannot be read: {cause.strerror or cause}."
+        return SessionEntry(path, path.parent.name, path.name, refused=text)
+
+
+def _bundle(path: Path) -> BundleEntry:
+    try:
+        bundle = Bundle.load(path)
+    except PlushSenseError as refusal:
+        return BundleEntry(path, path.stem, refused=str(refusal))
+    except OSError as cause:
+        return BundleEntry(path, path.stem, refused=f"'{path}' cannot be read: {cause.strerror or cause}.")
+    made = bundle.provenance
+    return BundleEntry(
+        path, path.stem, str(made.get("dataset") or ""), len(bundle.gestures), bool(made.get("simulated"))
+    )

@@ -1,0 +1,386 @@
+"""Facts of data sets and published packages, and the section that lists and validates packages."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import zipfile
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from markupsafe import Markup
+from nicegui import run, ui
+
+from plushsense.core.errors import ConfigError, PlushSenseError
+from plushsense.core.recorder_csv import SIMULATION_MARK
+from plushsense.dataset.index import open_dataset
+from plushsense.dataset.people import read_people
+from plushsense.dataset.privacy.pseudonyms import is_drawn
+from plushsense.dataset.publishing.checking import VALIDATORS
+from plushsense.dataset.publishing.contents import PUBLIC_COLUMNS
+from plushsense.dataset.publishing.croissant import CROISSANT_FILE
+from plushsense.dataset.publishing.description import CHECKSUMS
+from plushsense.dataset.publishing.readme import REIDENTIFICATION_JSON
+from plushsense.dataset.publishing.tables import list_package_files
+from plushsense.studio.app.guard import address
+from plushsense.studio.app.jobs import DONE, Jobs, StudioJob
+from plushsense.studio.app.shell import Page, html, tag
+from plushsense.studio.app.words import Words
+from plushsense.studio.app.workspace import PACKAGES, Workspace
+from plushsense.studio.widgets.work import WorkPanel, link, moment, size, table, text, verdict
+
+KEYS = "keys"
+"""Folder of the workspace for secrets: neither in a data set nor in a package."""
+# Dates under pseudonyms are later (`dataset.keyfile`).
+_MOVED_MS = 4_102_444_800_000
+_TOOLS = {
+    "publish": ("mlcroissant", "frictionless", "rocrate", "datacite"),
+    "baselines": ("sklearn",),
+}
+
+
+@dataclass(frozen=True)
+class DatasetFacts:
+    """Facts of a data set before publication; ``problem``: why it cannot be read.
+
+    ``own_codes``: people whose codes ``pseudonymise`` did not draw; ``own_dates``: the dates may be the true ones.
+    """
+
+    path: Path
+    problem: str = ""
+    name: str = ""
+    version: str = ""
+    simulated: bool = False
+    people: int = 0
+    recordings: int = 0
+    excluded: int = 0
+    streams: int = 0
+    licence: str = ""
+    contact_name: str = ""
+    contact_mail: str = ""
+    consent: str = ""
+    columns: tuple[str, ...] = ()
+    own_codes: tuple[str, ...] = ()
+    own_dates: bool = False
+
+    @classmethod
+    def of(cls, path: Path) -> DatasetFacts:
+        """Read a data set; return an error as its ``problem``."""
+        try:
+            dataset = open_dataset(path)
+            people = read_people(path)
+        except PlushSenseError as refusal:
+            return cls(path, problem=str(refusal))
+        head = dataset.head
+        columns = {c for p in people.values() for c in p.more} - set(PUBLIC_COLUMNS)
+        return cls(
+            path,
+            name=head.name,
+            version=head.version,
+            simulated=head.simulated,
+            people=len(dataset.subjects),
+            recordings=len(dataset.recordings),
+            excluded=len(dataset.recordings) - len(dataset.used),
+            streams=len(dataset.streams),
+            licence=head.licence,
+            contact_name=head.about.contact.name,
+            contact_mail=head.about.contact.email,
+            consent=head.consent,
+            columns=tuple(sorted(columns)),
+            own_codes=tuple(s for s in dataset.subjects if not is_drawn(s)),
+            own_dates=any(0 < r.epoch_ms < _MOVED_MS for r in dataset.recordings),
+        )
+
+
+@dataclass(frozen=True)
+class PackageFacts:
+    """Facts of a published package, which is a folder, a zip, or both.
+
+    ``contents``: (files, bytes) of each folder (its name ends in "/") and top-level file. ``reidentification``:
+    figures of the report, {} if no test was run.
+    """
+
+    name: str
+    folder: Path | None
+    zip: Path | None
+    citation: str = ""
+    title: str = ""
+    simulated: bool = False
+    reidentification: dict[str, Any] = field(default_factory=dict)
+    contents: dict[str, tuple[int, int]] = field(default_factory=dict)
+    made_s: float = 0.0
+
+    @property
+    def place(self) -> Path:
+        """Path to validate: the zip if there is one, because that is what is shared."""
+        found = self.zip or self.folder
+        assert found is not None
+        return found
+
+    @classmethod
+    def of(cls, workspace: Workspace, name: str) -> PackageFacts:
+        """Read a package; leave empty what cannot be read, because the validators report it."""
+        folder, packed = workspace.folder / PACKAGES / name, workspace.folder / PACKAGES / f"{name}.zip"
+        there = folder if (folder / CHECKSUMS).is_file() else None
+        zipped = packed if packed.is_file() else None
+        croissant = _load(there, zipped, CROISSANT_FILE)
+        made = [p.stat().st_mtime for p in (there, zipped) if p is not None]
+        return cls(
+            name,
+            there,
+            zipped,
+            str(croissant.get("citeAs", "")),
+            str(croissant.get("name", "")),
+            _has(there, zipped, SIMULATION_MARK),
+            _load(there, zipped, REIDENTIFICATION_JSON),
+            _contents(there, zipped),
+            max(made, default=0.0),
+        )
+
+
+def packages_of(workspace: Workspace) -> list[str]:
+    """List the names of the packages of a workspace, the newest first."""
+    root = workspace.folder / PACKAGES
+    found = {p.parent.name: p.stat().st_mtime for p in root.glob(f"*/{CHECKSUMS}") if not p.parent.name.startswith(".")}
+    found |= {p.stem: p.stat().st_mtime for p in root.glob("*.zip") if p.is_file()}
+    return sorted(found, key=lambda name: -found[name])
+
+
+def missing_extras() -> list[str]:
+    """Return the missing extras: ``publish`` for publication, ``baselines`` for re-identification tests."""
+    return [extra for extra, modules in _TOOLS.items() if not all(importlib.util.find_spec(m) for m in modules)]
+
+
+def _files(folder: Path | None, packed: Path | None) -> dict[str, int]:
+    """Return the files of a package and their sizes in bytes."""
+    if folder is not None:
+        return {p.relative_to(folder).as_posix(): p.stat().st_size for p in list_package_files(folder)}
+    if packed is not None:
+        try:
+            with zipfile.ZipFile(packed) as archive:
+                return {i.filename.partition("/")[2]: i.file_size for i in archive.infolist() if not i.is_dir()}
+        except (OSError, zipfile.BadZipFile):
+            return {}
+    return {}
+
+
+def _contents(folder: Path | None, packed: Path | None) -> dict[str, tuple[int, int]]:
+    grouped: dict[str, tuple[int, int]] = {}
+    for path, bytes_ in _files(folder, packed).items():
+        parts = path.split("/")
+        # Folders in the data folder are listed one by one.
+        depth = min(len(parts) - 1, 2)
+        top = "/".join(parts[:depth]) + "/" if depth else path
+        files, total = grouped.get(top, (0, 0))
+        grouped[top] = (files + 1, total + bytes_)
+    return dict(sorted(grouped.items(), key=lambda item: (not item[0].endswith("/"), item[0])))
+
+
+def _has(folder: Path | None, packed: Path | None, file: str) -> bool:
+    return (folder / file).is_file() if folder is not None else file in _files(None, packed)
+
+
+def _load(folder: Path | None, packed: Path | None, file: str) -> dict[str, Any]:
+    try:
+        if folder is not None:
+            found = json.loads((folder / file).read_text(encoding="utf-8"))
+        elif packed is not None:
+            with zipfile.ZipFile(packed) as archive:
+                name = next(n for n in archive.namelist() if n.partition("/")[2] == file)
+                found = json.loads(archive.read(name))
+        else:
+            return {}
+    except (OSError, ValueError, StopIteration, zipfile.BadZipFile):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+_SHOWN = 20
+
+
+class PackagesSection:
+    """The section with the list of packages and one open package."""
+
+    def __init__(self, page: Page, work: WorkPanel, lacking: list[str]) -> None:
+        self.page, self.words, self.workspace, self.work, self.lacking = page, page.words, page.workspace, work, lacking
+        self._detail = tag(ui.column().classes("w-full"), "package")
+        self._list = tag(ui.column().classes("w-full"), "packages")
+
+    async def build(self, name: str) -> None:
+        """Build the section and open the package ``name``, unless it is ""."""
+        if name:
+            await self.show(name)
+        await self.refresh()
+
+    async def refresh(self) -> None:
+        """Update the list of packages."""
+        words = self.words
+        names = await run.io_bound(lambda: packages_of(self.workspace)) or []
+        found = await run.io_bound(lambda: [PackageFacts.of(self.workspace, n) for n in names]) or []
+        rows = [
+            (
+                link(each.name, f"/publish?name={quote(each.name)}"),
+                each.title,
+                words("export.simulation_short") if each.simulated else "",
+                moment(each.made_s),
+                self._state(newest_validation(self.workspace.part(Jobs), each)),
+            )
+            for each in found
+        ]
+        self._list.clear()
+        with self._list:
+            text(words("publish.earlier"), "h2")
+            if not rows:
+                text(words("publish.none"), classes="ps-dim")
+                return
+            head = [words(f"publish.{k}") for k in ("package", "what", "data", "made", "last_check")]
+            table(words("publish.earlier_caption"), head, rows)
+
+    def _state(self, job: StudioJob | None) -> Markup:
+        if job is None:
+            return verdict(None, self.words("publish.never_checked"))
+        good = bool(job.result["valid"])
+        return verdict(good, f"{self.words('publish.valid' if good else 'publish.invalid')}, {moment(job.ended_s)}")
+
+    async def show(self, name: str) -> None:
+        """Open a package."""
+        words = self.words
+        with self.page.show_errors():
+            if name not in (await run.io_bound(lambda: packages_of(self.workspace)) or []):
+                raise ConfigError(f"There is no package '{name}' in this studio: choose one of the list.")
+            found = await run.io_bound(lambda: PackageFacts.of(self.workspace, name))
+            assert found is not None
+            job = newest_validation(self.workspace.part(Jobs), found)
+            ui.run_javascript(f"history.replaceState(null, '', {json.dumps(f'/publish?name={quote(name)}')})")
+            self._detail.clear()
+            with self._detail:
+                text(words("publish.one", name=name), "h2")
+                if found.simulated:
+                    text(words("shell.simulation"), classes="ps-said ps-said-warning w-full")
+                self._answers(found, job)
+                with tag(ui.column().classes("ps-card w-full"), "recognised"):
+                    text(words("publish.recognised"), "h3")
+                    for sentence in reidentification_text(words, found.reidentification):
+                        text(sentence)
+                self._contents(found)
+
+    def _answers(self, found: PackageFacts, job: StudioJob | None) -> None:
+        words = self.words
+        with tag(ui.column().classes("ps-card w-full"), "answers"):
+            text(words("publish.answers"), "h3")
+            if job is None:
+                text(words("publish.not_checked"))
+            else:
+                with ui.row().classes("items-center"):
+                    html(self._state(job))
+                    text(words("publish.all_agree" if job.result["valid"] else "publish.some_disagree"), "span")
+                self._validators(job.result)
+                for each in [*job.result.get("warnings", ()), *job.result.get("notes", ())]:
+                    text(f"{words('publish.note')} {each}", classes="ps-said ps-said-info w-full")
+            self._thorough = tag(ui.checkbox(words("publish.with_thorough")), "check-thorough")
+            again = ui.button(words("publish.check"), icon="fact_check", on_click=lambda: self._check(found))
+            tag(again.props("outline no-caps"), "check").set_enabled("publish" not in self.lacking)
+
+    def _validators(self, result: dict[str, Any]) -> None:
+        words = self.words
+        rows = []
+        for each in result["validators"]:
+            good, name = not each["problems"], each["validator"]
+            about = words(f"publish.v_{name}") if name in VALIDATORS else ""
+            found = words("publish.problems_found", n=each["problems"])
+            mark = verdict(good, words("publish.passed") if good else found)
+            rows.append((name, mark, about, each["looked_at"]))
+        head = [words(f"publish.{k}") for k in ("validator", "answer", "looks_at", "looked_at")]
+        tag(table(words("publish.validators_caption"), head, rows), "validators")
+        if problems := result["problems"]:
+            listed = [(p["validator"], p["file"] or words("publish.whole"), p["problem"]) for p in problems[:_SHOWN]]
+            head = [words(f"publish.{k}") for k in ("validator", "file", "problem")]
+            tag(table(words("publish.problems_caption", n=len(problems)), head, listed), "problems")
+            if len(problems) > _SHOWN:
+                text(words("publish.more_problems", n=len(problems) - _SHOWN), classes="ps-dim")
+
+    async def _check(self, found: PackageFacts) -> None:
+        self.page.say("")
+        with self.page.show_errors():
+            spec = {"place": str(self.workspace.inside(found.place)), "thorough": bool(self._thorough.value)}
+            await self.work.start("validate", spec)
+
+    def _contents(self, found: PackageFacts) -> None:
+        words = self.words
+        with tag(ui.column().classes("ps-card w-full"), "contents"):
+            text(words("publish.contents"), "h3")
+            rows = [(name, f"{files:,}", size(total)) for name, (files, total) in found.contents.items()]
+            files, total = (sum(each) for each in zip(*found.contents.values(), strict=True)) if rows else (0, 0)
+            with ui.expansion(words("publish.files", n=f"{files:,}", size=size(total))).classes("w-full"):
+                head = [words(f"publish.{k}") for k in ("file", "files_count", "size")]
+                table(words("publish.contents_caption"), head, rows, (1, 2))
+            if found.citation:
+                text(words("publish.cite"), "h3")
+                tag(text(found.citation), "citation")
+                if "doi.org" not in found.citation:
+                    text(words("publish.no_doi"), classes="ps-dim")
+            text(words("publish.take"), "h3")
+            if found.zip is not None:
+                message = words("publish.download", size=size(found.zip.stat().st_size))
+                down = ui.link(message, address(PACKAGES, found.name)).classes("ps-link").props("download")
+                tag(down, "download")
+            else:
+                text(words("publish.no_zip"), classes="ps-said ps-said-warning w-full")
+            text(words("publish.by_hand"))
+            text(str(found.place), classes="ps-path")
+
+
+def newest_validation(jobs: Jobs, found: PackageFacts) -> StudioJob | None:
+    """Return the newest job that validated this package since it was written."""
+    places = {str(p) for p in (found.folder, found.zip) if p is not None}
+    return next(
+        (
+            j
+            for j in jobs.all("publish", "validate")
+            if j.state == DONE and j.spec.get("place") in places and j.ended_s >= found.made_s - 1.0
+        ),
+        None,
+    )
+
+
+def reidentification_text(words: Words, figures: dict[str, Any]) -> list[str]:
+    """Summarise a re-identification test in sentences; ``figures`` is {} if none was run."""
+    trials = {(t["design"], t["sees"]): t for t in figures.get("trials", ())}
+    head = trials.get(("recordings", "everything"))
+    if head is None:
+        return [words("publish.nobody_looked")]
+    top, low, chance = head["top1"], (head["top1"].get("ci95") or [head["top1"]["mean"]])[0], head["chance"]
+    between = (
+        words("publish.interval", low=_of_100(top["ci95"][0]), high=_of_100(top["ci95"][1])) if top["ci95"] else ""
+    )
+    message = [
+        words(
+            "publish.named",
+            right=_of_100(top["mean"]),
+            people=head["people"],
+            recordings=head["recordings"],
+            between=between,
+            chance=_of_100(chance),
+        )
+    ]
+    for key, trial in (
+        ("unseen", trials.get(("gestures", "everything"))),
+        ("moved", trials.get(("recordings", "movement"))),
+        ("clock", trials.get(("recordings", "clock"))),
+        ("session", trials.get(("sessions", "everything"))),
+    ):
+        if trial is not None:
+            message.append(words(f"publish.named_{key}", right=_of_100(trial["top1"]["mean"])))
+    if ("sessions", "everything") not in trials:
+        message.append(words("publish.no_sessions"))
+    if figures.get("simulated"):
+        message.append(words("publish.means_simulated"))
+    else:
+        message.append(words("publish.means_guessing" if low <= chance else "publish.means_personal"))
+    return [*message, words("publish.lower_bound")]
+
+
+def _of_100(share: float) -> str:
+    return f"{100 * share:.0f}" if share >= 0.095 or share == 0 else f"{100 * share:.1f}"

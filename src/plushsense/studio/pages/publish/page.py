@@ -1,0 +1,324 @@
+"""The publish page: turns a data set into a validated package on this computer."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+from nicegui import context, run, ui
+
+from plushsense.core.errors import ConfigError
+from plushsense.dataset.publishing.description import LICENCES
+from plushsense.dataset.publishing.package import complete_head
+from plushsense.dataset.store import DatasetHead
+from plushsense.studio.app.jobs import Jobs, StudioJob
+from plushsense.studio.app.shell import Page, address, tag
+from plushsense.studio.app.workspace import DATASETS, PACKAGES
+from plushsense.studio.pages.publish.packages import KEYS, DatasetFacts, PackagesSection, missing_extras
+from plushsense.studio.widgets.work import WorkPanel, facts, scroll_to, style, text, titles
+
+_SHOWN = 5
+
+
+class StatementsForm:
+    """Fields for licence, contact and consent, filled from the data set or the last publication."""
+
+    def __init__(self, page: Page, found: DatasetFacts) -> None:
+        self.page, self.words, self.found = page, page.words, found
+
+    def build(self) -> None:
+        words, found = self.words, self.found
+        last = next(
+            (j.spec for j in self.page.workspace.part(Jobs).all("publish") if j.spec["dataset"] == str(found.path)), {}
+        )
+        name, _, mail = str(last.get("contact", "")).rstrip(">").partition(" <")
+        text(words("publish.statements"), "h3")
+        lacking = [
+            words(f"publish.lacks_{key}")
+            for key, there in (("licence", found.licence), ("contact", found.contact_mail), ("consent", found.consent))
+            if not there
+        ]
+        message = words("publish.lacks", what=", ".join(lacking)) if lacking else words("publish.lacks_nothing")
+        tag(text(message), "lacks")
+        known = {s: s if s == each.title else f"{s}: {each.title}" for s, each in LICENCES.items()}
+        value = found.licence or last.get("licence") or None
+        if value is not None and value not in known:
+            # A licence that the library refuses stays visible.
+            known[value] = value
+        licence = ui.select(known, value=value, label=words("publish.licence"), with_input=False).classes("w-full")
+        self._licence = tag(licence, "licence")
+        text(words("publish.licence_about"), classes="ps-dim")
+        with ui.row().classes("w-full"):
+            who = ui.input(words("publish.contact_name"), value=found.contact_name or name).classes("col-grow")
+            self._name = tag(who, "contact-name")
+            where = ui.input(words("publish.contact_mail"), value=found.contact_mail or mail).classes("col-grow")
+            self._mail = tag(where.props("type=email"), "contact-mail")
+        text(words("publish.contact_about"), classes="ps-dim")
+        consent = ui.textarea(words("publish.consent"), value=found.consent or last.get("consent", ""))
+        self._consent = tag(consent.props("autogrow").classes("w-full"), "consent")
+        text(words("publish.consent_about"), classes="ps-dim")
+        self._save = tag(ui.checkbox(words("publish.save")), "save")
+
+    def values(self) -> dict[str, Any]:
+        """Return the fields as arguments of `publish_dataset`."""
+        name, mail = (self._name.value or "").strip(), (self._mail.value or "").strip()
+        return {
+            "licence": self._licence.value or "",
+            "contact": f"{name} <{mail}>" if name or mail else "",
+            "consent": (self._consent.value or "").strip(),
+            "save": bool(self._save.value),
+        }
+
+
+class PseudonymsForm:
+    """The advice to replace codes and dates of people, and the form that does so.
+
+    Args:
+        start: called with the names of the new data set and the key file, words to remove, whether to drop notes.
+    """
+
+    def __init__(
+        self, page: Page, found: DatasetFacts, start: Callable[[str, str, list[str], bool], Awaitable[None]]
+    ) -> None:
+        self.page, self.words, self.found, self._start = page, page.words, found, start
+
+    def build(self) -> None:
+        words, found = self.words, self.found
+        if not found.own_codes and not found.own_dates:
+            tag(text(words("publish.renamed_already"), classes="ps-dim"), "renamed-already")
+            return
+        visible = ", ".join(found.own_codes[:_SHOWN]) + (" …" if len(found.own_codes) > _SHOWN else "")
+        with tag(ui.column().classes("w-full"), "advice"):
+            kind = "info" if found.simulated else "warning"
+            message = words("publish.advice", codes=visible or "–")
+            text(message, classes=f"ps-said ps-said-{kind} w-full")
+        with tag(ui.expansion(words("publish.rename")).classes("w-full"), "rename"):
+            text(words("publish.rename_about"))
+            name = self._free(f"{found.path.name}-shared")
+            self._name = tag(ui.input(words("publish.rename_name"), value=name).props("maxlength=64"), "rename-name")
+            key = ui.input(words("publish.rename_key"), value=f"{found.path.name}-people.csv").props("maxlength=64")
+            self._key = tag(key, "rename-key")
+            for field in (self._name, self._key):
+                field.classes("w-full")
+            text(words("publish.key_place", folder=str(self.page.workspace.folder / KEYS)), classes="ps-dim")
+            self._listed = tag(ui.textarea(words("publish.rename_words")).props("autogrow").classes("w-full"), "words")
+            self._drop = tag(ui.checkbox(words("publish.rename_drop")), "drop-notes")
+            text(words("publish.rename_safe"), classes="ps-said ps-said-warning w-full")
+            do = ui.button(words("publish.rename_do"), icon="masks", on_click=self._go).props("outline no-caps")
+            tag(do, "rename-do")
+
+    def _free(self, name: str) -> str:
+        number, free = 2, name
+        while (self.page.workspace.folder / DATASETS / free).exists():
+            number, free = number + 1, f"{name}-{number}"
+        return free
+
+    async def _go(self) -> None:
+        listed = [line.strip() for line in (self._listed.value or "").splitlines() if line.strip()]
+        name, key = (self._name.value or "").strip(), (self._key.value or "").strip()
+        await self._start(name, key, listed, bool(self._drop.value))
+
+
+_TASKS = ("publish", "validate", "pseudonymise")
+_STAGES = {"recognising people": "recognising", "writing": "writing", "rewriting": "rewriting"}
+_SWITCHES = ("streams", "excluded", "bids", "reidentification", "thorough")
+
+
+async def show(page: Page) -> None:
+    """Build the page. ``?dataset=PATH`` chooses a data set, ``?name=NAME`` opens a package."""
+    await _Publishing(page).build()
+
+
+class _Publishing:
+    def __init__(self, page: Page) -> None:
+        self.page, self.words, self.workspace = page, page.words, page.workspace
+        request = context.client.request
+        self.asked = dict(request.query_params) if request is not None else {}
+        self.dataset: DatasetFacts | None = None
+        self.lacking: list[str] = missing_extras()
+
+    async def build(self) -> None:
+        words = self.words
+        style()
+        text(words("publish.about"), classes="ps-dim")
+        with ui.row().classes("ps-said ps-said-warning w-full items-center no-wrap"):
+            ui.icon("lock").props('aria-hidden="true"')
+            tag(text(words("publish.danger")), "danger")
+        if "publish" in self.lacking:
+            tag(text(words("publish.missing_publish"), classes="ps-said ps-said-error w-full"), "missing-publish")
+        await self._form()
+        self.work = WorkPanel(self.page, _TASKS, self._progress_text, self._ended, self._allow)
+        self._allow()
+        self.packages = PackagesSection(self.page, self.work, self.lacking)
+        await self.packages.build(self.asked.get("name", ""))
+
+    # A new package --------------------------------------------------------------------------------------------
+
+    async def _form(self) -> None:
+        words = self.words
+        found = await titles(self.workspace)
+        with tag(ui.column().classes("ps-card w-full"), "new"):
+            text(words("publish.new"), "h2")
+            if not found:
+                tag(text(words("publish.no_dataset")), "no-dataset")
+                return
+            wanted = self.asked.get("dataset", "")
+            first = wanted if wanted in found else next(iter(found))
+            chosen = ui.select(
+                found, value=first, label=words("publish.dataset"), on_change=lambda e: self._choose(e.value)
+            )
+            tag(chosen.classes("w-full"), "dataset")
+            self._rest = ui.column().classes("w-full")
+            await self._choose(first)
+
+    async def _choose(self, path: str) -> None:
+        words = self.words
+        found = await run.io_bound(lambda: DatasetFacts.of(Path(path)))
+        assert found is not None
+        self.dataset = found
+        self._rest.clear()
+        with self._rest:
+            if found.problem:
+                tag(text(found.problem, classes="ps-said ps-said-error w-full"), "dataset-problem")
+                return
+            if found.simulated:
+                text(words("shell.simulation"), classes="ps-said ps-said-warning w-full")
+            tag(facts(self._facts_of(found)), "dataset-facts")
+            PseudonymsForm(self.page, found, self._pseudonymise).build()
+            self.statements = StatementsForm(self.page, found)
+            self.statements.build()
+            self._choices(found)
+            name = ui.input(words("publish.name"), value=self._free(found.path.name)).props("maxlength=64")
+            self._name = tag(name.classes("w-full"), "name")
+            button = ui.button(words("publish.do"), icon="inventory_2", on_click=self._start).props("no-caps")
+            self._button = tag(button, "do")
+        self._allow()
+
+    def _facts_of(self, found: DatasetFacts) -> list[tuple[str, str]]:
+        words = self.words
+        return [
+            (words("publish.dataset_name"), found.name),
+            (words("publish.version"), found.version),
+            (words("publish.people"), str(found.people)),
+            (words("publish.recordings"), words("publish.recordings_value", n=found.recordings, x=found.excluded)),
+            (words("publish.streams_count"), str(found.streams)),
+            (words("publish.place"), str(found.path)),
+        ]
+
+    def _choices(self, found: DatasetFacts) -> None:
+        words = self.words
+        text(words("publish.choices"), "h3")
+        self._switches: dict[str, ui.checkbox] = {}
+        for key in _SWITCHES:
+            box = ui.checkbox(words(f"publish.with_{key}"), value=key in ("streams", "reidentification"))
+            self._switches[key] = tag(box, f"with-{key}")
+            text(words(f"publish.with_{key}_about"), classes="ps-dim").style("margin: -12px 0 0 40px")
+        if "baselines" in self.lacking:
+            self._switches["reidentification"].set_value(False)
+            self._switches["reidentification"].set_enabled(False)
+            tag(text(words("publish.missing_baselines"), classes="ps-said ps-said-warning w-full"), "missing-baselines")
+        self._columns: dict[str, ui.checkbox] = {}
+        if found.columns:
+            text(words("publish.columns"), classes="ps-dim")
+            self._columns = {c: tag(ui.checkbox(c), f"column-{c}") for c in found.columns}
+        self._keep = tag(ui.checkbox(words("publish.with_key")), "with-key")
+        text(words("publish.with_key_about"), classes="ps-dim").style("margin: -12px 0 0 40px")
+        field = ui.input(words("publish.key"), value=f"{found.path.name}.key").props("maxlength=64").classes("w-full")
+        self._key = tag(field.bind_visibility_from(self._keep, "value"), "key")
+        where = text(words("publish.key_place", folder=str(self.workspace.folder / KEYS)), classes="ps-dim")
+        where.bind_visibility_from(self._keep, "value")
+
+    def _free(self, stem: str) -> str:
+        """Return a name that neither a folder nor a zip uses."""
+        plain = "".join(c if c.isalnum() or c in " ._-" else "-" for c in stem).strip(" .")[:56] or "package"
+        number, name, root = 2, plain, self.workspace.folder / PACKAGES
+        while (root / name).exists() or (root / f"{name}.zip").exists():
+            number, name = number + 1, f"{plain}-{number}"
+        return name
+
+    def _allow(self) -> None:
+        if hasattr(self, "_button") and hasattr(self, "work"):
+            self._button.set_enabled("publish" not in self.lacking and not self.work.running("publish"))
+
+    async def _start(self) -> None:
+        found = self.dataset
+        assert found is not None
+        self.page.say("")
+        with self.page.show_errors():
+            dataset = self.workspace.inside(found.path)
+            place = self.workspace.new(PACKAGES, self._name.value or "")
+            if place.with_name(f"{place.name}.zip").exists():
+                raise ConfigError(f"'{place.name}.zip' is there already: give another name, nothing is replaced.")
+            message = self.statements.values()
+            # Check now, while the form is visible, and not only in the job.
+            head = await run.io_bound(lambda: DatasetHead.read(dataset))
+            assert head is not None
+            complete_head(head, dataset, message["licence"], message["contact"], message["consent"])
+            spec = {
+                "dataset": str(dataset),
+                "place": str(place),
+                **message,
+                **{key: bool(box.value) for key, box in self._switches.items()},
+                "columns": [name for name, box in self._columns.items() if box.value],
+                "key": str(self._key_place()) if self._keep.value else "",
+            }
+            await self.work.start("publish", spec)
+
+    def _key_place(self) -> Path:
+        """Return the path of the key file, new or existing."""
+        name = (self._key.value or "").strip()
+        there = self.workspace.folder / KEYS / name
+        if name and there.parent == self.workspace.folder / KEYS and there.is_file():
+            return self.workspace.inside(there)
+        return self.workspace.new(KEYS, name)
+
+    async def _pseudonymise(self, name: str, key: str, words: list[str], drop_notes: bool) -> None:
+        found = self.dataset
+        assert found is not None
+        self.page.say("")
+        with self.page.show_errors():
+            place, there = self.workspace.new(DATASETS, name), self.workspace.folder / KEYS / key
+            one_of_before = key and there.parent == self.workspace.folder / KEYS and there.is_file()
+            kept = self.workspace.inside(there) if one_of_before else self.workspace.new(KEYS, key)
+            spec = {"dataset": str(self.workspace.inside(found.path)), "place": str(place), "key": str(kept)}
+            spec |= {"words": words, "drop_notes": drop_notes}  # type: ignore[dict-item]
+            await self.work.start("pseudonymise", spec)
+
+    # What runs ------------------------------------------------------------------------------------------------
+
+    def _progress_text(self, job: StudioJob) -> str:
+        words, stage = self.words, str(job.progress.get("stage", ""))
+        total = job.progress.get("total") or 0
+        of = f" {words('publish.of', done=job.progress.get('done', 0), total=total)}" if total else ""
+        if stage.startswith("validating"):
+            return f"{words('publish.stage_validating', name=stage.partition(': ')[2])}{of}"
+        known = _STAGES.get(stage, "begin")
+        return f"{words(f'publish.stage_{known}')}{of}"
+
+    async def _ended(self, job: StudioJob) -> None:
+        if job.task == "pseudonymise":
+            await self._renamed(job)
+            return
+        name = Path(job.spec["place"]).name
+        if job.task == "publish":
+            good = bool(job.result["valid"])
+            message = self.words("publish.done" if good else "publish.done_invalid", name=name)
+            self.page.say(message, "good" if good else "error")
+            if hasattr(self, "_name"):
+                self._name.set_value(self._free(name))
+        await self.packages.show(name.removesuffix(".zip") if job.task == "validate" else name)
+        await self.packages.refresh()
+        scroll_to("package")
+
+    async def _renamed(self, job: StudioJob) -> None:
+        result = job.result
+        self.page.say(self.words("publish.renamed", name=Path(job.spec["place"]).name, file=result["key"]), "good")
+        with self.page._messages, tag(ui.column().classes("w-full"), "findings"):
+            link = ui.link(self.words("publish.renamed_go"), address("publish", dataset=job.spec["place"])).classes(
+                "ps-link"
+            )
+            tag(link, "go-renamed")
+            for found in result["findings"]:
+                where = [str(found[k]) for k in ("file", "line") if found[k]]
+                text(": ".join([*where, found["message"]]), classes="ps-said ps-said-warning w-full")

@@ -1,0 +1,289 @@
+"""Recording sessions of the studio: started and resumed here, driven by any page, independent of open pages."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from plushsense.core.errors import ConfigError
+from plushsense.core.layouts import layout_names
+from plushsense.core.toml import builtin_names
+from plushsense.core.version import __version__
+from plushsense.devices.opening import parse_url
+from plushsense.recording.recorder import Recorder
+from plushsense.recording.session import OpenSession, SessionSummary, is_finished, list_sessions
+from plushsense.recording.session_files import SESSION_HEAD, SessionHead
+from plushsense.recording.setup import (
+    SessionRequest,
+    check_speed,
+    is_pseudo_terminal,
+    is_virtual,
+    lacks_consent,
+    open_toy,
+    prompt_virtual,
+    session_folder,
+    session_head,
+    session_layout,
+    speed_of,
+    with_speed,
+)
+from plushsense.recording.status import RecorderStatus, StepResult
+from plushsense.studio.app.toys import TappedDevice
+from plushsense.studio.app.workspace import VIRTUAL, ChangeSignal, Workspace
+
+PROTOCOLS, LAYOUTS = "protocols", "layouts"
+"""Folders in the workspace for a user's own files."""
+NO_CONSENT, PSEUDO = "no_consent", "pseudo"
+"""Notices before recording: keys of the page's texts."""
+SOFTWARE = f"plushsense {__version__} studio"
+
+
+@dataclass
+class ActiveSession:
+    """A session that is being recorded.
+
+    Attributes:
+        name: ``<subject>/<session>``, as it stands in the page's address.
+        notices: `NO_CONSENT`, `PSEUDO`. ``mended``: sentences about what a crash had left.
+    """
+
+    name: str
+    recorder: Recorder
+    device: TappedDevice
+    request: SessionRequest
+    notices: tuple[str, ...] = ()
+    mended: tuple[str, ...] = ()
+    _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
+
+    @property
+    def head(self) -> SessionHead:
+        """The head of the session's files."""
+        return self.recorder.session.head
+
+    def status(self) -> RecorderStatus:
+        """Return the recorder's current status."""
+        return self.recorder.status()
+
+    def steps(self) -> tuple[StepResult, ...]:
+        """Return all steps of the plan and the recording of each."""
+        return self.recorder.steps()
+
+    def press(self, key: str, seen: str) -> bool:
+        """Run a command if the status is still the one that was displayed; return whether it was run.
+
+        So two pages that press at the same moment, or a delayed press, give one command.
+
+        Args:
+            key: " ", "r", "s", "b", "p" as in the terminal, or ``go:<number of the step>``.
+            seen: `plushsense.recording.status.RecorderStatus.seen` of what was on the screen.
+
+        Raises:
+            ConfigError: for a key that is none.
+        """
+        recorder = self.recorder
+        with self._lock:
+            status = recorder.status()
+            commands: dict[str, Callable[[], None]] = {
+                " ": recorder.space,
+                "r": recorder.redo,
+                "s": recorder.skip,
+                "b": recorder.back,
+                "p": recorder.resume if status.state == "paused" else recorder.pause,
+            }
+            number = key.removeprefix("go:")
+            if number != key and number.isdecimal() and int(number) < status.steps:
+                commands[key] = lambda: recorder.go(int(number))
+            if key not in commands:
+                raise ConfigError(f"'{key}' is not a command of the recorder: use space, r, s, b, p or go:<step>.")
+            if status.seen != seen:
+                return False
+            commands[key]()
+            return True
+
+
+class RecordController:
+    """Starts, resumes and ends the sessions of a studio.
+
+    `changed` is notified whenever a session changes, starts or ends.
+
+    `begin`, `resume`, `close_session` and `sessions` block: call them outside the event loop.
+    """
+
+    def __init__(self, workspace: Workspace) -> None:
+        self.changed = ChangeSignal()
+        self._workspace = workspace
+        self._lock = threading.RLock()
+        self._opening = threading.Lock()
+        self._active: dict[str, ActiveSession] = {}
+
+    def active_sessions(self) -> list[ActiveSession]:
+        """Return the sessions that are being recorded now."""
+        with self._lock:
+            return list(self._active.values())
+
+    def get(self, name: str) -> ActiveSession | None:
+        """Return the active session of this name, or None."""
+        with self._lock:
+            return self._active.get(name)
+
+    def sessions(self) -> list[SessionSummary]:
+        """Return all sessions in the studio's folder, the newest first."""
+        return list_sessions(self._workspace.recordings)
+
+    def begin(self, request: SessionRequest, anew: bool = False) -> ActiveSession:
+        """Start a session, or return this person's active one.
+
+        Args:
+            anew: begin another one although the person's last is unfinished.
+
+        Raises:
+            PlushSenseError: what the recorder or the toy refuses; also when the last one is unfinished.
+        """
+        self._check(request)
+        with self._opening:
+            folder, known = session_folder(self._workspace.recordings, request, new=anew)
+            session = self._active_of(request, folder.parent.name)
+            if session is not None:
+                return session
+            if known is not None:
+                raise ConfigError(
+                    f"{folder.parent.name} has an unfinished session, {folder.name}: resume it, or choose to begin "
+                    "another one."
+                )
+            return self._open(request, folder, None)
+
+    def _active_of(self, request: SessionRequest, subject: str) -> ActiveSession | None:
+        """Return the person's active session, if there is one; end a finished session of this person or toy."""
+        for session in self.active_sessions():
+            over = session.status().state in ("finished", "stopped")
+            if over and (session.head.subject == subject or session.request.device == request.device):
+                self._end(session)
+            elif session.head.subject == subject:
+                return session
+        return None
+
+    def resume(self, name: str, device: str = "") -> ActiveSession:
+        """Resume an unfinished session, or return it if it is active.
+
+        Args:
+            device: the toy's URL; "": the one that it was begun with.
+
+        Raises:
+            PlushSenseError: what the recorder or the toy refuses.
+        """
+        folder = self._folder(name)
+        with self._opening:
+            session = self.get(name)
+            if session is not None:
+                return session
+            known = SessionHead.read(folder)
+            if known is None:
+                raise ConfigError(f"There is no session '{name}' in '{self._workspace.recordings}'.")
+            if is_finished(folder):
+                raise ConfigError(f"The session '{name}' is finished: begin a new one.")
+            url = device or known.device
+            request = SessionRequest(device=url, subject=known.subject, speed=self.speed_for(url, known.simulated))
+            self._check(request, known.device)
+            return self._open(request, folder, known)
+
+    def close_session(self, name: str) -> None:
+        """Close a session; a running recording is discarded, all else is kept. May be called twice."""
+        with self._opening:
+            with self._lock:
+                session = self._active.get(name)
+            if session is not None:
+                self._end(session)
+
+    def _end(self, session: ActiveSession) -> None:
+        session.recorder.close()
+        session.device.close()
+        with self._lock:
+            self._active.pop(session.name, None)
+        self.changed.notify()
+
+    def close(self) -> None:
+        """End all."""
+        for session in self.active_sessions():
+            self.close_session(session.name)
+
+    # What may be chosen ---------------------------------------------------------------------------------------
+
+    def speed_for(self, url: str, simulated: bool) -> float:
+        """Return the speed at which a toy runs, as a multiple of real time; 1 for a real toy."""
+        if not simulated and not is_virtual(url):
+            return speed_of(url)
+        return speed_of(url) if "speed" in parse_url(url).query else self._workspace.speed
+
+    def toys(self) -> list[str]:
+        """Return the toys to choose from: the chosen one, those named at start, the virtual one."""
+        return list(dict.fromkeys(u for u in (self._workspace.toy, *self._workspace.devices, VIRTUAL) if u))
+
+    def protocols(self) -> dict[str, str]:
+        """Return the protocols to choose from: name or path to title."""
+        own = self._workspace.folder / PROTOCOLS
+        return {n: n for n in sorted(builtin_names("protocols"), key=lambda n: (n != "plush-17", n))} | {
+            str(p): p.name for p in sorted(own.glob("*.toml"))
+        }
+
+    def layouts(self) -> dict[str, str]:
+        """Return the layouts to choose from: name or path to title."""
+        own = self._workspace.folder / LAYOUTS
+        return {n: n for n in layout_names()} | {str(p): p.name for p in sorted(own.glob("*.toml"))}
+
+    def _check(self, request: SessionRequest, known_device: str = "") -> None:
+        """Refuse toys, protocols and layouts that name files outside this studio."""
+        check_speed(request.speed)
+        if request.protocol and request.protocol not in self.protocols():
+            raise ConfigError(f"'{request.protocol}' is not a protocol of this studio: choose one from the list.")
+        if request.layout and request.layout not in self.layouts():
+            raise ConfigError(f"'{request.layout}' is not a layout of this studio: choose one from the list.")
+        address = parse_url(request.device)
+        given = request.device in (*self.toys(), known_device)
+        strange = address.scheme == "replay" or address.query.get("layout", "plush-15") not in self.layouts()
+        if strange and not given:
+            raise ConfigError(
+                f"'{request.device}' names a file: start the studio with --device {request.device} to record from it."
+            )
+
+    def _folder(self, name: str) -> Path:
+        folder = self._workspace.inside(self._workspace.recordings / name)
+        if folder.parent.parent != self._workspace.recordings or not (folder / SESSION_HEAD).is_file():
+            raise ConfigError(f"There is no session '{name}' in '{self._workspace.recordings}'.")
+        return folder
+
+    def _open(self, request: SessionRequest, folder: Path, known: SessionHead | None) -> ActiveSession:
+        layout = session_layout(request, folder, known)
+        device = TappedDevice(open_toy(with_speed(request.device, request.speed), layout))
+        try:
+            head = session_head(request, folder, known is None, device.layout, SOFTWARE)
+            notices = ((PSEUDO, is_pseudo_terminal(request, known or head)), (NO_CONSENT, lacks_consent(known or head)))
+            files = OpenSession(folder, head)
+            try:
+                recorder = Recorder(files, device, speed=request.speed, software=SOFTWARE)
+                prompt_virtual(recorder)
+                recorder.subscribe(lambda _what, _status: self.changed.notify())
+                recorder.start()
+            except BaseException:
+                files.close()
+                raise
+        except BaseException:
+            device.close()
+            raise
+        session = ActiveSession(
+            _name(folder),
+            recorder,
+            device,
+            replace(request, subject=head.subject),
+            tuple(key for key, applies in notices if applies),
+            tuple(files.progress.repairs),
+        )
+        with self._lock:
+            self._active[session.name] = session
+        self.changed.notify()
+        return session
+
+
+def _name(folder: Path) -> str:
+    return f"{folder.parent.name}/{folder.name}"

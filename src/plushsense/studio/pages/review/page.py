@@ -1,0 +1,82 @@
+"""The review page: the recordings of a data set as a table, one by one, and as overlays.
+
+The address holds the state of the page, so that it can be linked to and survives a reload:
+
+``/review?dataset=DIR``
+    a data set inside the folders of the studio, absolute or relative to the home folder; the first one by default.
+``recordings=ID`` (several times), ``title=TEXT``
+    only these recordings, and what they have in common. Unknown ids are left out with a message.
+``selection=KEY``
+    the same, stored under a key. `plushsense.studio.pages.review.selection.Reviews.address` chooses between both.
+``person, gesture, state, severity, check, text``
+    the filters (`plushsense.studio.pages.review.selection.RecordingFilter`).
+``view=table | one | overlay``, ``recording=ID``
+    the open view; ``recording`` alone opens that recording.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from urllib.parse import quote
+
+from nicegui import context, run, ui
+
+from plushsense.studio.app.shell import Page, tag
+from plushsense.studio.pages.review.controller import ReviewController
+from plushsense.studio.pages.review.recording_view import GestureOverlayView, RecordingView
+from plushsense.studio.pages.review.review import Review
+from plushsense.studio.pages.review.selection import Reviews
+from plushsense.studio.pages.review.table_view import RecordingTableView
+
+_CSS = Path(__file__).with_name("review.css")
+
+
+async def show(page: Page) -> None:
+    """Build the page."""
+    ui.add_css(_CSS.read_text(encoding="utf-8"))
+    words, request = page.words, context.client.request
+    query = request.query_params if request is not None else {}
+    asked = {key: str(value) for key, value in query.items()}
+    named = request.query_params.getlist("recordings") if request is not None else []
+    datasets = page.workspace.datasets()
+    place = asked.get("dataset") or (str(datasets[0]) if datasets else "")
+    with page.show_errors():
+        place = str(page.workspace.inside(place)) if place else ""
+    _choice_of_dataset(page, datasets, place)
+    if not place:
+        ui.label(words("review.no_dataset")).classes("ps-dim")
+        ui.link(words("pages.home"), "/").classes("ps-link")
+        return
+    waiting = tag(ui.label(words("review.opening")).props("role=status"), "opening")
+    await context.client.connected()
+    with page.show_errors():
+        reviews = page.workspace.part(Reviews)
+        review: Review | None = await run.io_bound(reviews.open, place)
+        if review is None:
+            return  # the studio is ending
+        title, only = asked.get("title", ""), named
+        if asked.get("selection"):
+            selection = await run.io_bound(reviews.selection, asked["selection"])
+            if selection is None:
+                return
+            title, only = selection
+        controller = ReviewController(page, review, asked)
+        controller.limit(title, only)
+        controller.build(RecordingTableView, RecordingView, GestureOverlayView)
+        await controller.begin(asked)
+    waiting.delete()
+
+
+def _choice_of_dataset(page: Page, datasets: list[Path], place: str) -> None:
+    words = page.words
+    titles = {str(p.resolve()): page.workspace.title(p) for p in datasets}
+    twice = {t for t in titles.values() if list(titles.values()).count(t) > 1}
+    options = {p: f"{t} ({Path(p).name})" if t in twice else t for p, t in titles.items()}
+    if len(options) > 1 or place not in options:
+        choice = ui.select(
+            options,
+            value=place if place in options else None,
+            label=words("review.dataset"),
+            on_change=lambda e: ui.navigate.to(f"/review?dataset={quote(str(e.value))}"),
+        )
+        tag(choice.props("outlined dense").style("min-width: 280px"), "dataset")

@@ -1,0 +1,415 @@
+"""The train page and its form."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from nicegui import context, run, ui
+
+from plushsense.core.errors import PlushSenseError
+from plushsense.models.arch import DEFAULT_FILTERS, DEFAULT_SYMBOL, NORMS, PADDINGS
+from plushsense.scoring.splits import parse_split
+from plushsense.studio.app.jobs import DONE, RUNNING, Jobs, StudioJob
+from plushsense.studio.app.shell import Page, html, on_change, query_path, tag
+from plushsense.studio.pages.train.jobs_section import JobsSection
+from plushsense.studio.pages.train.requests import (
+    EVALUATE,
+    KINDS,
+    PAPER,
+    SEARCH,
+    SPLITS,
+    SWEEP,
+    TRAIN,
+    JobRequest,
+    free_name,
+    grids,
+    job_request,
+)
+from plushsense.studio.pages.train.results import StoredResults, duration_text, score_labels
+from plushsense.studio.pages.train.results_section import ResultsSection
+from plushsense.training.spec import DEVICES, PRESETS
+from plushsense.windows.cut import ANYWHERE, TRAIN_CONTEXTS
+
+_ADVANCED: dict[str, tuple[str, ...]] = {
+    TRAIN: ("arch", "filters", "padding", "norm", "batch", "classes", "device", "quantize_aware", "fit_decisions"),
+    EVALUATE: ("arch", "filters", "padding", "norm", "batch", "classes", "device", "train_context", "int8"),
+    SWEEP: ("architectures", "filters", "batches", "padding", "context", "classes", "device"),
+    SEARCH: ("architectures", "filters", "batches", "padding", "context", "classes", "device", "share"),
+}
+_WORDS = {"architectures": "archs"}
+_PLACEHOLDERS = {
+    "arch": DEFAULT_SYMBOL,
+    "filters": ",".join(map(str, DEFAULT_FILTERS)),
+    "classes": "shared",
+    "batch": "64",
+    "architectures": "14d1_39d2_41d4,14d1_19d2_19d4",
+    "batches": "64",
+    "quantize_aware": "0",
+}
+_CHOICES: dict[str, tuple[str, ...]] = {
+    "padding": PADDINGS,
+    "norm": NORMS,
+    "device": DEVICES,
+    "context": ("stream", "loop"),
+    "train_context": TRAIN_CONTEXTS,
+}
+_NUMBERS = (
+    "epochs", "seed", "batch", "quantize_aware", "seeds", "max_parameters", "max_state_bytes", "max_macs_per_step",
+)  # fmt: skip
+
+
+class TrainingForm:
+    """The form for a new job; entered values stay when the kind changes."""
+
+    def __init__(self, page: Page, jobs: Jobs, results: StoredResults) -> None:
+        self._page, self._jobs, self._results, self._words = page, jobs, results, page.words
+        self._datasets = {str(path): page.workspace.title(path) for path in page.workspace.datasets()}
+        self._kind = TRAIN
+        self._values: dict[str, dict[str, Any]] = {kind: {} for kind in KINDS}
+        self._dataset = query_path(page.workspace, "dataset", self._datasets)
+        self._values[TRAIN] |= {"context": ANYWHERE, "preset": "people", "fit_decisions": True}
+        self._values[EVALUATE] |= {"split": SPLITS[0], "preset": "people"}
+        self._values[SWEEP] |= {"grid": PAPER}
+        self._values[SEARCH] |= {"grid": PAPER}
+        self._dry: StudioJob | None = None
+        self._asked: JobRequest | None = None
+        self._agreed = ""
+        w = self._words
+        with (
+            ui.element("section")
+            .classes("ps-card w-full column no-wrap ps-tight")
+            .props(f'aria-label="{w("train.new")}"')
+        ):
+            ui.label(w("train.new")).classes("text-lg").props('role="heading" aria-level="2"')
+            if not self._datasets:
+                ui.label(w("train.no_data"))
+                return
+            with ui.row().classes("w-full items-center"):
+                box = ui.select(self._datasets, label=w("train.data"), value=self._dataset, on_change=self._chosen)
+                tag(box.classes("w-80"), "dataset")
+                self._facts = tag(ui.row().classes("items-center"), "facts")
+            kinds = {kind: w(f"train.kinds.{kind}") for kind in KINDS}
+            radio = ui.radio(kinds, value=self._kind, on_change=self._kind_chosen).props("inline")
+            tag(radio, "kind").props(f'aria-label="{w("train.kind")}"')
+            self._told = tag(ui.label().classes("ps-dim"), "told")
+            self._fields = ui.column().classes("w-full ps-tight")
+            self._buttons()
+        self._build()
+
+    def _buttons(self) -> None:
+        w = self._words
+        with ui.row().classes("items-center"):
+            look = ui.button(w("train.estimate"), icon="schedule", on_click=self._estimate).props("outline no-caps")
+            tag(look, "estimate")
+            start = ui.button(w("train.start"), icon="play_arrow", on_click=self._start).props("unelevated no-caps")
+            tag(start, "start")
+        self._plan = tag(ui.column().classes("w-full ps-tight").props('role="status"'), "plan")
+        with ui.expansion(w("train.command"), icon="terminal").classes("w-full"):
+            self._command = tag(ui.label().classes("ps-code"), "command")
+
+    async def read(self) -> None:
+        """Read and display the facts of the chosen data set."""
+        if not self._dataset:
+            return
+        self._facts.clear()
+        path = Path(self._dataset)
+        with self._page.show_errors():
+            found = await run.io_bound(self._results.facts, self._page.workspace.inside(path))
+            if found is None:
+                return
+            w = self._words
+            message = w("train.facts", people=found.people, recordings=found.recordings, gestures=len(found.gestures))
+            with self._facts:
+                ui.label(message)
+                if found.simulated:
+                    html(score_labels(w, False, True))
+                    ui.label(w("shell.simulation")).classes("ps-dim")
+            if not found.streams and self._values[TRAIN]["context"] == ANYWHERE:
+                self._values[TRAIN]["context"] = "loop"
+                self._build()
+                with self._facts:
+                    ui.label(w("train.no_streams")).classes("ps-dim")
+
+    async def _chosen(self, event: Any) -> None:
+        self._dataset = str(event.value)
+        self._values[TRAIN].pop("name", None)
+        self._page.say("")
+        self._build()
+        await self.read()
+
+    def _kind_chosen(self, event: Any) -> None:
+        self._kind = str(event.value)
+        self._page.say("")
+        self._build()
+
+    # The fields -----------------------------------------------------------------------------------------------
+
+    def _build(self) -> None:
+        """Build the fields of the chosen kind."""
+        self._told.set_text(self._words(f"train.told.{self._kind}"))
+        self._fields.clear()
+        with self._fields:
+            {TRAIN: self._of_train, EVALUATE: self._of_evaluate, SWEEP: self._of_grid, SEARCH: self._of_grid}[
+                self._kind
+            ]()
+            with ui.expansion(self._words("train.advanced"), icon="tune").classes("w-full") as more:
+                tag(more, "advanced")
+                with ui.row().classes("w-full"):
+                    for key in _ADVANCED[self._kind]:
+                        self._field(key)
+        self._changed()
+
+    def _of_train(self) -> None:
+        title = self._datasets[self._dataset]
+        self._values[TRAIN].setdefault("name", free_name(self._page.workspace, self._jobs, title))
+        with ui.row().classes("w-full"):
+            self._field("name", wide=True)
+            self._select("context", self._contexts())
+            self._select("preset", {name: self._words(f"train.presets.{name}") for name in PRESETS})
+            self._field("epochs")
+            self._field("seed")
+
+    def _of_evaluate(self) -> None:
+        with ui.row().classes("w-full"):
+            self._select("split", {split: self._words(f"train.splits.{split}") for split in SPLITS})
+            self._select("preset", {name: self._words(f"train.presets.{name}") for name in PRESETS})
+            self._select("context", self._contexts())
+            self._field("epochs")
+            self._field("seed")
+        self._split_line()
+
+    def _of_grid(self) -> None:
+        w = self._words
+        known = {PAPER: w("train.grids.paper" if self._kind == SWEEP else "train.grids.search")}
+        known |= {str(path): path.name for path in grids(self._page.workspace)}
+        with ui.row().classes("w-full"):
+            self._select("grid", known)
+            own = {split: w(f"train.splits.{split}") for split in SPLITS}
+            self._select("split", {"": w("train.splits.default"), **own})
+            if self._kind == SWEEP:
+                self._field("grid_epochs", key="epochs")
+            else:
+                for key in ("max_parameters", "max_state_bytes", "max_macs_per_step"):
+                    self._field(key)
+            self._field("seeds")
+        ui.label(w("train.grids_told", folder=self._page.workspace.folder)).classes("ps-dim")
+        self._split_line()
+
+    def _contexts(self) -> dict[str, str]:
+        return {
+            "": self._words("train.contexts.default"),
+            **{name: self._words(f"train.contexts.{name}") for name in TRAIN_CONTEXTS},
+        }
+
+    def _split_line(self) -> None:
+        self._split_row = tag(ui.row().classes("items-center"), "split-told")
+        self._say_split()
+
+    def _say_split(self) -> None:
+        """Display how far the scores of the chosen split can be trusted."""
+        self._split_row.clear()
+        split = self._values[self._kind].get("split") or ("windows:holdout" if self._paper() else "")
+        if not split:
+            return
+        with self._split_row:
+            if parse_split(split).leaky:
+                html(score_labels(self._words, True, False))
+                ui.label(self._words("train.leaky_told"))
+            elif split.startswith("by-recording"):
+                ui.label(self._words("train.known_told"))
+
+    def _paper(self) -> bool:
+        return self._kind == SWEEP and self._values[SWEEP].get("grid") == PAPER
+
+    def _field(self, word: str, *, key: str = "", wide: bool = False) -> None:
+        """Build the field of a setting: a choice, a number, a checkbox or text."""
+        name = key or word
+        label = self._words(f"train.{_WORDS.get(word, word)}")
+        values = self._values[self._kind]
+        if word in _CHOICES:
+            self._select(word, {"": self._words("train.as_default"), **{one: one for one in _CHOICES[word]}})
+        elif word in ("fit_decisions", "int8"):
+            box: Any = ui.checkbox(label, value=bool(values.get(name)), on_change=self._keeper(name))
+            tag(box, name)
+        else:
+            number = word in _NUMBERS
+            held = values.get(name)
+            box = ui.input(label, value="" if held is None else str(held), placeholder=_PLACEHOLDERS.get(word))
+            box.on_value_change(self._keeper(name, _whole if number else _text))
+            box.props('inputmode="numeric"' if number else "").classes("w-80" if wide else "w-64")
+            tag(box, name)
+
+    def _select(self, key: str, options: Mapping[str, str]) -> None:
+        held = self._values[self._kind].get(key, "")
+        value = held if held in options else next(iter(options))
+        label = self._words(f"train.{key}")
+        tag(ui.select(dict(options), label=label, value=value, on_change=self._keeper(key)).classes("w-96"), key)
+
+    def _keeper(self, key: str, read: Callable[[Any], Any] | None = None) -> Callable[[Any], None]:
+        kind = self._kind
+
+        def keep(event: Any) -> None:
+            self._values[kind][key] = read(event.value) if read else event.value
+            if key in ("split", "grid") and kind != TRAIN:
+                self._say_split()
+            self._changed()
+
+        return keep
+
+    def _changed(self) -> None:
+        """Update the shell command, and remove an estimate that no longer applies."""
+        try:
+            now = self._order()
+        except PlushSenseError:
+            self._command.set_text("")
+        else:
+            self._command.set_text(now.command)
+            if self._agreed == now.key:
+                return
+        if self._agreed:
+            self._agreed = ""
+            self._plan.clear()
+
+    def _order(self) -> JobRequest:
+        return job_request(
+            self._page.workspace,
+            self._jobs,
+            {**self._values[self._kind], "kind": self._kind, "dataset": self._dataset},
+        )
+
+    # Looking and beginning ------------------------------------------------------------------------------------
+
+    def _estimate(self) -> None:
+        self._page.say("")
+        self.close()
+        with self._page.show_errors():
+            self._asked = self._order()
+            self._dry = self._jobs.start(self._asked.task, self._asked.dry, self._asked.title)
+            self._plan.clear()
+            with self._plan, ui.row().classes("items-center"):
+                ui.spinner(size="sm")
+                ui.label(self._words("train.estimating"))
+
+    def _start(self) -> None:
+        self._page.say("")
+        with self._page.show_errors():
+            now = self._order()
+            if now.task in (SWEEP, SEARCH) and self._agreed != now.key:
+                self._page.say(self._words("train.changed" if self._agreed else "train.look_first"), "warning")
+                return
+            self._jobs.start(now.task, now.spec, now.title)
+            self._agreed = ""
+            self._plan.clear()
+            self._values[TRAIN].pop("name", None)
+            self._build()
+
+    def close(self) -> None:
+        """Stop a running estimate."""
+        if self._dry is not None and self._dry.state == RUNNING:
+            self._jobs.stop(self._dry.id)
+        self._dry = None
+
+    def refresh(self) -> None:
+        """Display the estimate when it is ready."""
+        job, asked = self._dry, self._asked
+        if job is None or asked is None or job.state == RUNNING:
+            return
+        self._dry = None
+        self._plan.clear()
+        if job.state != DONE:
+            self._page.say(job.message, "error" if job.message else "info")
+            return
+        try:
+            same = self._order().key == asked.key
+        except PlushSenseError:
+            same = False
+        with self._plan:
+            self._show_plan(job.result, asked.task)
+            for sentence in job.warnings:
+                ui.label(f"• {sentence}").classes("ps-dim")
+            if not same:
+                ui.label(self._words("train.changed"))
+        if same and not job.result.get("problems"):
+            self._agreed = asked.key
+
+    def _show_plan(self, plan: Mapping[str, Any], task: str) -> None:
+        w = self._words
+        if plan.get("problems"):
+            with ui.element("div").classes("ps-said ps-said-error w-full").props('role="alert"'):
+                ui.label(w("train.problems"))
+                for problem in plan["problems"]:
+                    ui.label(f"• {problem}")
+            return
+        html(score_labels(w, plan["leaky"], plan["simulated"]))
+        visible = {key: plan[key] for key in ("people", "classes", "windows", "folds", "epochs") if key in plan}
+        if task in (TRAIN, EVALUATE):
+            text = w("train.plan_one", **visible, parameters=f"{plan['parameters']:,}", macs=_power(plan["macs"]))
+        elif task == SWEEP:
+            counts = {key: plan[key] for key in ("trials", "trainings", "folds", "seeds", "held", "split")}
+            text = w("train.plan_grid", **counts, macs=_power(plan["macs"]))
+        else:
+            text = w(
+                "train.plan_search",
+                candidates=plan["candidates"],
+                rungs=", ".join(map(str, plan["rungs"])),
+                left_out=len(plan["left_out"]),
+                split=plan["split"],
+                share=round(100 * plan["bound_share"]),
+                macs=_power(plan["bound_macs"]),
+            )
+        tag(ui.label(text), "plan-text")
+        tag(ui.label(w("train.about", time=duration_text(w, plan["seconds"]))), "plan-time")
+
+
+def _power(value: float) -> str:
+    """Return a number in scientific notation, as in ``2.3·10¹²``."""
+    digits, power = f"{value:.1e}".split("e")
+    return f"{digits}·10{str(int(power)).translate(str.maketrans('0123456789-', '⁰¹²³⁴⁵⁶⁷⁸⁹⁻'))}"
+
+
+def _whole(text: Any) -> Any:
+    """Convert digits into an integer; return other text unchanged, for the check of the settings."""
+    plain = str(text).strip()
+    return int(plain) if plain.removeprefix("-").isdecimal() else plain
+
+
+def _text(text: Any) -> str:
+    return str(text).strip()
+
+
+_CSS = Path(__file__).with_name("train.css")
+# Shortest interval between two updates of running jobs.
+_DRAWN_S = 0.4
+
+
+async def show(page: Page) -> None:
+    """Build the page."""
+    ui.add_head_html(f"<style>{_CSS.read_text(encoding='utf-8')}</style>")
+    jobs, results = page.workspace.part(Jobs), page.workspace.part(StoredResults)
+    ui.label(page.words("train.intro")).classes("ps-dim")
+    rows = await run.io_bound(results.rows)
+    form = TrainingForm(page, jobs, results)
+    work = JobsSection(page, jobs, lambda identity: visible.open(identity))
+    visible = ResultsSection(page, results, rows or [])
+    context.client.on_delete(form.close)
+
+    pending = False
+
+    def mark() -> None:
+        nonlocal pending
+        pending = True
+
+    async def draw() -> None:
+        nonlocal pending
+        if not pending:
+            return
+        pending = False
+        form.refresh()
+        if work.refresh():
+            await visible.reload()
+
+    on_change(jobs.changed, mark)
+    ui.timer(_DRAWN_S, draw)
+    await form.read()

@@ -1,0 +1,464 @@
+"""Stored results of evaluations, sweeps, searches and trainings, as rows of one table."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+from markupsafe import Markup
+
+from plushsense.core.errors import BadInput, PlushSenseError
+from plushsense.core.gestures import NOBODY
+from plushsense.dataset.index import open_dataset
+from plushsense.dataset.marks import MARKS
+from plushsense.dataset.store import HEAD, UNKNOWN_SUBJECT, DatasetHead
+from plushsense.evaluation.scores import Predictions, read_predictions
+from plushsense.models.bundle import Bundle
+from plushsense.scoring import metrics
+from plushsense.studio.app.words import Words
+from plushsense.studio.app.workspace import Workspace
+from plushsense.trials.tables import SUMMARY as SWEEP
+from plushsense.trials.tables import TRIALS_CSV
+from plushsense.windows.cut import ANYWHERE
+from plushsense.workflow.preparation import WHOLE_PEOPLE
+from plushsense.workflow.reporting import PREDICTIONS, SCORES
+
+
+def figure(value: float | None) -> str:
+    """Return a score as text with three digits, or a dash if there is none."""
+    return "–" if value is None else f"{value:z.3f}"
+
+
+def score_text(mean: float | None, sd: float | None) -> str:
+    """Return mean and standard deviation as text, as in ``0.573 ± 0.120``."""
+    return figure(mean) if mean is None or sd is None else f"{mean:z.3f} ± {sd:.3f}"
+
+
+def duration_text(words: Words, seconds: float) -> str:
+    """Return a duration in words."""
+    if seconds < 60:
+        return words("train.time.short")
+    minutes = round(seconds / 60)
+    if minutes < 90:
+        return words("train.time.min", n=minutes)
+    return words("train.time.hours", h=minutes // 60, n=minutes % 60)
+
+
+def score_labels(words: Words, leaky: bool, simulated: bool) -> Markup:
+    """Render the labels of a score: *simulation* and *leaky*."""
+    kinds = [kind for kind, true in (("simulation", simulated), ("leaky", leaky)) if true]
+    mark = Markup('<span class="ps-mark ps-mark-{}">{}</span>')
+    return Markup(" ").join(mark.format(kind, words(f"train.{kind}")) for kind in kinds)
+
+
+def averaged_over(words: Words, kind: str, units: int) -> str:
+    """Describe the units that a mean is taken over."""
+    return words(f"train.over.{kind}{'_one' if units == 1 else ''}", n=units)
+
+
+EVALUATION, TRIAL, TRAINING = "evaluation", "trial", "training"
+SUBJECTS, FOLDS, TRAININGS, HELD_BACK = "subjects", "folds", "trainings", "held_back"
+_HASH = 6
+
+
+@dataclass(frozen=True)
+class ResultRow:
+    """A result in the table.
+
+    Attributes:
+        kind: `EVALUATION`, `TRIAL` (of a sweep or search) or `TRAINING`.
+        path: folder of the evaluation or sweep, or path of the bundle.
+        trial: number within a sweep.
+        dataset: folder of the data set, "" if it is not in this studio; ``data`` is its name.
+        spread: what mean and standard deviation are taken over: ``units`` of `SUBJECTS`, `FOLDS` or `TRAININGS` (folds
+            times seeds), or for a single training the people `HELD_BACK`.
+        macs: multiply-accumulates for a decision, every 50 ms.
+        when_s: seconds since 1970.
+        apart: what else must be equal in a comparison: hash of the data set, classes, held-back people.
+    """
+
+    id: str
+    kind: str
+    path: Path
+    trial: str
+    dataset: str
+    data: str
+    network: str
+    schedule: str
+    split: str
+    context: str
+    leaky: bool
+    simulated: bool
+    seeds: str
+    spread: str
+    units: int
+    accuracy: float | None
+    accuracy_sd: float | None
+    macro_f1: float | None
+    macro_f1_sd: float | None
+    parameters: int
+    macs: int
+    when_s: float
+    apart: tuple[str, ...] = ()
+
+
+def of_evaluation(path: Path, dataset: Any) -> list[ResultRow]:
+    """Read the result of an ``evaluation.json``, as a list of one row."""
+    table = read_json(path)
+    model, config = table["model"], table["config"]
+    training = config["training"]
+    context = table["context"]
+    if table["train_context"] != context:
+        context = f"{table['train_context']} → {context}"
+    units = table[table["over"]]
+    return [
+        ResultRow(
+            str(path.parent),
+            EVALUATION,
+            path.parent,
+            "",
+            str(dataset),
+            table["dataset"]["name"],
+            f"{model['symbol']} {'/'.join(map(str, model['filters']))} {model['padding']}",
+            f"{config['preset']}, {training['epochs']}",
+            table["split"],
+            context,
+            table["leaky"],
+            table["simulated"],
+            ", ".join(map(str, table["seeds"])),
+            SUBJECTS if table["over"] == SUBJECTS else FOLDS,
+            len(units),
+            table["accuracy"]["mean"],
+            table["accuracy"]["sd"],
+            table["macro_f1"]["mean"],
+            table["macro_f1"]["sd"],
+            model["parameters"],
+            model["macs_per_step"],
+            path.stat().st_mtime,
+            (str(table["dataset"]["hash"])[:_HASH], *(str(one["label"]) for one in table["per_class"])),
+        )
+    ]
+
+
+def of_trials(path: Path, dataset: Any) -> list[ResultRow]:
+    """Read the finished trials of a sweep, or the finalists of a search."""
+    folder = path.parent
+    table = read_json(folder / SWEEP)
+    grid, when = table["grid"], path.stat().st_mtime
+    seeds = ", ".join(map(str, grid["seeds"]))
+    apart = (str(table.get("dataset_hash", ""))[:_HASH], *map(str, table.get("labels", ())))
+    rows = []
+    with path.open(encoding="utf-8", newline="") as file:
+        for trial in csv.DictReader(file):
+            if trial["status"] != "done" or not trial["accuracy"]:
+                continue
+            rows.append(
+                ResultRow(
+                    f"{folder}#{trial['trial']}",
+                    TRIAL,
+                    folder,
+                    trial["trial"],
+                    str(dataset),
+                    table["dataset"],
+                    f"{trial['arch']} {trial['filters']} {trial['padding']}",
+                    f"{table['preset']}, {trial['epochs']} ({trial['batch_asked']})",
+                    trial["split"],
+                    table["context"],
+                    trial["leaky"] == "true",
+                    trial["simulated"] == "true",
+                    seeds,
+                    *over_trainings(trial),
+                    float(trial["accuracy"]),
+                    _number(trial["accuracy_sd"]),
+                    _number(trial["macro_f1"]),
+                    _number(trial["macro_f1_sd"]),
+                    int(trial["parameters"]),
+                    int(trial["macs_per_step"]),
+                    when,
+                    apart,
+                )
+            )
+    return rows
+
+
+def of_bundle(path: Path, known: Any) -> list[ResultRow]:
+    """Read the result stored in a bundle; ``known`` maps names of data sets to folders."""
+    bundle = Bundle.load(path)
+    kept = bundle.provenance
+    scores, training = kept.get("scores", {}), kept.get("training", {})
+    arch = bundle.arch
+    name = str(kept.get("dataset", "?"))
+    split = str(scores.get("split", kept.get("split", "?")))
+    context = bundle.windowing.get("context", "?")
+    if context == ANYWHERE:
+        # As in evaluations: networks trained on any context are scored on whole gestures.
+        context = f"{ANYWHERE} → stream"
+    held_back = sorted(set(kept.get("validation_subjects", ())) - {NOBODY, UNKNOWN_SUBJECT})
+    return [
+        ResultRow(
+            str(path),
+            TRAINING,
+            path,
+            "",
+            known.get(name, ""),
+            name,
+            f"{arch.symbol} {'/'.join(map(str, arch.filters))} {arch.padding}",
+            f"{kept.get('preset', '?')}, {training.get('epochs', '?')}",
+            split,
+            str(context),
+            bool(scores.get("leaky")),
+            bool(kept.get("simulated")),
+            str(training.get("seed", "?")),
+            # If recordings or windows are held back, the network was trained on the same people.
+            *((HELD_BACK, len(held_back)) if split == WHOLE_PEOPLE else (TRAININGS, 1)),
+            scores.get("accuracy"),
+            None,
+            scores.get("macro_f1"),
+            None,
+            arch.parameters,
+            arch.macs_per_step,
+            path.stat().st_mtime,
+            (str(kept.get("dataset_hash", ""))[:_HASH], *bundle.gestures.labels, *held_back),
+        )
+    ]
+
+
+def over_trainings(trial: Mapping[str, Any]) -> tuple[str, int]:
+    """Return what the mean of a trial is taken over, and how many units that are."""
+    folds, seeds = int(trial["folds"]), int(trial["seeds"])
+    return (FOLDS, folds) if seeds == 1 else (TRAININGS, folds * seeds)
+
+
+def read_json(path: Path) -> Any:
+    """Read a JSON file.
+
+    Raises:
+        BadInput: if it cannot be read.
+    """
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as cause:
+        raise BadInput(f"'{path}' cannot be read ({cause}): make this result again.") from None
+
+
+def _number(text: str) -> float | None:
+    return float(text) if text else None
+
+
+T = TypeVar("T")
+
+
+class Confusion(NamedTuple):
+    """Confusion counts: ``counts[i][j]`` windows of ``labels[i]`` were classified as ``labels[j]``."""
+
+    labels: tuple[str, ...]
+    counts: tuple[tuple[int, ...], ...]
+
+
+@dataclass(frozen=True)
+class ResultDetails:
+    """Details of a result. ``clickable`` is true if the predictions of single windows are stored."""
+
+    row: ResultRow
+    by_gesture: Confusion | None = None
+    by_affect: Confusion | None = None
+    affects: dict[str, str | None] = field(default_factory=dict)
+    people: tuple[dict[str, Any], ...] = ()
+    clickable: bool = False
+    facts: dict[str, Any] = field(default_factory=dict)
+
+
+class MisreadRecording(NamedTuple):
+    """A recording in a cell: ``windows`` of its ``of`` windows fall into the cell."""
+
+    recording: str
+    subject: str
+    gesture: str
+    predicted: tuple[str, ...]
+    windows: int
+    of: int
+
+
+@dataclass(frozen=True)
+class DatasetCounts:
+    """Counts of a data set."""
+
+    name: str
+    people: int
+    recordings: int
+    gestures: tuple[str, ...]
+    streams: int
+    simulated: bool
+
+
+class StoredResults:
+    """Results of a workspace; each file is read once until it changes. Called from worker threads."""
+
+    def __init__(self, workspace: Workspace) -> None:
+        self._workspace = workspace
+        self._read: dict[tuple[str, Path], tuple[Any, Any]] = {}
+
+    def rows(self) -> list[ResultRow]:
+        """Return all readable results, the newest first."""
+        return sorted(self._rows(), key=lambda row: -row.when_s)
+
+    def _rows(self) -> Iterator[ResultRow]:
+        for dataset in self._workspace.datasets():
+            for folder in sorted((dataset / "evaluations").glob("*/")):
+                for name, read in ((SCORES, of_evaluation), (TRIALS_CSV, of_trials)):
+                    path = folder / name
+                    if path.is_file():
+                        yield from self._once(path, read, dataset) or ()
+        known = self._known()
+        for path in self._workspace.bundles():
+            yield from self._once(path, of_bundle, known) or ()
+
+    def _known(self) -> dict[str, str]:
+        return {self._workspace.title(path): str(path) for path in reversed(self._workspace.datasets())}
+
+    def row(self, identity: str) -> ResultRow:
+        """Return the result with an id.
+
+        Raises:
+            BadInput: if there is none.
+        """
+        for row in self._rows():
+            if row.id == identity:
+                return row
+        raise BadInput("This result is no longer there: its folder was moved or deleted.")
+
+    def details(self, row: ResultRow) -> ResultDetails:
+        """Read the details of a result.
+
+        Raises:
+            PlushSenseError: if its files cannot be read.
+        """
+        if row.kind == EVALUATION:
+            table = read_json(row.path / SCORES)
+            affects = {one["label"]: one["affect"] for one in table["per_class"]}
+            return ResultDetails(
+                row,
+                _confusion(table["confusion"]),
+                _confusion(table["confusion_affect"]),
+                affects,
+                tuple(table["subjects"]),
+                (row.path / PREDICTIONS).is_file(),
+                {"code_version": table["code_version"], "hash": table["dataset"]["hash"]},
+            )
+        if row.kind == TRIAL:
+            table = read_json(row.path / SWEEP)
+            counts = table.get("confusions", {}).get(row.trial)
+            affects = dict(zip(table["labels"], table["affects"], strict=True))
+            if counts is None:
+                return ResultDetails(row, affects=affects)
+            by_gesture = _confusion({"labels": table["labels"], "counts": counts})
+            return ResultDetails(row, by_gesture, sum_by_affect(by_gesture, affects), affects)
+        bundle = Bundle.load(row.path)
+        kept = bundle.provenance
+        affects = {g.label: g.affect for g in bundle.gestures.gestures}
+        return ResultDetails(row, affects=affects, facts={**kept, "fitted": bundle.decision.get("fitted")})
+
+    def misread(self, row: ResultRow, truth: Sequence[str], predicted: Sequence[str]) -> list[MisreadRecording]:
+        """Return the recordings of a cell, those with the most windows first.
+
+        Raises:
+            MissingExtraError: without polars. BadInput: if the predictions are missing.
+        """
+        found = self._once(row.path / PREDICTIONS, lambda path, _: read_predictions(path), None, refuse=True)
+        assert isinstance(found, Predictions)
+        return recordings_of_cell(found, truth, predicted)
+
+    def facts(self, dataset: Path) -> DatasetCounts:
+        """Return counts of a data set, cached until its files change.
+
+        Raises:
+            PlushSenseError: if the folder is no data set.
+        """
+        seen = tuple(_stamp(dataset / name) for name in (HEAD, "recordings.csv", MARKS))
+        key = ("facts", dataset)
+        if key not in self._read or self._read[key][0] != seen:
+            data = open_dataset(dataset)
+            people = {r.subject for r in data.used} & set(data.subjects)
+            made = {r.gesture for r in data.used}
+            labels = tuple(label for label in data.gestures.labels if label in made)
+            card = DatasetCounts(
+                data.head.name, len(people), len(data.used), labels, len(data.streams), data.head.simulated
+            )
+            # Opening may have rewritten the index.
+            seen = tuple(_stamp(dataset / name) for name in (HEAD, "recordings.csv", MARKS))
+            self._read[key] = (seen, card)
+        found: DatasetCounts = self._read[key][1]
+        return found
+
+    def is_simulated(self, dataset: Path) -> bool:
+        """Return whether a data set comes from a virtual toy."""
+        try:
+            return DatasetHead.read(dataset).simulated
+        except PlushSenseError:
+            return False
+
+    def _once(self, path: Path, read: Callable[[Path, Any], T], more: Any, refuse: bool = False) -> T | None:
+        key, stamp = (read.__name__, path), (_stamp(path), repr(more))
+        held = self._read.get(key)
+        if held is None or held[0] != stamp:
+            try:
+                held = (stamp, read(path, more))
+            except (PlushSenseError, OSError, KeyError, ValueError, TypeError):
+                if refuse:
+                    raise
+                held = (stamp, None)
+            self._read[key] = held
+        found: T | None = held[1]
+        return found
+
+
+def recordings_of_cell(
+    predictions: Predictions, truth: Sequence[str], predicted: Sequence[str]
+) -> list[MisreadRecording]:
+    """Return the recordings with windows of ``truth`` classified as ``predicted``, the most windows first."""
+    labels = np.array(predictions.labels, dtype=np.str_)
+    message, was = labels[predictions.predicted], labels[predictions.truth]
+    inside = np.isin(was, list(truth)) & np.isin(message, list(predicted))
+    found = []
+    for recording in np.unique(predictions.recording[inside]).tolist():
+        mine = predictions.recording == recording
+        hits = mine & inside
+        first = int(np.flatnonzero(hits)[0])
+        names, counts = np.unique(message[hits], return_counts=True)
+        found.append(
+            MisreadRecording(
+                recording,
+                str(predictions.subject[first]),
+                str(was[first]),
+                tuple(names[np.argsort(-counts, kind="stable")].tolist()),
+                int(hits.sum()),
+                int(mine.sum()),
+            )
+        )
+    return sorted(found, key=lambda one: (-one.windows, one.recording))
+
+
+def sum_by_affect(confusion: Confusion, affects: Mapping[str, str | None]) -> Confusion:
+    """Sum a confusion matrix of gestures by affect."""
+    of = [affects.get(label) or "none" for label in confusion.labels]
+    names, counts = metrics.grouped(np.array(confusion.counts, dtype=np.int64), of)
+    return Confusion(names, tuple(tuple(map(int, row)) for row in counts))
+
+
+def _confusion(table: Mapping[str, Any]) -> Confusion:
+    return Confusion(
+        tuple(label or "none" for label in table["labels"]), tuple(tuple(map(int, row)) for row in table["counts"])
+    )
+
+
+def _stamp(path: Path) -> tuple[int, int] | None:
+    try:
+        stat = path.stat()
+    except OSError:
+        return None
+    return stat.st_mtime_ns, stat.st_size

@@ -1,0 +1,120 @@
+"""Previews of a training or an evaluation: windows, folds, cost and about how long it takes here.
+
+The time is measured: a few epochs of the very network on a few of its windows, in this process. Reading and cutting
+the data and fitting decisions come on top, and a busy machine is slower.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from plushsense.core.gestures import NOBODY
+from plushsense.dataset.index import as_dataset
+from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
+from plushsense.evaluation.folds import fold_windows
+from plushsense.models.arch import Arch
+from plushsense.scoring.splits import parse_split
+from plushsense.training.spec import TrainSpec
+from plushsense.trials.plan import PASSES, Plan, Task
+from plushsense.windows.cut import WindowSet
+from plushsense.workflow.config import RunConfig
+from plushsense.workflow.preparation import Warn, classes_for, divide, silent, windows_for
+
+_BATCHES, _EPOCHS = 3, 3
+
+
+def preview_training(
+    dataset: Dataset | str | os.PathLike[str], config: RunConfig, *, warn: Warn = silent
+) -> dict[str, Any]:
+    """Return what `api.train` would train on; see `preview_evaluation` for the keys."""
+    dataset = as_dataset(dataset)
+    gestures = classes_for(dataset, config.evaluation.classes, config.windows.context, warn)
+    network = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
+    windows = windows_for(dataset, network, config.windows, gestures, warn, config.anywhere)
+    scored = windows
+    if config.scored_on != config.windows:
+        scored = windows_for(dataset, network, config.scored_on, gestures)
+    division = divide(windows, config, scored)
+    rate = _seconds_a_mac(windows, network, config.training)
+    said = {"split": division.kind, "leaky": division.split.leaky, "context": config.windows.context, "folds": 1}
+    return said | _describe(dataset, network, config, windows, [len(division.train)], rate, 1)
+
+
+def preview_evaluation(
+    dataset: Dataset | str | os.PathLike[str], config: RunConfig, *, warn: Warn = silent
+) -> dict[str, Any]:
+    """Return what `api.evaluate` would do, without training.
+
+    Returns:
+        ``split``, ``leaky``, ``context``, ``simulated``, ``folds``, ``people``, ``classes``, ``windows``, ``epochs`` at
+        most, ``parameters``, ``macs`` of all training, ``seconds`` about.
+    """
+    dataset = as_dataset(dataset)
+    gestures = classes_for(dataset, config.evaluation.classes, config.trained_on.context, warn)
+    network = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
+    score = fit_on = windows_for(dataset, network, config.scored_on, gestures, warn)
+    if config.trained_on != config.scored_on:
+        fit_on = windows_for(dataset, network, config.trained_on, gestures, anywhere=config.anywhere)
+    split = parse_split(config.evaluation.split)
+    folds = fold_windows(fit_on, score, split, config.evaluation.seed)
+    rate = _seconds_a_mac(fit_on, network, config.training)
+    side_by_side = min(config.evaluation.processes, len(folds))
+    said = {"split": split.text, "leaky": split.leaky, "context": config.scored_on.context, "folds": len(folds)}
+    return said | _describe(dataset, network, config, fit_on, [len(f.train) for f in folds], rate, side_by_side)
+
+
+def plan_seconds(planned: Plan, macs: float, workers: int) -> float:
+    """Return about how long ``macs`` multiply-accumulates of a plan's trainings take, ``workers`` at a time.
+
+    Measured on the training of the middle cost: networks differ, so that this is rough.
+    """
+    job = sorted(planned.jobs, key=planned.macs)[len(planned.jobs) // 2]
+    task: Task = job.task
+    return macs * _seconds_a_mac(planned.sets[task.span], task.arch, task.spec) / max(1, workers)
+
+
+def _describe(
+    dataset: Dataset,
+    network: Arch,
+    config: RunConfig,
+    windows: WindowSet,
+    sizes: list[int],
+    rate: float,
+    side_by_side: int,
+) -> dict[str, Any]:
+    macs = PASSES * network.macs_per_window * sum(sizes) * config.training.epochs
+    return {
+        "dataset": dataset.head.name,
+        "simulated": dataset.head.simulated,
+        "people": len(set(windows.subject.tolist()) - {NOBODY, UNKNOWN_SUBJECT}),
+        "classes": len(windows.labels),
+        "windows": len(windows),
+        "epochs": config.training.epochs,
+        "parameters": network.parameters,
+        "macs": macs,
+        "seconds": macs * rate / max(1, side_by_side),
+    }
+
+
+def _seconds_a_mac(windows: WindowSet, network: Arch, spec: TrainSpec) -> float:
+    """Measure how long a multiply-accumulate of training takes here, by the shortest of a few small epochs."""
+    from plushsense.training.fit import fit
+
+    few = max(spec.batch, 64) * _BATCHES
+    part = windows.take(np.arange(0, len(windows), max(1, len(windows) // few)))
+    ends: list[float] = []
+    fit(
+        part,
+        None,
+        network,
+        replace(spec, epochs=_EPOCHS, patience=None),
+        lambda *_: ends.append(time.perf_counter()),
+    )
+    shortest = min(after - before for before, after in pairwise(ends))
+    return shortest / (PASSES * network.macs_per_window * len(part))

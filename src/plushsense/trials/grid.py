@@ -1,0 +1,384 @@
+"""Grids: networks × epochs × batches to train and compare, checked as a whole before anything runs.
+
+A training contains the shorter ones: rate, order and turns of an epoch follow from its number and the seed, not from
+how many epochs are to come. Only where validation decides when to stop (``patience``) every number of epochs is a
+training of its own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+
+from plushsense.core.errors import ArchError, BadInput, ConfigError, nearest
+from plushsense.core.layouts import Layout
+from plushsense.core.toml import check_table, read_toml, unknown_key
+from plushsense.models.arch import (
+    NORMS,
+    PADDINGS,
+    PAPER_ARCHITECTURES,
+    PAPER_FILTERS,
+    Arch,
+    parse_filters,
+    parse_symbol,
+    slashed,
+)
+from plushsense.scoring.splits import parse_split
+from plushsense.training.spec import DEVICES, PRESETS, TrainSpec
+from plushsense.windows.cut import CONTEXTS, WindowSpec
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+
+FULL: Literal["full"] = "full"
+# A decision every 50 ms, as everywhere.
+_STEP_S = 0.05
+# Settings of the preset that a grid may change; None keeps the preset's.
+_OF_TRAINING = ("learning_rate", "halve_every", "patience", "augment", "turn_deg")
+
+
+@dataclass(frozen=True)
+class GridSpec:
+    """Settings of a grid. Nothing is checked when it is made: `problems` finds everything at once.
+
+    ``filters`` are sets of four, of which a network takes as many as it has layers. ``seeds`` are those of the
+    trainings; the split has its own, so that all trainings of a grid see the same folds. ``classes`` is "all",
+    "shared" or labels joined by commas. ``threads`` belongs to a training and to its id: in PyTorch's own layers
+    another number sums in another order (in ``training/fast`` it does not).
+    """
+
+    name: str = "grid"
+    architectures: tuple[str, ...] = PAPER_ARCHITECTURES
+    filters: tuple[tuple[int, ...], ...] = PAPER_FILTERS
+    epochs: tuple[int, ...] = (100, 250, 1000)
+    batches: tuple[int | Literal["full"], ...] = (64, 256, FULL)
+    seeds: tuple[int, ...] = (0,)
+    split: str = "windows:holdout"
+    split_seed: int = 0
+    preset: str = "search"
+    padding: str = "mirror"
+    norm: str = "batch"
+    context: str = "loop"
+    classes: str = "all"
+    window_s: float = 2.5
+    step_s: float = 0.5
+    learning_rate: float | None = None
+    halve_every: int | None = None
+    patience: int | None = None
+    augment: tuple[str, ...] | None = None
+    turn_deg: float | None = None
+    device: str = "auto"
+    threads: int = 1
+
+    @property
+    def training(self) -> TrainSpec:
+        """How every network is trained; epochs, batch and seed are the trial's."""
+        changes = {key: getattr(self, key) for key in _OF_TRAINING if getattr(self, key) is not None}
+        return PRESETS[self.preset].changed(device=self.device, threads=self.threads, **changes)
+
+    @property
+    def windows(self) -> WindowSpec:
+        """How windows are cut."""
+        return WindowSpec(window_s=self.window_s, step_s=self.step_s, context=self.context)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON; ``augment`` only where it is set, so that earlier grids keep their identity."""
+        return {key: value for key, value in asdict(self).items() if key != "augment" or value is not None}
+
+
+# Paper, section 3.6: 13 architectures × 4 filter sets × 3 epochs × 3 batches = 468 trials.
+GRIDS: dict[str, GridSpec] = {"paper": GridSpec(name="paper")}
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One network, trained for ``epochs`` in batches of ``batch`` windows ("full": all)."""
+
+    arch: Arch
+    filter_set: tuple[int, ...]
+    epochs: int
+    batch: int | str
+
+
+@dataclass(frozen=True)
+class Training:
+    """Trials that are trained in one go: they differ in their epochs only, the shortest first."""
+
+    trials: tuple[Trial, ...]
+
+    @property
+    def epochs(self) -> tuple[int, ...]:
+        """The epochs after which it is scored."""
+        return tuple(trial.epochs for trial in self.trials)
+
+
+def trainings(grid: GridSpec, layout: Layout, classes: int) -> list[Training]:
+    """Return all trials of a grid without `problems`, as the trainings that contain them."""
+    found = []
+    nested = grid.training.patience is None
+    for symbol in grid.architectures:
+        for filters in grid.filters:
+            arch = _network(grid, symbol, filters, layout, classes)
+            for batch in grid.batches:
+                trials = tuple(Trial(arch, filters, epochs, batch) for epochs in grid.epochs)
+                found += [Training(trials)] if nested else [Training((trial,)) for trial in trials]
+    return found
+
+
+def _network(grid: GridSpec, symbol: str, filters: Sequence[int], layout: Layout, classes: int) -> Arch:
+    return Arch.parse(
+        symbol,
+        filters,
+        channels=layout.n_inputs,
+        classes=classes,
+        padding=grid.padding,
+        norm=grid.norm,
+        window=layout.samples(grid.window_s),
+        step=layout.samples(_STEP_S),
+    )
+
+
+def problems(
+    grid: GridSpec, layout: Layout | None = None, past: int | None = None, windows: int | None = None
+) -> list[str]:
+    """Return everything that keeps a grid from being trained, one sentence each.
+
+    Args:
+        layout: of the toy, for the length of a window in samples.
+        past: samples up to the end of a recording that its stream holds, for at least half of the recordings.
+        windows: the fewest that any fold trains on, or more where the split cannot be made.
+    """
+    found = _of_settings(grid)
+    shapes: dict[str, int] = {}
+    for symbol in grid.architectures:
+        try:
+            shapes[symbol] = len(parse_symbol(symbol))
+        except ArchError as cause:
+            found.append(first_line(cause))
+    for filters in grid.filters:
+        if not filters or min(filters) < 1:
+            found.append(
+                f"The filters {slashed(filters) or '(none)'} cannot be used: accepted are whole numbers from 1."
+            )
+            continue
+        for symbol, layers in shapes.items():
+            if len(filters) < layers:
+                found.append(
+                    f"{symbol} has {layers} layers, but the filters {slashed(filters)} are only {len(filters)}: "
+                    "give one a layer."
+                )
+    found += _twice(grid)
+    for epochs in grid.epochs:
+        if epochs < 1:
+            found.append(f"Epochs {epochs} cannot be trained: accepted are whole numbers from 1.")
+    if list(grid.epochs) != sorted(grid.epochs):
+        found.append(f"The epochs {_listed(grid.epochs)} do not ascend: give {_listed(sorted(set(grid.epochs)))}.")
+    for batch in grid.batches:
+        if isinstance(batch, int) and batch < 2:
+            found.append(f"A batch of {batch} cannot be used: accepted are whole numbers from 2 and '{FULL}'.")
+        elif isinstance(batch, int) and windows is not None and batch > windows:
+            found.append(
+                f"A batch of {batch} is larger than the {windows} windows to train on with the split {grid.split}: "
+                f"give at most {windows}, or '{FULL}'."
+            )
+    found += [f"Seed {seed} cannot be used: accepted are whole numbers from 0." for seed in grid.seeds if seed < 0]
+    if layout is not None:
+        found += [line for symbol in shapes for line in _too_long(grid, symbol, layout, past)]
+    return list(dict.fromkeys(found))
+
+
+def _of_settings(grid: GridSpec) -> list[str]:
+    found = []
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", grid.name):
+        found.append(f"The name '{grid.name}' cannot be a folder's: accepted are letters, digits and . _ - between.")
+    for key in ("architectures", "filters", "epochs", "batches", "seeds"):
+        if not getattr(grid, key):
+            found.append(f"The grid has no {key}: give at least one.")
+    for key, known in (
+        ("preset", tuple(PRESETS)),
+        ("padding", PADDINGS),
+        ("norm", NORMS),
+        ("context", CONTEXTS),
+        ("device", DEVICES),
+    ):
+        value = getattr(grid, key)
+        if value not in known:
+            found.append(f"Unknown {key} '{value}': accepted are {', '.join(known)}.{nearest(value, known)}")
+    for key in (*_OF_TRAINING, "threads"):
+        if getattr(grid, key) is not None:
+            found += _refused(partial(TrainSpec().changed, **{key: getattr(grid, key)}))
+    found += _refused(lambda: WindowSpec(window_s=grid.window_s, step_s=grid.step_s))
+    found += _refused(lambda: parse_split(grid.split))
+    if grid.split_seed < 0:
+        found.append(f"split_seed is {grid.split_seed}: accepted are whole numbers from 0.")
+    return found
+
+
+def _refused(make: Callable[[], object]) -> list[str]:
+    try:
+        make()
+    except BadInput as cause:
+        return [first_line(cause)]
+    return []
+
+
+def _twice(grid: GridSpec) -> list[str]:
+    """Return the trials that are in the grid more than once: repeated values, and names of one network."""
+    found = []
+    for key in ("epochs", "batches", "seeds"):
+        values = getattr(grid, key)
+        again = [value for value in dict.fromkeys(values) if values.count(value) > 1]
+        found += [f"The grid has {value} among its {key} {values.count(value)} times: give it once." for value in again]
+    seen: dict[object, str] = {}
+    for symbol in grid.architectures:
+        for filters in grid.filters:
+            try:
+                shape = parse_symbol(symbol)
+            except ArchError:
+                continue
+            network, said = (shape, filters[: len(shape)]), f"{symbol} with {slashed(filters) or '(none)'}"
+            if network in seen:
+                other = f"as {seen[network]}" if seen[network] != said else "twice"
+                found.append(f"{said} is the same network {other}: leave one out.")
+            seen.setdefault(network, said)
+    return found
+
+
+def _too_long(grid: GridSpec, symbol: str, layout: Layout, past: int | None) -> list[str]:
+    """Return whether a network reads more than a window and its real past hold.
+
+    Without a real past a receptive field may reach beyond the window by less than its widest dilation, as the paper's
+    126d2 does: that much is rounding.
+    """
+    # An unknown padding or norm is said already.
+    known = replace(grid, padding=grid.padding if grid.padding in PADDINGS else "mirror", norm="batch")
+    try:
+        arch = _network(known, symbol, (1,) * 4, layout, 2)
+    except BadInput as cause:
+        # Of the window, which may be said already.
+        return [] if _of_settings(grid) else [first_line(cause)]
+    field, window = arch.receptive_field, arch.window
+    if grid.padding == "stream" and grid.context == "stream":
+        if past is None or arch.span <= max(past, window):
+            return []
+        return [
+            f"{symbol} sees {arch.span} samples for a decision (receptive field {field}), but half of the recordings "
+            f"have fewer than {past + 1} samples of real past up to their end: take shorter kernels."
+        ]
+    if field - window < max(layer.dilation for layer in arch.layers):
+        return []
+    real = "without padding 'stream' and context 'stream' there is no more"
+    return [
+        f"{symbol} has a receptive field of {field} samples, longer than the window of {window} ({real}): take "
+        f"shorter kernels, or a window_s of {field / layout.rate_hz:g}."
+    ]
+
+
+def first_line(cause: Exception) -> str:
+    """Return an error message without the picture below it."""
+    return str(cause).splitlines()[0]
+
+
+def _listed(values: Iterable[object]) -> str:
+    return ", ".join(map(str, values))
+
+
+# A search of the grid's networks stands beside it in the file: see `training.searchfile`.
+TABLES = ("grid", "search")
+
+Spec = TypeVar("Spec", bound="DataclassInstance")
+
+
+def load_grid(name_or_path: str | Path, changes: Mapping[str, Any] | None = None) -> tuple[GridSpec, list[str]]:
+    """Read a grid by its name or from a TOML file, with ``changes`` over it (values, or text as on the command line).
+
+    Returns:
+        the grid, and one sentence for each key or value that cannot be read; those are as in the paper's grid.
+
+    Raises:
+        ConfigError: for an unknown name, or a file that is missing or not TOML.
+    """
+    if str(name_or_path) in GRIDS:
+        grid, found = GRIDS[str(name_or_path)], list[str]()
+    else:
+        tables, found = grid_tables(name_or_path)
+        grid, more = over(GridSpec(name=Path(name_or_path).stem), tables["grid"], f"[grid] in '{name_or_path}'")
+        found += more
+    grid, more = changed(grid, changes or {})
+    return grid, found + more
+
+
+def changed(grid: GridSpec, changes: Mapping[str, Any]) -> tuple[GridSpec, list[str]]:
+    """Return a grid with some keys changed, as in `load_grid`; a change of None is ignored."""
+    return over(grid, {key: value for key, value in changes.items() if value is not None}, "the grid")
+
+
+def grid_tables(path: str | Path) -> tuple[dict[str, Mapping[str, Any]], list[str]]:
+    """Return the tables of a grid's file by name, and one sentence for each that cannot be read; those are empty.
+
+    Raises:
+        ConfigError: for a file that is missing or not TOML.
+    """
+    if Path(path).suffix != ".toml" and not Path(path).is_file():
+        raise ConfigError(
+            f"Unknown grid '{path}': accepted are {', '.join(GRIDS)} and the path of a TOML file."
+            f"{nearest(str(path), GRIDS)}"
+        )
+    content = read_toml(Path(path), "grid", ConfigError)
+    found = [unknown_key(key, TABLES, f"'{path}'") for key in content if key not in TABLES]
+    tables: dict[str, Mapping[str, Any]] = {name: {} for name in TABLES}
+    for name in tables:
+        if isinstance(content.get(name), Mapping):
+            tables[name] = content[name]
+        elif name in content or name == "grid":
+            found.append(f"'{path}' has no table [{name}]: write  [{name}]  and its keys below.")
+    return tables, found
+
+
+def over(spec: Spec, table: Mapping[str, Any], where: str) -> tuple[Spec, list[str]]:
+    """Return a grid (or another spec) with the values of a table, and a message for each key or value that is wrong.
+
+    Values may be text as on the command line, lists joined by commas. Of a list with a wrong item the others are kept,
+    so that what else is wrong with the grid is reported of it and not of the default.
+    """
+    kinds = get_type_hints(type(spec))
+    parsed = {key: _from_text(key, value, kinds.get(key)) for key, value in table.items()}
+    values, found = check_table(parsed, type(spec), where)
+    return replace(spec, **values), found
+
+
+def _from_text(key: str, value: Any, kind: Any) -> Any:
+    """Return a value of a table with its texts read as the numbers and lists that they stand for."""
+    if key == "filters":
+        return _filter_sets(value)
+    if key == "classes" and isinstance(value, list | tuple) and all(isinstance(item, str) for item in value):
+        return ",".join(value)
+    if get_origin(kind) is tuple:
+        items = [part.strip() for part in value.split(",")] if isinstance(value, str) else value
+        if not isinstance(items, list | tuple):
+            return items
+        return [_from_text("", item, get_args(kind)[0]) for item in items]
+    if isinstance(value, str) and kind is not str:
+        for number in (int, float)[: 2 if float in (kind, *get_args(kind)) else 1]:
+            with contextlib.suppress(ValueError):
+                return number(value)
+    return value
+
+
+def _filter_sets(value: Any) -> Any:
+    """Return ``[[4, 6], [8, 12]]``, also from text: ``4,6,8,8`` is one set, ``4/6/8/8,8/12/16/16`` are two."""
+    if isinstance(value, str):
+        value = [part.strip() for part in value.split(",")] if "/" in value else [value]
+    if not isinstance(value, list | tuple):
+        return value
+    sets = list(value)
+    for n, item in enumerate(sets):
+        with contextlib.suppress(ArchError):
+            sets[n] = parse_filters(item.replace("/", ",")) if isinstance(item, str) else item
+    return sets

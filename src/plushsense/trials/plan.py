@@ -1,0 +1,460 @@
+"""A sweep before it runs: the windows, the folds, every trial and every training with its id.
+
+A *trial* is a network with a number of epochs and a batch: a row of the grid. A *training* is what is trained in one
+go, the trials that differ in their epochs only, with one seed on one fold: a `Job` of the journal, whose `Task` says
+what to do. A *run* is a trial's part of one training.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from statistics import median
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import BadInput, ConfigError, DivergedError
+from plushsense.core.gestures import NOBODY, GestureSet
+from plushsense.dataset.store import Dataset
+from plushsense.evaluation.crossval import fold_fingerprint, windows_fingerprint
+from plushsense.evaluation.folds import WindowFold, fold_windows
+from plushsense.jobs.journal import JOURNAL, UNFINISHED, Journal, Result, job_id, keep_if_possible
+from plushsense.jobs.pool import Job, Report, run_jobs
+from plushsense.models.arch import Arch
+from plushsense.scoring import metrics
+from plushsense.scoring.metrics import Counts
+from plushsense.scoring.splits import Split, parse_split
+from plushsense.training.spec import TrainSpec
+from plushsense.trials.grid import FULL, GridSpec, Trial, first_line, problems, trainings
+from plushsense.windows.cut import WindowSet, shared_gestures
+from plushsense.workflow.config import ALL
+from plushsense.workflow.preparation import Warn, choose_classes, silent, windows_for
+from plushsense.workflow.reporting import journal_of
+
+# Part of every id: raise it when the meaning of a stored training changes.
+_VERSION = 1
+# Forward, and backward to the weights and to the layer before.
+PASSES = 3
+
+
+class GridProblems(ConfigError):
+    """All problems of a grid at once: ``found``, one sentence each."""
+
+    def __init__(self, found: Sequence[str]) -> None:
+        self.found = tuple(found)
+        several = "\n  - ".join([f"The grid has {len(found)} problems:", *found])
+        super().__init__(found[0] if len(found) == 1 else several)
+
+
+@dataclass(frozen=True)
+class Task:
+    """One training of one fold: ``epochs`` are those after which it is scored; ``span`` picks the windows; ``id`` the
+    job's.
+
+    ``start`` (a `FitState`) and the ``spent_s`` seconds of training before it change nothing in what comes out;
+    ``stateful``: the result holds its state as well, so that another training can go on from there.
+    """
+
+    arch: Arch
+    spec: TrainSpec
+    epochs: tuple[int, ...]
+    span: int
+    fold: int
+    id: str = ""
+    start: Any = None
+    spent_s: float = 0.0
+    stateful: bool = False
+
+    @property
+    def nested(self) -> bool:
+        """Whether the weights after an epoch are what a training of that many epochs ends with."""
+        return self.spec.patience is None
+
+
+@dataclass(frozen=True)
+class PlannedRun:
+    """One trial with one seed on one fold: which job holds it. ``batch`` in windows."""
+
+    job: str
+    seed: int
+    fold: str
+    span: int
+    fold_index: int
+    batch: int
+
+
+@dataclass(frozen=True)
+class PlannedTrial:
+    """A trial with its id and its runs."""
+
+    id: str
+    trial: Trial
+    runs: tuple[PlannedRun, ...]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything that a sweep will do. Windows are held once for each span that its networks need."""
+
+    grid: GridSpec
+    split: Split
+    gestures: GestureSet
+    sets: dict[int, WindowSet]
+    folds: dict[int, list[WindowFold]]
+    trials: tuple[PlannedTrial, ...]
+    jobs: tuple[Job, ...]
+
+    @property
+    def id(self) -> str:
+        """The same for the same data and settings, in whatever order a grid lists them."""
+        return job_id({"trials": sorted(t.id for t in self.trials), "runs": sorted(job.id for job in self.jobs)})
+
+    def macs(self, job: Job, nested: bool = True) -> int:
+        """Multiply-accumulates of a training, about; ``nested`` False: of its trials one by one."""
+        task: Task = job.task
+        epochs = task.epochs[-1] if nested else sum(task.epochs)
+        return PASSES * task.arch.macs_per_window * len(self.folds[task.span][task.fold].train) * epochs
+
+
+def plan(dataset: Dataset, grid: GridSpec, told: Sequence[str] = (), warn: Warn = silent) -> Plan:
+    """Plan a sweep.
+
+    Args:
+        told: what was wrong with the grid before (see `load_grid`): said together with the rest.
+
+    Raises:
+        GridProblems: with all problems of the grid on this data set at once, one a line.
+    """
+    return _planned(dataset, grid, _cut(dataset, grid, told, warn))
+
+
+def plans_by_epochs(
+    dataset: Dataset,
+    grid: GridSpec,
+    told: Sequence[str] = (),
+    warn: Warn = silent,
+    fits: Callable[[Arch], bool] = lambda arch: True,
+) -> list[Plan]:
+    """Return a plan for each number of epochs of a grid, all on the same windows.
+
+    ``fits``: which networks to plan for; all plans hold the same ones in the same order.
+    """
+    cut = _cut(dataset, grid, told, warn)
+    return [_planned(dataset, replace(grid, epochs=(epochs,)), cut, fits) for epochs in grid.epochs]
+
+
+def _cut(dataset: Dataset, grid: GridSpec, told: Sequence[str], warn: Warn) -> _Cut:
+    past, found = _past(dataset), list[str]()
+    cut, fewest = None, None
+    try:
+        cut = _Cut.of(dataset, grid, warn)
+        fewest = len(cut.windows)
+        fewest = min(len(fold.train) for fold in cut.folds())
+    except BadInput as cause:
+        found.append(first_line(cause))
+    # What is wrong with the grid may also keep windows from being cut, in the same words.
+    found = list(dict.fromkeys([*told, *problems(grid, dataset.layout, past, fewest), *found]))
+    if found or cut is None:
+        raise GridProblems(found)
+    _warn_of_rare(dataset, cut, warn)
+    return cut
+
+
+def _past(dataset: Dataset) -> int:
+    """Return the samples that half of the recordings have up to their end, in their stream where they lie in one."""
+    rate = dataset.layout.rate_hz
+    reaches = [
+        (max(r.stream_row, 0) + r.stop - r.start) * (rate / r.rate_hz if r.rate_hz > 0 else 1.0) for r in dataset.used
+    ]
+    return int(median(reaches)) if reaches else 0
+
+
+def _warn_of_rare(dataset: Dataset, cut: _Cut, warn: Warn) -> None:
+    if cut.split.apart and cut.grid.classes == ALL:
+        rare = set(cut.gestures.labels) - set(shared_gestures(dataset)[0].labels)
+        if rare:
+            warn(
+                f"{len(rare)} of the {len(cut.gestures)} classes are no gesture that 90 % of the people share "
+                f"({', '.join(sorted(rare))}): who is tested may be the only one who made them; "
+                "leave them out with --classes shared"
+            )
+
+
+@dataclass
+class _Cut:
+    """Windows and folds, cut once for each span."""
+
+    dataset: Dataset
+    grid: GridSpec
+    gestures: GestureSet
+    sets: dict[int, WindowSet]
+    by_span: dict[int, list[WindowFold]]
+    window: Arch
+
+    @classmethod
+    def of(cls, dataset: Dataset, grid: GridSpec, warn: Warn) -> _Cut:
+        """Cut for a window without more past, which tells of every grid how many windows there are."""
+        gestures = choose_classes(dataset, grid.classes, warn)
+        window = Arch.parse(
+            "1", "1", channels=dataset.layout.n_inputs, padding="mirror", window=dataset.layout.samples(grid.window_s)
+        )
+        cut = cls(dataset, grid, gestures, {}, {}, window)
+        cut.sets[window.span] = windows_for(dataset, window, grid.windows, gestures, warn)
+        return cut
+
+    @property
+    def split(self) -> Split:
+        """How the windows are divided; ConfigError for an unknown split."""
+        return parse_split(self.grid.split)
+
+    @property
+    def windows(self) -> WindowSet:
+        """Windows without more past."""
+        return self.sets[self.window.span]
+
+    def folds(self) -> list[WindowFold]:
+        """Return the folds of the windows of a span."""
+        return self.at(self.window)[1]
+
+    def at(self, arch: Arch) -> tuple[WindowSet, list[WindowFold]]:
+        """Return the windows that a network needs, and their folds."""
+        # A network that reads no more than a window reads the end of that window.
+        span = max(arch.span, arch.window)
+        if span not in self.sets:
+            self.sets[span] = windows_for(self.dataset, arch, self.grid.windows, self.gestures)
+        if span not in self.by_span:
+            windows = self.sets[span]
+            self.by_span[span] = fold_windows(windows, windows, self.split, self.grid.split_seed)
+        return self.sets[span], self.by_span[span]
+
+
+def _planned(dataset: Dataset, grid: GridSpec, cut: _Cut, fits: Callable[[Arch], bool] = lambda arch: True) -> Plan:
+    from plushsense.training.fit import resolve_device
+
+    # Where it is trained, settled once: it belongs to the id, and every worker must mean the same.
+    spec = resolve_device(grid.training)
+    prints: dict[int, tuple[str, list[str]]] = {}
+    trials: list[PlannedTrial] = []
+    jobs: dict[str, Job] = {}
+    used: set[int] = set()
+    for training in trainings(grid, dataset.layout, len(cut.gestures)):
+        arch = training.trials[0].arch
+        if not fits(arch):
+            continue
+        windows, folds = cut.at(arch)
+        span = windows.x.shape[2]
+        used.add(span)
+        if span not in prints:
+            prints[span] = windows_fingerprint(windows), [fold_fingerprint(fold) for fold in folds]
+        data, of_folds = prints[span]
+        base = {"version": _VERSION, "arch": arch.to_dict(), "windows": data, "vectors": windows.vectors}
+        runs = []
+        for seed in grid.seeds:
+            for i, fold in enumerate(folds):
+                batch = training.trials[0].batch
+                size = len(fold.train) if batch == FULL else int(batch)
+                task = Task(arch, replace(spec, epochs=training.epochs[-1], batch=size, seed=seed), training.epochs,
+                            span, i)  # fmt: skip
+                known = job_id({**base, **_settings(task), "fold": of_folds[i]})
+                jobs[known] = Job(known, replace(task, id=known))
+                runs.append(PlannedRun(known, seed, fold.name, span, i, size))
+        trials += [
+            PlannedTrial(_trial_id(base, trial, spec, of_folds), trial, tuple(runs)) for trial in training.trials
+        ]
+    sets = {span: windows for span, windows in cut.sets.items() if span in used}
+    made = Plan(grid, cut.split, cut.gestures, sets, {s: cut.by_span[s] for s in sets}, tuple(trials), ())
+    # The longest first: at the end only short ones are left, and all workers finish at about the same time.
+    ordered = sorted(jobs.values(), key=made.macs, reverse=True)
+    return replace(made, jobs=tuple(ordered))
+
+
+def _settings(task: Task) -> dict[str, Any]:
+    """Return what a training depends on beside its data and network."""
+    return {"training": task.spec.key(), "epochs": list(task.epochs)}
+
+
+def _trial_id(base: dict[str, Any], trial: Trial, spec: TrainSpec, folds: list[str]) -> str:
+    settings = {k: v for k, v in spec.key().items() if k not in ("seed", "batch", "epochs")}
+    return job_id({**base, "training": settings, "epochs": trial.epochs, "batch": trial.batch, "folds": folds})
+
+
+def processes(workers: int, threads: int) -> int:
+    """Return how many trainings run at a time; 0 stands for as many as the processors hold."""
+    if workers < 0:
+        raise ConfigError(f"workers is {workers}: accepted are whole numbers from 0 up.")
+    return workers or max(1, (os.cpu_count() or 1) // threads)
+
+
+# The columns of a training's curve, as its result holds them; the epoch is the row.
+CURVE = ("train_loss", "train_accuracy", "validation_loss", "validation_accuracy", "learning_rate")
+
+
+def train_all(
+    dataset: Dataset,
+    planned: Plan,
+    jobs: Sequence[Job],
+    *,
+    workers: int,
+    cluster: str | None,
+    on_done: Callable[[Job, Result, bool], None],
+    on_start: Callable[[Job], None] | None = None,
+    on_report: Callable[[Job, Any], None] | None = None,
+    on_failed: Callable[[Job, Exception], None] | None = None,
+) -> dict[str, Result]:
+    """Do those ``jobs`` on the windows of a plan that the data set's journal does not hold; as `run_jobs` else."""
+    unfinished = journal_of(dataset, UNFINISHED)
+
+    def done(job: Job, result: Result, resumed: bool) -> None:
+        unfinished.discard(job.id)
+        on_done(job, result, resumed)
+
+    return run_jobs(
+        jobs,
+        # Nodes of a cluster do not share a disk: there a training is done whole.
+        TrainAndScore(unfinished if cluster is None else None),
+        shared=(planned.sets, planned.folds),
+        workers=workers,
+        threads=planned.grid.threads,
+        journal=journal_of(dataset, JOURNAL),
+        cluster=cluster,
+        gpus=1.0 if cluster is not None and planned.grid.device == "cuda" else 0.0,
+        on_start=on_start,
+        on_report=on_report,
+        on_done=done,
+        on_failed=on_failed,
+    )
+
+
+@dataclass(frozen=True)
+class TrainAndScore:
+    """One training as a job: probabilities of the tested windows after each number of epochs that is scored.
+
+    A training whose loss is no longer a number is no reason to stop the others: it is trained up to the longest that
+    goes well, and says why not further. ``at`` is the epoch whose weights are scored. In ``unfinished`` a long training
+    keeps where it stands, once a minute, and goes on from there.
+    """
+
+    unfinished: Journal | None = None
+
+    def __call__(self, shared: Any, task: Task, report: Report, /) -> Result:
+        from plushsense.training.engine import FitState
+        from plushsense.training.fit import fit, predict
+
+        sets, folds = shared
+        windows, fold = sets[task.span], folds[task.span][task.fold]
+        train, validation, test = (windows.take(index) for index in (fold.train, fold.validation, fold.test))
+        wanted, failed, fitted = task.epochs, dict[str, str](), None
+        before = None if self.unfinished is None else self.unfinished.find(task.id)
+        start = task.start if before is None else FitState.from_arrays(before)
+
+        def save(state: FitState) -> None:
+            if self.unfinished is not None:
+                keep_if_possible(self.unfinished, task.id, state.to_arrays())
+
+        while wanted and fitted is None:
+            spec = replace(task.spec, epochs=wanted[-1])
+            keep = wanted if task.nested else ()
+            try:
+                fitted = fit(
+                    train, validation, task.arch, spec, lambda at, of, row: report((at, of, row["train_loss"])), keep,
+                    start=start, save=save if task.nested else None,
+                )  # fmt: skip
+            except DivergedError as cause:
+                failed[str(wanted[-1])] = str(cause)
+                wanted, start = wanted[:-1], None
+        if fitted is None:
+            return _result(
+                (), np.zeros((0, len(test), len(windows.labels))), [], [], np.zeros((0, len(CURVE))), 0, failed
+            )
+        tested, watched = [], []
+        for epochs in wanted:
+            weights = fitted.kept[epochs] if task.nested else fitted.weights
+            tested.append(predict(task.arch, weights, fitted.scaler, test, task.spec.device))
+            watched.append(
+                _watched(predict(task.arch, weights, fitted.scaler, validation, task.spec.device), validation)
+            )
+        curve = np.array([[row[name] for name in CURVE] for row in fitted.history], dtype=np.float64)
+        at = list(wanted) if task.nested else [fitted.best_epoch]
+        seconds = task.spent_s + fitted.seconds
+        result = _result(wanted, np.stack(tested), watched, at, curve, seconds, failed)
+        state = fitted.state if task.stateful and not failed else None
+        # Weights that were scored on the way are of no more use.
+        return result if state is None else {**result, **replace(state, kept={}).to_arrays()}
+
+
+def _result(
+    epochs: tuple[int, ...],
+    probabilities: NDArray[Any],
+    validation: list[tuple[float, float]],
+    at: list[int],
+    curve: NDArray[Any],
+    seconds: float,
+    failed: dict[str, str],
+) -> Result:
+    """Return probabilities (E, n, K) float32, validation scores (E, 2) and the curve, columns as in `CURVE`."""
+    return {
+        "epochs": list(epochs),
+        "at": at,
+        "probabilities": probabilities.astype(np.float32),
+        "validation": np.array(validation, dtype=np.float64).reshape(-1, 2),
+        "curve": curve,
+        "seconds": seconds,
+        "failed": failed,
+    }
+
+
+def _watched(probabilities: NDArray[Any], windows: WindowSet) -> tuple[float, float]:
+    counts = metrics.confusion(windows.y, np.argmax(probabilities, axis=1).astype(np.int64), len(windows.labels))
+    return metrics.accuracy(counts), metrics.macro_f1(counts)
+
+
+@dataclass(frozen=True)
+class Scored:
+    """A trial's part of one training: its figures, and confusions of all windows that were tested."""
+
+    figures: dict[str, float | None]
+    counts: Counts
+    windows: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class TrainingOutcome:
+    """Outcome of one training of a sweep: a score for each number of epochs, its curve, and what went wrong."""
+
+    scored: dict[int, Scored]
+    curve: NDArray[np.float64]
+    failed: dict[int, str]
+    seconds: float
+
+
+def outcome(plan: Plan, run: PlannedRun, result: Mapping[str, Any]) -> TrainingOutcome:
+    """Score one training's probabilities. Where people are kept apart, the toy at rest with nobody is not counted."""
+    windows, fold = plan.sets[run.span], plan.folds[run.span][run.fold_index]
+    truth, classes = windows.y[fold.test], len(windows.labels)
+    counted = windows.subject[fold.test] != NOBODY if plan.split.apart else np.ones(len(truth), dtype=np.bool_)
+    scored, before, seconds = dict[int, Scored](), 0, float(result["seconds"])
+    for i, epochs in enumerate(result["epochs"]):
+        read = np.argmax(result["probabilities"][i], axis=1).astype(np.int64)
+        counts = metrics.confusion(truth[counted], read[counted], classes)
+        accuracy, f1 = result["validation"][i]
+        figures = {
+            **{key: metric.function(counts) for key, metric in metrics.column_metrics().items()},
+            "validation_accuracy": float(accuracy),
+            "validation_macro_f1": float(f1),
+            "train_loss": float(result["curve"][result["at"][i] - 1, 0]),
+        }
+        # A training that contains others is paid for once: each number of epochs its own stretch.
+        share = seconds * (epochs - before) / result["epochs"][-1]
+        before = epochs
+        scored[epochs] = Scored(
+            {name: value if math.isfinite(value) else None for name, value in figures.items()},
+            metrics.confusion(truth, read, classes),
+            int(counted.sum()),
+            share,
+        )
+    return TrainingOutcome(scored, result["curve"], {int(e): why for e, why in result["failed"].items()}, seconds)

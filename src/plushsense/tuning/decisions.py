@@ -1,0 +1,464 @@
+"""Decision settings from people whose data the network's weights were not fitted on.
+
+Everything that stands between the network and what a toy says is fitted here, and on the training side only: event
+settings by a search over traces (`plushsense.tuning.events`), the conformal threshold and what counts as known from the
+same people's recordings, the sensors' limits (`fit_health`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import ConfigError, DatasetError
+from plushsense.core.gestures import GestureSet
+from plushsense.core.layouts import Layout
+from plushsense.core.recorder_csv import Frames
+from plushsense.dataset.store import Dataset, RecordingInfo
+from plushsense.models.bundle import Bundle
+from plushsense.runtime.decisions import DecideSpec
+from plushsense.runtime.events import ONE
+from plushsense.runtime.fixed import Ints, integer_logits, smoothing_weight, softmax
+from plushsense.runtime.health import MOST_MS, HealthSettings
+from plushsense.runtime.trace import TraceReplayer, trace_of
+from plushsense.tuning.events import OTHER, EventCosts, MarkedStream, Truth, tune
+from plushsense.tuning.gate import fit_gate
+from plushsense.windows.cut import cut_windows, whole_gestures
+
+_MARGIN = 0.1  # of what people showed
+_SAFETY = 2  # nothing seen may last longer than this part of what makes a fault
+_STILL_MS = 500
+_STILL_MOST_MS = 10_000
+_INT32 = -(1 << 31), (1 << 31) - 1
+
+Bools = NDArray[np.bool_]
+IntsLimits = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class HealthFit:
+    """Fitted ``plan`` with limits from data."""
+
+    plan: HealthSettings
+    frames: int
+    seconds: float
+    widened: tuple[str, ...]
+    still_ms: int
+
+
+def frames_of(dataset: Dataset, subjects: Iterable[str]) -> Iterator[Frames]:
+    """Yield the streams of some people; of those who have none, their recordings."""
+    people = set(subjects)
+    streams = [s for s in dataset.streams if s.subject in people]
+    with_stream = {s.subject for s in streams}
+    for stream in streams:
+        yield dataset.read_stream(stream.id)
+    for recording in dataset.used:
+        if recording.subject in people - with_stream:
+            yield dataset.read(recording)
+
+
+def fit_health(dataset: Dataset, subjects: Iterable[str], plan: HealthSettings | None = None) -> HealthFit:
+    """Fit limits with which the sensors of ``subjects`` are never at fault.
+
+    A channel's limits are the lowest and the highest valid value that anybody showed, and a tenth of the range between
+    further out, for people who touch harder. Where that is no longer within what the sensor can send, people reach its
+    end stop, and the limit is one step inside what they showed: touch stays there for a frame or two, a broken sensor
+    for good. Where somebody's values repeated beyond them for half of ``fault_ms``, they are moved to hold them.
+    ``still_ms`` is twice the longest time in which every channel repeated, at least 500 ms; when that is more than
+    10 s, the toy really is still, and the rule is off.
+
+    Args:
+        plan: the times to keep (``fault_ms``, ``recover_ms``); the defaults when left out.
+    """
+    plan = plan or HealthSettings()
+    layout = dataset.layout
+    parts = [f for f in frames_of(dataset, subjects) if len(f)]
+    if not parts:
+        return HealthFit(plan, 0, 0.0, (), 0)
+    values = np.concatenate([f.values for f in parts])
+    valid = np.stack([np.maximum(layout.valid_min_int, _INT32[0]), np.minimum(layout.valid_max_int, _INT32[1])])
+    valid = valid.astype(np.int64)
+    low, high = (edge.copy() for edge in valid)
+    for c in range(values.shape[1]):
+        mine = values[:, c]
+        mine = mine[(mine >= valid[0, c]) & (mine <= valid[1, c])]
+        if len(mine):
+            first, last = int(mine.min()), int(mine.max())
+            margin = int(np.ceil(_MARGIN * (last - first)))
+            inside = 1 if last - first > 1 else 0
+            low[c] = first - margin if first - margin > valid[0, c] else first + inside
+            high[c] = last + margin if last + margin < valid[1, c] else last - inside
+    usual = low.copy(), high.copy()
+    for frames in parts:
+        for rows, wrong in _held(frames, usual, valid, plan.fault_ms / _SAFETY, layout.gap_ms):
+            low = np.minimum(low, np.where(wrong, rows, low).min(axis=0))
+            high = np.maximum(high, np.where(wrong, rows, high).max(axis=0))
+    moved = (low != usual[0]) | (high != usual[1])
+    widened = [name for name, other in zip(layout.names, moved.tolist(), strict=True) if other]
+    still = max(_longest(f.device_ms, _repeats(f.values, f.device_ms, layout.gap_ms)) for f in parts)
+    still_ms = max(_STILL_MS, _SAFETY * still)
+    fitted = replace(
+        plan,
+        low=tuple(low.tolist()),
+        high=tuple(high.tolist()),
+        still_ms=still_ms if still_ms <= min(_STILL_MOST_MS, MOST_MS) else 0,
+    )
+    return HealthFit(fitted, len(values), _seconds(parts, layout), tuple(widened), still)
+
+
+def _seconds(parts: Iterable[Frames], layout: Layout) -> float:
+    steps = [np.diff(f.device_ms) for f in parts]
+    return float(sum(int(s[(s > 0) & (s <= layout.gap_ms)].sum()) for s in steps)) / 1000
+
+
+def _repeats(values: NDArray[np.int64], ms: NDArray[np.int64], gap_ms: int) -> Bools:
+    """Return which frames (T,) repeat the one before in every channel of ``values``; none over a gap or a reset."""
+    out = np.zeros(len(values), dtype=bool)
+    step = np.diff(ms)
+    out[1:] = (values[1:] == values[:-1]).all(axis=1) & (step >= 0) & (step <= gap_ms)
+    return out
+
+
+def _runs(at: Bools) -> list[tuple[int, int]]:
+    """Return (first, last) of every run of true values."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], at, [False]]).astype(np.int8)))
+    return [(int(a), int(b) - 1) for a, b in edges.reshape(-1, 2)]
+
+
+def _longest(ms: NDArray[np.int64], repeats: Bools) -> int:
+    """Return the longest duration of a run of repeats, counted from the frame that they repeat."""
+    return max((int(ms[b] - ms[a - 1]) for a, b in _runs(repeats)), default=0)
+
+
+def _held(
+    frames: Frames, usual: tuple[IntsLimits, IntsLimits], valid: IntsLimits, longest_ms: float, gap_ms: int
+) -> Iterator[tuple[IntsLimits, NDArray[np.bool_]]]:
+    """Yield the frames (n, C) of each stretch of ``longest_ms`` with some channel wrong all along, and where in
+    them a channel repeated a valid value beyond the ``usual``.
+    """
+    x, ms = frames.values, frames.device_ms
+    step = np.diff(ms, prepend=ms[:1])
+    invalid = (x < valid[0]) | (x > valid[1])
+    again = np.zeros(x.shape, dtype=bool)
+    again[1:] = (x[1:] == x[:-1]) & ((step[1:] >= 0) & (step[1:] <= gap_ms))[:, None]
+    beyond = again & ((x < usual[0]) | (x > usual[1])) & ~invalid
+    for a, b in _runs((invalid | beyond).any(axis=1)):
+        if ms[b] - ms[a] >= longest_ms:
+            yield x[a : b + 1], beyond[a : b + 1]
+
+
+COVERAGE = 0.9
+KNOWN_SHARE = 0.95
+# The search hears at most so much, people alike: it takes about 15 s then.
+MOST_SEARCHED_S = 3600.0
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledSteps:
+    """Steps (or windows) of known truth, (n,) each.
+
+    ``shares`` (n, K) in steps of 2^-15, ``highest`` logit in steps of 1/256, both smoothed; ``truth`` the class;
+    ``person`` and ``recording`` who and what it was.
+    """
+
+    shares: Ints
+    highest: Ints
+    truth: Ints
+    person: NDArray[np.str_]
+    recording: Ints
+
+    @property
+    def of_truth(self) -> Ints:
+        """Shares (n,) of the true class."""
+        return self.shares[np.arange(len(self.truth)), self.truth]
+
+    def take(self, at: NDArray[np.bool_]) -> LabelledSteps:
+        """Return the steps at which ``at`` is true."""
+        return LabelledSteps(*(getattr(self, f.name)[at] for f in fields(self)))
+
+
+def fit_decisions(
+    bundle: Bundle,
+    dataset: Dataset,
+    subjects: Iterable[str],
+    *,
+    coverage: float = COVERAGE,
+    known_share: float = KNOWN_SHARE,
+    false_alarms_per_hour: float = 1.0,
+    training: Iterable[str] = (),
+    spec: DecideSpec | None = None,
+    keep: Collection[str] = (),
+    prices: EventCosts | None = None,
+) -> DecideSpec:
+    """Fit all decision settings, with ``fitted`` saying on what.
+
+    - Events: those that cost least in the streams of ``subjects`` (`tuning.tune`).
+    - ``sure``: the split-conformal threshold at which the set of classes holds the true one in ``coverage`` of the
+      labelled steps (least ambiguous sets: Sadinle, Lei and Wasserman 2019), people and their recordings counting
+      alike; the finite-sample correction counts recordings, since steps of one are no new evidence.
+    - ``known``: the smoothed highest logit that ``known_share`` of the same steps reach.
+    - Gate: thresholds that fire so often on all that is not energetic (`plushsense.tuning.gate`), on everybody's
+      streams.
+    - Health: limits with which no sensor of anybody on the training side is at fault.
+
+    A labelled step stands in the second half of its recording: before, the network mostly sees something else.
+
+    Args:
+        subjects: people on the training side whom the weights were not fitted on.
+        training: people whom they were fitted on: with the others they show what sensors can reach.
+        spec: where the search begins; ``keep`` names its settings that stay.
+        prices: what an event costs that should not have been, or was late.
+
+    Raises:
+        ConfigError: for a coverage or a share that is none.
+        DatasetError: when ``subjects`` is nobody.
+    """
+    for name, value in (("coverage", coverage), ("known_share", known_share)):
+        if not 0.5 <= value < 1.0:
+            raise ConfigError(f"{name} is {value!r}; accepted are shares from 0.5 to under 1.")
+    spec, people = spec or DecideSpec(), sorted(set(subjects))
+    if not people:
+        raise DatasetError("Decision settings are fitted on people who were held back, and there is none.")
+    everybody = sorted({*people, *training})
+    health = fit_health(dataset, everybody, spec.health)
+    if "health" not in keep:
+        spec = replace(spec, health=health.plan)
+    gate: dict[str, Any] | None = None
+    if "gate" not in keep:
+        fitted = fit_gate(dataset, bundle.gestures, everybody, false_alarms_per_hour=false_alarms_per_hour)
+        spec, gate = replace(spec, gate=fitted.plan), fitted.report
+    streams = marked_streams(bundle, dataset, people, spec)
+    report: dict[str, Any] = {
+        "people": len(people),
+        "streams": len(streams),
+        "hours": round(sum(h.trace.seconds for h in streams) / 3600, 3),
+        "gestures": sum(_is_gesture(bundle, t) for h in streams for t in h.truths),
+        "simulated": dataset.head.simulated,
+    }
+    if streams:
+        if "known" not in keep:
+            spec = replace(spec, known=known_threshold(labelled_steps(bundle, streams, spec), known_share))
+        tuned = tune(streams, spec, bundle.gestures, prices, keep)
+        spec = tuned.spec
+        labelled = labelled_steps(bundle, streams, spec)
+        report["events"] = {
+            "on": "streams",
+            "cost": _round(tuned.cost),
+            "cost_before": _round(tuned.cost_before),
+            "tried": tuned.tried,
+            "moved": {name: list(values) for name, values in tuned.moved.items()},
+        }
+    else:
+        labelled = labelled_windows(bundle, dataset, people)
+        report["events"] = {"on": "nothing: nobody who was held back has a stream", "moved": {}}
+    if len(labelled.truth):
+        if "known" not in keep:
+            spec = replace(spec, known=known_threshold(labelled, known_share))
+        if "sure" not in keep:
+            spec = replace(spec, sure=sure_threshold(labelled, coverage))
+        report["answers"] = _answers(labelled, spec, coverage, known_share, bool(streams))
+    report["health"] = {
+        "people": len(everybody),
+        "hours": round(health.seconds / 3600, 3),
+        "end_stops": list(health.widened),
+        "longest_still_ms": health.still_ms,
+    }
+    if gate is not None:
+        report["gate"] = gate
+    return replace(spec, fitted=report)
+
+
+def _is_gesture(bundle: Bundle, truth: Truth) -> bool:
+    return truth.gesture != OTHER and not bundle.gestures.gestures[truth.gesture].idle
+
+
+def _round(value: float) -> float | None:
+    return round(value, 4) if np.isfinite(value) else None
+
+
+def _answers(
+    labelled: LabelledSteps, spec: DecideSpec, coverage: float, known_share: float, steps: bool
+) -> dict[str, Any]:
+    by_person = left_out_coverage(labelled, coverage)
+    people = len(set(labelled.person.tolist()))
+    return {
+        "on": "steps in the second half of a recording" if steps else "windows, not smoothed",
+        "coverage": coverage,
+        "recordings": len(np.unique(labelled.recording)),
+        # What other people's threshold gave each of them: the figure to expect of a new person.
+        "coverage_left_out": _round(float(np.mean(by_person))) if by_person else None,
+        "coverage_left_out_worst": _round(min(by_person)) if by_person else None,
+        # A share of new people that so few can vouch for, whatever the threshold: n / (n + 1).
+        "people_bound": _round(people / (people + 1)),
+        "classes_in_set": _round(float((labelled.shares >= spec.sure * ONE).sum(axis=1).mean())),
+        "known_share": known_share,
+    }
+
+
+def marked_streams(
+    bundle: Bundle,
+    dataset: Dataset,
+    subjects: Iterable[str],
+    spec: DecideSpec,
+    gestures: GestureSet | None = None,
+) -> list[MarkedStream]:
+    """Return the streams of some people as the network reads them, with their marked recordings.
+
+    Streams without a marked recording are left out. Of more than an hour, people get an equal share.
+
+    Args:
+        gestures: those whose indices the truths are; the network's own when left out.
+    """
+    people = set(subjects)
+    marked: dict[str, list[RecordingInfo]] = {}
+    for r in dataset.recordings:
+        if r.stream_row >= 0:
+            marked.setdefault(r.stream, []).append(r)
+    streams = [s for s in dataset.streams if s.subject in people and s.id in marked]
+    share_s = MOST_SEARCHED_S / max(len({s.subject for s in streams}), 1)
+    left = {s.subject: round(share_s * dataset.layout.rate_hz) for s in streams}
+    out = []
+    for stream in streams:
+        frames = dataset.read_stream(stream.id)
+        frames = frames.slice(0, min(len(frames), left[stream.subject]))
+        left[stream.subject] -= len(frames)
+        truths = truths_of(frames, marked[stream.id], gestures or bundle.gestures, dataset.layout.period_us)
+        if any(t.gesture != OTHER for t in truths):
+            out.append(MarkedStream(stream.subject, trace_of(frames, bundle, spec.health), truths))
+    return out
+
+
+def stream_times_us(frames: Frames, period_us: int) -> Ints:
+    """Return the time (T,) of every row as `FrameReader` counts it.
+
+    From the first, and on over a reset of the clock.
+    """
+    step = np.diff(frames.device_ms.astype(np.int64), prepend=frames.device_ms[:1]) * 1000
+    return np.cumsum(np.where(step < 0, period_us, step))
+
+
+def truths_of(
+    frames: Frames, recordings: Sequence[RecordingInfo], gestures: GestureSet, period_us: int
+) -> tuple[Truth, ...]:
+    """Return the marked stretches of a stream in order of time.
+
+    Excluded recordings, and other gestures, are `OTHER`.
+    """
+    times = stream_times_us(frames, period_us)
+    out = []
+    for r in recordings:
+        first, last = r.stream_row + r.start, r.stream_row + r.stop
+        if last <= len(times) and first < last:
+            known = not r.excluded and r.gesture in gestures.labels
+            gesture = gestures.index(r.gesture) if known else OTHER
+            out.append(Truth(int(times[first]), int(times[last - 1]), gesture))
+    return tuple(sorted(out, key=lambda t: t.start_us))
+
+
+def labelled_steps(bundle: Bundle, streams: Sequence[MarkedStream], spec: DecideSpec) -> LabelledSteps:
+    """Return the steps in the second half of each recording that the network knows, smoothed as ``spec`` has it."""
+    weight = smoothing_weight(spec.smoothing_s, bundle.arch.step * bundle.layout.period_us / 1e6)
+    shares = [np.zeros((0, len(bundle.gestures)), dtype=np.int64)]
+    highest = [_ints(())]
+    truth: list[int] = []
+    person: list[str] = []
+    recording: list[int] = []
+    number = 0
+    for h in streams:
+        parts = TraceReplayer(h.trace).smoothed(weight)
+        times = [h.trace.step_times_us(part) for part in h.trace.parts]
+        for t in h.truths:
+            if t.gesture == OTHER:
+                continue
+            number += 1
+            for part, at in zip(parts, times, strict=True):
+                mine = (at >= (t.start_us + t.stop_us) // 2) & (at <= t.stop_us)
+                shares.append(part.shares[mine])
+                highest.append(part.highest[mine])
+                n = int(mine.sum())
+                truth += [t.gesture] * n
+                person += [h.person] * n
+                recording += [number] * n
+    return LabelledSteps(
+        np.concatenate(shares), np.concatenate(highest), _ints(truth), np.array(person, dtype=np.str_), _ints(recording)
+    )
+
+
+def labelled_windows(bundle: Bundle, dataset: Dataset, subjects: Iterable[str]) -> LabelledSteps:
+    """Return the windows of some people's recordings; for data without streams."""
+    people = set(subjects)
+    mine = [r for r in dataset.recordings if r.subject in people]
+    spec = whole_gestures(bundle.windowing)
+    span_s = bundle.arch.span / bundle.layout.rate_hz
+    spec = replace(spec, span_s=span_s if span_s > spec.window_s else 0.0)
+    try:
+        windows = cut_windows(Dataset(dataset.path, dataset.head, mine, dataset.streams), spec, bundle.gestures)
+    except DatasetError:
+        empty = np.zeros((0, len(bundle.gestures)), dtype=np.int64)
+        return LabelledSteps(empty, _ints(()), _ints(()), np.zeros(0, dtype=np.str_), _ints(()))
+    logits = integer_logits(bundle.network().forward(bundle.scaler.apply(windows.x)))
+    shares = np.array([softmax(row) for row in logits], dtype=np.int64)
+    return LabelledSteps(shares, logits.max(axis=1), windows.y, windows.subject, windows.recording)
+
+
+def _ints(values: Sequence[int]) -> Ints:
+    return np.array(values, dtype=np.int64)
+
+
+def weights_of(labelled: LabelledSteps) -> NDArray[np.float64]:
+    """Return weights (n,) that sum to 1: people count alike, and the recordings of a person."""
+    weight = np.zeros(len(labelled.truth))
+    people = np.unique(labelled.person)
+    for person in people:
+        mine = labelled.person == person
+        recordings = np.unique(labelled.recording[mine])
+        for recording in recordings:
+            at = mine & (labelled.recording == recording)
+            weight[at] = 1.0 / (len(people) * len(recordings) * at.sum())
+    return weight
+
+
+def _lower(scores: Ints, labelled: LabelledSteps, share: float) -> int:
+    """Return the largest threshold that ``share`` of the weight reaches, corrected for the number of recordings."""
+    n = len(np.unique(labelled.recording))
+    under = max(0.0, ((1.0 - share) * (n + 1) - 1.0) / n)
+    order = np.argsort(scores, kind="stable")
+    before = np.cumsum(weights_of(labelled)[order]) - weights_of(labelled)[order]
+    at = int(np.flatnonzero(before <= under + 1e-12)[-1])
+    return int(scores[order[at]])
+
+
+def sure_threshold(labelled: LabelledSteps, coverage: float) -> float:
+    """Return the conformal threshold on smoothed probabilities at a coverage, in whole steps of 2^-15."""
+    return _lower(labelled.of_truth, labelled, coverage) / ONE
+
+
+def known_threshold(labelled: LabelledSteps, share: float) -> float | None:
+    """Return the smoothed highest logit that a share of the labelled steps reach; None without any."""
+    return _lower(labelled.highest, labelled, share) / 256 if len(labelled.truth) else None
+
+
+def left_out_coverage(labelled: LabelledSteps, coverage: float) -> list[float]:
+    """Return for each person the share of steps whose set holds the truth with the threshold of the others.
+
+    Recordings count alike. Empty for one person.
+    """
+    people = np.unique(labelled.person)
+    if len(people) < 2:
+        return []
+    out = []
+    for person in people:
+        mine = labelled.take(labelled.person == person)
+        threshold = sure_threshold(labelled.take(labelled.person != person), coverage)
+        out.append(covered(mine, threshold))
+    return out
+
+
+def covered(labelled: LabelledSteps, threshold: float) -> float:
+    """Return the share of steps whose set holds the truth; people and recordings count alike."""
+    return float((weights_of(labelled) * (labelled.of_truth >= threshold * ONE)).sum())

@@ -1,0 +1,284 @@
+"""Search of event settings over traces, by what wrong, late and missing events cost.
+
+A stream is read by the network once (`plushsense.runtime.trace`); its events are replayed for every setting that is
+tried, by the event machine of the toy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.gestures import GestureSet
+from plushsense.runtime.decisions import DecideSpec
+from plushsense.runtime.events import AFFECT_CODES, BEGUN, ENDED, NAMED, NO_GESTURE, Update
+from plushsense.runtime.trace import Trace, TraceReplayer
+
+OTHER = -1
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """Known stretch of a stream: a class index, or `OTHER` for what the network does not know."""
+
+    start_us: int
+    stop_us: int
+    gesture: int
+
+
+@dataclass(frozen=True, eq=False)
+class MarkedStream:
+    """Stream of one person as the network reads it, with its known stretches."""
+
+    person: str
+    trace: Trace
+    truths: tuple[Truth, ...]
+
+
+@dataclass(frozen=True)
+class EventCosts:
+    """Costs of errors, in missed gestures.
+
+    A gesture costs its best event: ``missed`` without one; ``late_s`` for every second until it was named, at most 3;
+    ``unnamed`` when only its affect was reported; when it was taken for another, ``family`` for one of its family,
+    ``same`` for one of its affect, ``other`` where it has no affect, ``affect`` for one of another affect. Every
+    further event of it costs ``again``, and half its error. An event where nothing was going on costs ``idle``, one in
+    a stretch of which nobody knows what went on ``unmarked``: people also practise.
+    """
+
+    missed: float = 1.0
+    late_s: float = 0.2
+    unnamed: float = 0.25
+    family: float = 0.3
+    same: float = 0.5
+    other: float = 1.0
+    affect: float = 2.0
+    again: float = 0.1
+    idle: float = 1.0
+    unmarked: float = 0.25
+    early_us: int = 250_000
+    grace_us: int = 1_000_000
+
+
+@dataclass(slots=True)
+class TimedEvent:
+    """Reported event; ``named_us`` is when its gesture was named."""
+
+    begun_us: int
+    affect: int
+    gesture: int
+    named_us: int
+    ended_us: int = 0
+
+
+def timed_events(updates: Sequence[Update]) -> list[TimedEvent]:
+    """Return whole events from their updates."""
+    out: list[TimedEvent] = []
+    for u in updates:
+        if u.kind == BEGUN:
+            out.append(TimedEvent(u.now, u.affect, u.gesture, u.now))
+        elif u.kind == NAMED:
+            out[-1].gesture, out[-1].affect, out[-1].named_us = u.gesture, u.affect, u.now
+        elif u.kind == ENDED:
+            out[-1].ended_us = u.now
+    return out
+
+
+def event_costs(
+    stream: MarkedStream, events: Sequence[TimedEvent], gestures: GestureSet, prices: EventCosts
+) -> NDArray[np.float64]:
+    """Return the costs (n,) of the events of a stream, a number for each of its n gestures, in order of time.
+
+    An event where there was no gesture counts with the nearest.
+    """
+    idle = [g.idle for g in gestures.gestures]
+    mine = [t for t in stream.truths if t.gesture != OTHER and not idle[t.gesture]]
+    silent = [t for t in stream.truths if t.gesture != OTHER and idle[t.gesture]]
+    others = [t for t in stream.truths if t.gesture == OTHER]
+    if not mine:
+        return np.zeros(0)
+    starts = np.array([t.start_us for t in mine])
+    answers: list[list[TimedEvent]] = [[] for _ in mine]
+    total = np.zeros(len(mine))
+    for event in events:
+        at = _place(event, mine, prices)
+        if at is not None:
+            answers[at].append(event)
+            continue
+        nearest = int(np.abs(starts - event.begun_us).argmin())
+        if _within(event, silent, prices.early_us, 0):
+            total[nearest] += prices.idle
+        elif not _within(event, others, prices.early_us, prices.grace_us):
+            total[nearest] += prices.unmarked
+    for at, (truth, reported) in enumerate(zip(mine, answers, strict=True)):
+        # An event that goes on from before and is right needs no other one.
+        going_on = [
+            e
+            for e in events
+            if e.gesture == truth.gesture
+            and e.begun_us < truth.start_us - prices.early_us
+            and 2 * (min(e.ended_us, truth.stop_us) - truth.start_us) >= truth.stop_us - truth.start_us
+        ]
+        each = [_price(e, truth, gestures, prices) for e in reported]
+        if going_on:
+            each.insert(0, (True, 0.0))
+        if not each:
+            total[at] += prices.missed
+            continue
+        first = min(range(len(each)), key=lambda i: each[i][1])
+        total[at] += each[first][1]
+        total[at] += sum(
+            prices.again + (0.0 if right else cost / 2) for i, (right, cost) in enumerate(each) if i != first
+        )
+    return total
+
+
+def _within(event: TimedEvent, truths: Sequence[Truth], early_us: int, grace_us: int) -> bool:
+    return any(t.start_us - early_us <= event.begun_us <= t.stop_us + grace_us for t in truths)
+
+
+def _place(event: TimedEvent, truths: Sequence[Truth], prices: EventCosts) -> int | None:
+    """Return the gesture that an event belongs to: of those around its beginning its own, else the latest."""
+    around = [
+        i for i, t in enumerate(truths) if t.start_us - prices.early_us <= event.begun_us <= t.stop_us + prices.grace_us
+    ]
+    own = [i for i in around if truths[i].gesture == event.gesture]
+    near = own or around
+    return near[-1] if near else None
+
+
+def _price(event: TimedEvent, truth: Truth, gestures: GestureSet, prices: EventCosts) -> tuple[bool, float]:
+    """Return whether an event was right, and its cost as the answer to a gesture."""
+    real = gestures.gestures[truth.gesture]
+    late = prices.late_s * min(max(event.named_us - truth.start_us, 0) / 1e6, 3.0)
+    if event.gesture == truth.gesture:
+        return True, late
+    if event.gesture == NO_GESTURE:
+        right = event.affect in (0, AFFECT_CODES[real.affect])
+        return right, prices.unnamed + late if right else prices.affect
+    as_which = gestures.gestures[event.gesture]
+    if as_which.family == real.family:
+        return False, prices.family + late
+    if as_which.affect != real.affect:
+        return False, prices.affect
+    return False, (prices.other if real.affect == "none" else prices.same) + late
+
+
+# What is tried, in this order, twice. The first are those that matter most.
+TRIED: dict[str, tuple[float, ...]] = {
+    "enter": (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9),
+    "least_s": (0.05, 0.1, 0.2, 0.3, 0.5),
+    "smoothing_s": (0.1, 0.2, 0.3, 0.5, 0.8),
+    "rest_s": (0.0, 0.2, 0.5, 1.0),
+    "switch_s": (0.1, 0.3, 0.5, 1.0),
+    "end_s": (0.1, 0.3, 0.6, 1.0),
+    "leave": (0.1, 0.2, 0.3, 0.4, 0.5),
+    "hold_s": (0.0, 0.2, 0.5),
+}
+TRIED_AFFECT: dict[str, tuple[float, ...]] = {
+    "enter_affect": (0.6, 0.7, 0.8, 0.9, 0.95),
+    "leave_affect": (0.2, 0.4, 0.6),
+}
+TRIED_GATE: dict[str, tuple[float, ...]] = {"wait_s": (0.5, 1.0, 1.5, 2.5)}
+_BLOCK = 10  # gestures in a row whose costs are taken for one number
+
+
+@dataclass(frozen=True)
+class TunedEvents:
+    """``spec`` and what it costs a gesture, beside the settings that the search began with; ``tried`` settings."""
+
+    spec: DecideSpec
+    cost: float
+    cost_before: float
+    tried: int
+    moved: dict[str, tuple[float, float]]
+
+
+def tune(
+    streams: Sequence[MarkedStream],
+    spec: DecideSpec,
+    gestures: GestureSet,
+    prices: EventCosts | None = None,
+    keep: Collection[str] = (),
+) -> TunedEvents:
+    """Return the event settings that cost the least a gesture, people counting alike.
+
+    One setting after the other is moved to its best value, twice over all, and only where the gain is more than its
+    standard error over blocks of 10 gestures and at least half of the people gain: of few people one learns little,
+    and what they cannot tell stays as it is.
+
+    Args:
+        spec: where the search begins; gate, health, ``known`` and ``sure`` are kept.
+        keep: settings that are not tried.
+    """
+    prices = prices or EventCosts()
+    listeners = [(h, TraceReplayer(h.trace)) for h in streams]
+    gate = bool(spec.gate.rules)
+    knobs = TRIED | (TRIED_AFFECT if gestures.has_affect else {}) | (TRIED_GATE if gate else {})
+    knobs = {name: values for name, values in knobs.items() if name not in keep}
+    known: dict[tuple[Any, ...], list[NDArray[np.float64]]] = {}
+
+    def cost(candidate: DecideSpec) -> list[NDArray[np.float64]]:
+        key = tuple(getattr(candidate, name) for name in knobs)
+        if key not in known:
+            known[key] = [
+                event_costs(h, timed_events(listener.updates(candidate)), gestures, prices) for h, listener in listeners
+            ]
+        return known[key]
+
+    people = [h.person for h in streams]
+    now = before = cost(spec)
+    moved: dict[str, tuple[float, float]] = {}
+    for _ in range(2):
+        changed = False
+        for name, values in knobs.items():
+            best, best_gain = None, 0.0
+            for value in values:
+                if value == getattr(spec, name) or (name == "leave" and value > spec.enter):
+                    continue
+                candidate = with_setting(spec, name, value)
+                gain, error, share = compare_costs(now, cost(candidate), people)
+                if gain > max(best_gain, error) and share >= 0.5:
+                    best, best_gain = candidate, gain
+            if best is not None:
+                moved[name] = (moved.get(name, (getattr(spec, name), 0.0))[0], getattr(best, name))
+                spec, now, changed = best, cost(best), True
+        if not changed:
+            break
+    return TunedEvents(spec, _mean(now, people), _mean(before, people), len(known), moved)
+
+
+def with_setting(spec: DecideSpec, name: str, value: float) -> DecideSpec:
+    """Return the spec with one setting changed; ``leave`` is never above ``enter``."""
+    values: dict[str, Any] = {name: value}
+    if name == "enter":
+        values["leave"] = min(spec.leave, value)
+    return replace(spec, **values)
+
+
+def _mean(each: Sequence[NDArray[np.float64]], people: Sequence[str]) -> float:
+    by_person = _by_person(each, people)
+    return float(np.mean([c.mean() for c in by_person])) if by_person else float("nan")
+
+
+def _by_person(each: Sequence[NDArray[np.float64]], people: Sequence[str]) -> list[NDArray[np.float64]]:
+    out = [np.concatenate([c for c, p in zip(each, people, strict=True) if p == who]) for who in dict.fromkeys(people)]
+    return [c for c in out if len(c)]
+
+
+def compare_costs(
+    before: Sequence[NDArray[np.float64]], after: Sequence[NDArray[np.float64]], people: Sequence[str]
+) -> tuple[float, float, float]:
+    """Return the mean gain a gesture of ``after`` over ``before`` (costs of each stream), its standard error over
+    blocks of gestures, and the share of people who do not lose by it.
+    """
+    gains = [a - b for a, b in zip(_by_person(before, people), _by_person(after, people), strict=True)]
+    if not gains:
+        return 0.0, float("inf"), 0.0
+    blocks = np.array([g[at : at + _BLOCK].mean() for g in gains for at in range(0, len(g), _BLOCK)])
+    error = float(blocks.std(ddof=1) / np.sqrt(len(blocks))) if len(blocks) > 1 else float("inf")
+    return float(np.mean([g.mean() for g in gains])), error, float(np.mean([g.mean() >= 0 for g in gains]))

@@ -1,0 +1,415 @@
+"""Fitting the gate: which signals, terms and thresholds notice the energetic gestures of some people, and little else.
+
+What is tried: each input's level, each input's jerk and the jerk of all inputs of a kind, at several lags and floors;
+rules of one or two terms. A rule's thresholds are chosen so that on everything that is not energetic it would have
+fired at most so often an hour; of the rules that then notice most, the quickest is taken. A further rule is added while
+it finds energetic recordings that those before it miss.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.gestures import GestureSet
+from plushsense.core.layouts import Layout
+from plushsense.dataset.store import Dataset
+from plushsense.runtime.events import AFFECT_CODES, NO_GESTURE
+from plushsense.runtime.gate import (
+    EXTRA_BITS,
+    HELD,
+    JERK,
+    LEVEL,
+    MOST_LAG,
+    NOISE_CLIP,
+    THRESHOLD_BITS,
+    Gate,
+    GateSettings,
+    Rule,
+    Signal,
+    Term,
+)
+from plushsense.tuning.gate_rules import BETWEEN, CALM, LEFT_OUT, FoundRule, Heights, Material, best_rule, material_of
+
+LEAD = 1200
+"""Samples read before a piece, in which a baseline settles."""
+PIECE = 4800
+_CELLS = 12_000  # pieces times signals that go side by side: more no longer fit the cache
+
+
+def raw_signal(x: NDArray[np.int64], signal: Signal) -> NDArray[np.int64]:
+    """Return a signal (T,) of inputs (T, I) before its baseline."""
+    columns: NDArray[np.int64] = np.clip(x[:, list(signal.inputs)] >> signal.shift, -HELD, HELD)
+    if signal.kind == LEVEL:
+        return np.asarray(columns[:, 0])
+    out = np.zeros(len(x), dtype=np.int64)
+    out[signal.lag :] = np.abs(columns[signal.lag :] - columns[: -signal.lag]).sum(axis=1)
+    return np.minimum(out, HELD)
+
+
+def signal_sizes(
+    xs: Sequence[NDArray[np.int64]], signals: Sequence[Signal], deviations: bool = False
+) -> list[NDArray[np.int32]]:
+    """Return the sizes of the signals, with the deviation's sign: an array (T, S) of each stretch (T, I).
+
+    As `plushsense.runtime.gate.Gate` computes them, but for two things: stretches are read in pieces that each begin
+    `LEAD` samples early, and samples that repeat the one before count like others. Then many pieces go side by side.
+    With ``deviations`` these are given instead.
+    """
+    out = [np.zeros((len(x), len(signals)), dtype=np.int32) for x in xs]
+    pieces = [(n, at, max(0, at - LEAD)) for n, x in enumerate(xs) for at in range(0, len(x), PIECE)]
+    pieces.sort(key=lambda p: p[2] - min(p[1] + PIECE, len(xs[p[0]])))  # the longest first
+    per = max(1, _CELLS // max(1, len(signals)))
+    for first in range(0, len(pieces), per):
+        some = pieces[first : first + per]
+        stops = [min(at + PIECE, len(xs[n])) for n, at, _ in some]
+        # A jerk looks back behind the piece, so that signals are made with the samples before.
+        block = np.zeros((stops[0] - some[0][2], len(some), len(signals)), dtype=np.int32)
+        for column, ((n, _, begin), stop) in enumerate(zip(some, stops, strict=True)):
+            back = max(0, begin - 16)
+            for s, signal in enumerate(signals):
+                block[: stop - begin, column, s] = raw_signal(xs[n][back:stop], signal)[begin - back :]
+        sizes = _follow_block(block, signals, deviations)
+        for column, ((n, at, begin), stop) in enumerate(zip(some, stops, strict=True)):
+            out[n][at:stop] = sizes[at - begin : stop - begin, column]
+    return out
+
+
+def _follow_block(block: NDArray[np.int32], signals: Sequence[Signal], deviations: bool) -> NDArray[np.int32]:
+    """Replace raw signals (T, pieces, S) by their sizes, in place."""
+    slow = np.array([s.baseline for s in signals], dtype=np.int32)
+    slower = np.array([s.noise for s in signals], dtype=np.int32)
+    floor = np.array([s.floor for s in signals], dtype=np.int32)
+    base = block[0] << EXTRA_BITS
+    noise = np.zeros_like(base)
+    for t in range(len(block)):
+        value = block[t]
+        deviation = value - (base >> EXTRA_BITS)
+        size = np.abs(deviation)
+        level = (noise >> EXTRA_BITS) + floor
+        base += ((value << EXTRA_BITS) - base) >> slow
+        noise += ((np.minimum(size, NOISE_CLIP * level) << EXTRA_BITS) - noise) >> slower
+        block[t] = deviation if deviations else np.sign(deviation) * ((size << THRESHOLD_BITS) // level)
+    return block
+
+
+Ints32 = NDArray[np.int32]
+
+_TOGETHER = 6  # stretches whose every candidate is in memory at a time
+_MOST, _FLOORS = 24, 2  # candidates kept, and how many of them may differ in their floor only
+
+
+@dataclass(frozen=True)
+class GateSpec:
+    """Settings of the fit of a gate; times in seconds.
+
+    Attributes:
+        false_alarms_per_hour: how often it may fire on what is not energetic.
+        lags_s: of jerk; floors: as quantiles of a signal's deviation in all that was recorded.
+        times_s: for how long a term must hold; within_s: how long it is remembered.
+        deaf_s: after firing.
+        rules: most rules of one affect.
+        least: a first rule must find this share of the energetic recordings, else there is no gate.
+        gain: a further rule must find this share, at least two recordings.
+        worth: what goes on between recordings is calm, unless that costs this share of them.
+    """
+
+    false_alarms_per_hour: float = 1.0
+    lags_s: tuple[float, ...] = (0.02, 0.05, 0.1)
+    floors: tuple[float, ...] = (0.5, 0.9, 0.99)
+    times_s: float = 0.02
+    within_s: float = 0.05
+    deaf_s: float = 0.5
+    baseline_s: float = 1.28
+    noise_s: float = 2.56
+    rules: int = 3
+    least: float = 0.2
+    gain: float = 0.005
+    worth: float = 0.05
+
+
+@dataclass(frozen=True)
+class GateFit:
+    """Fitted ``plan``, and a ``report`` of what it was fitted on."""
+
+    plan: GateSettings
+    report: dict[str, Any] = field(default_factory=dict)
+
+
+def fit_gate(
+    dataset: Dataset,
+    gestures: GestureSet,
+    subjects: Collection[str],
+    *,
+    false_alarms_per_hour: float = 1.0,
+    spec: GateSpec | None = None,
+) -> GateFit:
+    """Fit a gate on ``subjects``' streams, and on their recordings where there is no stream.
+
+    Args:
+        gestures: the classes of the model that the gate stands beside; they say what is energetic, and its affect.
+        false_alarms_per_hour: how often it may fire on all that is not energetic.
+
+    An empty plan, with the reason in the report, where nothing energetic is to be noticed.
+    """
+    spec = spec or GateSpec(false_alarms_per_hour)
+    figures = {"people": len(set(subjects)), "false_alarms_per_hour_allowed": spec.false_alarms_per_hour}
+    names = [g.label for g in gestures.gestures if g.energetic]
+    if not names:
+        return GateFit(GateSettings(), {**figures, "reason": f"no gesture of '{gestures.name}' is energetic"})
+    material = material_of(dataset, gestures, subjects)
+    if not any(label in names for _, label in material.trials):
+        return GateFit(GateSettings(), {**figures, "reason": f"nobody here recorded {', '.join(names)}"})
+    candidates = _Candidates(dataset.layout, material, spec)
+    signals: list[Signal] = []
+    rules: list[Rule] = []
+    believed = True
+    for affect in dict.fromkeys(g.affect for g in gestures.gestures if g.energetic):
+        labels = [g.label for g in gestures.gestures if g.energetic and g.affect == affect]
+        found, used = _rules_of(candidates, labels, spec)
+        believed = believed and used
+        gesture = gestures.index(labels[0]) if len(labels) == 1 else NO_GESTURE
+        for rule in found:
+            terms = []
+            for column, threshold in rule.terms:
+                signal, sign = candidates.candidates[column]
+                if signal not in signals:
+                    signals.append(signal)
+                terms.append(Term(signals.index(signal), threshold, sign, candidates.times))
+            rules.append(
+                Rule(
+                    tuple(terms), AFFECT_CODES[affect], gesture, candidates.within, dataset.layout.samples(spec.deaf_s)
+                )
+            )
+    plan = GateSettings(tuple(signals), tuple(rules))
+    if not rules:
+        return GateFit(plan, {**figures, "reason": "no rule finds enough of them at so few false alarms"})
+    return GateFit(
+        plan, {**figures, "between_recordings_believed": believed, **measure_gate(plan, material, dataset.layout)}
+    )
+
+
+def _rules_of(candidates: _Candidates, labels: list[str], spec: GateSpec) -> tuple[list[FoundRule], bool]:
+    """Return rules for some gestures, and whether what went on between the recordings was counted as calm.
+
+    It is, unless that costs recall: where people practised between their recordings, nobody knows what is calm.
+    """
+    best: tuple[int, list[FoundRule], bool] = (-1, [], True)
+    for believed in (True, False):
+        heights, hours = candidates.heights(labels, believed)
+        n_trials = len(np.unique(heights.trials))
+        left = int(hours * spec.false_alarms_per_hour)
+        found: list[FoundRule] = []
+        while len(found) < spec.rules:
+            rule = best_rule(heights, left, candidates.layout.rate_hz)
+            least = spec.least * n_trials if not found else max(2.0, spec.gain * n_trials)
+            if rule is None or rule.near < least:
+                break
+            found.append(rule)
+            left -= rule.alarms
+            heights = heights.without(rule)
+        hits = sum(rule.hits for rule in found)
+        if hits > best[0] + spec.worth * n_trials:
+            best = hits, found, believed
+        if hits >= 0.9 * n_trials or not candidates.between:
+            break
+    return best[1], best[2]
+
+
+class _Candidates:
+    """Candidates for terms, and their sizes in all of the material."""
+
+    def __init__(self, layout: Layout, material: Material, spec: GateSpec) -> None:
+        self.layout, self.material = layout, material
+        self.times = layout.samples(spec.times_s)
+        self.within = round(spec.within_s * layout.rate_hz)
+        self.chunk = layout.samples(spec.deaf_s) + 1
+        self.between = material.hours(BETWEEN) > 0
+        self._xs = [s.x for s in material.stretches]
+        candidates = self._signs(self._floors(signals_of(layout, spec), spec))
+        kept = self._promising(candidates, spec)
+        self.candidates = [candidates[k] for k in kept]
+        self._sizes = [self._lasting(sizes) for sizes in self._signed(self._xs, self.candidates)]
+
+    def _signed(self, xs: list[NDArray[np.int64]], candidates: list[tuple[Signal, int]]) -> list[Ints32]:
+        sizes = signal_sizes(xs, [signal for signal, _ in candidates])
+        for column, (_, sign) in enumerate(candidates):
+            for of in sizes:
+                one = of[:, column]
+                np.copyto(one, np.abs(one) if sign == 0 else np.maximum(one * sign, 0))
+        return sizes
+
+    def _lasting(self, sizes: Ints32) -> Ints32:
+        """Return sizes as a term counts them: the lowest of ``times``, then the highest of ``within``."""
+        lasting = sizes.copy()
+        for back in range(1, self.times):
+            lasting[back:] = np.minimum(lasting[back:], sizes[:-back])
+            lasting[:back] = 0
+        held = lasting.copy()
+        for back in range(1, self.within + 1):
+            held[back:] = np.maximum(held[back:], lasting[:-back])
+        return held
+
+    def _floors(self, signals: list[Signal], spec: GateSpec) -> list[Signal]:
+        """Return each signal at each floor, held within the range of the gate."""
+        longest = sorted(self._xs, key=len)[-12:]
+        sample = np.abs(np.concatenate(signal_sizes([x[: 4 * PIECE] for x in longest], signals, deviations=True)))
+        floors = np.percentile(sample, [100 * share for share in spec.floors], axis=0)
+        out = []
+        for column, signal in enumerate(signals):
+            out += [replace(signal, floor=f) for f in sorted({min(HELD, max(1, int(v))) for v in floors[:, column]})]
+        return out
+
+    def _signs(self, signals: list[Signal]) -> list[tuple[Signal, int]]:
+        """Return each signal with the sign in which the energetic recordings move its level; jerk has none."""
+        levels = [k for k, s in enumerate(signals) if s.kind == LEVEL]
+        pieces, trials = [], []
+        for stretch in self.material.stretches:
+            for trial in np.unique(stretch.what[stretch.what >= 0]).tolist():
+                at = np.flatnonzero(stretch.what == trial)
+                pieces.append(stretch.x[max(0, int(at[0]) - 300) : int(at[-1]) + 1])
+                trials.append(len(at))
+        some = slice(None, None, max(1, len(pieces) // 100))
+        sizes = signal_sizes(pieces[some], [signals[k] for k in levels])
+        ends = [(s[-n:].max(axis=0), -s[-n:].min(axis=0)) for s, n in zip(sizes, trials[some], strict=True)]
+        up, down = (np.median(np.array([e[way] for e in ends]), axis=0) for way in (0, 1))
+        sign = dict.fromkeys(range(len(signals)), 0)
+        for k, u, d in zip(levels, up, down, strict=True):
+            sign[k] = 1 if u > 1.5 * d else -1 if d > 1.5 * u else 0
+        return [(signal, sign[k]) for k, signal in enumerate(signals)]
+
+    def _promising(self, candidates: list[tuple[Signal, int]], spec: GateSpec) -> list[int]:
+        """Return the candidates that separate best on their own."""
+        calm, rough = [], []
+        for first in range(0, len(self._xs), _TOGETHER):
+            some = self.material.stretches[first : first + _TOGETHER]
+            for stretch, sizes in zip(some, self._signed([s.x for s in some], candidates), strict=True):
+                kind = np.where(stretch.what >= 0, stretch.what, np.where(stretch.what == LEFT_OUT, -2, -1))
+                edges = np.flatnonzero(np.append(True, (np.diff(kind) != 0) | (np.arange(1, len(kind)) % 50 == 0)))
+                tops, kinds = np.maximum.reduceat(sizes, edges, axis=0), kind[edges]
+                calm.append(tops[kinds == -1])
+                for trial in np.unique(kinds[kinds >= 0]).tolist():
+                    rough.append(tops[kinds == trial].max(axis=0))
+        calms, roughs = np.concatenate(calm), np.array(rough)
+        lax = min(len(calms), 1 + 20 * (1 + int(spec.false_alarms_per_hour * len(calms) / 7200)))
+        needed = np.partition(calms, len(calms) - lax, axis=0)[len(calms) - lax] if len(calms) else 0
+        order = np.argsort(-(roughs > needed).mean(axis=0), kind="stable").tolist()
+        kept: list[int] = []
+        seen: list[Signal] = []
+        for k in order:
+            signal = replace(candidates[k][0], floor=1)
+            if seen.count(signal) < _FLOORS and len(kept) < _MOST:
+                kept.append(k)
+                seen.append(signal)
+        return kept
+
+    def heights(self, labels: list[str], between: bool) -> tuple[Heights, float]:
+        """Return the sizes that rules for ``labels`` are chosen on, and how many hours of it are calm."""
+        chosen = np.array([label in labels for _, label in self.material.trials])
+        calm, chunks, rough, trials, delays = [], [], [], [], []
+        first_chunk = 0
+        for stretch, sizes in zip(self.material.stretches, self._sizes, strict=True):
+            quiet = (stretch.what == CALM) | ((stretch.what == BETWEEN) & between)
+            calm.append(sizes[quiet])
+            chunks.append(first_chunk + np.flatnonzero(quiet) // self.chunk)
+            first_chunk += len(quiet) // self.chunk + 1
+            at = np.flatnonzero(stretch.what >= 0)
+            at = at[chosen[stretch.what[at]]]
+            rough.append(sizes[at])
+            trials.append(stretch.what[at])
+            delays.append(np.arange(len(at)) - np.searchsorted(stretch.what[at], stretch.what[at]))
+        together = np.concatenate(trials)
+        order = np.argsort(together, kind="stable")
+        heights = Heights.of(
+            np.concatenate(calm),
+            np.concatenate(chunks),
+            np.concatenate(rough)[order],
+            together[order],
+            np.concatenate(delays)[order],
+            self._apart(),
+        )
+        return heights, sum(map(len, calm)) / self.layout.rate_hz / 3600
+
+    def _apart(self) -> NDArray[np.bool_]:
+        """Return which candidates may be combined.
+
+        With several kinds of sensors, a rule reads two, so that no broken one fires the gate alone.
+        """
+        n = len(self.candidates)
+        if len({c.kind for c in self.layout.channels}) == 1:
+            return np.ones((n, n), dtype=bool)
+        inputs = [set(signal.inputs) for signal, _ in self.candidates]
+        return np.array([[not a & b for b in inputs] for a in inputs])
+
+
+def signals_of(layout: Layout, spec: GateSpec) -> list[Signal]:
+    """Return the candidate signals of a layout.
+
+    Level and jerk of each input, and the jerk of all inputs of a kind, at every lag.
+    """
+    kinds = {c.name: c.kind for c in layout.channels}
+    kinds |= {d.name: kinds[d.of[0]] for d in layout.derived}
+    groups: dict[str, list[int]] = {}
+    for at, name in enumerate(layout.inputs):
+        groups.setdefault(kinds[name], []).append(at)
+    lags = sorted({min(MOST_LAG, layout.samples(s)) for s in spec.lags_s})
+    slow, slower = (max(1, min(15, round(math.log2(s * layout.rate_hz)))) for s in (spec.baseline_s, spec.noise_s))
+    several = [tuple(group) for group in groups.values()]
+    watched: list[tuple[int, tuple[int, ...], int]] = [(LEVEL, (at,), 1) for at in range(layout.n_inputs)]
+    watched += [(JERK, (at,), lags[len(lags) // 2]) for at in range(layout.n_inputs)]
+    watched += [(JERK, group, lag) for group in several for lag in lags if (JERK, group, lag) not in watched]
+    return [Signal(kind, group, lag, 0, slow, slower) for kind, group, lag in watched]
+
+
+def measure_gate(plan: GateSettings, material: Material, layout: Layout) -> dict[str, Any]:
+    """Measure a gate on some people's material, by the integer `Gate` itself.
+
+    Recall by gesture; false alarms an hour in calm recordings and between recordings (a gate is deaf for a while after
+    each); the median time from a recording's first sample to the first firing in it.
+    """
+    first: dict[int, int] = {}
+    wrong = {CALM: 0, BETWEEN: 0}
+    calm_hit: set[int] = set()
+    wrong_by: dict[str, int] = {}
+    for stretch in material.stretches:
+        gate = Gate(plan)
+        begun = {int(t): int(np.argmax(stretch.what == t)) for t in np.unique(stretch.what) if t >= 0}
+        for at, row in enumerate(stretch.x.tolist()):
+            if gate.push(row) < 0:
+                continue
+            what = int(stretch.what[at])
+            if what >= 0:
+                first.setdefault(what, at - begun[what])
+            elif what != LEFT_OUT:
+                wrong[what] += 1
+                if what == CALM:
+                    calm_hit.add(int(stretch.calm[at]))
+                    label = material.calm[int(stretch.calm[at])][1]
+                    wrong_by[label] = wrong_by.get(label, 0) + 1
+    by_gesture: dict[str, list[int]] = {}
+    for trial, (_, label) in enumerate(material.trials):
+        by_gesture.setdefault(label, []).append(trial)
+    hours = {what: material.hours(what) for what in (CALM, BETWEEN)}
+    total = sum(hours.values())
+    delays = [at / layout.rate_hz for at in first.values()]
+    return {
+        "recordings": len(material.trials),
+        "recall": round(len(first) / max(1, len(material.trials)), 4),
+        "recall_by_gesture": {
+            label: round(sum(t in first for t in trials) / len(trials), 4) for label, trials in by_gesture.items()
+        },
+        "median_s_after_recording_began": round(float(np.median(delays)), 3) if delays else None,
+        "calm_hours": round(hours[CALM], 3),
+        "between_hours": round(hours[BETWEEN], 3),
+        "false_alarms_per_hour": round(sum(wrong.values()) / total, 2) if total else None,
+        "false_alarms_per_hour_in_calm_recordings": round(wrong[CALM] / hours[CALM], 2) if hours[CALM] else None,
+        "false_alarms_per_hour_between": round(wrong[BETWEEN] / hours[BETWEEN], 2) if hours[BETWEEN] else None,
+        "calm_recordings": len(material.calm),
+        "calm_recordings_with_a_false_alarm": len(calm_hit),
+        "false_alarms_by_gesture": dict(sorted(wrong_by.items())),
+    }

@@ -1,0 +1,274 @@
+"""Choice of a gate's rules: two terms and their thresholds, by recall and false alarms."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.gestures import GestureSet
+from plushsense.dataset.store import Dataset, RecordingInfo
+from plushsense.windows.clock import Segment, resample
+from plushsense.windows.cut import recordings_in_time
+from plushsense.windows.features import network_inputs
+
+BETWEEN, CALM, LEFT_OUT = -1, -2, -3
+"""Of a sample: between recordings; in one of a gesture that is not energetic; what nobody can tell."""
+
+GUARD_S = 0.7
+"""So long before and after an energetic recording nobody can tell: the hand may begin early and end late."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """Even samples without a break: ``x`` (T, I) raw inputs, ``what`` (T,) an index of `Material.trials` or one of
+    `BETWEEN`, `CALM`, `LEFT_OUT`, ``calm`` (T,) the recording of a calm sample (an index into ``Material.calm``), else
+    -1.
+    """
+
+    subject: str
+    x: NDArray[np.int64]
+    what: NDArray[np.int64]
+    calm: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Material:
+    """Stretches of some people; ``trials`` are their energetic recordings, ``calm`` the others, as (id, gesture)."""
+
+    stretches: tuple[Stretch, ...]
+    trials: tuple[tuple[str, str], ...]
+    calm: tuple[tuple[str, str], ...]
+    rate_hz: float
+
+    def hours(self, what: int) -> float:
+        """Return the total duration of one kind of samples, in hours."""
+        return sum(int((s.what == what).sum()) for s in self.stretches) / self.rate_hz / 3600
+
+
+def material_of(dataset: Dataset, gestures: GestureSet, subjects: Collection[str]) -> Material:
+    """Return the streams of ``subjects``, and their recordings that lie in no stream.
+
+    What is energetic ``gestures`` say. Free choice, labels that are not among them, excluded recordings and those
+    that nobody stopped in time are left out: nobody knows what they hold.
+    """
+    layout = dataset.layout
+    people = set(subjects)
+    mine = [r for r in dataset.recordings if r.subject in people]
+    in_time = {r.id for r in recordings_in_time([r for r in mine if not r.excluded])}
+    trials: list[tuple[str, str]] = []
+    calm: list[tuple[str, str]] = []
+    stretches: list[Stretch] = []
+
+    def kind(r: RecordingInfo) -> int:
+        found = gestures.find(r.gesture)
+        if r.id not in in_time or found is None or found.free_choice:
+            return LEFT_OUT
+        if found.energetic:
+            trials.append((r.id, found.label))
+            return len(trials) - 1
+        calm.append((r.id, found.label))
+        return CALM
+
+    def add(subject: str, segments: list[Segment], rows: list[tuple[int, int, RecordingInfo]], rest: int) -> None:
+        guard = layout.samples(GUARD_S)
+        kinds = [(first, last, kind(r)) for first, last, r in rows]
+        at_calm, numbers = len(calm) - sum(k == CALM for _, _, k in kinds), []
+        for _, _, k in kinds:
+            numbers.append(at_calm if k == CALM else -1)
+            at_calm += k == CALM
+        for segment in segments:
+            what = np.full(len(segment), rest)
+            which = np.full(len(segment), -1)
+            spans = [np.searchsorted(segment.row_of, edge, side="left").tolist() for edge in [k[:2] for k in kinds]]
+            for (first, last), (_, _, k) in zip(spans, kinds, strict=True):
+                if k >= 0 and last > first:
+                    around = what[max(0, first - guard) : last + guard]
+                    around[around == BETWEEN] = LEFT_OUT
+            for (first, last), (_, _, k), number in zip(spans, kinds, numbers, strict=True):
+                what[first:last], which[first:last] = k, number
+            stretches.append(Stretch(subject, network_inputs(segment.data, layout), what, which))
+
+    for stream in dataset.streams:
+        if stream.subject in people:
+            located = [
+                (r.stream_row + r.start, r.stream_row + r.stop, r)
+                for r in mine
+                if r.stream == stream.id and r.stream_row >= 0
+            ]
+            add(stream.subject, resample(dataset.read_stream(stream.id), layout), located, BETWEEN)
+    for r in mine:
+        if r.stream_row < 0 and r.id in in_time:
+            frames = dataset.read(r)
+            add(r.subject, resample(frames, layout), [(0, len(frames), r)], LEFT_OUT)
+    return Material(tuple(stretches), tuple(trials), tuple(calm), layout.rate_hz)
+
+
+Ints32 = NDArray[np.int32]
+Whole = NDArray[np.int64]
+
+_SHARES = (0.5, 1, 2, 4, 7, 10, 15, 20, 30, 40, 50, 65, 80)
+"""Thresholds of the first term that are tried: percentiles of the trials' heights."""
+_COMMON = 0.05
+"""A first term that holds in more of the calm samples than this is no term."""
+_SHORTLIST = 60
+_NEARBY = (0.85, 1.0, 1.18)
+"""Other people are a little different: a rule's recall is the mean of that with its thresholds times these."""
+_CARELESS = 2
+"""At the lowest of them a rule may be wrong so many times as often as allowed, and once more."""
+_PER_SECOND = 0.1
+"""What an answer a second sooner is worth, as a share of the trials."""
+
+
+@dataclass(frozen=True, eq=False)
+class Heights:
+    """Sizes of candidates, as a term counts them: rows of samples, a column for each candidate.
+
+    ``calm`` (n, S) of what is not energetic, in ``chunks`` (n,), stretches of one alarm at most; ``rough`` (m, S) of
+    the ``trials`` (m,), ``delays`` (m,) samples after each trial's begin. Both sorted by chunk and trial. ``least``
+    (S,) is the lowest threshold of a first term; calm samples below all of them are not here. ``apart`` (S, S):
+    which two candidates may be the terms of one rule.
+    """
+
+    calm: Ints32
+    chunks: Whole
+    rough: Ints32
+    trials: Whole
+    delays: Whole
+    least: Whole
+    apart: NDArray[np.bool_]
+
+    @classmethod
+    def of(
+        cls, calm: Ints32, chunks: Whole, rough: Ints32, trials: Whole, delays: Whole, apart: NDArray[np.bool_]
+    ) -> Heights:
+        """Return the calm samples in which a rule could fire, beside all energetic ones."""
+        least = np.ones(rough.shape[1], dtype=np.int64)
+        if len(calm):
+            rank = min(len(calm) - 1, int(len(calm) * (1.0 - _COMMON)))
+            for column in range(len(least)):
+                least[column] = max(1, np.partition(calm[:, column], rank)[rank] + 1)
+        if len(trials):
+            least = np.maximum(least, _highest(rough, trials)[0].min(axis=0))
+        loud = (calm >= least).any(axis=1)
+        return cls(calm[loud], chunks[loud], rough, trials, delays, least, apart)
+
+    def without(self, found: FoundRule) -> Heights:
+        """Return what is left where a rule does not already fire."""
+        calm = ~np.isin(self.chunks, self.chunks[found.holds(self.calm)])
+        rough = ~np.isin(self.trials, self.trials[found.holds(self.rough)])
+        left = self.rough[rough], self.trials[rough], self.delays[rough]
+        return Heights(self.calm[calm], self.chunks[calm], *left, self.least, self.apart)
+
+
+@dataclass(frozen=True)
+class FoundRule:
+    """A rule: columns and their thresholds (one or two), and what it does to the trials it was chosen on: ``hits``,
+    ``near`` (the mean with thresholds a little higher and lower), ``alarms``, the median ``delay`` in samples.
+    """
+
+    terms: tuple[tuple[int, int], ...]
+    hits: int = 0
+    near: float = 0.0
+    alarms: int = 0
+    delay: float = 0.0
+
+    def holds(self, heights: Ints32) -> NDArray[np.bool_]:
+        """Return where the rule holds, (n,)."""
+        every: NDArray[np.bool_] = np.ones(len(heights), dtype=np.bool_)
+        for column, threshold in self.terms:
+            every &= heights[:, column] >= threshold
+        return every
+
+    def times(self, factor: float) -> FoundRule:
+        """Return the rule with other thresholds."""
+        return FoundRule(tuple((column, max(1, round(factor * threshold))) for column, threshold in self.terms))
+
+    def alarms_in(self, heights: Heights) -> int:
+        """Return the number of chunks in which it is wrong."""
+        return len(np.unique(heights.chunks[self.holds(heights.calm)]))
+
+
+def best_rule(heights: Heights, alarms: int, rate_hz: float) -> FoundRule | None:
+    """Return the rule that finds most trials, and soonest, with at most ``alarms`` chunks in which it is wrong.
+
+    Thresholds stand in the middle (in decibels) between what the alarms ask for and what would begin to cost trials.
+    """
+    n_trials = len(np.unique(heights.trials))
+    if n_trials == 0:
+        return None
+    tops, _ = _highest(heights.rough, heights.trials)
+    tried: list[tuple[int, int, int, int]] = []
+    for first in range(heights.rough.shape[1]):
+        for threshold in np.unique(np.percentile(tops[:, first], _SHARES).astype(np.int64)):
+            if threshold < heights.least[first]:
+                continue
+            loud = heights.calm[:, first] >= threshold
+            needed = _needed(heights.calm[loud], heights.chunks[loud], alarms)
+            strong = heights.rough[:, first] >= threshold
+            reached, _ = _highest(heights.rough[strong], heights.trials[strong])
+            hits = (reached >= needed).sum(axis=0)
+            tried += [(int(hits[s]), first, int(threshold), int(s)) for s in np.flatnonzero(heights.apart[first])]
+    tried.sort(key=lambda r: -r[0])
+    best: tuple[float, FoundRule] | None = None
+    seen: set[tuple[int, int]] = set()
+    for _, first, threshold, second in tried:
+        if (first, second) in seen:
+            continue
+        seen.add((first, second))
+        if len(seen) > _SHORTLIST:
+            break
+        found = _settle(heights, first, threshold, second, alarms)
+        if found is not None:
+            worth = found.near / n_trials - _PER_SECOND * found.delay / rate_hz
+            if best is None or worth > best[0]:
+                best = worth, found
+    return best[1] if best else None
+
+
+def _settle(heights: Heights, first: int, threshold: int, second: int, alarms: int) -> FoundRule | None:
+    """Move both thresholds to the middle of their accepted range, one after the other, twice."""
+    terms = {first: threshold, second: 1} if first != second else {first: threshold}
+    for column in (second, first, second):
+        calm, rough = (
+            np.logical_and.reduce([h[:, c] >= t for c, t in terms.items() if c != column] or [np.ones(len(h), bool)])
+            for h in (heights.calm, heights.rough)
+        )
+        needed = int(_needed(heights.calm[calm][:, [column]], heights.chunks[calm], alarms)[0])
+        if column == first:
+            needed = max(needed, int(heights.least[first]))
+        reached, _ = _highest(heights.rough[rough][:, [column]], heights.trials[rough])
+        passing = reached[reached >= needed]
+        if not len(passing):
+            return None
+        middle = round((needed * float(np.percentile(passing, 1))) ** 0.5)
+        terms[column] = max(needed, min(int(passing.min()), middle))
+    found = FoundRule(tuple(terms.items()))
+    right = found.holds(heights.rough)
+    trials, at = np.unique(heights.trials[right], return_index=True)
+    careless = found.times(_NEARBY[0]).alarms_in(heights)
+    if not len(trials) or careless > _CARELESS * alarms + 1:
+        return None
+    near = [len(np.unique(heights.trials[found.times(f).holds(heights.rough)])) for f in _NEARBY]
+    delay = float(np.median(heights.delays[right][at]))
+    return FoundRule(found.terms, len(trials), float(np.mean(near)), found.alarms_in(heights), delay)
+
+
+def _highest(heights: Ints32, groups: Whole) -> tuple[Ints32, Whole]:
+    """Return the highest value in each column of each group of consecutive rows."""
+    if not len(groups):
+        return heights[:0], groups[:0]
+    starts = np.flatnonzero(np.append(True, np.diff(groups) != 0))
+    return np.maximum.reduceat(heights, starts, axis=0), groups[starts]
+
+
+def _needed(calm: Ints32, chunks: Whole, alarms: int) -> Whole:
+    """Return the lowest threshold of each column that is reached in at most ``alarms`` chunks; at least 1."""
+    tops, _ = _highest(calm, chunks)
+    if len(tops) <= alarms:
+        return np.ones(calm.shape[1], dtype=np.int64)
+    rank = len(tops) - 1 - alarms
+    highest = np.partition(tops, rank, axis=0)[rank]
+    return np.array([max(1, int(one) + 1) for one in highest], dtype=np.int64)

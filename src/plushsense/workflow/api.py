@@ -1,0 +1,444 @@
+"""The Python face: what the command line does, as calls. A result shows itself in a notebook.
+
+This is where training and evaluation meet; neither knows of the other.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from plushsense.core.errors import ConfigError
+from plushsense.core.gestures import NOBODY
+from plushsense.core.version import __version__
+from plushsense.dataset.files import CACHE
+from plushsense.dataset.generation import Generation
+from plushsense.dataset.importing.importers import import_recordings
+from plushsense.dataset.index import as_dataset
+from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
+from plushsense.deploy.quantize import (
+    QUANTIZE_VERSION,
+    Ranges,
+    calibration,
+    integer_probabilities,
+    quantize,
+    refuse_undeployable,
+)
+from plushsense.evaluation.crossval import Evaluation, FoldOutput, FoldProgress, windows_fingerprint
+from plushsense.evaluation.crossval import evaluate as crossvalidate
+from plushsense.evaluation.scores import FoldRecord, gather_predictions
+from plushsense.evaluation.scores import compute_scores as score_predictions
+from plushsense.jobs.journal import UNFINISHED, Journal, job_id, keep_if_possible
+from plushsense.models.arch import Arch
+from plushsense.models.bundle import Bundle
+from plushsense.runtime.decisions import DecideSpec
+from plushsense.scoring.splits import parse_split
+from plushsense.training.spec import TrainSpec
+from plushsense.tuning.decisions import fit_decisions as fit_on_people
+from plushsense.windows.cut import ANYWHERE, WindowSet
+from plushsense.workflow.config import RunConfig, from_settings
+from plushsense.workflow.preparation import (
+    WHOLE_PEOPLE,
+    Warn,
+    classes_for,
+    divide,
+    outside_streams,
+    silent,
+    windows_for,
+)
+from plushsense.workflow.reporting import check_place, journal_of, save_evaluation
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from plushsense.training.engine import FitState
+
+
+# So long a training that was stopped can go on.
+_KEPT_S = 30 * 24 * 3600.0
+
+
+def unfinished(dataset: Dataset | str | os.PathLike[str]) -> Journal:
+    """Return the journal in a data set's cache that keeps the state of unfinished trainings."""
+    if isinstance(dataset, Dataset):
+        return journal_of(dataset, UNFINISHED)
+    folder = Path(dataset)
+    return Journal(folder / CACHE / UNFINISHED, Generation.of(folder).writing)
+
+
+class Kept:
+    """The state of one training in a journal, under a key of all that its outcome depends on."""
+
+    def __init__(
+        self, journal: Journal | None, network: Arch, spec: TrainSpec, train: WindowSet, watched: WindowSet
+    ) -> None:
+        self._journal, self.before_s, self._began = journal, 0.0, time.monotonic()
+        if journal is None:
+            return
+        from plushsense.training.fit import resolve_device
+
+        settings = {"arch": network.to_dict(), "training": resolve_device(spec).key(), "vectors": train.vectors}
+        # Most that was given up is never taken up again, and it was trained on people.
+        journal.prune(_KEPT_S)
+        prints = [windows_fingerprint(train), windows_fingerprint(watched)]
+        self._job = job_id({"what": "training", **settings, "windows": prints})
+
+    def found(self) -> FitState | None:
+        held = None if self._journal is None else self._journal.find(self._job)
+        if held is None:
+            return None
+        from plushsense.training.engine import FitState
+
+        self.before_s = float(held["seconds"])
+        return FitState.from_arrays(held)
+
+    def save(self, state: FitState) -> None:
+        if self._journal is not None:
+            spent = self.before_s + time.monotonic() - self._began
+            keep_if_possible(self._journal, self._job, {**state.to_arrays(), "seconds": spent})
+
+    def forget(self) -> None:
+        if self._journal is not None:
+            self._journal.discard(self._job)
+
+
+# Of the held-back windows, the share on which float and 8 bits have to say the same; below it training says so.
+_AGREEMENT = 0.95
+_SAVE_EVERY_S = 0.5
+
+EpochProgress = Callable[[int, int, dict[str, Any]], None]
+
+
+@dataclass(frozen=True)
+class TrainAndPredict:
+    """Train one fold and predict its test windows, as a cross-validation calls it.
+
+    ``int8``: the network is also deployed, with ranges of the windows it was trained on, and reads the test windows.
+    """
+
+    arch: Arch
+    spec: TrainSpec
+    int8: bool = False
+
+    def __call__(
+        self, train: WindowSet, validation: WindowSet, test: WindowSet, progress: EpochProgress, /
+    ) -> FoldOutput:
+        from plushsense.training.fit import fit, predict
+
+        fitted = fit(train, validation, self.arch, self.spec, progress)
+        probabilities = predict(self.arch, fitted.weights, fitted.scaler, test, self.spec.device)
+        deployed = None
+        if self.int8:
+            kept = calibration(self.arch, fitted.weights, fitted.scaler, train.x)
+            network = quantize(self.arch, fitted.weights, fitted.scaler, Ranges.from_dict(kept))
+            deployed = integer_probabilities(network, test.x)
+        return FoldOutput(probabilities, fitted.history, fitted.seconds, fitted.best_epoch, deployed)
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A trained network: ``bundle``, the ``history`` of its epochs, and ``scores`` with what they were taken on.
+
+    ``seconds``: of training, before a stop and after. The bundle does not hold them: the same data, settings and seed
+    give the same file, byte for byte.
+    """
+
+    bundle: Bundle
+    history: list[dict[str, Any]]
+    scores: dict[str, Any]
+    seconds: float = 0.0
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Save the bundle."""
+        return self.bundle.save(Path(path))
+
+    def figure(self) -> Figure:
+        """Loss and accuracy over the epochs."""
+        from plushsense.reports.figures import training_curves
+
+        return training_curves([self.history], title=self.bundle.arch.symbol)
+
+    def __repr__(self) -> str:
+        return f"Trained({self.bundle!r}; {self.scores['said']})"
+
+
+def train(
+    dataset: Dataset | str | os.PathLike[str],
+    config: RunConfig | None = None,
+    *,
+    arch: str | None = None,
+    filters: Sequence[int] | str | None = None,
+    quantize_aware: int = 0,
+    fit_decisions: bool = True,
+    journal: Journal | None = None,
+    progress: EpochProgress | None = None,
+    warn: Warn = silent,
+    **settings: Any,
+) -> Trained:
+    """Train one network on a data set.
+
+    Whole people validate (15 % of them, chosen by the seed), and the scores are theirs. Under presets with early
+    stopping they also decide when to stop, which flatters a little; ask `evaluate` for a figure over everybody.
+    The preset ``search`` splits windows as the paper does (70/15/15), which is leaky, and says so.
+    ``context="anywhere"`` trains for work in a stream (see `windows.anywhere`): idleness is a class then, and what is
+    scored is whole gestures with their real past.
+
+    Args:
+        config: resolved settings; or give ``arch``, ``filters`` and settings such as ``preset="loso"``,
+            ``context="loop"``, ``epochs=20``, ``seed=1``, ``classes="all"``, ``padding``, ``norm``.
+        quantize_aware: epochs of fine-tuning for 8 bits after the training (see `training.quantized`); 0: none.
+        fit_decisions: also fit how decisions are made, on the people who validate (see `live.fitting`). Settings of
+            the configuration's table ``live`` that are not the defaults stay.
+        journal: where the training keeps how far it is (see `plushsense.workflow.api`). One that was stopped or killed
+            then goes on from there and ends in the same bundle; what comes after the training is done anew.
+        progress: called with (epoch, epochs at most, the epoch's row); epochs of before a stop are told first.
+        warn: called with one sentence for everything that was left out, and when 8 bits change many answers.
+    """
+    dataset = as_dataset(dataset)
+    config = config or from_settings(arch=arch, filters=filters, **settings)
+    if quantize_aware < 0:
+        raise ConfigError(f"quantize_aware is {quantize_aware}: accepted are 0 (off) and more epochs.")
+    gestures = classes_for(dataset, config.evaluation.classes, config.windows.context, warn)
+    network = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
+    if quantize_aware:
+        refuse_undeployable(network)
+    windows = windows_for(dataset, network, config.windows, gestures, warn, config.anywhere)
+    scored = windows
+    if config.scored_on != config.windows:
+        scored = windows_for(dataset, network, config.scored_on, gestures)
+    division = divide(windows, config, scored)
+    train_at, test_at = division.train, division.fold.test
+    if division.kind == WHOLE_PEOPLE:
+        # Decisions are fitted on the whole streams of those who validate.
+        train_at = train_at[outside_streams(windows, dataset, division.fold.subjects)[train_at]]
+    from plushsense.training.fit import fit, predict
+
+    train_on, watched = windows.take(train_at), scored.take(division.watch)
+    state = Kept(journal, network, config.training, train_on, watched)
+    start = state.found()
+    if start is not None and progress is not None:
+        for row in start.history:
+            progress(row["epoch"], config.training.epochs, row)
+    fitted = fit(
+        train_on, watched, network, config.training, progress,
+        start=start, save=None if journal is None else state.save, save_every_s=_SAVE_EVERY_S,
+    )  # fmt: skip
+    weights, scaler = fitted.weights, fitted.scaler
+    kept = calibration(network, weights, scaler, windows.x[train_at])
+    if quantize_aware:
+        from plushsense.training.quantized import fine_tune
+
+        tuned = fine_tune(train_on, network, weights, scaler, kept, config.training, quantize_aware, progress)
+        weights = tuned.weights
+    test = scored.take(test_at)
+    probabilities = predict(network, weights, scaler, test, config.training.device)
+    predictions = gather_predictions(scored, [(division.fold.name, test_at)], [probabilities])
+    sizes = (len(train_at), len(division.watch), len(test_at))
+    record = FoldRecord(division.fold.name, division.fold.subjects, sizes, len(fitted.history), fitted.seconds)
+    figures = score_predictions(predictions, [record], scored.affects, division.split.apart)
+    scores = {
+        "split": division.kind,
+        "leaky": division.split.leaky,
+        "said": division.said,
+        "windows": len(test_at),
+        "accuracy": figures["accuracy"]["mean"],
+        "macro_f1": figures["macro_f1"]["mean"],
+        "nobody": figures["nobody"],
+        "best_epoch": fitted.best_epoch,
+        "simulated": dataset.head.simulated,
+        "int8": None,
+    }
+    if kept:
+        integer = quantize(network, weights, scaler, Ranges.from_dict(kept))
+        deployed = gather_predictions(scored, [(division.fold.name, test_at)], [integer_probabilities(integer, test.x)])
+        after = score_predictions(deployed, [record], scored.affects, division.split.apart)
+        same = float((deployed.predicted == predictions.predicted).mean())
+        scores["int8"] = {"accuracy": after["accuracy"]["mean"], "macro_f1": after["macro_f1"]["mean"]}
+        scores["int8"] |= {"agreement": same}
+        if same < _AGREEMENT:
+            more = "more epochs of --quantize-aware" if quantize_aware else "--quantize-aware 10"
+            warn(
+                f"8 bits change {100 * (1 - same):.1f} % of the answers on the windows that were held back: try {more}"
+            )
+    bundle = Bundle(
+        arch=network,
+        weights=weights,
+        layout=dataset.layout,
+        scaler=scaler,
+        gestures=gestures,
+        windowing=_windowing(config),
+        decision=config.live.to_dict(),
+        provenance={
+            "dataset": dataset.head.name,
+            "dataset_hash": dataset.hash,
+            "simulated": dataset.head.simulated,
+            "subjects": sorted({str(s) for s in windows.subject[train_at]}),
+            "validation_subjects": sorted({str(s) for s in scored.subject[division.watch]}),
+            "split": division.kind,
+            "context": _context_counts(windows),
+            "preset": config.preset,
+            "training": config.training.to_dict(),
+            "quantize_aware": quantize_aware,
+            "scores": scores,
+            "code_version": __version__,
+        },
+        calibration=kept,
+    )
+    if fit_decisions:
+        bundle = _with_decisions(bundle, dataset, config.live, warn)
+    state.forget()
+    # Whoever is taken out before the bundle is written is not in the list of those that `forget` found.
+    dataset.generation.check()
+    return Trained(bundle, fitted.history, scores, state.before_s + fitted.seconds)
+
+
+def _with_decisions(bundle: Bundle, dataset: Dataset, given: DecideSpec, warn: Warn) -> Bundle:
+    """Return the bundle with decision settings fitted on the validation people; unchanged without them."""
+    if bundle.provenance["split"] != WHOLE_PEOPLE:
+        warn("decision settings are the defaults: they are fitted on whole people who were held back, and none was")
+        return bundle
+    validated, trained = (
+        set(bundle.provenance[key]) - {NOBODY, UNKNOWN_SUBJECT} for key in ("validation_subjects", "subjects")
+    )
+    plain = DecideSpec()
+    keep = {f.name for f in fields(DecideSpec) if getattr(given, f.name) != getattr(plain, f.name)}
+    decided = fit_on_people(bundle, dataset, validated, training=trained, spec=given, keep=keep)
+    return replace(bundle, decision=decided.to_dict())
+
+
+def _windowing(config: RunConfig) -> dict[str, Any]:
+    """Return how windows were cut, as a bundle keeps it."""
+    tables = config.to_dict()
+    anywhere = {"anywhere": tables["anywhere"]} if config.windows.context == ANYWHERE else {}
+    return {**tables["windows"], **anywhere}
+
+
+def evaluate(
+    dataset: Dataset | str | os.PathLike[str],
+    config: RunConfig | None = None,
+    *,
+    split: str | None = None,
+    arch: str | None = None,
+    filters: Sequence[int] | str | None = None,
+    out: str | os.PathLike[str] | None = None,
+    overwrite: bool = False,
+    cluster: str | None = None,
+    int8: bool = False,
+    progress: Callable[[FoldProgress], None] | None = None,
+    warn: Warn = silent,
+    **settings: Any,
+) -> Evaluation:
+    """Train and score one network for each fold of ``split``.
+
+    Finished folds are kept in the data set's ``cache`` folder; an evaluation that was stopped goes on from there.
+
+    Args:
+        config, arch, filters, settings, warn: as for `train`, and ``train_context``, ``workers``.
+        split: "leave-one-subject-out" (default), "by-subject:5", "by-recording:5", "windows:5" (leaky).
+        out: a folder for ``evaluation.json`` and ``predictions.parquet``; one that holds an evaluation of other
+            settings or data is refused unless ``overwrite``.
+        cluster: address of a Ray cluster that trains the folds instead of this machine's processes.
+        int8: also deploy each fold's network, with ranges of its own training windows, and score it on the same
+            windows: key ``int8`` of the result. Folds that were kept without it are trained again.
+    """
+    dataset = as_dataset(dataset)
+    config = config or from_settings(arch=arch, filters=filters, **settings)
+    if split is not None:
+        config = replace(config, evaluation=replace(config.evaluation, split=split))
+    parse_split(config.evaluation.split)
+    if out is not None:
+        check_place(Path(out), config, dataset, replace=overwrite)
+    gestures = classes_for(dataset, config.evaluation.classes, config.trained_on.context, warn)
+    network = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
+    if int8:
+        refuse_undeployable(network)
+    score = fit_on = windows_for(dataset, network, config.scored_on, gestures, warn)
+    if config.trained_on != config.scored_on:
+        fit_on = windows_for(dataset, network, config.trained_on, gestures, anywhere=config.anywhere)
+    from plushsense.training.fit import resolve_device
+
+    result = crossvalidate(
+        fit_on,
+        score,
+        config.evaluation.split,
+        TrainAndPredict(network, config.training, int8),
+        journal=journal_of(dataset, "folds"),
+        key={
+            "arch": network.to_dict(),
+            "training": resolve_device(config.training).key(),
+            "vectors": fit_on.vectors,
+            **({"int8": QUANTIZE_VERSION} if int8 else {}),
+        },
+        workers=config.evaluation.processes,
+        cluster=cluster,
+        seed=config.evaluation.seed,
+        progress=progress,
+    )
+    if out is not None:
+        with dataset.generation.writing():
+            save_evaluation(result, dataset, config, network, Path(out))
+    return result
+
+
+def load(path: str | os.PathLike[str]) -> Bundle:
+    """Load a model bundle (``*.plush``)."""
+    return Bundle.load(Path(path))
+
+
+def simulate(
+    out: str | os.PathLike[str],
+    *,
+    people: int = 25,
+    repetitions: int = 3,
+    seed: int = 1,
+    dataset: str | os.PathLike[str] | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> dict[str, Any]:
+    """Write recordings of virtual people as the authors' recorder would leave them; by default in the paper's shape.
+
+    Args:
+        out: a new or empty folder.
+        dataset: also import them as a data set there.
+        progress: called with ("recording" or "importing", done, in all).
+    """
+    from plushsense.recording.simulate import simulate as run
+
+    tell = progress or (lambda *_: None)
+    done = run(
+        Path(out),
+        people=people,
+        repetitions=repetitions,
+        seed=seed,
+        progress=lambda at, total, _: tell("recording", at, total),
+    )
+    summary: dict[str, Any] = dict(done.to_dict())
+    if dataset is not None:
+        import_simulation(out, dataset, tell)
+        summary["dataset"] = str(dataset)
+    return summary
+
+
+def import_simulation(
+    source: str | os.PathLike[str], dest: str | os.PathLike[str], progress: Callable[[str, int, int], None]
+) -> Dataset:
+    """Import what `simulate` wrote, as a data set that says what it is."""
+    return import_recordings(
+        Path(source),
+        Path(dest),
+        layout="plush-15",
+        name="virtual toy",
+        licence="MIT",
+        consent="nobody: a simulation",
+        progress=lambda at, total: progress("importing", at, total),
+    ).dataset
+
+
+def _context_counts(windows: WindowSet) -> dict[str, int]:
+    kinds, counts = np.unique(windows.context, return_counts=True)
+    return {str(kind): int(n) for kind, n in zip(kinds, counts, strict=True)}

@@ -1,0 +1,251 @@
+"""Settings of one run: network, training, windows and split. A TOML file can hold them.
+
+    [windows]     window_s, step_s, context, longest_factor
+    [anywhere]    every_s, onset_s, after_s, settle_s, idle_share, busy_share
+    [model]       arch, filters, padding, norm, step_s, pool_s
+    [training]    preset, epochs, batch, learning_rate, halve_every, patience, seed, augment, …
+    [evaluation]  split, classes, train_context, workers, seed
+    [live]        smoothing_s
+
+Flags of the command line go over the file; an unknown key is refused with the nearest known one.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from plushsense.core.errors import ConfigError, nearest
+from plushsense.core.layouts import Layout
+from plushsense.core.toml import check_table, read_toml, refuse_unknown
+from plushsense.models.arch import DEFAULT_FILTERS, DEFAULT_SYMBOL, Arch, parse_filters
+from plushsense.runtime.decisions import DecideSpec
+from plushsense.scoring.splits import parse_split
+from plushsense.training.spec import CONTEXT, PADDING, PRESETS, TrainSpec, preset
+from plushsense.windows.anywhere import AnywhereSpec
+from plushsense.windows.cut import ANYWHERE, TRAIN_CONTEXTS, WindowSpec
+
+SHARED, ALL = "shared", "all"
+
+
+@dataclass(frozen=True)
+class ModelSpec:
+    """The network, in the terms of the toy. ``padding`` None is the preset's; ``pool_s`` None fills the window."""
+
+    arch: str = DEFAULT_SYMBOL
+    filters: tuple[int, ...] = DEFAULT_FILTERS
+    padding: str | None = None
+    norm: str = "batch"
+    step_s: float = 0.05
+    pool_s: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, seconds in (("step_s", self.step_s), ("pool_s", self.pool_s)):
+            if seconds is not None and not 0.0 < seconds <= 60.0:
+                raise ConfigError(f"{name} is {seconds}: accepted is above 0, at most 60 seconds.")
+
+    def build(self, layout: Layout, classes: int, window_s: float, padding: str) -> Arch:
+        """Build the network for a toy's layout and a number of classes."""
+        return Arch.parse(
+            self.arch,
+            self.filters,
+            channels=layout.n_inputs,
+            classes=classes,
+            padding=self.padding or padding,
+            norm=self.norm,
+            window=layout.samples(window_s),
+            step=layout.samples(self.step_s),
+            pool=None if self.pool_s is None else layout.samples(self.pool_s),
+        )
+
+
+@dataclass(frozen=True)
+class EvaluationSpec:
+    """Settings of the scoring. ``train_context`` None: training windows are cut as those that are scored.
+
+    ``classes`` is "shared" (gestures that at least 90 % of the people made and that are not free choice), "all", or
+    labels. ``workers`` 0: one a processor.
+    """
+
+    split: str = "leave-one-subject-out"
+    classes: str | tuple[str, ...] = SHARED
+    train_context: str | None = None
+    workers: int = 0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        parse_split(self.split)
+        for name, value in (("workers", self.workers), ("seed", self.seed)):
+            if value < 0:
+                raise ConfigError(f"{name} is {value}: accepted are whole numbers from 0 up.")
+        context = self.train_context
+        if context is not None and context not in TRAIN_CONTEXTS:
+            raise ConfigError(
+                f"Unknown train_context '{context}': accepted are {', '.join(TRAIN_CONTEXTS)}."
+                f"{nearest(context, TRAIN_CONTEXTS)}"
+            )
+
+    @property
+    def processes(self) -> int:
+        """Worker processes."""
+        return self.workers or os.cpu_count() or 1
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Resolved settings of a run."""
+
+    preset: str = "people"
+    windows: WindowSpec = field(default_factory=WindowSpec)
+    model: ModelSpec = field(default_factory=ModelSpec)
+    training: TrainSpec = field(default_factory=TrainSpec)
+    evaluation: EvaluationSpec = field(default_factory=EvaluationSpec)
+    live: DecideSpec = field(default_factory=DecideSpec)
+    anywhere: AnywhereSpec = field(default_factory=AnywhereSpec)
+
+    @property
+    def trained_on(self) -> WindowSpec:
+        """The windows to train on."""
+        return replace(self.windows, context=self.evaluation.train_context or self.windows.context)
+
+    @property
+    def scored_on(self) -> WindowSpec:
+        """The windows to score: what is trained anywhere is scored on gestures with their real past."""
+        return replace(self.windows, context="stream") if self.windows.context == ANYWHERE else self.windows
+
+    @property
+    def padding(self) -> str:
+        """The padding that is used."""
+        return self.model.padding or PADDING[self.preset]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON, as a bundle keeps them."""
+        return asdict(self) | {"training": self.training.to_dict()}
+
+    def outcome(self) -> dict[str, Any]:
+        """Return the settings that change an evaluation's figures, as plain values for JSON."""
+        evaluation = asdict(self.evaluation) | {
+            "train_context": self.evaluation.train_context or self.windows.context,
+        }
+        del evaluation["workers"]
+        training = {k: v for k, v in self.training.key().items() if k not in ("device", "threads")}
+        anywhere = {"anywhere": asdict(self.anywhere)} if self.trained_on.context == ANYWHERE else {}
+        return {
+            **anywhere,
+            "windows": asdict(self.windows),
+            "model": asdict(self.model) | {"padding": self.padding},
+            "training": training,
+            "evaluation": evaluation,
+        }
+
+
+@dataclass(frozen=True)
+class _TrainingTable(TrainSpec):
+    preset: str = "people"
+    turn_deg: float = 0.0
+
+
+_TABLES: dict[str, type[Any]] = {
+    "windows": WindowSpec,
+    "model": ModelSpec,
+    "training": _TrainingTable,
+    "evaluation": EvaluationSpec,
+    "live": DecideSpec,
+    "anywhere": AnywhereSpec,
+}
+
+_DERIVED = {("windows", "span_s"): "it follows from the network; set arch, window_s or pool_s"}
+
+
+def _checked(name: str, given: Mapping[str, Any], source: str) -> dict[str, Any]:
+    """Return the values of a table, each of the type that its key accepts.
+
+    Raises:
+        ConfigError: for an unknown key, or a value of another type.
+    """
+    for key in given:
+        if (name, key) in _DERIVED:
+            raise ConfigError(f"In [{name}]{source}, {key} cannot be set: {_DERIVED[name, key]}.")
+    if name == "model" and isinstance(given.get("filters"), str):
+        given = {**given, "filters": parse_filters(given["filters"])}
+    values, problems = check_table(given, _TABLES[name], f"[{name}]{source}")
+    if problems:
+        raise ConfigError(problems[0])
+    return values
+
+
+def resolve(path: str | Path | None = None, **flags: Mapping[str, Any]) -> RunConfig:
+    """Read the settings of a TOML file and put ``flags`` over them: ``resolve(None, training={"seed": 3})``.
+
+    A flag of None is not given. ``preset`` stands in the table ``training``.
+
+    Raises:
+        ConfigError: for an unknown table or key (with the nearest known one) or a value that does not fit.
+    """
+    tables: dict[str, dict[str, Any]] = {name: {} for name in _TABLES}
+    if path is not None:
+        content = read_toml(Path(path), "configuration", ConfigError)
+        refuse_unknown(content, _TABLES, f"'{path}'", ConfigError)
+        for name, table in content.items():
+            if not isinstance(table, dict):
+                raise ConfigError(f"'{name}' in '{path}' is a single value; it is a table: write  [{name}]")
+            tables[name].update(_checked(name, table, f" of '{path}'"))
+    refuse_unknown(flags, _TABLES, "the settings", ConfigError)
+    for name, given in flags.items():
+        tables[name].update(_checked(name, {key: value for key, value in given.items() if value is not None}, ""))
+    chosen = tables["training"].pop("preset", "people")
+    training = preset(chosen)
+    tables["windows"].setdefault("context", CONTEXT[chosen])
+    return RunConfig(
+        chosen,
+        WindowSpec(**tables["windows"]),
+        ModelSpec(**tables["model"]),
+        training.changed(**tables["training"]),
+        EvaluationSpec(**tables["evaluation"]),
+        DecideSpec(**tables["live"]),
+        AnywhereSpec(**tables["anywhere"]),
+    )
+
+
+PRESET_NAMES = tuple(PRESETS)
+
+
+# Where each setting of `train`, `evaluate` and `baselines` belongs.
+_SETTINGS: dict[str, tuple[str, ...]] = {
+    "windows": ("context", "window_s", "step_s", "longest_factor"),
+    "model": ("arch", "filters", "padding", "norm", "pool_s"),
+    "training": (
+        "preset",
+        "epochs",
+        "batch",
+        "learning_rate",
+        "halve_every",
+        "patience",
+        "device",
+        "augment",
+        "turn_deg",
+    ),
+    "evaluation": ("classes", "train_context", "workers"),
+    "live": ("smoothing_s",),
+    "anywhere": ("every_s", "onset_s", "after_s", "settle_s", "idle_share", "busy_share"),
+}
+
+
+def from_settings(**settings: Any) -> RunConfig:
+    """Build a configuration from names: ``arch="14d1_39d2_41d4", preset="loso", epochs=20``; None counts as not given.
+
+    Raises:
+        ConfigError: for a name that there is not, with the nearest.
+    """
+    known = [key for keys in _SETTINGS.values() for key in keys] + ["seed"]
+    for key in settings:
+        if key not in known:
+            raise ConfigError(f"Unknown setting '{key}': accepted are {', '.join(known)}.{nearest(key, known)}")
+    tables: dict[str, dict[str, Any]] = {
+        table: {key: settings[key] for key in keys if key in settings} for table, keys in _SETTINGS.items()
+    }
+    tables["training"]["seed"] = tables["evaluation"]["seed"] = settings.get("seed")
+    return resolve(None, **tables)

@@ -1,0 +1,500 @@
+"""A classifier of scikit-learn, for people who have arrays and know its tools and not ours."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from plushsense.core.errors import ArrayError, need
+from plushsense.core.gestures import Gesture, GestureSet, plain_label
+from plushsense.core.layouts import DEVICE_MS, HOST_MS, Channel, CsvFormat, Layout, load_layout
+from plushsense.core.version import __version__
+from plushsense.deploy.quantize import calibration
+from plushsense.models.arch import DEFAULT_FILTERS, DEFAULT_SYMBOL, Arch
+from plushsense.models.bundle import Bundle
+from plushsense.models.reference import softmax
+from plushsense.runtime.decisions import DecideSpec
+from plushsense.scoring.splits import VALIDATION_SHARE
+from plushsense.training.spec import PADDING, preset
+from plushsense.windows.cut import WindowSet
+
+ANONYMOUS = "arrays"
+ANONYMOUS_RATE_HZ = 100.0
+
+_INT32 = np.iinfo(np.int32).max
+# Steps in one spread (standard deviation) of a channel, and steps up to its largest value, which leave room for twice
+# that value later.
+_STEPS_IN_SPREAD = 2.0**16
+_STEPS_IN_PEAK = 2.0**29
+# What a sum's rounding leaves of a channel's spread that has none.
+_CONSTANT = 1e-12
+
+
+def rows_of(X: Any) -> tuple[Any, tuple[int, int] | None]:
+    """Return windows (N, C, T) as rows (N, C·T), as scikit-learn checks them, and (C, T); other input unchanged."""
+    shape = X.shape if hasattr(X, "shape") else np.asarray(X).shape
+    if len(shape) < 3:
+        return X, None
+    if len(shape) > 3:
+        raise ArrayError(f"X has the shape {shape}: expected (N, C, T), or (N, C·T) with channels=C.")
+    return np.reshape(np.asarray(X), (shape[0], shape[1] * shape[2])), (shape[1], shape[2])
+
+
+def shape_of(features: int, found: tuple[int, int] | None, asked: int | None) -> tuple[int, int]:
+    """Return (C, T) of the windows: their own shape, else the one given, else one channel."""
+    if asked is not None and (not isinstance(asked, int | np.integer) or asked < 1):
+        raise ArrayError(f"channels is {asked!r}: accepted are None and whole numbers from 1 up.")
+    if found is not None and asked is not None and found[0] != asked:
+        raise ArrayError(
+            f"X holds windows of {found[0]} channels, but channels or layout say {asked}: change one of them."
+        )
+    channels = found[0] if found is not None else int(asked or 1)
+    if features % channels:
+        raise ArrayError(f"X has n_features = {features}, which {channels} channels do not divide: give (N, C·T).")
+    if features // channels < 2:
+        raise ArrayError(
+            f"X has n_features = {features} in {channels} channels: a window needs at least 2 samples of each."
+        )
+    return channels, features // channels
+
+
+def people_of(groups: ArrayLike | None, n: int) -> NDArray[np.str_]:
+    """Return the person of each window; without groups each window is a person."""
+    people = np.arange(n) if groups is None else np.asarray(groups)
+    if people.shape != (n,):
+        raise ArrayError(f"groups has the shape {people.shape}: expected ({n},), one a window.")
+    return people.astype(str)
+
+
+def watching_of(people: NDArray[np.str_], seed: int) -> NDArray[np.bool_]:
+    """Select the windows of the people who decide when training stops."""
+    names = np.unique(people)
+    if len(names) < 2:
+        return np.zeros(len(people), dtype=bool)
+    held = np.random.default_rng(seed).permutation(names)[: max(1, round(VALIDATION_SHARE * len(names)))]
+    return np.isin(people, held)
+
+
+def anonymous_layout(x: NDArray[Any]) -> Layout:
+    """Build a layout for windows (N, C, T) without channel names.
+
+    Integers of up to 32 bits keep their value (step 1). Floats are read in steps of a power of two, at most 1/65536
+    of the channel's spread but no finer than 2⁻²⁹ of its largest value; a constant channel, from which nothing is
+    learnt, in steps as large as itself. The rate is unknown; 100 Hz stands in for it.
+    """
+    whole = x.dtype.kind in "biu"
+    names = [f"channel {i}" for i in range(x.shape[1])]
+    channels = tuple(
+        Channel(name, "unknown", "unknown", step=_step(x[:, i].astype(np.float64), whole))
+        for i, name in enumerate(names)
+    )
+    columns = (HOST_MS, DEVICE_MS, *names)
+    return Layout(
+        name=ANONYMOUS,
+        title=f"Arrays of unknown sensors; {ANONYMOUS_RATE_HZ:g} Hz assumed",
+        rate_hz=ANONYMOUS_RATE_HZ,
+        channels=channels,
+        wire=(DEVICE_MS, *names),
+        derived=(),
+        inputs=tuple(names),
+        csv=CsvFormat(columns, columns, ", "),
+    )
+
+
+def _step(values: NDArray[np.float64], whole: bool) -> float:
+    peak = float(np.abs(values).max())
+    if peak == 0.0 or (whole and peak <= _INT32):
+        return 1.0
+    # Divided first: squares of large values would not be finite.
+    spread = float((values / peak).std())
+    finest = max(spread / _STEPS_IN_SPREAD, 1.0 / _STEPS_IN_PEAK) if spread > _CONSTANT else 1.0
+    return float(2.0 ** np.floor(np.log2(max(finest * peak, 1e-300))))
+
+
+def to_integers(x: NDArray[Any], layout: Layout) -> NDArray[np.int32]:
+    """Scale windows (N, C, T) to the integers that a network of ``layout`` reads.
+
+    With an anonymous layout, values are rounded to its steps, and what 32 bits do not hold is cut off. With a real
+    one, windows are those of `cut_windows`, integers already.
+
+    Raises:
+        ArrayError: for values that are not finite, or no integers where the layout is real.
+    """
+    refuse_holes(x)
+    if layout.name == ANONYMOUS:
+        steps = np.array([c.step for c in layout.channels])
+        whole: NDArray[np.int32] = np.clip(np.rint(x / steps[:, None]), -_INT32, _INT32).astype(np.int32)
+        return whole
+    if x.dtype.kind == "f" and (np.rint(x) != x).any():
+        raise ArrayError(
+            f"X holds values that are not whole numbers, but with the layout '{layout.name}' it must hold the integers "
+            "that cut_windows gives: leave scaling to the classifier, or leave layout out."
+        )
+    if x.size and (x.max() > _INT32 or x.min() < -_INT32 - 1):
+        raise ArrayError(f"X holds values beyond 32 bits, which the layout '{layout.name}' cannot hold: check X.")
+    return x.astype(np.int32)
+
+
+def refuse_holes(x: NDArray[Any]) -> None:
+    """Refuse NaN and infinity, saying where the first is."""
+    if x.dtype.kind == "f" and not np.isfinite(x).all():
+        bad = ~np.isfinite(x)
+        window, channel, sample = (int(i) for i in np.argwhere(bad)[0])
+        raise ArrayError(
+            f"X holds NaN or infinity in {int(bad.any(axis=(1, 2)).sum())} of {len(x)} windows, first in window "
+            f"{window}, channel {channel}, sample {sample}: fill such places or leave these windows out."
+        )
+
+
+def windows_of(
+    x: NDArray[np.int32], y: NDArray[np.int64], people: NDArray[np.str_], layout: Layout, gestures: GestureSet
+) -> WindowSet:
+    """Build a window set in which each window is a recording of its own."""
+    n = len(x)
+    rows = np.full((n, 2), -1, dtype=np.int64)
+    return WindowSet(
+        x=x,
+        y=y,
+        labels=gestures.labels,
+        affects=gestures.affects,
+        families=gestures.families,
+        recording=np.arange(n, dtype=np.int64),
+        recording_ids=tuple(map(str, range(n))),
+        subject=people,
+        context=np.full(n, "inside"),
+        stream=np.full(n, ""),
+        window_rows=rows,
+        recording_rows=rows,
+        rate_hz=layout.rate_hz,
+        inputs=layout.inputs,
+        vectors=tuple(
+            tuple(layout.inputs.index(axis) for axis in vector)
+            for vector in layout.vectors
+            if set(vector) <= set(layout.inputs)
+        ),
+    )
+
+
+def gestures_of(classes: NDArray[Any], known: GestureSet | None = None) -> GestureSet:
+    """Build a gesture for each class, in class order, with affect and family where ``known`` has the label.
+
+    Labels that a gesture set would take for one (``a`` and ``A``), or that are empty, are told apart by their number.
+    """
+    texts = [str(c) for c in classes.tolist()]
+    plain = [plain_label(t) for t in texts]
+    if "" in plain or len(set(plain)) < len(plain):
+        texts = [f"class {i}: {t}" for i, t in enumerate(texts)]
+    found = [known.find(t) if known is not None else None for t in texts]
+    gestures = tuple(replace(g, label=t) if g else Gesture(t) for g, t in zip(found, texts, strict=True))
+    return GestureSet(known.name if known is not None else ANONYMOUS, gestures, inferred=known is None)
+
+
+def labels_table(classes: NDArray[Any]) -> dict[str, Any]:
+    """Return the labels of ``classes`` as a bundle keeps them; `labels_from` restores them with their type."""
+    values = classes.tolist()
+    if not all(isinstance(v, str | int | float) for v in values):
+        return {"labels": [str(v) for v in values], "dtype": "O"}
+    return {"labels": values, "dtype": "O" if classes.dtype.kind == "O" else classes.dtype.str}
+
+
+def labels_from(bundle: Bundle) -> NDArray[Any]:
+    """Restore the class labels of a bundle with their type; without a table, the gestures' labels."""
+    table = bundle.provenance.get("estimator", {})
+    if "labels" not in table:
+        return np.array(bundle.gestures.labels)
+    return np.array(table["labels"], dtype=np.dtype(table["dtype"]))
+
+
+if TYPE_CHECKING or importlib.util.find_spec("sklearn") is None:
+    # The name must load in every install (`from plushsense import *`), so what scikit-learn would give is only
+    # declared here; making a classifier says what to install. The type checker reads the same lines.
+    class BaseEstimator:
+        def __new__(cls, *_: Any, **__: Any) -> Self:
+            need("sklearn", "baselines")
+            return super().__new__(cls)
+
+        def get_params(self, deep: bool = True) -> dict[str, Any]: ...
+        def set_params(self, **params: Any) -> Self: ...
+        def set_fit_request(self, *, groups: bool | str | None = None) -> Self: ...
+        def __sklearn_tags__(self) -> Any: ...
+        def __getstate__(self) -> dict[str, Any]: ...
+        def __setstate__(self, state: dict[str, Any]) -> None: ...
+
+    class ClassifierMixin:
+        def score(self, X: ArrayLike, y: ArrayLike, sample_weight: ArrayLike | None = None) -> float: ...
+
+else:
+    from sklearn.base import BaseEstimator, ClassifierMixin
+
+# Windows at a time: what a layer computes is in memory whole.
+_READ = 256
+
+
+class PlushClassifier(ClassifierMixin, BaseEstimator):
+    """Learns to tell windows apart: a small 1D CNN, with the manners of scikit-learn.
+
+        windows = ps.cut_windows(dataset)
+        y = np.array(windows.labels)[windows.y]
+        model = ps.PlushClassifier(layout=dataset.layout)
+        cross_val_score(model, windows.x, y, groups=windows.subject, cv=LeaveOneGroupOut())
+        model.fit(windows.x, y).save("model.plush", gestures=dataset.gestures)     # for ``plushsense live``
+
+    ``X`` is (N, C, T): N windows of C channels of T samples; or (N, C·T), as ``X.reshape(N, -1)`` makes it and
+    pipelines pass it on: one channel after the other, how many says ``channels`` (1 where neither it nor ``layout`` is
+    given). Both forms may be mixed between ``fit`` and ``predict``. Labels may be of any type that scikit-learn
+    sorts; ``predict`` gives the same type back. Sample weights are not supported, nor is ``partial_fit``.
+
+    Training needs the extra ``train`` (PyTorch); a trained or unpickled classifier predicts without it. A pickle holds
+    the network as a bundle's bytes and no object of PyTorch.
+
+    Args:
+        arch, filters, padding, norm: the network (see `Arch`). The padding None is the preset's: ``stream`` for
+            most, which needs T of at least the receptive field; ``mirror`` works with any T from 2.
+        preset, epochs, batch, learning_rate: the training; None keeps the preset's number.
+        channels: how many channels a row (N, C·T) holds.
+        layout: a `Layout`, or its name or path, where ``X`` holds the integers of `cut_windows`: then vectors are
+            turned in training as `train` does, and the bundle reads a toy. Without it, channels are anonymous, floats
+            are read in steps of at most 1/65536 of a channel's spread, and the bundle assumes 100 Hz.
+        random_state: a whole number gives the same weights each time; also a RandomState, or None for chance.
+
+    Attributes:
+        classes_: the labels in class order, (K,).
+        n_features_in_: C·T.
+        bundle_: the trained `Bundle`; its gestures are the classes.
+        history_: one row an epoch, as `Fitted.history`.
+
+    Raises:
+        ArrayError: a ValueError, for arrays that do not fit. What scikit-learn checks itself it refuses in its own
+            words (ValueError, NotFittedError).
+    """
+
+    # With metadata routing on, groups reach ``fit`` unless set_fit_request says otherwise.
+    __metadata_request__fit = {"groups": True}  # noqa: RUF012, RUF100
+
+    classes_: NDArray[Any]
+    n_features_in_: int
+    bundle_: Bundle
+    history_: list[dict[str, Any]]
+
+    def __init__(
+        self,
+        arch: str = DEFAULT_SYMBOL,
+        filters: Sequence[int] | str = DEFAULT_FILTERS,
+        padding: str | None = None,
+        norm: str = "batch",
+        preset: str = "people",
+        epochs: int | None = None,
+        batch: int | None = None,
+        learning_rate: float | None = None,
+        channels: int | None = None,
+        layout: Layout | str | os.PathLike[str] | None = None,
+        random_state: int | np.random.RandomState | None = 0,
+    ) -> None:
+        self.arch = arch
+        self.filters = filters
+        self.padding = padding
+        self.norm = norm
+        self.preset = preset
+        self.epochs = epochs
+        self.batch = batch
+        self.learning_rate = learning_rate
+        self.channels = channels
+        self.layout = layout
+        self.random_state = random_state
+
+    def __sklearn_tags__(self) -> Any:
+        tags = super().__sklearn_tags__()
+        tags.input_tags.three_d_array = True
+        return tags
+
+    def fit(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None = None) -> Self:
+        """Train on the windows ``X`` with the labels ``y`` (N,).
+
+        ``groups`` (N,) names the person of each window. Under a preset that stops early (``loso``, ``paper``) 15 % of
+        the people decide when; without groups 15 % of the windows do, which is leaky. Other presets train on all of X.
+        The bundle keeps their names, as that of `train` does, so that `forget` finds it.
+        """
+        from sklearn.utils.multiclass import check_classification_targets
+        from sklearn.utils.validation import validate_data
+
+        from plushsense.training.fit import fit
+
+        layout = self._known_layout()
+        rows, found = rows_of(X)
+        rows, labels = validate_data(self, rows, y, ensure_all_finite=False)
+        asked = self.channels
+        if layout is not None:
+            if asked not in (None, layout.n_inputs):
+                raise ArrayError(f"channels is {asked}, but the layout '{layout.name}' has {layout.n_inputs} inputs.")
+            asked = layout.n_inputs
+        channels, samples = shape_of(rows.shape[1], found, asked)
+        x = rows.reshape(len(rows), channels, samples)
+        refuse_holes(x)
+        check_classification_targets(labels)
+        classes, index = np.unique(labels, return_inverse=True)
+        if len(classes) < 2:
+            raise ArrayError(f"y holds one class ({classes[0]!s}) and no other: telling apart needs at least two.")
+        spec = preset(
+            self.preset,
+            epochs=_plain(self.epochs),
+            batch=_plain(self.batch),
+            learning_rate=_plain(self.learning_rate),
+            seed=_seed(self.random_state),
+        )
+        layout = layout or anonymous_layout(x)
+        gestures = gestures_of(classes)
+        arch = Arch.parse(
+            self.arch,
+            self.filters,
+            channels=channels,
+            classes=len(classes),
+            padding=PADDING[self.preset] if self.padding is None else self.padding,
+            norm=self.norm,
+            window=samples,
+            step=min(5, samples),
+        )
+        if arch.span > samples:
+            raise ArrayError(
+                f"X has windows of {samples} samples, but {arch.symbol} under the padding '{arch.padding}' sees "
+                f"{arch.span}: give longer windows, a shorter network, or padding='mirror'."
+            )
+        people = people_of(groups, len(x))
+        windows = windows_of(to_integers(x, layout), index.astype(np.int64), people, layout, gestures)
+        watching = watching_of(people, spec.seed) if spec.patience is not None else np.zeros(len(x), dtype=bool)
+        fitted = fit(
+            windows.take(np.flatnonzero(~watching)),
+            windows.take(np.flatnonzero(watching)) if watching.any() else None,
+            arch,
+            spec,
+        )
+        named = groups is not None
+        self.classes_, self.history_ = classes, fitted.history
+        self.bundle_ = Bundle(
+            arch=arch,
+            weights=fitted.weights,
+            layout=layout,
+            scaler=fitted.scaler,
+            gestures=gestures,
+            windowing={"window_s": samples / layout.rate_hz, "context": "unknown"},
+            decision=DecideSpec().to_dict(),
+            provenance={
+                "dataset": "arrays given to PlushClassifier",
+                "estimator": {"settings": self._settings(), **labels_table(classes)},
+                "windows": len(x),
+                "subjects": sorted(set(people[~watching].tolist())) if named else [],
+                "validation_subjects": sorted(set(people[watching].tolist())) if named else [],
+                "split": "none",
+                "preset": self.preset,
+                "training": spec.to_dict(),
+                "code_version": __version__,
+            },
+            calibration=calibration(arch, fitted.weights, fitted.scaler, windows.x[~watching]),
+        )
+        return self
+
+    def decision_function(self, X: ArrayLike) -> NDArray[np.float64]:
+        """Return logits (N, K) in the order of ``classes_``; for two classes second minus first, (N,)."""
+        logits = self._logits(X)
+        return logits[:, 1] - logits[:, 0] if logits.shape[1] == 2 else logits
+
+    def predict_proba(self, X: ArrayLike) -> NDArray[np.float64]:
+        """Return probabilities (N, K) in the order of ``classes_``."""
+        return softmax(self._logits(X))
+
+    def predict(self, X: ArrayLike) -> NDArray[Any]:
+        """Return the most probable label of each window, (N,)."""
+        best = self._logits(X).argmax(axis=1)
+        found: NDArray[Any] = self.classes_[best]
+        return found
+
+    def to_bundle(self, gestures: GestureSet | None = None) -> Bundle:
+        """Return the trained network as a bundle, with affects and families of the labels that ``gestures`` knows."""
+        from sklearn.utils.validation import check_is_fitted
+
+        check_is_fitted(self, "bundle_")
+        return (
+            self.bundle_ if gestures is None else replace(self.bundle_, gestures=gestures_of(self.classes_, gestures))
+        )
+
+    def save(self, path: str | os.PathLike[str], gestures: GestureSet | None = None) -> Path:
+        """Save the bundle (``*.plush``), for `load`, ``plushsense live`` and `from_bundle`."""
+        return self.to_bundle(gestures).save(Path(path))
+
+    @classmethod
+    def from_bundle(cls, bundle: Bundle | str | os.PathLike[str]) -> Self:
+        """Build a trained classifier from any bundle; ``X`` is then what that training read."""
+        bundle = bundle if isinstance(bundle, Bundle) else Bundle.load(Path(bundle))
+        arch = bundle.arch
+        settings: dict[str, Any] = {
+            "arch": arch.symbol,
+            "filters": arch.filters,
+            "padding": arch.padding,
+            "norm": arch.norm,
+            "channels": arch.channels,
+            "layout": None if bundle.layout.name == ANONYMOUS else bundle.layout,
+        }
+        kept = bundle.provenance.get("estimator", {}).get("settings", {})
+        made = cls(**settings, **{name: kept[name] for name in _TRAINING if name in kept})
+        made.bundle_, made.classes_, made.history_ = bundle, labels_from(bundle), []
+        made.n_features_in_ = arch.channels * max(arch.window, arch.span)
+        return made
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = dict(super().__getstate__())
+        if "bundle_" in state:
+            state["bundle_"] = state["bundle_"].to_bytes()
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        state = dict(state)
+        if "bundle_" in state:
+            state["bundle_"] = Bundle.from_bytes(state["bundle_"], "in the pickle")
+        super().__setstate__(state)
+
+    def _known_layout(self) -> Layout | None:
+        if self.layout is None or isinstance(self.layout, Layout):
+            return self.layout
+        return load_layout(self.layout if isinstance(self.layout, str) else Path(self.layout))
+
+    def _settings(self) -> dict[str, Any]:
+        """Return the training settings as a bundle keeps them for `from_bundle`."""
+        kept = {name: _plain(getattr(self, name)) for name in _TRAINING}
+        return kept | {"random_state": kept["random_state"] if isinstance(kept["random_state"], int) else None}
+
+    def _logits(self, X: ArrayLike) -> NDArray[np.float64]:
+        from sklearn.utils.validation import check_is_fitted, validate_data
+
+        check_is_fitted(self, "bundle_")
+        channels = self.bundle_.arch.channels
+        shape = (channels, self.n_features_in_ // channels)
+        rows, found = rows_of(X)
+        if found not in (None, shape):
+            raise ArrayError(f"X has the shape {np.asarray(X).shape}: expected (N, {shape[0]}, {shape[1]}), as in fit.")
+        rows = validate_data(self, rows, reset=False, ensure_all_finite=False)
+        x = to_integers(rows.reshape(len(rows), *shape), self.bundle_.layout)
+        network, scaler = self.bundle_.network(), self.bundle_.scaler
+        return np.concatenate([network.forward(scaler.apply(x[at : at + _READ])) for at in range(0, len(x), _READ)])
+
+
+# The settings that only the training reads.
+_TRAINING = ("preset", "epochs", "batch", "learning_rate", "random_state")
+
+
+def _seed(random_state: Any) -> int:
+    from sklearn.utils import check_random_state
+
+    if isinstance(random_state, int | np.integer):
+        return int(random_state)
+    return int(check_random_state(random_state).randint(np.iinfo(np.int32).max))
+
+
+def _plain(value: Any) -> Any:
+    """Convert a NumPy number to a Python number."""
+    return value.item() if isinstance(value, np.generic) else value

@@ -1,0 +1,131 @@
+"""Choose the gestures and cut the windows that a network is trained on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import DatasetError
+from plushsense.core.gestures import NOBODY, GestureSet
+from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
+from plushsense.evaluation.folds import WindowFold, fold_windows
+from plushsense.models.arch import Arch
+from plushsense.scoring.splits import VALIDATION_SHARE, Split, parse_split
+from plushsense.windows.anywhere import AnywhereSpec, add_idle_gesture, cut_anywhere
+from plushsense.windows.cut import ANYWHERE, WindowSet, WindowSpec, cut_windows, shared_gestures
+from plushsense.workflow.config import ALL, SHARED, RunConfig
+
+Warn = Callable[[str], None]
+
+
+def silent(_: str) -> None:
+    """Ignore a warning."""
+
+
+def choose_classes(dataset: Dataset, wanted: str | Sequence[str], warn: Warn = silent) -> GestureSet:
+    """Return the classes to tell apart: "shared", "all", or labels (a list, or text with commas)."""
+    if wanted == SHARED:
+        gestures, left_out = shared_gestures(dataset)
+        if left_out:
+            reasons = "; ".join(f"{label} ({why})" for label, why in left_out.items())
+            warn(f"left out of the shared gestures: {reasons}")
+    elif wanted == ALL:
+        made = {r.gesture for r in dataset.used}
+        gestures = dataset.gestures.subset([g for g in dataset.gestures.labels if g in made])
+    else:
+        labels = wanted.split(",") if isinstance(wanted, str) else wanted
+        gestures = dataset.gestures.subset([label.strip() for label in labels])
+    if len(gestures) < 2:
+        raise DatasetError(
+            f"Only {len(gestures)} gesture is left to tell apart ({', '.join(gestures.labels) or 'none'}): "
+            "choose others with --classes all or --classes LABEL,LABEL."
+        )
+    return gestures
+
+
+def classes_for(dataset: Dataset, wanted: str | Sequence[str], context: str, warn: Warn = silent) -> GestureSet:
+    """Return the chosen classes, with one for idleness where training goes anywhere in a stream."""
+    gestures = choose_classes(dataset, wanted, warn)
+    if context != ANYWHERE:
+        return gestures
+    with_one = add_idle_gesture(gestures, dataset)
+    if added := [g.label for g in with_one.gestures if g not in gestures.gestures]:
+        warn(f"added a class for what happens between gestures: {added[0]}")
+    return with_one
+
+
+def windows_for(
+    dataset: Dataset,
+    arch: Arch,
+    spec: WindowSpec,
+    gestures: GestureSet,
+    warn: Warn = silent,
+    anywhere: AnywhereSpec | None = None,
+) -> WindowSet:
+    """Cut windows as ``arch`` needs them, with as much past as a decision sees."""
+    span_s = arch.span / dataset.layout.rate_hz
+    spec = replace(spec, span_s=span_s if span_s > spec.window_s else 0.0)
+    if spec.context == ANYWHERE:
+        cut = cut_anywhere(dataset, spec, gestures, anywhere)
+    else:
+        cut = cut_windows(dataset, spec, gestures)
+    for line in cut.left_out:
+        warn(f"left out: {line}")
+    return cut
+
+
+def outside_streams(windows: WindowSet, dataset: Dataset, people: Collection[str]) -> NDArray[np.bool_]:
+    """Return which windows lie in no stream of ``people``, (N,).
+
+    The toy at rest is nobody's and trains in every fold, but somebody may have recorded it within a session; whoever
+    is heard as a whole stream must not have given any of it.
+    """
+    theirs = [s.id for s in dataset.streams if s.subject in people]
+    return ~np.isin(windows.stream, np.array(theirs, dtype=np.str_))
+
+
+WHOLE_PEOPLE = "validation-subjects"
+
+
+@dataclass(frozen=True)
+class TrainValidationSplit:
+    """The train/validation split of a single training, with a description in words."""
+
+    split: Split
+    kind: str
+    said: str
+    fold: WindowFold
+    train: NDArray[np.int64]
+    watch: NDArray[np.int64]
+
+
+def divide(windows: WindowSet, config: RunConfig, scored: WindowSet | None = None) -> TrainValidationSplit:
+    """Hold some people back; of fewer than three, some recordings. Nothing that is scored is trained on.
+
+    ``watch`` and ``test`` are of ``scored``: the same recordings, cut in another way (the same when left out).
+    """
+    scored = windows if scored is None else scored
+    seed = config.evaluation.seed
+    stopped = "" if config.training.patience is None else " but decided when to stop"
+    if config.preset == "search":
+        split = parse_split("windows:holdout")
+        fold = fold_windows(windows, scored, split, seed)[0]
+        said = "15 % of the windows, drawn at random: leaky, windows of one recording stand on both sides"
+        return TrainValidationSplit(split, split.text, said, fold, fold.train, fold.validation)
+    people = set(windows.subject.tolist()) - {NOBODY, UNKNOWN_SUBJECT}
+    if len(people) >= 3:
+        split = parse_split(f"by-subject:{min(len(people), round(1 / VALIDATION_SHARE))}")
+        kind, said = WHOLE_PEOPLE, f"people who were not trained on{stopped}: "
+    else:
+        recordings = len(np.unique(windows.recording))
+        split = parse_split(f"by-recording:{max(2, min(recordings // 2, round(1 / VALIDATION_SHARE)))}")
+        kind = "validation-recordings"
+        said = f"recordings that were not trained on{stopped}; of the people who were, so flattering"
+    fold = fold_windows(windows, scored, split, seed)[0]
+    if split.apart:
+        said += ", ".join(fold.subjects)
+    rest = np.sort(np.concatenate([fold.train, fold.validation]))
+    return TrainValidationSplit(split, kind, said, fold, rest, fold.test)

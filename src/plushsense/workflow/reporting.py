@@ -1,0 +1,225 @@
+"""Evaluations on disk, and the page that shows them."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from plushsense.core.errors import BadInput, ConfigError
+from plushsense.core.files import write_file
+from plushsense.core.version import __version__
+from plushsense.dataset.files import CACHE
+from plushsense.dataset.index import as_dataset
+from plushsense.dataset.store import Dataset
+from plushsense.evaluation.crossval import Evaluation
+from plushsense.jobs.journal import Journal, job_id
+from plushsense.models.arch import Arch
+from plushsense.models.bundle import Bundle
+from plushsense.workflow.config import RunConfig
+
+
+def check_folder(out: Path, what: str) -> None:
+    """Check that results can be written to the folder ``out``; ``what`` names them, as in "A sweep".
+
+    Raises:
+        ConfigError: where it cannot.
+    """
+    there = next(p for p in (out.absolute(), *out.absolute().parents) if p.exists())
+    if not there.is_dir():
+        raise ConfigError(f"{what} cannot be written to '{out}': '{there}' is a file; give a folder.")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise ConfigError(f"{what} cannot be written to '{out}': you may not write in '{there}'.")
+
+
+def journal_of(dataset: Dataset, kind: str) -> Journal:
+    """Return the journal of one kind of results in the data set's cache.
+
+    It refuses what was made with a person who was taken out since ``dataset`` was opened (`dataset.generation`).
+    """
+    return Journal(dataset.path / CACHE / kind, dataset.generation.writing)
+
+
+def machine(*more: str) -> str:
+    """Describe the processor, ``more`` and the system in plain words, without the host's name."""
+    processor = platform.processor() or platform.machine()
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+        processor = next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        pass
+    return ", ".join((processor, *more, platform.system()))
+
+
+SCORES, PREDICTIONS, PAGE = "evaluation.json", "predictions.parquet", "report.html"
+
+
+def evaluation_id(config: RunConfig, dataset: Dataset) -> str:
+    """Return 20 hexadecimal digits that are the same for the same settings and data."""
+    return job_id({"settings": config.outcome(), "data": dataset.hash})
+
+
+def check_place(out: Path, config: RunConfig, dataset: Dataset, *, replace: bool = False) -> None:
+    """Check that an evaluation can be written to a folder, before hours of training rather than after.
+
+    Raises:
+        ConfigError: where ``out`` is no folder and cannot be one, holds a ``report.html`` of something else, or (not
+            with ``replace``) an evaluation of other settings or other data.
+    """
+    from plushsense.reports.page import check_page_path
+
+    check_folder(out, "An evaluation")
+    check_page_path(out / PAGE)
+    path = out / SCORES
+    if replace or not path.exists():
+        return
+    held = _evaluation_table(path)
+    if held.get("id") == evaluation_id(config, dataset):
+        return
+    kept = held.get("dataset")
+    other = isinstance(kept, Mapping) and kept.get("hash") != dataset.hash
+    raise ConfigError(
+        f"'{out}' holds an evaluation of {'other data' if other else 'other settings'} "
+        f"({held.get('split')}, {held.get('title')}): choose another --out, or --force to replace it."
+    )
+
+
+def save_evaluation(result: Evaluation, dataset: Dataset, config: RunConfig, arch: Arch, out: Path) -> Path:
+    """Write ``predictions.parquet`` and ``evaluation.json`` (scores, data set, network, settings) to a folder."""
+    out.mkdir(parents=True, exist_ok=True)
+    # Never predictions beside the scores of others: who is in them is read from there when a person is to be forgotten.
+    (out / SCORES).unlink(missing_ok=True)
+    result.write_predictions(out / PREDICTIONS)
+    content = {
+        **result.to_dict(),
+        "predictions": PREDICTIONS,
+        "id": evaluation_id(config, dataset),
+        "simulated": dataset.head.simulated,
+        "validation_decides": config.training.patience is not None,
+        "title": evaluation_title(result, arch, config),
+        "model": card(arch, rate_hz=dataset.layout.rate_hz),
+        "dataset": dataset.summary(),
+        "config": config.to_dict(),
+        "code_version": __version__,
+    }
+    path = out / SCORES
+    write_file(path, json.dumps(content, ensure_ascii=False, indent=1))
+    return path
+
+
+def evaluation_title(result: Evaluation, arch: Arch, config: RunConfig) -> str:
+    """Return a title that tells one evaluation from another."""
+    context = f"{result.context} context"
+    if result.train_context != result.context:
+        context += f", trained on {result.train_context}"
+    training = f"{config.preset} training, seed {config.training.seed}"
+    return f"{arch.title} {arch.padding}, {result.split.text}, {context}, {training}"
+
+
+def card(arch: Arch, **more: Any) -> dict[str, Any]:
+    """Return the counts of a network for a model card and the command line."""
+    return {
+        **arch.to_dict(),
+        "parameters": arch.parameters,
+        "receptive_field": arch.receptive_field,
+        "span": arch.span,
+        "macs_per_window": arch.macs_per_window,
+        "macs_per_step": arch.macs_per_step,
+        "state_bytes_int8": arch.state_bytes_int8,
+        "table3": arch.table3,
+        **more,
+    }
+
+
+def write_report(
+    path: str | os.PathLike[str],
+    dataset: Dataset | str | os.PathLike[str],
+    evaluations: Sequence[Evaluation | Mapping[str, Any] | str | os.PathLike[str]] = (),
+    models: Sequence[Bundle | str | os.PathLike[str]] = (),
+    title: str | None = None,
+) -> Path:
+    """Write one self-contained HTML page: data set, protocol, scores, confusions, curves, model cards.
+
+    Args:
+        evaluations: results of `evaluate`, or folders (or files) where they were saved.
+        models: bundles, or their paths.
+    """
+    from plushsense.reports.evaluation import write_evaluation_report
+
+    dataset = as_dataset(dataset)
+    summary = dataset.summary()
+    bundles = [b if isinstance(b, Bundle) else Bundle.load(Path(b)) for b in models]
+    cards = [
+        card(
+            b.arch,
+            rate_hz=b.layout.rate_hz,
+            name=str(b.provenance.get("name", f"{b.arch.symbol} trained on {b.provenance.get('dataset', '?')}"))
+            + (f", adapted to {b.adapted_to}" if b.personal else ""),
+            provenance=dict(b.provenance),
+        )
+        for b in bundles
+    ]
+    shown = {
+        "name": summary["name"],
+        "layout": dataset.layout.title,
+        "subjects": summary["subjects"],
+        "recordings": summary["recordings"],
+        "gestures": [f"{g['label']} ({g['recordings']})" for g in summary["gestures"]],
+        "streams": summary["streams"],
+        "recordings located in a stream": summary["located_in_stream"],
+        "warnings": summary["with_warnings"],
+        "excluded": summary["excluded"],
+        "licence": summary["licence"],
+        "hash": summary["hash"],
+    }
+    with dataset.generation.writing():
+        return write_evaluation_report(
+            Path(path),
+            title=title or f"PlushSense: {summary['name']}",
+            dataset=shown,
+            evaluations=[_evaluation_table(e) for e in evaluations],
+            models=cards,
+            simulated=bool(summary["simulated"]),
+        )
+
+
+def _evaluation_table(given: Evaluation | Mapping[str, Any] | str | os.PathLike[str]) -> dict[str, Any]:
+    if isinstance(given, Evaluation):
+        return given.to_dict()
+    if isinstance(given, Mapping):
+        table = dict(given)
+    else:
+        path = Path(given)
+        path = path / SCORES if path.is_dir() else path
+        try:
+            table = json.loads(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            raise BadInput(
+                f"There is no evaluation at '{path}': make one with  plushsense evaluate ... --out DIR"
+            ) from None
+        except (OSError, ValueError) as cause:
+            raise BadInput(
+                f"'{path}' is not an evaluation ({cause}): give a folder that evaluate --out wrote."
+            ) from None
+        if not isinstance(table, dict):
+            raise BadInput(f"'{path}' is not an evaluation: give a folder that evaluate --out wrote.")
+    # The page has its own words for the network; the counts stand on the model card.
+    table.pop("model", None)
+    return table
+
+
+def name_of(config: RunConfig, dataset: Dataset) -> str:
+    """Return a folder name for an evaluation: readable settings, and a hash of everything else."""
+    from plushsense.workflow.reporting import evaluation_id
+
+    evaluation, model = config.evaluation, config.model
+    context = config.windows.context
+    if evaluation.train_context not in (None, context):
+        context = f"{evaluation.train_context}-to-{context}"
+    filters = "-".join(map(str, model.filters))
+    parts = (evaluation.split.replace(":", "-"), model.arch, filters, config.padding, model.norm, context)
+    words = "_".join(parts) + f"_{config.preset}_e{config.training.epochs}_seed{config.training.seed}"
+    return f"{words[:180]}_{evaluation_id(config, dataset)[:8]}"

@@ -1,0 +1,88 @@
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from plushsense.core.errors import DatasetError
+from plushsense.core.files import PART, new_folder, replacing_file, write_file
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows refuses to replace a file that is being replaced")
+def test_threads_that_write_one_file_at_once_leave_one_of_their_texts(tmp_path: Path) -> None:
+    path = tmp_path / "index.csv"
+    texts = [letter * 100_000 for letter in "abcd"]
+    failed: list[OSError] = []
+
+    def write(text: str) -> None:
+        try:
+            for _ in range(30):
+                write_file(path, text)
+        except OSError as cause:
+            failed.append(cause)
+
+    threads = [threading.Thread(target=write, args=(text,)) for text in texts]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert failed == []
+    assert path.read_text(encoding="utf-8") in texts
+    assert [p.name for p in tmp_path.iterdir()] == ["index.csv"]
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(p.name for p in folder.iterdir())
+
+
+@pytest.mark.parametrize("content", ["ä\n", b"\x00\r\n"])
+def test_a_file_is_replaced_byte_for_byte(tmp_path: Path, content: str | bytes) -> None:
+    path = tmp_path / "a.txt"
+    for _ in range(2):
+        write_file(path, content)
+        assert path.read_bytes() == (content if isinstance(content, bytes) else content.encode())
+    assert names(tmp_path) == ["a.txt"]
+
+
+@pytest.mark.parametrize("failure", [OSError, KeyboardInterrupt])
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path, failure: type[BaseException]) -> None:
+    path = tmp_path / "a.txt"
+    write_file(path, "old")
+    with pytest.raises(failure), replacing_file(path) as part:
+        part.write_text("new")
+        assert names(tmp_path) == [part.name, "a.txt"] and part.name.endswith(PART)
+        raise failure
+    assert (path.read_text(), names(tmp_path)) == ("old", ["a.txt"])
+
+
+@pytest.mark.skipif(os.name != "posix", reason="modes are POSIX")
+def test_modes_follow_the_umask_and_private_files_are_the_owners(tmp_path: Path) -> None:
+    (tmp_path / "plain").write_text("")
+    write_file(tmp_path / "usual", "")
+    write_file(tmp_path / "secret", "", private=True)
+    modes = {name: (tmp_path / name).stat().st_mode & 0o777 for name in names(tmp_path)}
+    assert modes["usual"] == modes["plain"]
+    assert modes["secret"] == 0o600
+
+
+@pytest.mark.parametrize("failure", [OSError(28, "No space left on device"), KeyboardInterrupt()])
+def test_a_failed_folder_does_not_appear(tmp_path: Path, failure: BaseException) -> None:
+    expected = DatasetError if isinstance(failure, OSError) else KeyboardInterrupt
+    with pytest.raises(expected), new_folder(tmp_path / "out", DatasetError) as work:
+        (work / "file").write_text("x")
+        raise failure
+    assert names(tmp_path) == []
+
+
+def test_a_folder_is_filled_where_it_is_empty_and_refused_where_it_is_not(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    with new_folder(tmp_path / "out", DatasetError, last="a") as work:
+        (work / "a").write_text("x")
+        (work / "b").write_text("y")
+    assert names(tmp_path / "out") == ["a", "b"]
+    with pytest.raises(DatasetError, match="already holds something"), new_folder(tmp_path / "out", DatasetError):
+        pass
+    assert names(tmp_path) == ["out"]

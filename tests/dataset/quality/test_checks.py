@@ -1,0 +1,546 @@
+"""Every check finds the fault that is planted for it, there and nowhere else, and keeps silent on clean recordings."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from plushsense.cli.check import overview
+from plushsense.core.errors import ConfigError
+from plushsense.core.gestures import Gesture, GestureSet
+from plushsense.core.layouts import load_layout
+from plushsense.core.recorder_csv import (
+    Frames,
+    format_header,
+    format_rows,
+    read_recording,
+    read_stream,
+    recording_filename,
+)
+from plushsense.dataset.importing.importers import import_recordings
+from plushsense.dataset.index import open_dataset
+from plushsense.dataset.marks import Mark, append_marks
+from plushsense.dataset.quality.checking import CheckReport, check
+from plushsense.dataset.quality.findings import CheckLimits, Issue
+from plushsense.dataset.quality.measurements import Examination
+from plushsense.dataset.quality.registry import CHECKS, Check
+from plushsense.dataset.store import Dataset
+from plushsense.recording.simulate import simulate
+
+PLUSH = load_layout("plush-15")
+LABELS = ("Back stroke 1", "Head stroke 1", "Tail tap 1", "Hold strong")
+TOUCHED = (8, 3, 7, 9)
+PEOPLE = ("P1", "P2", "P3", "P4")
+TIMES = 4
+START = 1_700_000_000_000
+
+
+def session(person: int) -> tuple[Frames, list[tuple[str, int, int]]]:
+    """A session without a fault: rest, gesture, rest, …; and where each recording of which gesture lies."""
+    rng = np.random.default_rng(person)
+    marks, at = [], 0
+    for _ in range(TIMES):
+        for label in LABELS:
+            rows = int(rng.integers(280, 320))
+            marks.append((label, at + 300, at + 300 + rows))
+            at += 300 + rows
+    rows = at + 300
+    level = np.array([500, 300, 100, 120, 140, 80, 90, 60, 110, 130, 200, -300, 16000])
+    values = np.tile(level, (rows, 1)) + rng.normal(0, 4, (rows, 13))
+    for label, first, last in marks:
+        t = np.linspace(-0.25, 1.25, last - first)
+        touch = np.where((t > 0) & (t < 1), np.sin(np.pi * np.clip(t, 0, 1)) ** 2, 0.0)
+        touch = touch * (1 + 0.4 * np.sin(2 * np.pi * (8 * t + rng.random())))
+        strength = rng.uniform(0.8, 1.2)
+        values[first:last, TOUCHED[LABELS.index(label)]] += 900 * strength * touch
+        values[first:last, 0] += 500 * strength * touch
+        for c in (10, 11, 12):
+            values[first:last, c] += 800 * strength * touch * np.sin(2 * np.pi * (6 * t + rng.random()))
+    clock = 5000 + np.arange(rows) * 10
+    return Frames(np.rint(values).astype(np.int64), clock, START + person * 10**8 + clock), marks
+
+
+@pytest.fixture(scope="module")
+def clean(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    src = tmp_path_factory.mktemp("quality")
+    for person, name in enumerate(PEOPLE):
+        (src / "src" / name).mkdir(parents=True)
+        frames, marks = session(person)
+        (src / "src" / name / "fulldatastream.csv").write_text(format_rows(frames, PLUSH), newline="\n")
+        for label, first, last in marks:
+            part = frames.slice(first, last)
+            assert part.host_ms is not None
+            path = src / "src" / name / recording_filename(label, int(part.host_ms[-1]), len(part))
+            path.write_text(format_header(PLUSH) + format_rows(part, PLUSH), newline="\n")
+    gestures = GestureSet("four", tuple(Gesture(label, "positive") for label in LABELS))
+    done = import_recordings(src / "src", src / "DS", layout=PLUSH, gestures=gestures)
+    assert done.recordings == len(PEOPLE) * len(LABELS) * TIMES
+    assert done.to_dict()["warnings"] == [], "a clean session is imported without a warning"
+    return src / "DS"
+
+
+@pytest.fixture
+def copy(clean: Path, tmp_path: Path) -> Path:
+    shutil.copytree(clean, tmp_path / "DS")
+    return tmp_path / "DS"
+
+
+@pytest.fixture(scope="module")
+def on_clean(clean: Path) -> CheckReport:
+    return check(open_dataset(clean))
+
+
+@pytest.mark.parametrize("name", list(CHECKS))
+def test_a_clean_recording_is_left_alone(name: str, on_clean: CheckReport) -> None:
+    assert name in on_clean.checks
+    assert [f.message for f in on_clean.findings_of(name)] == []
+
+
+def test_only_what_was_asked_for_is_looked_at(clean: Path) -> None:
+    result = check(open_dataset(clean), only=["gaps", "duration"], limits=CheckLimits(duration=0.001))
+    assert result.checks == ("gaps", "duration")
+    assert {f.check for f in result.findings} == {"duration"}
+    with pytest.raises(ConfigError, match="no check 'gap'.*Did you mean 'gaps'"):
+        check(open_dataset(clean), only=["gap"])
+
+
+# Planting -------------------------------------------------------------------------------------------------------
+
+
+def recording(folder: Path, number: int = 5, label: str = "Head stroke 1", person: str = "P2") -> Path:
+    """One recording's file; the same each time."""
+    return sorted((folder / "recordings" / person).glob(f"{label}_*.csv"))[number % TIMES]
+
+
+def change(path: Path, how: Callable[[Frames], Frames]) -> str:
+    """Rewrite a recording or stream with ``how`` applied: what finds it is the id."""
+    kind = path.parents[1].name
+    read = (read_stream if kind == "streams" else read_recording)(path, PLUSH).frames
+    head = "" if kind == "streams" else format_header(PLUSH)
+    path.write_text(head + format_rows(how(read), PLUSH), newline="\n")
+    return path.relative_to(path.parents[1]).with_suffix("").as_posix()
+
+
+def with_values(at: slice | np.ndarray, channel: int | slice, value: object) -> Callable[[Frames], Frames]:
+    def how(frames: Frames) -> Frames:
+        values = frames.values.copy()
+        values[at, channel] = value
+        return replace(frames, values=values)
+
+    return how
+
+
+def renamed(path: Path, rows: int) -> Path:
+    """The same file under a name that says its true number of rows."""
+    return path.rename(path.with_name(path.name.rsplit("_", 1)[0] + f"_{rows}.csv"))
+
+
+def later(frames: Frames, row: int, device: int, host: int | None = None) -> Frames:
+    """Everything from ``row`` on comes later by so many ms."""
+    shift = (np.arange(len(frames)) >= row).astype(np.int64)
+    assert frames.host_ms is not None
+    return replace(
+        frames,
+        device_ms=frames.device_ms + shift * device,
+        host_ms=frames.host_ms + shift * (device if host is None else host),
+    )
+
+
+def join(*parts: Frames) -> Frames:
+    """Recordings one after another, 10 ms apart."""
+    values = np.concatenate([p.values for p in parts])
+    clock = parts[0].device_ms[0] + np.arange(len(values)) * 10
+    assert parts[0].host_ms is not None
+    return Frames(values, clock, clock - clock[0] + parts[0].host_ms[0])
+
+
+def stuck(folder: Path) -> str:
+    return change(recording(folder), lambda f: with_values(slice(100, 200), 3, f.values[100, 3])(f))
+
+
+def hung(folder: Path) -> str:
+    return change(recording(folder), lambda f: with_values(slice(40, 260), slice(None), f.values[40])(f))
+
+
+def flat(folder: Path) -> str:
+    return change(recording(folder), with_values(slice(None), 5, 77))
+
+
+def flat_stream(folder: Path) -> str:
+    return change(folder / "streams" / "P3" / "fulldatastream.csv", with_values(slice(None), 5, 77))
+
+
+def saturated(folder: Path) -> str:
+    return change(
+        recording(folder), lambda f: replace(f, values=np.minimum(f.values, [9999, 9999, 9999, 400, *[20000] * 9]))
+    )
+
+
+def drifting(folder: Path) -> str:
+    def how(frames: Frames) -> Frames:
+        values = frames.values.copy()
+        values[:, 3] += np.linspace(0, 1500, len(frames)).astype(np.int64)
+        return replace(frames, values=values)
+
+    return change(folder / "streams" / "P3" / "fulldatastream.csv", how)
+
+
+def drifting_without_stream(folder: Path) -> str:
+    (folder / "streams" / "P3" / "fulldatastream.csv").unlink()
+    for path in (folder / "recordings" / "P3").glob("*.csv"):
+        epoch = int(path.name.split("_")[1])
+        passed = (epoch - START - 2 * 10**8) / 100
+        change(path, lambda f, by=passed: with_values(slice(None), 3, f.values[:, 3] + int(by * 3))(f))
+    return "P3"
+
+
+def garbage(folder: Path) -> str:
+    return change(recording(folder), with_values(slice(50, 60), 7, -9000))
+
+
+def blank(folder: Path) -> str:
+    return change(recording(folder), with_values(slice(50, 60), slice(None), 0))
+
+
+def spiky(folder: Path) -> str:
+    return change(recording(folder), with_values(np.arange(40, 280, 40), 11, 9000))
+
+
+def malformed(folder: Path) -> str:
+    path = recording(folder)
+    lines = path.read_text().splitlines(keepends=True)
+    lines[30] = lines[30][:7] + "\n"
+    path.write_text("".join(lines), newline="\n")
+    return path.relative_to(folder / "recordings").with_suffix("").as_posix()
+
+
+def duplicate(folder: Path) -> str:
+    path = recording(folder, label="Tail tap 1")
+    target = path.with_name(path.name.replace("Tail tap 1", "zz"))
+    target = path.parents[1] / "P4" / recording(folder, 2, "Tail tap 1", "P4").name
+    frames = read_recording(path, PLUSH).frames
+    moved = replace(frames, device_ms=frames.device_ms + 999, host_ms=frames.device_ms + START)
+    target.write_text(format_header(PLUSH) + format_rows(moved, PLUSH), newline="\n")
+    target = renamed(target, len(moved))
+    return target.relative_to(folder / "recordings").with_suffix("").as_posix()
+
+
+def overlapping(folder: Path) -> str:
+    path = recording(folder)
+    stream = read_stream(folder / "streams" / "P2" / "fulldatastream.csv", PLUSH).frames
+    frames = read_recording(path, PLUSH).frames
+    first = int(np.flatnonzero(stream.device_ms == frames.device_ms[0])[0])
+    both = stream.slice(first + 100, first + 400)
+    assert both.host_ms is not None
+    new = path.with_name(recording_filename("Head stroke 1", int(both.host_ms[-1]), len(both)))
+    new.write_text(format_header(PLUSH) + format_rows(both, PLUSH), newline="\n")
+    return new.relative_to(folder / "recordings").with_suffix("").as_posix()
+
+
+def missing(folder: Path) -> str:
+    recording(folder).unlink()
+    (folder / "index.json").unlink()
+    return "P2"
+
+
+def two_in_one(folder: Path) -> str:
+    path = recording(folder)
+    other = read_recording(recording(folder, 6), PLUSH).frames
+    change(path, lambda f: join(f, f.slice(0, 60), other))
+    path = renamed(path, len(read_recording(path, PLUSH).frames))
+    return path.relative_to(folder / "recordings").with_suffix("").as_posix()
+
+
+def nothing_happens(folder: Path) -> str:
+    stream = read_stream(folder / "streams" / "P2" / "fulldatastream.csv", PLUSH).frames
+    path = recording(folder)
+    change(path, lambda f: stream.slice(5, 295))
+    path = renamed(path, 290)
+    return path.relative_to(folder / "recordings").with_suffix("").as_posix()
+
+
+def never_stopped(folder: Path) -> str:
+    stream = read_stream(folder / "streams" / "P2" / "fulldatastream.csv", PLUSH).frames
+    path = recording(folder)
+    change(path, lambda f: stream.slice(300, 3900))
+    path = renamed(path, 3600)
+    return path.relative_to(folder / "recordings").with_suffix("").as_posix()
+
+
+def too_long(folder: Path) -> str:
+    path = recording(folder)
+    change(path, lambda f: join(f, *[f.slice(0, 50)] * 4))
+    path = renamed(path, len(read_recording(path, PLUSH).frames))
+    return path.relative_to(folder / "recordings").with_suffix("").as_posix()
+
+
+def too_short(folder: Path) -> str:
+    path = recording(folder)
+    change(path, lambda f: f.slice(80, 200))
+    path = renamed(path, 120)
+    return path.relative_to(folder / "recordings").with_suffix("").as_posix()
+
+
+def other_rows(folder: Path) -> str:
+    path = renamed(recording(folder), 999)
+    return path.relative_to(folder / "recordings").with_suffix("").as_posix()
+
+
+def cut(folder: Path) -> str:
+    path = folder / "streams" / "P2" / "fulldatastream.csv"
+    path.write_text(path.read_text() + "100; 3", newline="\n")
+    return "P2/fulldatastream"
+
+
+def resumed(folder: Path) -> str:
+    return change(folder / "streams" / "P2" / "fulldatastream.csv", lambda f: later(f, 5000, 30, 300_000))
+
+
+def next_day(folder: Path) -> str:
+    return change(folder / "streams" / "P2" / "fulldatastream.csv", lambda f: later(f, 5000, -40_000, 80_000_000))
+
+
+def reset(folder: Path) -> str:
+    return change(recording(folder), lambda f: later(f, 120, -6000, 10))
+
+
+def leap(folder: Path) -> str:
+    return change(folder / "streams" / "P2" / "fulldatastream.csv", lambda f: later(f, 5000, 900_000, 0))
+
+
+def gap(folder: Path) -> str:
+    return change(recording(folder), lambda f: later(f, 120, 60))
+
+
+def loss(folder: Path) -> str:
+    def how(frames: Frames) -> Frames:
+        kept = np.setdiff1d(np.arange(len(frames)), np.arange(10, 250, 12))
+        assert frames.host_ms is not None
+        return Frames(frames.values[kept], frames.device_ms[kept], frames.host_ms[kept])
+
+    path = recording(folder)
+    change(path, how)
+    path = renamed(path, len(read_recording(path, PLUSH).frames))
+    return path.relative_to(folder / "recordings").with_suffix("").as_posix()
+
+
+def slow(folder: Path) -> str:
+    return change(
+        recording(folder), lambda f: replace(f, device_ms=f.device_ms[0] + (f.device_ms - f.device_ms[0]) * 3)
+    )
+
+
+def jittery(folder: Path) -> str:
+    def how(frames: Frames) -> Frames:
+        shake = np.random.default_rng(1).integers(-4, 5, len(frames))
+        return replace(frames, device_ms=frames.device_ms + shake)
+
+    return change(recording(folder), how)
+
+
+def elsewhere(folder: Path) -> str:
+    return change(recording(folder), lambda f: replace(f, host_ms=f.device_ms + START + 5 * 10**9))
+
+
+PLANTS: list[tuple[str, Callable[[Path], str]]] = [
+    ("stuck", stuck),
+    ("stuck", hung),
+    ("flat", flat),
+    ("flat", flat_stream),
+    ("saturated", saturated),
+    ("drift", drifting),
+    ("drift", drifting_without_stream),
+    ("garbage", garbage),
+    ("blank-rows", blank),
+    ("spikes", spiky),
+    ("malformed", malformed),
+    ("duplicate", duplicate),
+    ("overlap", overlapping),
+    ("missing", missing),
+    ("several-gestures", two_in_one),
+    ("no-onset", nothing_happens),
+    ("never-stopped", never_stopped),
+    ("duration", too_long),
+    ("duration", too_short),
+    ("rows", other_rows),
+    ("cut-line", cut),
+    ("resumed", resumed),
+    ("resumed", next_day),
+    ("clock-reset", reset),
+    ("clock-reset", leap),
+    ("gaps", gap),
+    ("lost-frames", loss),
+    ("rate", slow),
+    ("jitter", jittery),
+    ("not-in-stream", elsewhere),
+]
+
+
+@pytest.mark.parametrize(("name", "plant"), PLANTS, ids=lambda v: getattr(v, "__name__", v))
+def test_a_planted_fault_is_found_where_it_is(name: str, plant: Callable[[Path], str], copy: Path) -> None:
+    about = plant(copy)
+    (copy / "index.json").unlink(missing_ok=True)
+    result = check(open_dataset(copy))
+    found = result.findings_of(name)
+    assert {f.about for f in found} == {about}, [f"{f.check} {f.about}: {f.message}" for f in result.findings]
+    assert all(f.action and f.message and f.severity for f in found)
+    assert all(0 <= a < b for f in found for a, b in f.rows)
+
+
+def test_every_check_has_a_planted_fault() -> None:
+    counted = {"label", "class-balance", "subject-balance"}
+    assert {name for name, _ in PLANTS} | counted == set(CHECKS)
+
+
+def test_balance_and_labels_are_counted_over_the_data_set(copy: Path) -> None:
+    for path in [*(copy / "recordings" / "P4").glob("*.csv")][2:]:
+        path.unlink()
+    for n, path in enumerate(sorted((copy / "recordings" / "P3").glob("Hold*.csv"))):
+        path.rename(path.with_name(path.name.replace("Hold strong", "Waving")))
+        assert n < TIMES
+    for path in [*(copy / "recordings").glob("P[12]/Hold*.csv")][:6]:
+        path.unlink()
+    (copy / "index.json").unlink()
+    said = {f.check: f for f in check(open_dataset(copy)).findings}
+    assert "P4 2" in said["subject-balance"].message
+    assert "Hold strong" in said["class-balance"].message
+    assert "'Waving' (4 recordings)" in said["label"].message
+    assert said["label"].about == ""
+
+
+def test_what_asks_for_a_decision_is_an_error(copy: Path) -> None:
+    reset(copy)
+    result = check(open_dataset(copy))
+    assert not result.ok
+    (asked,) = result.undecided
+    assert (asked.check, asked.severity) == ("clock-reset", "error")
+    append_marks(copy, [Mark(asked.recording, "exclude", "x", "a fall")])
+    after = check(open_dataset(copy))
+    assert after.ok
+    assert (after.recordings, after.excluded) == (result.recordings - 1, 1)
+    assert not [f for f in after.findings if f.recording == asked.recording], "what is excluded is not looked at"
+
+
+def test_a_trimmed_recording_is_judged_by_what_remains(copy: Path) -> None:
+    about = never_stopped(copy)
+    (copy / "index.json").unlink()
+    append_marks(copy, [Mark(about, "trim", "x", start=0, stop=300)])
+    result = check(open_dataset(copy))
+    assert result.findings_of("never-stopped", "rows", "several-gestures") == []
+
+
+def test_the_mean_is_over_recordings_that_were_stopped(copy: Path) -> None:
+    """One of 10 times the length would pull a plain mean until half of the others lie outside ±40 %."""
+    never_stopped(copy)
+    (copy / "index.json").unlink()
+    assert check(open_dataset(copy)).findings_of("duration") == []
+
+
+def test_what_is_true_of_nearly_all_is_said_once(copy: Path) -> None:
+    for path in (copy / "recordings").rglob("*.csv"):
+        change(path, lambda f: replace(f, device_ms=f.device_ms[0] + (f.device_ms - f.device_ms[0]) * 2))
+    (rate,) = check(open_dataset(copy)).findings_of("rate")
+    assert rate.about == ""
+    assert "so in 64 of 64 recordings" in rate.message
+
+
+def test_accepted_findings_stay_but_do_not_count(copy: Path) -> None:
+    about = reset(copy)
+    append_marks(copy, [Mark(about, "accept", "x", "known", check="clock-reset")])
+    result = check(open_dataset(copy))
+    (found,) = result.findings_of("clock-reset")
+    assert found.accepted
+    assert result.ok
+    assert result.counts()["accepted"] == {"clock-reset": 1}
+    assert result.counts()["by_check"].get("clock-reset") is None
+
+
+def test_a_gesture_of_free_choice_is_compared_within_a_person(copy: Path) -> None:
+    head = (copy / "dataset.toml").read_text()
+    at = head.index('label = "Hold strong"')
+    free = head[at:].replace("free_choice = false", "free_choice = true", 1)
+    (copy / "dataset.toml").write_text(head[:at] + free)
+    for path in (copy / "recordings" / "P1").glob("Hold*.csv"):
+        change(path, lambda f: join(f, f, f))
+        renamed(path, len(read_recording(path, PLUSH).frames))
+    (copy / "index.json").unlink()
+    assert check(open_dataset(copy)).findings_of("duration", "missing") == []
+
+
+def test_bursts_are_no_gaps(copy: Path) -> None:
+    """Frames that a phone stamps several at once: a wait of 60 ms that the next ones make up for is none."""
+
+    def how(frames: Frames) -> Frames:
+        late = frames.device_ms // 70 * 70
+        return replace(frames, device_ms=late)
+
+    about = change(recording(copy), how)
+    result = check(open_dataset(copy))
+    assert result.findings_of("gaps", "lost-frames", "rate") == []
+    assert [f.about for f in result.findings_of("jitter")] == [about]
+    change(recording(copy), lambda f: later(f, 150, 400))
+    assert [f.about for f in check(open_dataset(copy)).findings_of("gaps")] == [about]
+
+
+def test_simulated_sessions_raise_no_alarm(tmp_path: Path) -> None:
+    simulate(tmp_path / "src", people=3, repetitions=3, at_rest=4)
+    dataset: Dataset = import_recordings(tmp_path / "src", tmp_path / "DS", layout="plush-15").dataset
+    result = check(dataset)
+    assert result.ok
+    # The virtual people's tempo varies, and their toy sends a garbled value now and then.
+    assert {f.check for f in result.findings if f.severity == "warning"} <= {"duration"}
+    assert len(result.findings_of("duration")) <= 5
+    assert {f.check for f in result.findings if f.severity == "info"} <= {"duration", "garbage"}
+
+
+def test_the_real_recordings_known_faults_are_found(real_data: Path, tmp_path: Path) -> None:
+    dataset = import_recordings(real_data / "makeability-gestures", tmp_path / "DS", layout="accel-3").dataset
+    result = check(dataset)
+    assert [f.recording for f in result.findings_of("never-stopped")] == ["P22/Forehand Tennis_1589429213972_18907"]
+    assert {f.recording for f in result.findings_of("clock-reset") if f.recording} == {
+        "P27/Jumping Jack_1589674214418_191"
+    }
+    assert len({f.recording for f in result.findings_of("gaps") if f.recording}) == 16
+    assert {f.subject for f in result.findings_of("rate")} == {"P09", "P10", "P16", "P19"}
+    assert len({f.recording for f in result.findings_of("rate") if f.recording}) == 4 * 55
+    ends = {p.parent.name for p in (real_data / "makeability-gestures").glob("*/fulldatastream.csv") if _is_cut(p)}
+    assert {f.subject for f in result.findings_of("cut-line")} == ends
+    assert {f.subject for f in result.findings_of("resumed")} == {"P04", "P05", "P06", "P12", "P25", "P27"}
+    assert {(f.check, f.recording) for f in result.undecided} == {
+        ("never-stopped", "P22/Forehand Tennis_1589429213972_18907"),
+        ("clock-reset", "P27/Jumping Jack_1589674214418_191"),
+    }
+
+
+def _is_cut(path: Path) -> bool:
+    return not path.read_bytes().endswith(b"\n")
+
+
+def test_the_page_lists_every_check_of_the_registry() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "checks.md").read_text(encoding="utf-8")
+    table = page.partition("| check | about |")[2].partition("\n\n")[0]
+    listed = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
+    assert [name for cell in listed for name in re.findall(r"`([a-z-]+)`", cell)] == list(CHECKS)
+    assert {re.findall(r"`([a-z-]+)`", cell)[0] for cell in listed if "*import*" in cell} == {
+        name for name, check in CHECKS.items() if check.at_import
+    }
+
+
+def test_a_check_is_one_function_and_one_line(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def long(examined: Examination) -> Iterator[Issue]:
+        if len(examined.frames) > 10:
+            yield Issue("holds more than 10 rows")
+
+    monkeypatch.setitem(CHECKS, "long", Check(("recording",), "error", "exclude it", examine=long, at_import=True))
+    (copy / "index.json").unlink(missing_ok=True)
+    dataset = open_dataset(copy)
+    result = check(dataset, only=["long"])
+    assert all("holds more than 10 rows" in r.flags for r in dataset.recordings)
+    assert result.counts()["by_check"] == {"long": 1}, "a finding about nearly every recording is reported once"
+    assert "long" in "\n".join(overview(result))

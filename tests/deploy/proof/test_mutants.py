@@ -1,0 +1,29 @@
+"""The mutants: each changes one thing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from plushsense.core.errors import BadInput
+from plushsense.deploy.proof.mutants import mutants_of, source_mutants
+from plushsense.deploy.targets import C_FOLDER
+
+
+def test_the_texts_of_the_mutants_occur_in_the_c(small: Path) -> None:
+    source = (C_FOLDER / "plushsense.c").read_text(encoding="utf-8")
+    found = mutants_of((small / "plush_model.bin").read_bytes(), source)
+    assert len({f.name for f in found}) == len(found) == len(source_mutants()) + 10
+    for mutant in found:
+        assert (mutant.image is None) != (mutant.source is None)
+        assert mutant.source != source
+    image = np.frombuffer((small / "plush_model.bin").read_bytes(), dtype=np.uint8)
+    for mutant in found:
+        if mutant.image is not None:
+            # The checksum and one number.
+            changed = np.flatnonzero(np.frombuffer(mutant.image, dtype=np.uint8) != image)
+            assert 1 <= (changed >= 16).sum() <= 2 and ((changed >= 12) & (changed < 16)).any()
+    with pytest.raises(BadInput, match="occurs 0 times"):
+        mutants_of((small / "plush_model.bin").read_bytes(), source.replace("+ 16384u", "+ 16385u"))

@@ -1,0 +1,86 @@
+"""Opening an export to check it, and comparing what a toy wrote: the first number that differs is named."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from plushsense.core.errors import BadInput, PlushSenseError
+from plushsense.deploy.proof.vectors import Export, compare
+from support.exports import bundle_of, exported
+
+
+def test_comparing_names_the_first_number_that_differs() -> None:
+    labels = ("a", "b")
+    expected = np.arange(48, dtype=np.int32).reshape(3, 16)
+    expected[:, 0] = 0, 1, 2
+
+    def seen(rows: np.ndarray, words: bytes = b"") -> tuple[int, int, str | None]:
+        found = compare(expected, rows.astype("<i4").tobytes() + words, labels)
+        assert found.vectors == 3
+        return found.mismatches, found.max_abs_diff, found.first
+
+    assert seen(expected) == (0, 0, None)
+    one = expected.copy()
+    one[1, 15] += 5
+    one[2, 4] -= 9
+    message = "row 1 (event, frame 17): the smoothed probability of 'b' should be 31 and is 36"
+    assert seen(one) == (2, 9, message)
+    logit = expected.copy()
+    logit[0, 12] = -1
+    assert seen(logit) == (1, 13, "row 0 (answer, frame 1): the logit of 'a' should be 12 and is -1")
+    for row, column, name in ((0, 8, "answer"), (1, 8, "since"), (2, 5, "suspect"), (2, 2, "ms")):
+        field, was = expected.copy(), int(expected[row, column])
+        field[row, column] += 7
+        kind = ("answer", "event", "health")[row]
+        message = f"row {row} ({kind}, frame {16 * row + 1}): '{name}' should be {was} and is {was + 7}"
+        assert seen(field) == (1, 7, message)
+    assert seen(expected[:2]) == (1, 0, "row 2 (health, frame 33) never came")
+    assert seen(np.concatenate([expected, expected[:1]])) == (1, 0, "row 3 (answer, frame 1) is one too many")
+    assert seen(expected, b"Something.") == (1, 0, "Something")
+    assert seen(expected[:0], b"Nothing.") == (3, 0, "Nothing; row 0 (answer, frame 1) never came")
+    far = expected.copy()
+    far[0, 12], high = -(1 << 31), (1 << 31) - 1
+    assert compare(np.full_like(far, high), far.astype("<i4").tobytes(), labels).max_abs_diff == 2**32 - 1
+
+
+BAD = [
+    (lambda o: (o / "plushsense.c").unlink(), "lacks plushsense.c"),
+    (lambda o: (o / "plush_model.bin").unlink(), "lacks plush_model.bin"),
+    (lambda o: (o / "model.plush").unlink(), "lacks model.plush"),
+    (lambda o: (o / "export.json").unlink(), "is no export"),
+    (lambda o: (o / "export.json").write_text("{"), "cannot be read"),
+    (lambda o: (o / "golden" / "frames.bin").unlink(), "cannot be read"),
+    (lambda o: (o / "golden" / "frames.bin").write_bytes(b"abc"), "no whole rows of 14 numbers"),
+    (lambda o: (o / "golden" / "answers.bin").write_bytes(bytes(4)), "no whole rows of 48 numbers"),
+    (lambda o: (o / "model.plush").write_bytes(b"abc"), "model.plush"),
+]
+
+
+@pytest.mark.parametrize(("how", "words"), BAD, ids=[words for _, words in BAD])
+def test_an_export_that_is_none(own: Path, how: Callable[[Path], object], words: str) -> None:
+    how(own)
+    with pytest.raises(PlushSenseError, match=re.escape(words)) as refusal:
+        Export(own)
+    assert "\n" not in str(refusal.value)
+
+
+def test_golden_vectors_of_another_model_or_damaged(own: Path, tmp_path: Path) -> None:
+    other = exported(tmp_path / "other", bundle_of("plush-15", seed=4))
+    shutil.copyfile(other / "golden" / "answers.bin", own / "golden" / "answers.bin")
+    with pytest.raises(BadInput, match="are not those of model.plush"):
+        Export(own)
+    shutil.rmtree(own / "golden")
+    shutil.copytree(other / "golden", own / "golden")
+    frames = bytearray((other / "golden" / "frames.bin").read_bytes())
+    for at in range(9000, 9400, 4):  # some of them garbage already
+        frames[at] ^= 16
+    (other / "golden" / "frames.bin").write_bytes(bytes(frames))
+    for folder in (own, other):
+        with pytest.raises(BadInput, match=r"they are damaged, or of another model \(row "):
+            Export(folder)

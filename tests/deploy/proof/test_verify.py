@@ -1,0 +1,437 @@
+"""The proof of the C: it holds for real exports, and it notices what is wrong with bad ones."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from plushsense.cli.main import main
+from plushsense.cli.verify import _text
+from plushsense.core.errors import BadInput, ToolError
+from plushsense.core.gestures import Gesture, GestureSet
+from plushsense.core.layouts import Layout, load_layout
+from plushsense.dataset.importing.importers import import_recordings
+from plushsense.dataset.index import open_dataset
+from plushsense.deploy.golden import EVENT, FAULT, HEALTH, column
+from plushsense.deploy.package import ARDUINO, package
+from plushsense.deploy.profile import profile
+from plushsense.deploy.proof.mutants import RULES, source_mutants
+from plushsense.deploy.proof.scenarios import all_outcomes, covered, scenarios_of
+from plushsense.deploy.proof.vectors import Export
+from plushsense.deploy.proof.verify import Setting, VerificationReport, verify
+from plushsense.deploy.quantize import integer_model
+from plushsense.deploy.targets import TARGETS
+from plushsense.runtime.decisions import DecideSpec
+from plushsense.runtime.events import NO_GESTURE
+from plushsense.runtime.gate import JERK, GateSettings, Rule, Signal, Term
+from plushsense.runtime.health import HealthSettings
+from plushsense.runtime.image import HEAD_BYTES, image_head
+from support.exports import bundle_of, exported
+
+EMULATED = [name for name in TARGETS if name != "host"]
+
+
+def eight() -> Layout:
+    """Eight channels without a valid range, at a rate whose period is no whole number of milliseconds."""
+    names = [f"c{i}" for i in range(8)]
+    return Layout.from_dict(
+        {
+            "name": "eight",
+            "rate_hz": 90.0,
+            "channels": [{"name": n, "unit": "count", "kind": "capacitive"} for n in names],
+            "wire": ["device_ms", *names],
+        }
+    )
+
+
+@pytest.fixture(scope="session")
+def emulators(target_here: Callable[[str], str]) -> None:
+    """Compilers and emulators of every target."""
+    for name in TARGETS:
+        target_here(name)
+
+
+def plainly(setting: Setting) -> bool:
+    return setting.optimise == "-O2" and setting.cc in (None, "gcc") and not setting.image and not setting.cpp
+
+
+def run(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, dict[str, Any], str]:
+    code = main(["verify", *words, "--json"])
+    output = capsys.readouterr()
+    return code, json.loads(output.out) if output.out else {}, output.err
+
+
+@pytest.fixture
+def two_settings(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the ten ways to compile on the host two: what the verb says does not need them all."""
+    monkeypatch.setattr(
+        "plushsense.deploy.proof.verify.settings_of", lambda name: [Setting(name, "gcc", o) for o in ("-O0", "-O2")]
+    )
+
+
+def edit(path: Path, old: str, new: str) -> None:
+    text = path.read_text(encoding="utf-8")
+    assert text.count(old) == 1
+    path.write_text(text.replace(old, new), encoding="utf-8")
+
+
+# ---- It holds ------------------------------------------------------------------------------------------------------
+
+
+def test_every_way_to_compile_on_the_host(all_compilers: None, small: Path) -> None:
+    done = verify(Export(small), ["host"])
+    assert done.passed and done.mismatches == 0 and done.first is None
+    made = {(r.compiler, r.flags) for r in done.runs}
+    assert {(cc, o) for cc in ("gcc", "clang") for o in ("-O0", "-O2", "-O3")} <= made
+    assert {("gcc", "-O1 sanitizers"), ("gcc", "-O2 called from C++"), ("gcc", "-O2 plush_model.bin")} <= made
+    assert all("sanitizers" in what for what, _ in done.not_run), "clang's are a package of their own"
+    rows = [len(v.answers) for v in (Export(small).golden, *Export(small).scenarios())]
+    assert min(rows) > 500 and {r.vectors for r in done.runs} == {sum(rows)}
+
+
+def test_a_last_layer_that_was_adapted_and_rules_that_were_fitted(c_compiler: str, tmp_path: Path) -> None:
+    """As `adapt` and the fitting of settings leave a bundle: other dense weights, re-quantised, and every rule."""
+    plain = bundle_of("plush-15", "9d1_5d2", "4,6")
+    weights = dict(plain.weights)
+    rng = np.random.default_rng(3)
+    weights["dense.weight"] = (weights["dense.weight"] * rng.uniform(-3, 3, (18, 1))).astype(np.float32)
+    weights["dense.bias"] = (weights["dense.bias"] + rng.normal(size=18)).astype(np.float32)
+    blow = Rule((Term(0, 60),), 3, NO_GESTURE)
+    spec = DecideSpec(
+        enter=0.2,
+        leave=0.1,
+        known=-1.0,
+        gate=GateSettings((Signal(JERK, (1, 4, 10), lag=2, floor=20),), (blow,)),
+        health=HealthSettings((-1500,) * 13, (30_000,) * 13, still_ms=400),
+    )
+    bundle = replace(plain, weights=weights, decision=spec.to_dict())
+    export = Export(exported(tmp_path / "out", bundle))
+    assert export.is_own and not np.array_equal(
+        export.model.network.dense.weights, integer_model(plain).network.dense.weights
+    )
+    kinds = column(export.golden.answers, "what", EVENT), column(export.golden.answers, "source", EVENT)
+    assert {1, 3} <= set(kinds[0]) and set(kinds[1]) == {0, 1}, "its own golden vectors tell events, and blows"
+    assert FAULT in column(export.golden.answers, "state", HEALTH)
+    done = verify(export, ["host"], only=plainly)
+    assert done.passed and done.first is None
+
+
+def test_scenarios_cover_all_outcomes(small: Path) -> None:
+    export = Export(small)
+    found = scenarios_of(export.model, export.bundle.scaler)
+    assert set().union(*map(covered, found)) == all_outcomes()
+
+
+MAIN = {
+    "paper-11": ("14d1_39d2_41d4", "8,12,16", "plush-15"),
+    "default-11": ("14d1_19d2_19d4", "8,12,16", "plush-15"),
+    "paper-3": ("14d1_39d2_41d4", "8,12,16", "accel-3"),
+    "default-3": ("14d1_19d2_19d4", "8,12,16", "accel-3"),
+    "four-layers-6": ("19d1_19d2_19d4_17d8", "4,6,8,8", "phone-6"),
+    "one-layer-8": ("250", "5", "eight"),
+    "two-layers-3": ("100_151", "3,5", "accel-3"),
+}
+
+
+@pytest.mark.parametrize("name", MAIN)
+def test_the_same_on_every_chip(emulators: None, tmp_path: Path, name: str) -> None:
+    symbol, filters, layout = MAIN[name]
+    read = eight() if layout == "eight" else load_layout(layout)
+    export = Export(exported(tmp_path / "out", bundle_of(read, symbol, filters)))
+    more = export.made_up(5000 - export.golden.samples) if export.golden.samples < 5000 else []
+    done = verify(export, ["host", *EMULATED], more, only=plainly)
+    assert done.first is None and done.passed
+    assert [r.target for r in done.runs] == ["host", *EMULATED]
+    assert sum(c.samples for c in done.counts) >= 5000
+    tracking = column(export.golden.answers, "state")
+    assert tracking.sum() > 100 and (tracking == 0).sum() > 100
+    assert {r.vectors for r in done.runs} == {sum(c.answers for c in done.counts)}
+
+
+# ---- It notices ----------------------------------------------------------------------------------------------------
+
+
+def test_every_fault_is_caught_on_the_host(c_compiler: str, small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    export = Export(small)
+    done = verify(export, ["host"], only=plainly, mutants=lambda mutant: True)
+    assert [f.name for f in done.mutants if not f.caught] == [] and done.passed
+    kinds = {"weight", "shift", "index", "rounding", "clamp", "rule", "constant", *RULES}
+    assert {f.kind for f in done.mutants} == kinds
+    assert len(done.mutants) == len(source_mutants()) + 10
+    # By an answer, not because the toy would not begin or crashed.
+    assert all("should be" in (f.first or "") and "plush_begin" not in (f.first or "") for f in done.mutants)
+
+
+def test_a_fault_of_the_rules_that_no_scenario_shows_is_no_defect_of_the_c(
+    c_compiler: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two classes, one of them idle in the scenarios: a mutant needs more scenarios, or is reported as not shown."""
+    two = GestureSet("two", (Gesture("pat", "positive"), Gesture("rest", "none")))
+    export = Export(exported(tmp_path / "out", bundle_of("accel-3", gestures=two, seed=2)))
+    seldom = "an affect stays at the share at which it begins"
+
+    def result() -> VerificationReport:
+        names = {seldom, "an event begins a step too soon"}
+        return verify(export, ["host"], only=plainly, mutants=lambda mutant: mutant.name in names)
+
+    assert all(f.caught for f in result().mutants)
+    monkeypatch.setattr("plushsense.deploy.proof.verify.MORE_SCENARIOS", 0)
+    done = result()
+    assert [f.name for f in done.mutants if not f.caught] == [seldom] == [f.name for f in done.mutants if f.silent]
+    assert done.passed and done.to_dict()["passed"]
+    assert "not shown: no test scenario of this network" in "\n".join(_text(done))
+
+
+def test_scenarios_have_sensors_that_are_stuck_where_they_may_be(small: Path) -> None:
+    """Also where six spreads are wider than the valid range, as of a lively accelerometer."""
+    export = Export(small)
+    wide = replace(export.bundle.scaler, scale=export.bundle.scaler.scale / 1e6)
+    low, high = export.model.layout.valid_min_int, export.model.layout.valid_max_int
+    for scenario in scenarios_of(export.model, wide):
+        limits = scenario.model.rules.health
+        assert (np.array(limits.low) > low).any() and (np.array(limits.high) < high).any()
+        assert "fault" in covered(scenario)
+
+
+def test_a_weight_a_shift_an_index_and_a_rounding_are_caught_on_every_chip(emulators: None, small: Path) -> None:
+    chosen = {"one weight of layer 1 by one", "one shift of layer 2 by one"}
+    chosen |= {source_mutants()[i].name for i in (1, 4)}
+    done = verify(Export(small), EMULATED, only=plainly, mutants=lambda mutant: mutant.name in chosen)
+    assert sorted((f.kind, f.target, f.caught) for f in done.mutants) == sorted(
+        (kind, name, True) for kind in ("weight", "shift", "index", "rounding") for name in EMULATED
+    )
+    assert done.passed
+
+
+def test_golden_vectors_that_are_too_weak_let_a_fault_through(
+    c_compiler: str, own: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    golden = Export(own).golden
+    few = golden.answers[golden.answers[:, 1] < 40]
+    assert len(few)
+    (own / "golden" / "frames.bin").write_bytes(golden.frames[:40].astype("<u4").tobytes())
+    (own / "golden" / "answers.bin").write_bytes(few.astype("<i4").tobytes())
+    done = verify(Export(own), ["host"], only=plainly, mutants=lambda mutant: mutant.kind in ("weight", "constant"))
+    assert done.mismatches == 0 and not done.passed
+    assert done.decisions == 0 and not verify(Export(own), ["host"], only=plainly).passed, "the toy only warmed"
+    assert not any(f.caught for f in done.mutants if f.kind == "weight")
+
+
+def test_a_file_edited_by_hand_is_what_is_tested(
+    c_compiler: str, two_settings: None, own: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    edit(own / "plushsense.c", "(int32_t)(((e << 15)", "(int32_t)(((e << 14)")
+    code, report, _ = run(capsys, str(own), "--target", "host", "--trust")
+    assert code == 1 and not report["passed"] and not report["own"] and report["changed"] == ["plushsense.c"]
+    assert report["mismatches"] == sum(r["mismatches"] for r in report["runs"]) > 0
+    assert report["max_abs_diff"] >= 1
+    assert report["first"].startswith("On host (gcc -O0), golden: row ")
+    assert "'confidence' should be " in report["first"] and report["first"].count(".") == 1
+
+
+def test_changed_copies_in_the_packages_are_reported(
+    c_compiler: str, two_settings: None, own: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    package(own)
+    code, _, err = run(capsys, str(own), "--target", "host")
+    assert code == 0 and "copies" not in err
+    edit(own / ARDUINO / "src" / "plushsense.c", "toy->heard = 1;", "toy->heard = 2;")
+    code, report, err = run(capsys, str(own), "--target", "host")
+    assert code == 0 and report["passed"], "what is proved are the originals"
+    assert f"these copies of them were changed: {ARDUINO}/src/plushsense.c" in err
+
+
+def test_the_folders_own_header_is_what_the_caller_reads(c_compiler: str, own: Path) -> None:
+    edit(own / "plushsense.h", "typedef struct plush_toy {", "typedef struct plush_toy {\n    uint32_t mine[5];")
+    done = verify(Export(own), ["host"], only=lambda s: s.optimise == "-O2" and s.cc == "gcc", trust=True)
+    assert done.passed and not done.own
+
+
+def test_an_image_that_was_edited(c_compiler: str, own: Path) -> None:
+    image = bytearray((own / "plush_model.bin").read_bytes())
+    image[200] ^= 1
+    (own / "plush_model.bin").write_bytes(bytes(image))
+    done = verify(Export(own), ["host"], only=lambda s: (s.cc, s.optimise) == ("gcc", "-O2"), trust=True)
+    assert len(done.runs) == 3
+    bad = [r for r in done.runs if r.mismatches]
+    assert [r.flags for r in bad] == ["-O2 plush_model.bin"]
+    assert bad[0].mismatches == bad[0].vectors and "PLUSH_DAMAGED" in (bad[0].first or "")
+    with pytest.raises(BadInput, match="is not what this PlushSense makes of model.plush"):
+        verify(Export(own), ["host"], mutants=lambda mutant: True, trust=True)
+    with pytest.raises(BadInput, match="is not what this PlushSense makes of model.plush"):
+        Export(own).made_up(10)
+
+
+def test_without_smoothing_no_mutant_is_applied_that_cannot_show(c_compiler: str, tmp_path: Path) -> None:
+    """Nor one that the toy would only refuse."""
+    bundle = replace(bundle_of("plush-15", "9d1_5d2", "4,6"), decision={"smoothing_s": 0})
+    done = verify(Export(exported(tmp_path / "out", bundle)), ["host"], only=plainly, mutants=lambda mutant: True)
+    assert done.passed and len(done.mutants) == len(source_mutants()) + 9
+    assert all("should be" in (f.first or "") and "plush_begin" not in (f.first or "") for f in done.mutants)
+
+
+def test_an_edited_model_that_agrees_with_its_golden_vectors_is_not_vouched_for(
+    c_compiler: str, own: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The title, which no answer shows; in plush_model.c it is the old one."""
+    whole = (own / "plush_model.bin").read_bytes()
+    body = bytearray(whole[HEAD_BYTES:])
+    body[-3] ^= 1
+    (own / "plush_model.bin").write_bytes(image_head(bytes(body)) + body)
+    done = verify(Export(own), ["host"], only=lambda s: s.image, trust=True)
+    assert not done.passed and "plush_model.c does not hold the bytes of plush_model.bin" in (done.first or "")
+    assert not verify(Export(own), ["host"], only=plainly, trust=True).own
+    (own / "plush_model.bin").write_bytes(whole)
+    edit(own / "export.json", '"smoothing": ', '"smoothing": 1')
+    assert main(["verify", str(own), "--target", "host"]) == 2
+    assert "plush_model.bin in " in capsys.readouterr().err
+    assert main(["verify", str(own), "--target", "host", "--trust"]) == 0
+    assert "NOT OURS: plush_model.c, plush_model.bin are not what this PlushSense writes" in capsys.readouterr().out
+    edit(own / "export.json", '"smoothing": ', '"smoothing": true, "was": ')
+    assert main(["verify", str(own), "--target", "host"]) == 2
+    assert "has the smoothing True" in capsys.readouterr().err
+
+
+def test_c_that_warns_or_writes_past_its_memory(c_compiler: str, own: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    edit(own / "plushsense.c", "toy->heard = 1;", "toy->heard = 1; int unused;")
+    done = verify(Export(own), ["host"], only=plainly, trust=True)
+    assert done.mismatches == sum(r.vectors for r in done.runs) and "unused" in (done.first or "")
+    edit(own / "plushsense.c", "toy->heard = 1; int unused;", "((uint32_t *)toy->memory)[-1] = 0; toy->heard = 1;")
+    done = verify(Export(own), ["host"], only=plainly, trust=True)
+    assert "before the toy's memory" in (done.first or "") and done.mismatches >= 1
+
+
+# ---- Code from elsewhere -------------------------------------------------------------------------------------------
+
+PLANTED = """
+#include <stdlib.h>
+__attribute__((constructor)) static void planted(void)
+{
+    if (system("touch '%s'") != 0)
+        exit(3);
+}
+"""
+
+
+@pytest.mark.parametrize("name", ["plushsense.h", "plushsense.c", "plush_model.h", "plush_model.c"])
+def test_code_that_is_not_ours_is_not_run(
+    c_compiler: str, own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    ran = tmp_path / "ran"
+    text = (own / name).read_text(encoding="utf-8")
+    (own / name).write_text(text + PLANTED % ran, encoding="utf-8")
+    code, report, err = run(capsys, str(own), "--target", "host")
+    assert code == 2 and report == {} and not ran.exists()
+    assert f"{name} in '{own}' is not what this PlushSense writes" in err and "--trust" in err and err.count("\n") == 1
+    with pytest.raises(BadInput, match=name.replace(".", r"\.")):
+        profile(own, ["host"])
+    assert not ran.exists()
+
+
+def test_code_that_is_trusted_is_run_and_not_called_ours(
+    c_compiler: str, two_settings: None, own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name, ran = "plushsense.c", tmp_path / "ran"
+    text = (own / name).read_text(encoding="utf-8")
+    (own / name).write_text(text + PLANTED % ran, encoding="utf-8")
+    code, report, _ = run(capsys, str(own), "--target", "host", "--trust")
+    assert ran.exists() and (code, report["passed"], report["own"], report["changed"]) == (0, True, False, [name])
+
+
+def test_a_header_beside_the_export_is_not_compiled(
+    c_compiler: str, two_settings: None, own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The folder would stand before the system's on the search path."""
+    ran = tmp_path / "ran"
+    header = f"#pragma once\n#pragma GCC system_header\n#include_next <string.h>\n{PLANTED % ran}"
+    (own / "string.h").write_text(header, encoding="utf-8")
+    code, report, _ = run(capsys, str(own), "--target", "host")
+    assert not ran.exists()
+    assert (code, report["own"], report["changed"]) == (0, True, [])
+    profile(own, ["host"])
+    assert not ran.exists()
+
+
+# ---- Recordings, long streams ---------------------------------------------------------------------------------------
+
+
+def test_recordings_go_through_the_c(
+    c_compiler: str, two_settings: None, recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = exported(tmp_path / "out", bundle_of("accel-3", "5d1_4d3", "3,5"))
+    code, report, err = run(capsys, str(out), "--target", "host", "--dataset", str(recorded), "--samples", "5000")
+    assert code == 0 and report["mismatches"] == 0
+    assert [s["name"] for s in report["streams"]] == ["golden", "scenario", "recordings"]
+    assert report["streams"][2]["frames"] == 780 and "these recordings make" in err
+    assert all(r["vectors"] == sum(s["answers"] for s in report["streams"]) for r in report["runs"])
+    assert sorted(p.name for p in out.iterdir()) == sorted(
+        p.name for p in exported(tmp_path / "b", Export(out).bundle).iterdir()
+    )
+
+
+def test_real_recordings_go_through_the_c(c_compiler: str, real_data: Path, tmp_path: Path) -> None:
+    some = tmp_path / "raw"
+    for person in ("P01", "P10"):
+        shutil.copytree(real_data / "makeability-gestures" / person, some / person)
+    import_recordings(some, tmp_path / "ds", layout="accel-3")
+    export = Export(exported(tmp_path / "out", bundle_of("accel-3", "14d1_19d2_19d4", "8,12,16")))
+    vectors = export.recorded(open_dataset(tmp_path / "ds"), [], 6000)
+    assert sum(v.samples for v in vectors) >= 6000
+    done = verify(export, ["host"], vectors, only=plainly)
+    assert done.passed and done.runs[0].vectors >= 6000 // 5
+
+
+def test_long_streams_are_cut_where_an_emulator_has_no_more_room(
+    c_compiler: str, small: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("plushsense.deploy.proof.vectors.MOST_FRAME_BYTES", 56 * 2000)
+    export = Export(small)
+    vectors = export.made_up(5000)
+    assert len(vectors) >= 3 and {len(v.frames) for v in vectors[:-1]} == {2000}
+    done = verify(export, ["host"], vectors, only=plainly)
+    assert done.passed and [c.name for c in done.counts] == ["golden", "scenario", "made up"]
+    assert done.counts[2].samples >= 4900 and done.runs[0].vectors == sum(c.answers for c in done.counts)
+
+
+def test_a_model_of_another_layout_among_the_files_is_named(c_compiler: str, own: Path, tmp_path: Path) -> None:
+    other = exported(tmp_path / "other", bundle_of("accel-3", "9d1_5d2", "4,6"))
+    for name in ("plush_model.h", "plush_model.c"):
+        shutil.copyfile(other / name, own / name)
+    done = verify(Export(own), ["host"], only=plainly, trust=True)
+    assert not done.passed
+    assert "other channels or classes than model.plush" in str(done.first)
+
+
+def test_what_is_requested_must_be_there(
+    c_compiler: str, own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, report, err = run(capsys, str(tmp_path))
+    assert code == 2 and report == {} and "is no export" in err and err.count("\n") == 1
+    code, _, err = run(capsys, str(own), "--target", "xtesna")
+    assert code == 2 and "Did you mean 'xtensa'?" in err
+    code, _, err = run(capsys, str(own), "--subject", "A")
+    assert code == 2 and "--dataset" in err
+    code, _, err = run(capsys, str(own), "--samples", "0")
+    assert code == 2 and "--samples is 0" in err
+    tools = tmp_path / "bin"
+    tools.mkdir()
+    for tool in ("gcc", "as", "ld"):
+        (tools / tool).symlink_to(shutil.which(tool) or "")
+    monkeypatch.setenv("PATH", str(tools))
+    code, _, err = run(capsys, str(own), "--target", "xtensa")
+    assert code == 2 and "gcc-xtensa-lx106" in err and "qemu-system-misc" in err and err.count("\n") == 1
+    code, report, _ = run(capsys, str(own))
+    assert code == 0 and {r["target"] for r in report["runs"]} == {"host"}
+    why = {n["what"]: n["why"] for n in report["not_run"]}
+    assert "gcc-xtensa-lx106" in why["xtensa"] and set(EMULATED) <= set(why)
+    assert "clang" in why["host, clang -O2"]
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(ToolError, match="Nothing can be checked here"):
+        verify(Export(own))

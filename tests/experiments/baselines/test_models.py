@@ -1,0 +1,125 @@
+"""Baselines: what is fitted to what, how it is read, and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from plushsense.core.errors import BadInput, ConfigError
+from plushsense.experiments.baselines.models import (
+    BASELINES,
+    FEATURES,
+    TITLES,
+    ClassicalFit,
+    ClassicalReader,
+    classical,
+    likelihoods,
+)
+from support.fakes import rhythms
+
+pytestmark = pytest.mark.usefixtures("scikit_learn")
+
+SAMPLES = 50
+
+
+def fitted(name: str = "knn", features: str = "statistics", pca: bool = False, seed: int = 0) -> ClassicalReader:
+    reader = ClassicalFit(name, features, pca, SAMPLES, seed)(rhythms(), rhythms(0))
+    assert isinstance(reader, ClassicalReader)
+    return reader
+
+
+@pytest.mark.parametrize("name", list(BASELINES))
+def test_every_baseline_learns_gives_probabilities_and_repeats_itself(name: str) -> None:
+    test = rhythms(30, seed=9)
+    for features, pca in (("statistics", False), ("statistics", True), ("flattened", True)):
+        once, again = fitted(name, features, pca), fitted(name, features, pca)
+        read = once(test)
+        assert read.shape == (30, 3) and read.dtype == np.float32
+        assert read.sum(axis=1) == pytest.approx(np.ones(30), abs=1e-5)
+        assert np.array_equal(read, again(test))
+        if features == "statistics":
+            assert (read.argmax(axis=1) == test.y).mean() > 0.8, (name, pca)
+    assert name in TITLES
+
+
+@pytest.mark.parametrize("name", ["forest", "extra-trees", "mlp", "subspace-knn"])
+def test_another_seed_is_another_program(name: str) -> None:
+    test = rhythms(30, seed=9)
+    noisy = replace(test, x=test.x + np.random.default_rng(3).integers(-400, 400, test.x.shape).astype(np.int32))
+    assert not np.array_equal(fitted(name, seed=0)(noisy), fitted(name, seed=1)(noisy))
+
+
+def test_scaling_and_pca_are_fitted_to_the_training_windows_only() -> None:
+    train = rhythms()
+    # Planted: windows to validate and to test of another level and size would show in a mean and in a direction.
+    other = replace(rhythms(40, seed=5), x=rhythms(40, seed=5).x * 50 + 90_000)
+    fit = ClassicalFit("knn", "flattened", True, SAMPLES, 0)
+    with_them, without = fit(train, other), fit(train, rhythms(0))
+    assert isinstance(with_them, ClassicalReader) and isinstance(without, ClassicalReader)
+    with_them(other)
+    flat = FEATURES["flattened"](train, SAMPLES)
+    for reader in (with_them, without):
+        scaler, pca = reader.pipeline[0], reader.pipeline[1]
+        assert scaler.mean_ == pytest.approx(flat.mean(axis=0))
+        assert scaler.scale_ == pytest.approx(flat.std(axis=0))
+        assert scaler.n_samples_seen_ == len(train)
+        scaled = (flat - flat.mean(axis=0)) / flat.std(axis=0)
+        kept = np.cumsum(np.sort(np.linalg.eigvalsh(np.cov(scaled.T)))[::-1])
+        assert pca.n_components_ == int(np.searchsorted(kept / kept[-1], 0.95)) + 1 < flat.shape[1]
+    assert np.array_equal(with_them(train), without(train))
+
+
+def test_classical_programs_read_the_end_of_a_longer_window() -> None:
+    long = rhythms(30, samples=80)
+    past = np.random.default_rng(1).integers(-9000, 9000, (30, 2, 80 - SAMPLES))
+    other = replace(long, x=np.concatenate([past, long.x[:, :, -SAMPLES:]], axis=2).astype(np.int32))
+    reader = fitted("rbf-svm")
+    assert np.array_equal(reader(long), reader(other))
+    assert FEATURES["flattened"](long, SAMPLES).shape == (30, 2 * SAMPLES)
+    assert FEATURES["statistics"](long, SAMPLES).shape == (30, 16)
+
+
+def test_a_size_is_what_the_program_holds() -> None:
+    small, large = (ClassicalFit("knn", "flattened", False, SAMPLES, 0)(rhythms(n), rhythms(0)) for n in (60, 600))
+    # Nearest neighbours hold their windows: 540 more of 100 values of 8 bytes, and a class each.
+    assert large.size_bytes - small.size_bytes == pytest.approx(540 * (100 * 8 + 8), rel=0.05)
+
+
+def test_a_gesture_that_was_not_trained_on_gets_nothing() -> None:
+    train = rhythms()
+    two = train.take(np.flatnonzero(train.y != 1))
+    for name in ("knn", "rbf-svm", "cubic-svm"):
+        read = ClassicalFit(name, "statistics", False, SAMPLES, 0)(two, rhythms(0))(train)
+        assert (read[:, 1] == 0).all() and read.sum(axis=1) == pytest.approx(np.ones(60), abs=1e-5)
+
+
+def test_decision_values_keep_their_order() -> None:
+    class Margins:
+        classes_ = np.array([0, 2, 3])
+
+        def decision_function(self, x: np.ndarray) -> np.ndarray:
+            return x
+
+    x = np.array([[2.2, 0.1, 1.0], [-500.0, 900.0, 3.0]])
+    found = likelihoods(Margins(), x, 4)
+    assert found.argmax(axis=1).tolist() == [0, 2] and np.isfinite(found).all()
+    assert found[0, 3] > found[0, 2] > found[0, 1] == 0
+
+
+def test_what_takes_too_long_is_left_out() -> None:
+    asked = classical(["knn", "boosting"], ["statistics", "flattened"], [False, True], SAMPLES, 3)
+    assert len(asked) == 7
+    assert ("boosting", "flattened", False) not in {(c.name, c.features, c.pca) for c in asked}
+    assert all(c.key["seed"] == 3 and c.key["library"].startswith("scikit-learn ") for c in asked)
+
+
+def test_what_is_refused() -> None:
+    train = rhythms()
+    with pytest.raises(BadInput, match="gesture 1 only"):
+        ClassicalFit("knn", "statistics", False, SAMPLES, 0)(train.take(np.flatnonzero(train.y == 1)), rhythms(0))
+    with pytest.raises(ConfigError, match="Unknown baseline 'forrest'.* Did you mean 'forest'"):
+        classical(["forrest"], ["statistics"], [False], SAMPLES, 0)
+    with pytest.raises(ConfigError, match="Unknown features 'statistic'.* Did you mean 'statistics'"):
+        classical(["forest"], ["statistic"], [False], SAMPLES, 0)

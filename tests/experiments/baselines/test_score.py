@@ -1,0 +1,155 @@
+"""The comparison: side by side, the gap, the resuming, and who is refused."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from plushsense.core.errors import BadInput, ConfigError
+from plushsense.experiments.baselines.score import CompareProgress, Contender, compare
+from plushsense.jobs.journal import Journal
+from plushsense.windows.cut import WindowSet
+
+HERE = Path(__file__).parents[2]
+
+from support.fakes import LABELS, study
+
+pytestmark = pytest.mark.usefixtures("scikit_learn")
+
+SPLITS = ("leave-one-subject-out", "windows:4")
+
+
+@dataclass(frozen=True)
+class Known:
+    """Knows a recording that it was trained on, and nothing else; leaves a mark for each fit."""
+
+    folder: str
+    pause: float = 0.0
+
+    def __call__(self, train: WindowSet, validation: WindowSet, /) -> KnownReader:
+        assert len(validation)
+        with Path(self.folder, "fits").open("a") as file:
+            file.write("x")
+        time.sleep(self.pause)
+        return KnownReader(tuple(np.unique(train.x[:, 1, 0]).tolist()))
+
+
+@dataclass(frozen=True)
+class KnownReader:
+    seen: tuple[int, ...]
+
+    @property
+    def size_bytes(self) -> int:
+        return 8 * len(self.seen)
+
+    def __call__(self, windows: WindowSet, /) -> np.ndarray:
+        read = np.where(np.isin(windows.x[:, 1, 0], self.seen), windows.y, (windows.y + 1) % len(LABELS))
+        return np.eye(len(LABELS), dtype=np.float32)[read]
+
+
+@dataclass(frozen=True)
+class Misshapen:
+    size_bytes: int = 1
+
+    def __call__(self, *sets: WindowSet) -> Any:
+        # As a fit it is given two sets, as a reader one.
+        return self if len(sets) == 2 else np.zeros((1, 1), dtype=np.float32)
+
+
+def known(folder: Path, name: str = "known", pause: float = 0.0, **key: Any) -> Contender:
+    return Contender(name, f"the {name} one", "windows", False, Known(str(folder), pause), key)
+
+
+def fits(folder: Path) -> int:
+    return len((folder / "fits").read_text()) if (folder / "fits").exists() else 0
+
+
+def test_side_by_side_with_the_gap(tmp_path: Path) -> None:
+    windows = study(windows=4)
+    said: list[CompareProgress] = []
+    table = compare(windows, [known(tmp_path), known(tmp_path, "other")], SPLITS, progress=said.append)
+    json.dumps(table, allow_nan=False)
+    assert [(r["name"], r["split"]) for r in table["models"]] == [
+        (name, split) for name in ("known", "other") for split in SPLITS
+    ]
+    honest, leaky = table["models"][:2]
+    assert (honest["leaky"], honest["over"], honest["folds"]) == (False, "subjects", 6)
+    assert (leaky["leaky"], leaky["over"], leaky["folds"]) == (True, "folds", 4)
+    assert honest["accuracy"]["mean"] == 0.0 and leaky["accuracy"]["mean"] > 0.9
+    assert leaky["pooled"]["accuracy"] > 0.9 and leaky["macro_f1"]["mean"] > 0.9
+    gap = table["gaps"][0]
+    assert (gap["name"], gap["split"], gap["leaky_split"]) == ("known", *SPLITS)
+    assert gap["accuracy"] == pytest.approx(leaky["accuracy"]["mean"]) and len(table["gaps"]) == 2
+    assert all(r["predict_ms"] > 0 and r["predict_batch_ms"] > 0 and r["train_s"] > 0 for r in table["models"])
+    assert honest["size_bytes"] % 8 == 0 and honest["size_bytes"] > 0
+    assert (table["windows"], table["subjects"], table["recordings"]) == (len(windows), 6, 30)
+    assert [s.done for s in said] == list(range(1, 21)) and fits(tmp_path) == 20 == said[-1].jobs
+
+
+def test_finished_fits_are_kept_and_a_changed_key_is_another_job(tmp_path: Path) -> None:
+    windows, journal = study(), Journal(tmp_path / "journal")
+    first = compare(windows, [known(tmp_path, depth=1)], ["by-subject:3"], journal=journal)
+    again = compare(windows, [known(tmp_path, depth=1)], ["by-subject:3"], journal=journal)
+    assert fits(tmp_path) == 3 and again["resumed"] == 3
+    # Times too are those of the first run: the journal holds what was measured.
+    assert {**again, "resumed": 0} == first
+    compare(windows, [known(tmp_path, depth=2)], ["by-subject:3"], journal=journal)
+    assert fits(tmp_path) == 6
+    compare(windows, [known(tmp_path, depth=1)], ["by-subject:3"], journal=journal, seed=4)
+    assert fits(tmp_path) == 9
+
+
+def test_a_killed_comparison_goes_on_and_ends_the_same(tmp_path: Path) -> None:
+    program = (
+        "import sys; sys.path[:0] = {here!r}\n"
+        "from pathlib import Path\n"
+        "from support.fakes import study\n"
+        "from test_score import known, SPLITS\n"
+        "from plushsense.experiments.baselines.score import compare\n"
+        "from plushsense.jobs.journal import Journal\n"
+        "compare(study(windows=4), [known(Path({folder!r}), pause=0.3)], SPLITS, journal=Journal({journal!r}))\n"
+    ).format(here=[str(HERE), str(Path(__file__).parent)], folder=str(tmp_path), journal=str(tmp_path / "journal"))
+    process = subprocess.Popen([sys.executable, "-c", program])
+    until = time.monotonic() + 30
+    while fits(tmp_path) < 3 and process.poll() is None and time.monotonic() < until:
+        time.sleep(0.02)
+    process.kill()
+    assert process.wait() != 0
+    kept = len(list((tmp_path / "journal").glob("*.npz")))
+    assert 2 <= kept < 10
+    before = fits(tmp_path)
+    table = compare(study(windows=4), [known(tmp_path)], SPLITS, journal=Journal(tmp_path / "journal"))
+    assert table["resumed"] == kept and fits(tmp_path) == before + 10 - kept
+    whole = compare(study(windows=4), [known(tmp_path)], SPLITS)
+    for one, other in zip(table["models"], whole["models"], strict=True):
+        assert (one["accuracy"], one["macro_f1"], one["pooled"]) == (
+            other["accuracy"],
+            other["macro_f1"],
+            other["pooled"],
+        )
+
+
+def test_what_is_refused(tmp_path: Path) -> None:
+    windows = study()
+    one = known(tmp_path)
+    with pytest.raises(ConfigError, match="asked for twice"):
+        compare(windows, [one], ["windows:4", "windows:4"])
+    with pytest.raises(ConfigError, match="No split"):
+        compare(windows, [one], [])
+    with pytest.raises(ConfigError, match="Did you mean"):
+        compare(windows, [one], ["by-subjects:3"])
+    with pytest.raises(BadInput, match="people"):
+        compare(windows, [one], ["by-subject:30"])
+    with pytest.raises(ConfigError, match="stands twice"):
+        compare(windows, [one, one], ["windows:4"])
+    assert fits(tmp_path) == 0
+    with pytest.raises(ConfigError, match=r"the odd one, windows gave probabilities of the shape \(1, 1\)"):
+        compare(windows, [Contender("odd", "the odd one", "windows", False, Misshapen(), {})], ["windows:4"])

@@ -1,0 +1,145 @@
+"""The protocol's page and tables: figures as they are, the paper's beside them, simulation said everywhere."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from plushsense.core.gestures import load_gestures
+from plushsense.experiments.protocol import report
+from plushsense.experiments.protocol.report import PAPER
+from plushsense.experiments.protocol.score import SYSTEMS
+
+TIMES = {"median": 0.013, "p90": 0.2}
+
+
+def row(group, system, **more):
+    figures = {
+        "trials": 45, "activated": 44, "named": 40, "activation": 0.9778, "gesture_activation": 0.8889,
+        "reaction_s": TIMES, "within_200_ms": 44, "likelihood": 0.834,
+        "gentle": 45, "called_negative": 1, "called": {"right": 40, "family": 3, "affect": 0, "wrong": 1, "unnamed": 1},
+    }  # fmt: skip
+    return {"group": group, "title": group.title(), "system": system} | figures | more
+
+
+def result(simulated=True, label="Tail hit 1", **more):
+    outcome = {"gesture": label, "group": "energetic", "system": "hybrid", "reaction_s": 0.1}
+    return {
+        "heading": "The protocol", "simulated": simulated, "about": [["People", "5"]], "said": ["No gate."], "left": [],
+        "counted": ["How it is counted."], "outcomes": [outcome, outcome | {"reaction_s": None}],
+        "rows": [
+            row("energetic", "hybrid", gentle=0, called_negative=0), row("fine", "rules"), row("fine", "cnn"),
+            row("taps", "cnn", activated=0, named=0, reaction_s={"median": None, "p90": None}, likelihood=None),
+            row("all", "cnn"),
+        ],
+        "by_gesture": [{"gesture": label} | row("energetic", "hybrid")],
+        "confusions": [
+            {"system": "cnn", "did": "Tail scratch", "called": "Tail tap", "trials": 2, "share": 0.13},
+            {"system": "cnn", "did": "Tail scratch", "called": None, "trials": 13, "share": 0.87},
+            {"system": "rules", "did": "Tail scratch", "called": "never shown", "trials": 1, "share": 1.0},
+        ],
+        "between": [
+            {"system": "cnn", "hours": 0.5, "positive": 3, "neutral": 9, "negative": 1, "none": 0,
+             "reactions_per_hour": 8.0, "negative_per_hour": 2.0},
+        ],
+        "aims": [
+            {"aim": "Fast", "measured": 0.9778, "unit": "share", "part": 44, "of": 45, "met": False},
+            {"aim": "Soon", "measured": 1.4, "unit": "s", "part": None, "of": 40, "met": True},
+            {"aim": "Open", "measured": None, "unit": "share", "part": 0, "of": 0, "met": None},
+        ],
+    } | more  # fmt: skip
+
+
+def test_shares_bear_their_counts_and_do_not_round_a_miss_away():
+    assert report.percent(44, 45) == "97.8 % (44/45)"
+    assert report.percent(254, 255) == "99.6 % (254/255)"
+    assert report.percent(1, 210) == "0.5 % (1/210)"
+    assert report.percent(45, 45) == "100 % (45/45)"
+    assert report.percent(0, 45) == "0 % (0/45)"
+    assert report.percent(13, 90) == "14 % (13/90)"
+    assert report.percent(0, 0) == "—"
+    assert report.seconds(-0.001) == "0.00"
+
+
+def test_the_table_stands_beside_the_paper():
+    rows = report.group_table(result()).rows
+    by = {(r["title"] or "Fine", r["system"]): r for r in rows}
+    assert by["Fine", "Rules"]["paper_answered"] == "≈ 6 %" and by["Fine", "Rules"]["paper_time"] == "—"
+    assert by["Fine", "Network"]["paper_time"] == "2.3–2.4 s"
+    assert by["Energetic", "Hybrid"]["paper_answered"] == "—"
+    assert by["Energetic", "Hybrid"]["quick"] == "97.8 % (44/45)"
+    assert by["Energetic", "Hybrid"]["negative"] == "", "a blow is rightly called negative"
+    assert by["Fine", "Rules"]["quick"] == ""
+    assert by["Fine", "Rules"]["named"] == "—", "rules name no gesture"
+    assert (by["Taps", "Network"]["median"], by["Taps", "Network"]["likelihood"]) == ("—", "—")
+    assert len(report.group_table(result()).columns) == 13
+    assert "paper: time" in report.group_table(result()).text()
+    elsewhere = result()
+    for row in elsewhere["rows"]:
+        row["group"] = "other"
+    assert len(report.group_table(elsewhere).columns) == 10, "the paper has no such gestures"
+
+
+def test_the_csv_holds_numbers_of_groups_and_gestures():
+    rows = report.figure_table(result()).rows
+    assert [(r["of"], r["name"], r["system"]) for r in rows[:1] + rows[-1:]] == [
+        ("group", "Energetic", "hybrid"), ("gesture", "Tail hit 1", "hybrid"),
+    ]  # fmt: skip
+    assert (rows[0]["reaction_median_s"], rows[0]["within_200_ms"], rows[0]["said_first_family"]) == (0.013, 44, 3)
+    assert next(r for r in rows if r["name"] == "Fine" and r["system"] == "rules")["paper_answered"] == "≈ 6 %"
+    assert {r["simulated"] for r in rows} == {"yes"}
+
+
+def test_aims_say_met_or_not():
+    assert [(r["measured"], r["met"]) for r in report.aim_table(result()).rows] == [
+        ("97.8 % (44/45)", "NOT met"), ("1.40 s", "met"), ("—", "not measured"),
+    ]  # fmt: skip
+
+
+def test_the_papers_cells_are_of_systems_and_groups_that_there_are():
+    from plushsense.experiments.protocol.score import GROUPS, group_of
+
+    ours = {group_of(g) for g in load_gestures("plush-18").gestures}
+    assert {group for group, _ in PAPER} <= ours <= set(GROUPS)
+    assert {system for _, system in PAPER} == set(SYSTEMS) - {"hybrid"}
+
+
+def test_a_page_is_whole_and_says_what_it_is():
+    pytest.importorskip("jinja2")
+    pytest.importorskip("matplotlib")
+    page = report.page(result(label="<b>& $x$"))
+    assert "This is a simulation." in page
+    tables = len(re.findall("<h2", page))
+    assert page.count("Simulation:</strong>") == tables
+    assert "&lt;b&gt;&amp; $x$" in page
+    assert "<b>" not in page
+    assert "never shown" not in page
+    assert not re.search(r'(src|href)="(?!data:)', page)
+    assert "NOT met" in page
+    real = report.page(result(simulated=False, aims=[], left=[{"who": "P09", "why": "has no session stream"}]))
+    assert "simulation" not in real.lower().replace("<!--", "")
+    assert "P09 has no session stream" in real
+    assert "What we aim at" not in real
+
+
+def test_where_the_paper_has_nothing_its_columns_are_not_there():
+    pytest.importorskip("jinja2")
+    pytest.importorskip("matplotlib")
+    other = result(rows=[row("fast", "cnn"), row("other", "cnn")], simulated=False, aims=[])
+    page = report.page(other)
+    assert "beside the paper" not in page
+    assert "five new people" not in page
+
+
+def test_the_figure_draws_every_answer_and_names_who_was_missed():
+    pytest.importorskip("matplotlib")
+    made = report.figure(result())
+    axes = made.axes[0]
+    assert axes.get_title(loc="left") == "SIMULATION"
+    texts = [t.get_text() for t in axes.texts]
+    assert "44 of 45 not answered" in texts
+    assert sum(len(c.get_offsets()) for c in axes.collections) == 1
+    names = [t.get_text() for t in axes.get_yticklabels()]
+    assert names[0] == "Energetic: hybrid"
+    assert len(names) == 4, "all gestures together are no row"

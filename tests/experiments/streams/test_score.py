@@ -1,0 +1,395 @@
+"""Whole streams: quick replays are the real ones, truth lies where it was recorded, nobody tunes on those scored."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from plushsense.core.errors import BadInput, ConfigError
+from plushsense.core.gestures import Gesture, GestureSet
+from plushsense.core.layouts import load_layout
+from plushsense.core.recorder_csv import Frames, format_rows, write_recording
+from plushsense.dataset.importing.importers import import_recordings
+from plushsense.dataset.index import open_dataset
+from plushsense.dataset.marks import Mark, append_marks
+from plushsense.dataset.store import Dataset
+from plushsense.experiments.streams.replay import (
+    StreamScore,
+    StreamTrace,
+    StreamTruth,
+    hear,
+    people_with_streams,
+    quick,
+    rate,
+    row_times_s,
+    score,
+    truth_of,
+    usual_rows,
+)
+from plushsense.experiments.streams.score import (
+    Fitted,
+    PeopleFold,
+    Settings,
+    crossvalidated_streams,
+    people_folds,
+    pooled_scores,
+    scored_people,
+    summed,
+)
+from plushsense.experiments.streams.systems import (
+    SYSTEMS,
+    TunedPoint,
+    balanced,
+    best_of,
+    cheapest,
+    fewest,
+    gated,
+    searched,
+    tried,
+)
+from plushsense.jobs.journal import Journal
+from plushsense.models.arch import Arch
+from plushsense.models.bundle import Bundle
+from plushsense.models.reference import random_weights
+from plushsense.runtime.decisions import DecideSpec, Rules, argmax_spec
+from plushsense.runtime.events import ONE, EventSettings
+from plushsense.runtime.fixed import smoothing_weight
+from plushsense.runtime.gate import JERK, GateSettings, Rule, Signal, Term
+from plushsense.runtime.trace import Part, Trace, TraceReplayer, replay, reported_events, trace_of
+from plushsense.scoring.events import Interval
+from plushsense.windows.features import Scaler
+
+ACCEL = load_layout("accel-3")
+GESTURES = GestureSet(
+    "touches",
+    (
+        Gesture("Rest", "neutral", idle=True),
+        Gesture("Hug", "positive", "Hold"),
+        Gesture("Squeeze", "positive", "Hold"),
+        Gesture("Hit", "negative", energetic=True),
+    ),
+)
+REST, HUG, SQUEEZE, HIT = range(4)
+ARCH = Arch.parse("5d1_4d3", (6, 5), channels=3, classes=4, padding="stream", window=48, step=5)
+STEP_S = 0.05
+
+
+def made_trace(logits: list[np.ndarray], inputs: np.ndarray | None = None, suspect: tuple[int, ...] = ()) -> Trace:
+    """A stream that a network answered with ``logits``, a part each; one of None is too short for any answer."""
+    parts, now = [], 0
+    for rows in logits:
+        n = len(rows)
+        samples = ARCH.span + ARCH.step * (n - 1) + 3 if n else ARCH.span - 6
+        values = np.zeros((samples, 3), dtype=np.int64) if inputs is None else inputs[:samples]
+        doubt = np.zeros(samples, dtype=np.bool_)
+        doubt[[at for at in suspect if at < samples]] = True
+        parts.append(Part(now, now + (samples - 1) * 10_000 + 3_000, values, doubt, rows.astype(np.int64)))
+        now += samples * 10_000 + 500_000
+    return Trace(ARCH, 10_000, GESTURES, 0, tuple(parts), 0)
+
+
+GATE = GateSettings((Signal(JERK, (0, 1, 2), lag=2, floor=40),), (Rule((Term(0, 40),), 3, HIT, deaf=9),))
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_quick_replays_give_the_events_of_the_live_loop(seed: int) -> None:
+    draw = np.random.default_rng(seed)
+    # Slow swings, so that something lasts; and a noisy part.
+    parts = [np.cumsum(draw.normal(0, swing, (n, 4)), axis=0) for swing, n in ((120, 300), (400, 80), (0, 0), (60, 40))]
+    inputs = np.cumsum(draw.integers(-9, 10, (1600, 3)), axis=0) + 400 * (draw.random((1600, 1)) > 0.99)
+    trace = made_trace(parts, inputs, tuple(draw.integers(0, 900, 40).tolist()))
+    counts = {name: int(draw.integers(low, 9)) for low, name in ((1, "least"), (1, "switch"), (1, "end"), (0, "hold"))}
+    plan = EventSettings(
+        enter=int(draw.integers(0, ONE)),
+        leave=int(draw.integers(0, ONE)),
+        enter_affect=int(draw.integers(ONE // 3, ONE + 2)),
+        leave_affect=int(draw.integers(0, ONE)),
+        known=int(draw.integers(-2000, 2000)),
+        rest=int(draw.integers(0, 20)),
+        wait=int(draw.integers(0, 20)),
+        **counts,
+    )
+    listener = TraceReplayer(trace)
+    for gate in (GateSettings(), GATE):
+        for smoothing_s in (0.0, 0.2):
+            rules, weight = Rules(plan, gate), smoothing_weight(smoothing_s, STEP_S)
+            assert listener.replay(rules, weight) == list(replay(trace, rules, weight).updates)
+
+
+def test_replays_of_a_real_network_on_a_troubled_stream_are_the_same() -> None:
+    frames = troubled()
+    listener = TraceReplayer(trace_of(frames, bundle()))
+    assert len(listener.trace.parts) > 2
+    for spec in (argmax_spec(), DecideSpec(enter=0.3, leave=0.2), replace(argmax_spec(0.1), gate=GATE, end_s=0.4)):
+        weight = smoothing_weight(spec.smoothing_s, listener.step_s)
+        rules = spec.rules(listener.step_s)
+        updates = listener.replay(rules, weight)
+        assert updates == list(replay(listener.trace, rules, weight).updates) and updates
+        events = listener.events(spec)
+        assert events == reported_events(updates)
+        assert all(e.start_s <= e.named_s <= e.stop_s for e in events)
+
+
+def troubled() -> Frames:
+    """A gap and a clock that is set back."""
+    draw = np.random.default_rng(5)
+    time = 7_000 + np.cumsum(draw.integers(8, 13, 900))
+    time[300:] += 400
+    time[600:] -= time[600] - 20
+    values = np.cumsum(draw.integers(-300, 301, (900, 3)), axis=0)
+    return Frames(values.astype(np.int64), time.astype(np.int64), time.astype(np.int64))
+
+
+def bundle(seed: int = 3, people: tuple[str, ...] = ()) -> Bundle:
+    weights = {k: 4 * v for k, v in random_weights(ARCH, seed).items()}
+    return Bundle(ARCH, weights, ACCEL, Scaler(np.zeros(3), np.full(3, 0.002)), GESTURES, {}, {}, {"subjects": people})
+
+
+def test_rows_have_the_time_of_the_trace() -> None:
+    frames = troubled()
+    times = row_times_s(frames, 10_000)
+    trace = trace_of(frames, bundle())
+    assert [p.start_us / 1e6 for p in trace.parts] == pytest.approx([times[0], times[300], times[600]], abs=0.011)
+    assert [p.ends_us / 1e6 for p in trace.parts] == pytest.approx([times[299], times[599], times[-1]])
+
+
+# --- counts by hand -------------------------------------------------------------------------------------------------
+
+
+def steps(*pieces: tuple[int, int]) -> np.ndarray:
+    """Logits that leave no doubt: (class, for how many steps)."""
+    return np.concatenate([np.tile(np.where(np.arange(4) == k, 4000, -4000), (n, 1)) for k, n in pieces])
+
+
+def heard(truth: StreamTruth, *pieces: tuple[int, int]) -> StreamTrace:
+    trace = made_trace([steps(*pieces)])
+    hours = trace.seconds / 3600
+    return StreamTrace(truth, TraceReplayer(trace), hours, hours / 2, 2.0 / 3600)
+
+
+def when(step: int) -> float:
+    """Seconds of a step's answer."""
+    return (ARCH.span - 1) / 100 + step * STEP_S
+
+
+def test_every_count_of_one_stream_by_hand() -> None:
+    truth = StreamTruth(
+        "P1/s",
+        "P1",
+        False,
+        (
+            Interval(when(10), when(30), "Hug"),
+            Interval(when(60), when(80), "Hit"),
+            Interval(when(200), when(210), "Hug"),
+        ),
+        rest=((when(100), when(140)),),
+        other=((when(150), when(170)),),
+        doubtful=((when(270), when(400)),),
+    )
+    h = heard(
+        truth, (REST, 16), (HUG, 20), (REST, 30), (SQUEEZE, 4), (REST, 40), (HIT, 5), (REST, 40), (HUG, 5),
+        (REST, 70), (HIT, 3), (REST, 40), (HIT, 20), (REST, 10),
+    )  # fmt: skip
+    found = score(h, argmax_spec())
+    gesture = found.total()
+    assert (gesture.truths, gesture.hits, gesture.deletions) == (3, 1, 2)
+    # The last hit begins in the doubtful stretch and is not counted.
+    assert (gesture.events, gesture.matched, gesture.insertions, gesture.confused) == (5, 1, 4, 1)
+    assert found.places == {"rest": 1, "other": 1, "unmarked": 1}
+    assert gesture.latencies == pytest.approx([6 * STEP_S])
+    # A squeeze where a blow was is another affect; nothing was said of the second hug.
+    assert found.cost == 5.0 + 3 * 3.0 + 2.0
+    assert found.total("affect").hits == 1 and found.total("anything").hits == 2
+    assert found.levels["family"]["Hold"].truths == 2
+    shown = found.to_dict()
+    assert shown["false_events_per_hour"] == pytest.approx(4 / h.hours)
+    assert shown["outside_per_uncovered_hour"] == pytest.approx(3 / h.free_hours)
+    assert shown["at_rest_per_hour"] == pytest.approx(1 / h.rest_hours)
+    assert StreamScore.from_kept(found.kept()).to_dict() == shown
+    n = quick([h], argmax_spec())
+    assert (n.hits, n.truths, n.insertions) == (1, 3, 4) and n.f1 == pytest.approx(gesture.f1)
+
+
+def test_a_gate_is_heard_at_once_and_named_by_the_network() -> None:
+    truth = StreamTruth("s", "P1", False, (Interval(0.30, 1.5, "Hit"),), (), (), ())
+    inputs = np.zeros((400, 3), dtype=np.int64)
+    inputs[::2] = 1
+    inputs[32:60] = 4000 * np.tile([[1], [1], [-1], [-1]], (7, 1))
+    trace = made_trace([steps((REST, 20), (HIT, 10), (REST, 30))], inputs)
+    plan = replace(GATE, rules=(replace(GATE.rules[0], gesture=255),))
+    spec = replace(argmax_spec(), enter=0.9, end_s=0.2, wait_s=2.0, gate=plan)
+    found = score(StreamTrace(truth, TraceReplayer(trace), 1.0, 1.0, 0.0), spec)
+    affect, gesture = found.total("affect"), found.total()
+    assert found.gate_events == 1 and affect.hits == gesture.hits == 1
+    assert affect.latencies[0] < 0.1
+    assert gesture.latencies[0] == pytest.approx(when(20) - 0.30)
+    without = score(StreamTrace(truth, TraceReplayer(trace), 1.0, 1.0, 0.0), replace(spec, gate=GateSettings()))
+    assert without.total("affect").latencies[0] == pytest.approx(when(20) - 0.30)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_the_quick_counts_are_those_of_the_whole_score(seed: int) -> None:
+    draw = np.random.default_rng(seed)
+    trace = made_trace([np.cumsum(draw.normal(0, 200, (400, 4)), axis=0)])
+    starts = np.sort(draw.uniform(0, 20, 8))
+    labels = draw.choice(["Hug", "Squeeze", "Hit"], 8)
+    truths = tuple(Interval(float(s), float(s + 1), str(k)) for s, k in zip(starts, labels, strict=True))
+    h = StreamTrace(StreamTruth("s", "P1", False, truths, (), (), ((3.0, 4.0),)), TraceReplayer(trace), 0.5, 0.4, 0.0)
+    for spec in (argmax_spec(), argmax_spec(0.3), DecideSpec(enter=0.5), DecideSpec(gate=GATE)):
+        n, whole = quick([h], spec), score(h, spec).total()
+        assert (n.hits, n.truths, n.matched, n.insertions) == (
+            whole.hits, whole.truths, whole.matched, whole.insertions,
+        )  # fmt: skip
+
+
+def test_settings_are_chosen_on_those_who_tune() -> None:
+    truths = tuple(Interval(when(20 + 60 * n), when(40 + 60 * n), "Hug") for n in range(3))
+    # Each hug is preceded by a short false blow, which a least duration would swallow.
+    pieces = [p for _ in range(3) for p in ((REST, 8), (HIT, 2), (REST, 12), (HUG, 18), (REST, 20))]
+    tuning = [heard(StreamTruth("s", "P1", False, truths, (), (), ()), *pieces)]
+    points = searched(tuning, SYSTEMS["hysteresis"])
+    best = fewest(points, 1.0)
+    assert (best.recall, best.false_per_hour) == (1.0, 0.0)
+    assert balanced(points).f1 == 1.0 and cheapest(tuning, points).false_per_hour == 0.0
+    # Without a rule there is no gate, and nothing to choose anew; with one, every choice without it is still there.
+    assert gated(tuning, points, GateSettings()) == points
+    with_gate = [replace(p.spec, gate=GateSettings(), wait_s=1.0) for p in gated(tuning, points, GATE)]
+    assert all(replace(p.spec, wait_s=1.0) in with_gate for p in best_of(points))
+    plain = tried(tuning, [argmax_spec()])[0]
+    assert plain.recall == 1.0 and plain.false_per_hour == pytest.approx(rate(3, tuning[0].hours))
+    several = [TunedPoint(argmax_spec(), r, f, 0.0) for r, f in ((0.5, 4.0), (0.8, 9.0), (0.8, 8.0), (0.6, 10.0))]
+    assert best_of(several) == [several[0], several[2]]
+    assert fewest(several, 0.55) == several[2] and fewest(several, 0.9) == several[2]
+
+
+# --- a data set -----------------------------------------------------------------------------------------------------
+
+RESETS_AT = 500
+
+
+@pytest.fixture(scope="session")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("streams")
+    for person in range(6):
+        draw = np.random.default_rng(person)
+        place = folder / f"P{person + 1}"
+        place.mkdir()
+        clock = 1_000 + 10 * np.arange(1600, dtype=np.int64)
+        clock[RESETS_AT:] -= 3_000
+        values = draw.integers(-2000, 2001, (1600, 3)).astype(np.int64)
+        stream = Frames(values, clock, 1_700_000_000_000 + 10 * np.arange(1600, dtype=np.int64) + 60_000 * person)
+        (place / "fulldatastream.csv").write_text(format_rows(stream, ACCEL))
+        for label, first, rows in (("Hug", 100, 150), ("Rest", 300, 100), ("Hit", 700, 60), ("Wave", 900, 100)):
+            assert stream.host_ms is not None
+            name = f"{label}_{int(stream.host_ms[first + rows - 1])}_{rows}.csv"
+            write_recording(place / name, stream.slice(first, first + rows), ACCEL)
+    return folder
+
+
+@pytest.fixture()
+def dataset(recordings: Path, tmp_path: Path) -> Dataset:
+    return import_recordings(recordings, tmp_path / "DS", layout=ACCEL, gestures=GESTURES).dataset
+
+
+def test_truth_lies_where_it_was_recorded(dataset: Dataset) -> None:
+    stream = next(s for s in dataset.streams if s.subject == "P1")
+    recording = next(r for r in dataset.recordings if r.subject == "P1" and r.gesture == "Hug")
+    frames = dataset.read_stream(stream.id)
+    found = truth_of(dataset, stream, frames, GESTURES, usual_rows(dataset))
+    assert [(t.label, t.start_s, t.stop_s) for t in found.truths] == [
+        ("Hug", pytest.approx(1.0), pytest.approx(2.49)),
+        ("Hit", pytest.approx(7.0), pytest.approx(7.59)),  # the clock was set back before it
+    ]
+    assert found.rest == (pytest.approx((3.0, 3.99)),)
+    assert found.other == (pytest.approx((9.0, 9.99)),)
+    append_marks(dataset.path, [Mark(recording.id, "trim", "K", "", start=30, stop=150)])
+    trimmed = open_dataset(dataset.path)
+    again = truth_of(trimmed, stream, frames, GESTURES, usual_rows(trimmed))
+    assert again.truths[0].start_s == pytest.approx(1.3) and again.truths[0].stop_s == pytest.approx(2.49)
+    append_marks(dataset.path, [Mark(recording.id, "exclude", "K", "")])
+    excluded = open_dataset(dataset.path)
+    left = truth_of(excluded, stream, frames, GESTURES, usual_rows(excluded))
+    assert [t.label for t in left.truths] == ["Hit"] and left.doubtful == (pytest.approx((1.3, 2.49)),)
+
+
+def test_time_that_was_heard_and_time_without_truth(dataset: Dataset) -> None:
+    (h,) = hear(dataset, bundle(), ["P1"])
+    assert 3600 * h.hours == pytest.approx(16.0, abs=0.1)
+    assert 3600 * h.free_hours == pytest.approx(16.0 - 1.49 - 0.59, abs=0.1)
+    assert 3600 * h.rest_hours == pytest.approx(0.99, abs=0.05)
+
+
+@dataclass(frozen=True)
+class Remembering:
+    """Notes whom it was given; the network is the same for everybody."""
+
+    notes: Path
+
+    def __call__(self, data: Dataset, fold: PeopleFold, progress: Callable[..., Any], /) -> Fitted:
+        progress(1, 1, {})
+        with self.notes.open("a") as file:
+            file.write(f"{fold.name} {','.join(fold.train)} {','.join(fold.validation)} {','.join(fold.test)}\n")
+        return Fitted({"windows": bundle()}, GATE, {"gate": "made up"})
+
+
+def test_folds_keep_people_apart_and_are_resumed(dataset: Dataset, tmp_path: Path) -> None:
+    fit = Remembering(tmp_path / "notes")
+    settings = Settings(("argmax", "hybrid", "full"), targets=(0.3, 0.9))
+    journal = Journal(tmp_path / "journal")
+    seen: list[tuple[int, int]] = []
+    folds = crossvalidated_streams(
+        dataset, "by-subject:3", fit, settings=settings, journal=journal, key={"fit": 1},
+        progress=lambda at: seen.append((at.done, at.resumed)),
+    )  # fmt: skip
+    notes = fit.notes.read_text().splitlines()
+    assert len(notes) == len(folds) == 3
+    tested: list[str] = []
+    for line in notes:
+        train, validation, test = (set(part.split(",")) for part in line.split(" ")[-3:])
+        assert not train & validation and not test & (train | validation) and len(train | validation | test) == 6
+        tested += test
+    assert sorted(tested) == people_with_streams(dataset)
+    # No network was trained anywhere in the stream, so that the system that needs one is left out.
+    assert [list(fold["systems"]) for fold in folds] == [["argmax", "hybrid"]] * 3
+    again = crossvalidated_streams(
+        dataset, "by-subject:3", fit, settings=settings, journal=journal, key={"fit": 1},
+        progress=lambda at: seen.append((at.done, at.resumed)),
+    )  # fmt: skip
+    assert again == folds and len(fit.notes.read_text().splitlines()) == 3 and seen[-1] == (3, 3)
+    crossvalidated_streams(dataset, "by-subject:3", fit, settings=settings, journal=journal, key={"fit": 2})
+    assert len(fit.notes.read_text().splitlines()) == 6
+
+    table = summed(folds)
+    plain = table["systems"]["argmax"]["plain"]
+    assert plain["truths"] == 12 and plain["hits"] + plain["deletions"] == 12
+    assert [p["subject"] for p in plain["people"]] == sorted(tested)
+    assert sum(p["truths"] for p in plain["people"]) == 12
+    alone = pooled_scores(scored_people(dataset, bundle(), tested, argmax_spec(0.0)))
+    for name in ("events", "hits", "insertions", "fragmentations", "merges", "latency_s", "cost_per_truth"):
+        assert alone[name] == plain[name], name
+    assert table["reference"] is None and table["at_recall"] == []
+
+
+def test_a_reference_beside_itself_is_one(dataset: Dataset, tmp_path: Path) -> None:
+    settings = Settings(("argmax", "smoothed"), targets=(0.2, 0.5, 0.8))
+    folds = crossvalidated_streams(dataset, "by-subject:2", Remembering(tmp_path / "notes"), settings=settings)
+    rows = summed(folds)["at_recall"]
+    ratios = [row["systems"]["smoothed"]["ratio"] for row in rows]
+    assert {r for r in ratios if r is not None} <= {1.0} and any(r is not None for r in ratios)
+
+
+def test_what_cannot_be_split_is_refused(dataset: Dataset, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="does not keep people apart"):
+        people_folds(dataset, "by-recording:5")
+    with pytest.raises(ConfigError, match="needs a key"):
+        crossvalidated_streams(dataset, "by-subject:3", Remembering(tmp_path / "n"), journal=Journal(tmp_path / "j"))
+    for path in (dataset.path / "streams").rglob("*.csv"):
+        path.unlink()
+    (dataset.path / "index.json").unlink()
+    with pytest.raises(BadInput, match="no stream in which a recording is located"):
+        people_folds(open_dataset(dataset.path), "by-subject:3")

@@ -1,0 +1,88 @@
+"""Nothing of a stream that is heard as a whole is trained on, whoever made it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import plushsense as ps
+from plushsense.core.gestures import NOBODY
+from plushsense.dataset.store import Dataset
+from plushsense.evaluation.folds import fold_windows
+from plushsense.experiments.abstention import _without_other_people
+from plushsense.experiments.streams.run import TrainStreams, recipes_for
+from plushsense.experiments.streams.score import PeopleFold
+from plushsense.experiments.streams.systems import ANYWHERE, WINDOWS
+from plushsense.scoring.splits import parse_split
+from plushsense.training import fit as fitting
+from plushsense.windows.cut import WindowSet
+from plushsense.workflow.config import from_settings
+from plushsense.workflow.preparation import outside_streams, windows_for
+
+
+@pytest.fixture
+def rested(dataset: Dataset) -> Dataset:
+    """Everybody recorded the toy at rest within their own session; as `dataset.index` has it, that is nobody's."""
+    recordings = [replace(r, subject=NOBODY) if r.gesture == "Rest" else r for r in dataset.recordings]
+    assert all(r.stream_row >= 0 for r in recordings)
+    return Dataset(dataset.path, dataset.head, recordings, dataset.streams)
+
+
+@pytest.fixture
+def trained(monkeypatch: pytest.MonkeyPatch) -> list[WindowSet]:
+    """The windows that networks were trained on, as it went."""
+    seen: list[WindowSet] = []
+    real = fitting.fit
+
+    def note(train: WindowSet, *rest: object, **more: object) -> object:
+        seen.append(train)
+        return real(train, *rest, **more)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(fitting, "fit", note)
+    return seen
+
+
+def owners(dataset: Dataset, windows: WindowSet) -> set[str]:
+    """In whose streams windows lie."""
+    owner = {s.id: s.subject for s in dataset.streams}
+    return {owner[name] for name in windows.stream.tolist() if name}
+
+
+def test_a_fold_of_the_benchmark(rested: Dataset, trained: list[WindowSet], tmp_path: Path) -> None:
+    config = from_settings(filters=(4, 4, 4), epochs=2, classes="all")
+    fold = PeopleFold("fold 1", ("P1", "P2", "P3"), ("P4",), ("P5",))
+    TrainStreams(recipes_for(rested, config, {WINDOWS, ANYWHERE}, None), False, tmp_path)(rested, fold, lambda *_: None)
+    assert len(trained) == 2
+    for windows in trained:
+        assert owners(rested, windows) == {"P1", "P2", "P3"}
+        assert NOBODY in windows.subject and "Rest" in np.array(windows.labels)[windows.y]
+
+
+def test_a_training_that_fits_decisions(rested: Dataset, trained: list[WindowSet]) -> None:
+    bundle = ps.train(rested, filters=(4, 4, 4), epochs=2, classes="all").bundle
+    (held,) = set(bundle.provenance["validation_subjects"]) - {NOBODY}
+    assert owners(rested, trained[0]) == {"P1", "P2", "P3", "P4", "P5"} - {held}
+
+
+def test_a_fold_of_abstaining(rested: Dataset) -> None:
+    config = from_settings()
+    gestures = rested.gestures
+    arch = config.model.build(rested.layout, len(gestures), config.windows.window_s, config.padding)
+    windows = windows_for(rested, arch, config.windows, gestures)
+    for fold in fold_windows(windows, windows, parse_split("by-subject:3"), 0):
+        apart = _without_other_people(fold, windows, rested)
+        heard = set(windows.subject[np.concatenate([fold.validation, fold.test])].tolist()) - {NOBODY}
+        assert owners(rested, windows.take(fold.train)) & heard  # it would be otherwise
+        assert owners(rested, windows.take(apart.train)) and not owners(rested, windows.take(apart.train)) & heard
+        assert apart.test.tolist() == fold.test.tolist()
+
+
+def test_what_lies_in_no_stream_of_theirs(dataset: Dataset) -> None:
+    config = from_settings()
+    arch = config.model.build(dataset.layout, 3, config.windows.window_s, config.padding)
+    windows = windows_for(dataset, arch, config.windows, dataset.gestures)
+    assert (outside_streams(windows, dataset, {"P1", "P3"}) == ~np.isin(windows.subject, ["P1", "P3"])).all()
+    assert outside_streams(windows, dataset, set()).all()

@@ -1,0 +1,363 @@
+"""The report of a sweep: what the paper shows, computed from known numbers, and honest about what they are of."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import polars
+import pytest
+
+from plushsense.core.errors import BadInput, ConfigError
+from plushsense.experiments.sweep import figures as sweep_figures
+from plushsense.experiments.sweep import tables as sweep_tables
+from plushsense.experiments.sweep.report import confusion_words, sections_of, write_report
+from plushsense.experiments.sweep.results import read_sweep
+from plushsense.models.arch import PAPER_ARCHITECTURES, PAPER_FILTERS
+from plushsense.reports.labels import overlap
+from plushsense.scoring.metrics import accuracy_complexity_ratio
+from plushsense.trials import paper
+from support.made_sweep import make_sweep
+
+SMALL = {
+    "archs": ("250", "14d1_39d2_41d4"),
+    "filter_sets": ((4, 6, 8, 8), (8, 12, 16, 16)),
+    "epochs": (20, 60),
+    "batches": ("64", "full"),
+}
+ONE = {
+    "archs": ("14d1_39d2_41d4",),
+    "filter_sets": ((8, 12, 16, 16),),
+    "epochs": (20,),
+    "batches": ("64",),
+    "labels": ("Rest", "Slow & low", "<script>$\\frac"),
+    "channels": 4,
+}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_sweep(tmp_path_factory.mktemp("whole") / "S", epochs=(10, 25, 100))
+
+
+def known(folder: Path, scores: dict[tuple[str, str], list[float | None]], **more: object) -> Path:
+    """A made-up sweep with these accuracies for (arch, filters) in the order of its schedules; macro-F1 is 0.1 less."""
+    make_sweep(folder, **{**SMALL, **more})  # type: ignore[arg-type]
+    frame = polars.read_parquet(folder / "trials.parquet")
+    left = {key: iter(values) for key, values in scores.items()}
+    found = [next(left[(r["arch"], r["filters"])]) for r in frame.to_dicts()]
+    f1 = [None if v is None else v - 0.1 for v in found]
+    frame = frame.with_columns(
+        polars.Series("accuracy", found, dtype=polars.Float64), polars.Series("macro_f1", f1, dtype=polars.Float64)
+    )
+    frame.write_parquet(folder / "trials.parquet")
+    return folder
+
+
+SCORES: dict[tuple[str, str], list[float | None]] = {
+    ("250", "4"): [0.5, 0.6, 0.7, 0.4],
+    ("250", "8"): [0.3, 0.3, 0.3, 0.3],
+    ("14d1_39d2_41d4", "4/6/8"): [0.70, 0.2, 0.2, 0.1],
+    ("14d1_39d2_41d4", "8/12/16"): [0.8, None, 0.6, 0.4],
+}
+
+
+def test_acr_is_the_papers():
+    assert accuracy_complexity_ratio(0.75, 13262) == pytest.approx(0.75 / math.log10(13262))
+    for (arch, filters), row in paper.TABLE4.items():
+        found = accuracy_complexity_ratio(row.highest, paper.count_parameters(arch, filters))
+        assert found is not None and abs(found - row.acr) < 0.0016, (arch, filters)
+        assert paper.printed_parameters(arch, filters) == row.parameters
+    assert accuracy_complexity_ratio(None, 100) is None and accuracy_complexity_ratio(0.5, 1) is None
+
+
+def test_table3_stands_beside_the_papers_and_names_the_misprint(whole):
+    table = sweep_tables.table3(read_sweep(whole))
+    assert [r["arch"] for r in table.rows] == list(PAPER_ARCHITECTURES)
+    row = next(r for r in table.rows if r["arch"] == "14d1_39d2_41d4")
+    assert (row["8/12/16/16 ours"], row["8/12/16/16 paper"]) == (13262, "13.2k")
+    assert (row["32/48/64/64 ours"], row["32/48/64/64 paper"]) == (192386, "192k")
+    odd = next(r for r in table.rows if r["arch"] == "100_151")
+    assert odd["32/48/64/64 paper"] == "169k (misprint?)"
+    said = " ".join(table.notes)
+    assert "Of 52 cells" in said and "36 meet" in said and "15 more" in said
+    assert "100_151 at 32/48" in said and "misprint" in said
+    assert not any("channels" in c.head for c in table.columns)
+
+
+@pytest.mark.parametrize(
+    ("said", "count", "meets"),
+    [
+        ("13.2k", 13262, True),
+        ("13.3k", 13262, True),
+        ("13.1k", 13262, False),
+        ("192k", 192386, True),
+        ("8k", 8038, True),
+    ],
+)
+def test_a_printed_count_is_met_rounded_or_cut_off(said, count, meets):
+    assert paper.agrees(said, count) is meets
+
+
+def test_other_data_are_counted_at_the_papers_size_too(tmp_path):
+    sweep = read_sweep(make_sweep(tmp_path / "S", **ONE))
+    table = sweep_tables.table3(sweep)
+    (row,) = table.rows
+    assert row["8/12/16/16 ours"] < row["8/12/16/16 at the paper's size"] == 13262
+    assert "11 channels and 18 classes" in " ".join(table.notes)
+    assert "None of these" in " ".join(
+        sweep_tables.table3(read_sweep(make_sweep(tmp_path / "T", **{**ONE, "archs": ("9",)}))).notes
+    )
+
+
+def test_table4_has_maxima_means_and_the_papers_row(tmp_path):
+    sweep = read_sweep(known(tmp_path / "S", SCORES))
+    table = sweep_tables.table4(sweep)
+    assert [(r["arch"], r["filters"]) for r in table.rows] == [
+        ("14d1_39d2_41d4", "8/12/16"),
+        ("14d1_39d2_41d4", "4/6/8"),
+        ("250", "4"),
+        ("250", "8"),
+    ]
+    first = table.rows[0]
+    assert (first["accuracy"], first["mean_accuracy"], first["trials"]) == (0.8, pytest.approx(0.6), 3)
+    assert first["acr"] == pytest.approx(0.8 / math.log10(13262)) and first["macro_f1"] == pytest.approx(0.7)
+    assert (first["paper_accuracy"], first["paper_mean"], first["paper_acr"]) == (0.75, 0.657, 0.182)
+    assert [r["paper_accuracy"] for r in table.rows[1:]] == [None] * 3
+    assert [r["above"] for r in table.rows] == ["yes", "no", "no", "no"], "0.70 is not above 70 %"
+    assert [r["above"] for r in sweep_tables.table4(sweep, threshold=0.2).rows] == ["yes"] * 4
+    assert len(sweep_tables.table4(sweep, top=1).rows) == 2
+    assert "1 of 4 scored networks" in " ".join(table.notes)
+
+
+def test_architectures_over_all_and_over_one_filter_set(tmp_path):
+    sweep = read_sweep(known(tmp_path / "S", SCORES))
+    rows = {r["arch"]: r for r in sweep_tables.architectures(sweep)}
+    assert rows["250"]["highest"] == 0.7 and rows["250"]["mean"] == pytest.approx((2.2 + 1.2) / 8)
+    assert rows["14d1_39d2_41d4"]["trials"] == 7 and rows["14d1_39d2_41d4"]["parameters"] == 13262
+    assert {r["arch"]: r["mean"] for r in sweep_tables.architectures(sweep, "4/6/8/8")}["250"] == pytest.approx(0.55)
+
+
+def test_the_effect_is_over_networks_that_have_every_schedule(tmp_path):
+    sweep = read_sweep(known(tmp_path / "S", SCORES))
+    table = sweep_tables.effect(sweep)
+    first = next(r for r in table.rows if (r["epochs"], r["batch_asked"]) == (20, "64"))
+    assert first["networks"] == 3 and first["accuracy"] == pytest.approx(np.mean([0.5, 0.3, 0.7]))
+    assert first["accuracy_sd"] == pytest.approx(np.std([0.5, 0.3, 0.7], ddof=1))
+    assert "3 networks" in table.notes[0]
+    lone = {key: [0.5, None, 0.5, 0.5] for key in SCORES}
+    odd = sweep_tables.effect(read_sweep(known(tmp_path / "T", lone)))
+    assert "not to be compared" in odd.notes[0] and len(odd.rows) == 3
+
+
+def test_batches_and_filter_sets_are_in_order_of_size(whole):
+    sweep = read_sweep(whole)
+    assert sweep_tables.batches(sweep) == ["64", "256", "full"]
+    assert sweep.filter_sets == ["/".join(map(str, f)) for f in PAPER_FILTERS]
+
+
+def test_the_fronts_hold_what_no_network_beats(whole):
+    sweep = read_sweep(whole)
+    points = sweep_tables.pareto_points(sweep, "parameters")
+    assert len(points) == 52
+    edge = [(p["value"], p["macro_f1"]) for p in points if p["front"]]
+    assert edge == sorted(edge) and [f for _, f in edge] == sorted(f for _, f in edge)
+    assert max(p["macro_f1"] for p in points) == edge[-1][1] and min(p["value"] for p in points) == edge[0][0]
+
+
+def test_labels_of_a_front_cover_neither_each_other_nor_the_edge(whole):
+    figure = sweep_figures.pareto(read_sweep(whole), "parameters")
+    axes = figure.axes[0]
+    boxes = [t.get_window_extent() for t in axes.texts if t.get_text()]
+    plain = [(b.x0, b.y0, b.x1, b.y1) for b in boxes]
+    assert len(plain) >= 3
+    assert not any(overlap(a, b) for i, a in enumerate(plain) for b in plain[:i])
+    inside = axes.get_window_extent()
+    assert all(inside.x0 <= b[0] and b[2] <= inside.x1 and inside.y0 <= b[1] and b[3] <= inside.y1 for b in plain)
+
+
+def test_the_confusion_is_by_affect_and_counted(tmp_path):
+    folder = make_sweep(
+        tmp_path / "S", **{**ONE, "labels": ("Hit", "Rest", "Pat"), "affects": ("negative", "neutral", "positive")}
+    )
+    head = json.loads((folder / "sweep.json").read_text())
+    (trial,) = head["confusions"]
+    head["confusions"][trial] = [[8, 1, 1], [0, 9, 1], [0, 0, 10]]
+    (folder / "sweep.json").write_text(json.dumps(head))
+    sweep = read_sweep(folder)
+    row = sweep.chosen
+    assert row is not None
+    said = confusion_words(sweep, row)
+    assert "27 of 30 windows right (90.0 %)" in said and "10.0 % as one of another affect" in said
+    figure = sweep_figures.confusion(sweep, row)
+    assert figure is not None
+    assert [t.get_text() for t in figure.axes[0].get_xticklabels()] == ["Pat", "Rest", "Hit"]
+    assert {"positive", "neutral", "negative"} <= {t.get_text() for t in figure.axes[0].texts}
+
+
+def test_a_nested_training_is_cut_at_the_trials_epochs(whole):
+    sweep = read_sweep(whole)
+    trial = next(t for t in sweep.trials if t["epochs"] == 25)
+    (history,) = sweep.histories(trial)
+    assert [e["epoch"] for e in history] == list(range(1, 26))
+
+
+def test_the_page_is_complete_marked_and_beside_its_files(tmp_path):
+    made = write_report(make_sweep(tmp_path / "S", **SMALL, simulated=True, waiting=0.2))
+    page = made.page.read_text(encoding="utf-8")
+    assert made.page == tmp_path / "S" / "report.html"
+    assert not re.findall(r'(?:src|href)="(?!data:|#)[^"]*"', page)
+    assert "<script" not in page and '<meta name="generator" content="PlushSense">' in page
+    assert all(f'alt="{start}' in page for start in ("Bars:", "Points:", "Lines:", "Confusion", "Learning", "A panel"))
+    assert f"{made.done} of {made.trials} trials done" in page and made.done < made.trials == 16
+    assert "This split leaks" in page and "These scores are of a simulation" in page and "one seed, no spread" in page
+    heads = re.findall(r"<th[^>]*>(.*?)</th>", page, flags=re.DOTALL)
+    scores = [
+        h for h in heads if re.match(r"(Highest |Mean )?(accuracy|macro-f1|acr|f1|recall)\b", h, flags=re.IGNORECASE)
+    ]
+    assert len(scores) > 10 and all("LEAKY" in h and "SIMULATION" in h for h in scores)
+    names = {f.name for f in made.files}
+    assert {"table-3.csv", "table-4.csv", "acr.csv", "effect.csv", "pareto.csv"} <= names
+    for figure in (
+        "figure-7-architectures",
+        "figure-8-filter-sets",
+        "figure-9-size",
+        "acr",
+        "effect",
+        "pareto-parameters",
+    ):
+        assert {f"{figure}.png", f"{figure}.svg"} <= names, figure
+        assert (made.folder / f"{figure}.png").read_bytes().startswith(b"\x89PNG")
+    with (made.folder / "table-4.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert all((r["leaky"], r["simulated"], r["split"]) == ("yes", "yes", "windows:holdout") for r in rows)
+
+
+def test_every_figure_says_what_it_is_of(tmp_path):
+    sweep = read_sweep(make_sweep(tmp_path / "S", **SMALL, simulated=True, waiting=0.2))
+    drawn = [d.figure for section in sections_of(sweep) for d in section.drawings]
+    assert len(drawn) >= 8
+    for figure in drawn:
+        said = figure.get_supxlabel().replace("\n", " ")
+        assert "LEAKY" in said and "SIMULATION" in said and "MADE-UP" in said and "one seed, no spread" in said
+        assert f"of {sweep.total} trials done" in said
+
+
+def test_a_fair_split_of_real_data_bears_no_mark(tmp_path):
+    case = {**SMALL, "split": "by-subject:5", "leaky": False, "folds": 5, "seeds": 2, "archs": ("250",)}
+    page = write_report(make_sweep(tmp_path / "S", **case)).page.read_text(encoding="utf-8")
+    assert "LEAKY" not in page and "SIMULATION" not in page and "trials done." not in page
+    assert "mean of 2 seeds × 5 folds" in page and "± sd" in page
+
+
+def test_the_smallest_sweep_renders_escaped_and_says_what_it_leaves_out(tmp_path):
+    made = write_report(make_sweep(tmp_path / "S", **ONE, dataset="<b>$x", name="<i>"))
+    page = made.page.read_text(encoding="utf-8")
+    assert "<script" not in page and "&lt;script&gt;" in page and "&lt;b&gt;$x" in page and "<i>" not in page
+    for said in ("one filter set only", "One network only", "nothing to compare", "have no affect", "No front"):
+        assert said in page, said
+    names = {f.name for f in made.files}
+    assert "figure-7-architectures.png" in names and "figure-8-filter-sets.png" not in names
+
+
+def test_a_sweep_without_a_score_is_a_page_too(tmp_path):
+    made = write_report(make_sweep(tmp_path / "S", **SMALL, waiting=1.1))
+    page = made.page.read_text(encoding="utf-8")
+    assert "0 of 16 trials done" in page and "No trial is done yet" in page and "13.2k" in page
+    assert [f.name for f in made.files] == ["table-3.csv"]
+
+
+def test_paddings_in_one_grid_are_other_networks(tmp_path):
+    one = polars.read_parquet(make_sweep(tmp_path / "A", **ONE) / "trials.parquet")
+    folder = make_sweep(tmp_path / "B", **ONE, padding="stream", draw=1)
+    other = polars.read_parquet(folder / "trials.parquet").with_columns(trial=polars.lit("f" * 20))
+    polars.concat([one, other]).write_parquet(folder / "trials.parquet")
+    sweep = read_sweep(folder)
+    assert [n.label for n in sweep.networks] == ["14d1_39d2_41d4 mirror", "14d1_39d2_41d4 stream"]
+    assert len(sweep_tables.pareto_points(sweep, "macs_per_step")) == 2
+
+
+def test_an_older_report_is_replaced_and_nothing_else_touched(tmp_path):
+    folder = make_sweep(tmp_path / "S", **ONE)
+    first = write_report(folder)
+    own = first.folder / "my notes.txt"
+    own.write_text("keep")
+    make_sweep(folder, **{**ONE, "archs": ("250",)})
+    second = write_report(folder)
+    assert own.read_text() == "keep"
+    gone = {f.name for f in first.files} - {f.name for f in second.files}
+    assert gone and not any((second.folder / name).exists() for name in gone)
+    thesis = tmp_path / "elsewhere" / "thesis-files"
+    thesis.mkdir(parents=True)
+    (thesis / "table-3.csv").write_text("mine")
+    with pytest.raises(ConfigError, match="exists and is not of a report"):
+        write_report(folder, tmp_path / "elsewhere" / "thesis.html")
+    assert (thesis / "table-3.csv").read_text() == "mine" and not (tmp_path / "elsewhere" / "thesis.html").exists()
+    (folder / "report.html").write_text("my thesis")
+    with pytest.raises(ConfigError, match="not a report"):
+        write_report(folder)
+
+
+def test_a_folder_that_is_no_sweep_is_one_sentence(tmp_path):
+    with pytest.raises(BadInput, match=r"no sweep at .* plushsense sweep"):
+        read_sweep(tmp_path)
+    folder = make_sweep(tmp_path / "S", **ONE)
+    (folder / "trials.parquet").write_bytes(b"nothing")
+    with pytest.raises(BadInput, match=r"cannot be read .* run the sweep again"):
+        read_sweep(folder)
+    polars.DataFrame({"trial": ["a"]}).write_parquet(folder / "trials.parquet")
+    with pytest.raises(BadInput, match="lacks the column 'arch'"):
+        read_sweep(folder)
+    (folder / "sweep.json").write_text("{")
+    with pytest.raises(BadInput, match="is not a sweep"):
+        read_sweep(folder)
+
+
+@pytest.mark.parametrize(
+    "dataset", ["short", "a data set with a long name, which somebody gave it who likes long names"]
+)
+def test_nothing_is_cut_off_in_a_small_figure(tmp_path, dataset):
+    sweep = read_sweep(make_sweep(tmp_path / "S", **ONE, simulated=True, dataset=dataset))
+    for section in sections_of(sweep):
+        for drawing in section.drawings:
+            figure = drawing.figure
+            figure.draw_without_rendering()
+            whole = figure.bbox
+            named = [a for axes in figure.axes for a in (axes.title, axes.xaxis.label, axes.yaxis.label)]
+            others = [t for t in figure.texts if t.get_text()]
+            assert others, "what the scores are of"
+            for text in [*others, *(t for t in named if t.get_text())]:
+                box = text.get_window_extent()
+                assert whole.x0 - 1 <= box.x0 and box.x1 <= whole.x1 + 1, (drawing.name, text.get_text())
+                assert whole.y0 - 1 <= box.y0 and box.y1 <= whole.y1 + 1, (drawing.name, text.get_text())
+
+
+def test_a_trial_of_some_folds_is_neither_ranked_nor_averaged(tmp_path: Path) -> None:
+    """One easy person looks better than all together: what is not done wholly compares with nothing."""
+    folder = known(tmp_path / "S", SCORES)
+    frame = polars.read_parquet(folder / "trials.parquet")
+    lucky = (polars.col("arch") == "250") & (polars.col("filters") == "8") & (polars.col("epochs") == 20)
+    lucky &= polars.col("batch_asked") == "64"
+    changes = {"accuracy": 0.99, "macro_f1": 0.99, "validation_accuracy": 0.99, "status": "partial"}
+    frame = frame.with_columns(
+        **{key: polars.when(lucky).then(polars.lit(value)).otherwise(polars.col(key)) for key, value in changes.items()}
+    )
+    frame.write_parquet(folder / "trials.parquet")
+    sweep = read_sweep(folder)
+    assert sweep.best is not None and sweep.best["accuracy"] == 0.8
+    shown = [
+        *sweep_tables.best_trials(sweep).rows,
+        *sweep_tables.table4(sweep).rows,
+        *sweep_tables.architecture_table(sweep).rows,
+        *sweep_tables.acr_ranking(sweep).rows,
+        *sweep_tables.pareto(sweep).rows,
+        *sweep_tables.effect(sweep).rows,
+    ]
+    for key in ("accuracy", "highest", "macro_f1", "validated_accuracy"):
+        assert max(row.get(key) or 0.0 for row in shown) <= 0.8, key
+    (network,) = [n for n in sweep.networks if (n.arch, n.filters) == ("250", "8")]
+    assert len(network.done) == 3 and network.mean() == pytest.approx(0.3)

@@ -1,0 +1,96 @@
+"""``plushsense abstain`` and what ``train`` leaves in a bundle, on a small data set."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import plushsense as ps
+from plushsense.core.errors import ConfigError, DatasetError
+from plushsense.dataset.importing.importers import import_recordings
+from plushsense.dataset.store import Dataset
+from plushsense.runtime.decisions import DecideSpec
+
+Cli = Callable[..., Any]
+SMALL = ("--filters", "4,4,4", "--epochs", "6")
+
+
+def test_train_fits_decisions_on_those_who_validate(cli: Cli, dataset: Dataset, tmp_path: Path) -> None:
+    ran = cli("train", dataset.path, *SMALL, "--out", tmp_path / "m.plush", "--json")
+    assert ran.status == 0, ran.err
+    bundle = ps.load(tmp_path / "m.plush")
+    spec = DecideSpec.from_dict(bundle.decision)
+    fitted = spec.fitted
+    assert fitted["people"] == len(bundle.provenance["validation_subjects"]) == 1
+    assert fitted["health"]["people"] == 5
+    assert fitted["streams"] == 1 and fitted["answers"]["coverage_left_out"] is None
+    assert spec.known is not None and spec.health.low
+    assert ran.json["decision"]["fitted"] == fitted
+    # Who they are stands in the provenance alone, which an export takes out.
+    assert not any(f'"{code}"' in json.dumps(bundle.decision) for code in dataset.subjects)
+    ran = cli("train", dataset.path, *SMALL, "--out", tmp_path / "plain.plush", "--no-fit-decisions")
+    assert ps.load(tmp_path / "plain.plush").decision["fitted"] == {}
+    assert "Decisions fitted" not in ran.out
+
+
+def test_given_settings_stay_and_train_says_what_it_did(cli: Cli, dataset: Dataset, tmp_path: Path) -> None:
+    (tmp_path / "run.toml").write_text("[live]\nsmoothing_s = 0.45\nenter = 0.85\n")
+    ran = cli("train", dataset.path, *SMALL, "--config", tmp_path / "run.toml", "--out", tmp_path / "m.plush")
+    spec = DecideSpec.from_dict(ps.load(tmp_path / "m.plush").decision)
+    assert (spec.smoothing_s, spec.enter) == (0.45, 0.85)
+    assert "Decisions fitted on 1 person who were held back" not in ran.out
+    assert "Decisions fitted on 1 person who was held back" in ran.out
+    gate = spec.fitted["gate"]
+    notices = f"it notices {100 * gate['recall']:.0f} % of" if "recall" in gate else gate["reason"]
+    assert notices in ran.out, "what the gate's fit found, or why there is none"
+
+
+def test_where_nobody_is_held_back_the_defaults_stay_and_train_says_so(dataset: Dataset) -> None:
+    said: list[str] = []
+    trained = ps.train(dataset, preset="search", epochs=1, filters=(4, 4, 4), warn=said.append)
+    assert DecideSpec.from_dict(trained.bundle.decision) == DecideSpec()
+    assert any("decision settings are the defaults" in line for line in said)
+
+
+def test_abstain_withholds_gestures_and_goes_on_from_what_is_kept(cli: Cli, dataset: Dataset, tmp_path: Path) -> None:
+    words = ("abstain", dataset.path, "--split", "by-subject:2", *SMALL, "--workers", 1, "--out", tmp_path / "a")
+    ran = cli(*words, "--json")
+    assert ran.status == 0, ran.err
+    table = ran.json
+    assert table["people"] == 5 and table["recordings"] == 5 * 6
+    assert {row["confidence"] for row in table["confidences"]} >= {"softmax", "energy", "set size"}
+    assert all(-2 < row["gain"] <= 1 for row in table["confidences"] if row["gain"] is not None)
+    assert table["stated_coverage"]["by_person"]["n"] == 5
+    assert table["withheld"] == {} and table["free_choice"] is None
+    assert (tmp_path / "a" / "risk-coverage.png").read_bytes()[:4] == b"\x89PNG"
+    assert json.loads((tmp_path / "a" / "abstaining.json").read_text())["people"] == 5
+    more = cli(*words, "--withhold")
+    assert "training: 8 of 8 networks (2 from before)" in more.err
+    for label in ("Rest", "Slow", "Fast"):
+        assert label in more.out
+    again = cli(*words, "--withhold", "--json")
+    assert "training: 8 of 8 networks (8 from before)" in again.err
+    for row in again.json["withheld"].values():
+        assert (row["recordings"], row["folds"]) == (10, 2)
+        assert 0 <= row["auroc"]["logit"]["mean"] <= 1
+
+
+def test_what_cannot_be_asked_is_refused(dataset: Dataset, recordings: Path, tmp_path: Path) -> None:
+    from plushsense.experiments.abstention import abstaining
+
+    with pytest.raises(ConfigError, match="people apart"):
+        abstaining(dataset, split="windows:5")
+    for person in ("P1", "P2", "P3"):
+        (tmp_path / "src" / person).mkdir(parents=True)
+        for file in (recordings / person).glob("*_*_*.csv"):
+            (tmp_path / "src" / person / file.name).write_bytes(file.read_bytes())
+    plain = import_recordings(tmp_path / "src", tmp_path / "plain", layout="accel-3").dataset
+    with pytest.raises(DatasetError, match="stream"):
+        abstaining(plain)
+    # Without a stream a bundle is fitted all the same, on recordings.
+    fitted = ps.train(plain, epochs=1, filters=(4, 4, 4)).bundle.decision["fitted"]
+    assert fitted["streams"] == 0 and "windows" in fitted["answers"]["on"]

@@ -1,0 +1,148 @@
+"""People left out, before and after a personal touch: which recordings adapt, which test, and what is counted."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from plushsense.core.errors import BadInput
+from plushsense.experiments.adaptation import Stranger, Touched
+from plushsense.experiments.adaptation import evaluate_adapting_adapting as evaluate_adapting
+from plushsense.windows.cut import WindowSet
+
+LABELS = ("hold", "tap", "hit")
+
+
+def made(each: int = 4, people: tuple[str, ...] = ("A", "B"), rows: int = 100) -> tuple[WindowSet, dict[str, int]]:
+    """One window a recording; the later a recording was made, the smaller its name. ``x`` holds its class."""
+    ids, y, subject, begin = [], [], [], []
+    for person in people:
+        for k, label in enumerate(LABELS):
+            for n in range(each):
+                ids.append(f"{person}/{label}_{9 - n}")
+                y.append(k)
+                subject.append(person)
+                begin.append(1000 * k + 200 * n)
+    order = np.argsort(ids)
+    ids, y, subject, begin = ([each[i] for i in order] for each in (ids, y, subject, begin))
+    n = len(ids)
+    place = np.array([(b, b + rows) for b in begin])
+    windows = WindowSet(
+        x=np.repeat(np.array(y, dtype=np.int32)[:, None, None], 5, axis=2),
+        y=np.array(y, dtype=np.int64),
+        labels=LABELS,
+        affects=("none",) * 3,
+        families=LABELS,
+        recording=np.arange(n),
+        recording_ids=tuple(ids),
+        subject=np.array(subject),
+        context=np.full(n, "stream"),
+        stream=np.array([f"{s}/stream" for s in subject]),
+        window_rows=place,
+        recording_rows=np.array([(b + 50, b + 100) for b in begin]),
+        rate_hz=100.0,
+        inputs=("a",),
+    )
+    return windows, {i: 9 - int(i[-1]) for i in ids}
+
+
+def says(classes: np.ndarray) -> np.ndarray:
+    return np.eye(3)[classes]
+
+
+def always_hold(windows: WindowSet) -> np.ndarray:
+    return says(np.zeros(len(windows), dtype=int))
+
+
+def truth(windows: WindowSet) -> np.ndarray:
+    return says(windows.x[:, 0, 0])
+
+
+class Recorder:
+    """An adaptation that remembers what it was given."""
+
+    def __init__(self, reader=truth, accepted: bool = True) -> None:
+        self.given: list[WindowSet] = []
+        self.reader, self.accepted = reader, accepted
+
+    def __call__(self, own: WindowSet) -> Touched:
+        self.given.append(own)
+        return Touched({"float": self.reader}, self.accepted)
+
+
+def test_all_choices_and_what_is_gained() -> None:
+    windows, times = made()
+    adapt = Recorder()
+    found = evaluate_adapting(windows, [Stranger(p, {"float": always_hold}, adapt) for p in ("A", "B")], times)
+    assert found["choices"] == 12 and len(adapt.given) == 12 and found["refused"] == 0.0
+    assert all(len(own) == 6 and len(set(own.subject)) == 1 for own in adapt.given)
+    one = found["engines"]["float"]
+    assert one["accuracy"]["before"]["mean"] == pytest.approx(1 / 3) and one["accuracy"]["after"]["mean"] == 1.0
+    assert one["accuracy"]["gain"]["mean"] == pytest.approx(2 / 3) and one["macro_f1"]["after"]["mean"] == 1.0
+    assert one["right"] == {"mean": 4.0, "worst_mean": 4.0, "worst": 4, "worse_people": 0, "worse_choices": 0.0}
+    assert [row["subject"] for row in one["people"]] == ["A", "B"] and one["people"][0]["recordings"] == 6.0
+
+
+def test_the_first_choice_is_the_first_recordings_by_the_clock() -> None:
+    windows, times = made()
+    adapt = Recorder()
+    evaluate_adapting(windows, [Stranger("A", {"float": always_hold}, adapt)], times)
+    first = {windows.recording_ids[r] for r in adapt.given[0].recording}
+    assert first == {f"A/{label}_{n}" for label in LABELS for n in (9, 8)}
+
+
+def test_a_loss_is_counted_person_by_person_and_choice_by_choice() -> None:
+    windows, times = made()
+    strangers = [
+        Stranger("A", {"float": truth}, Recorder(always_hold)),
+        Stranger("B", {"float": always_hold}, Recorder(truth)),
+    ]
+    right = evaluate_adapting(windows, strangers, times)["engines"]["float"]["right"]
+    assert right == {"mean": 0.0, "worst_mean": -4.0, "worst": -4, "worse_people": 1, "worse_choices": 0.5}
+
+
+def test_what_is_refused_changes_nothing() -> None:
+    windows, times = made()
+    found = evaluate_adapting(windows, [Stranger("A", {"float": truth}, Recorder(always_hold, False))], times)
+    assert found["refused"] == 1.0 and found["engines"]["float"]["right"]["mean"] == 0.0
+
+
+def test_random_choices_differ_from_gesture_to_gesture() -> None:
+    windows, times = made()
+    adapt = Recorder()
+    found = evaluate_adapting(windows, [Stranger("A", {"float": always_hold}, adapt)], times, random=20)
+    assert found["choices"] == 26
+    mixed = [{windows.recording_ids[r][-1] for r in own.recording} for own in adapt.given[6:]]
+    assert any(len(numbers) > 2 for numbers in mixed) and all(len(own) == 6 for own in adapt.given)
+
+
+def test_no_adapting_window_touches_a_tested_recording() -> None:
+    windows, times = made(rows=300)  # windows reach into the next recording
+    adapt, tested = Recorder(), []
+
+    def reads(test: WindowSet) -> np.ndarray:
+        tested.append(test)
+        return always_hold(test)
+
+    evaluate_adapting(windows, [Stranger("A", {"float": reads}, adapt)], times)
+    for own, test in zip(adapt.given, tested, strict=True):
+        for first, last in test.recording_rows:
+            assert not ((own.window_rows[:, 0] < last) & (first < own.window_rows[:, 1])).any()
+    assert any(len(own) < 6 for own in adapt.given)
+
+
+def test_engines_are_compared() -> None:
+    windows, times = made()
+
+    def adapt(own: WindowSet) -> Touched:
+        return Touched({"float": truth, "int8": truth}, True)
+
+    found = evaluate_adapting(windows, [Stranger("A", {"float": truth, "int8": always_hold}, adapt)], times)
+    assert found["agreement"] == {"before": pytest.approx(1 / 3), "after": 1.0}
+    assert set(found["engines"]) == {"float", "int8"}
+
+
+def test_too_few_recordings_to_test() -> None:
+    windows, times = made(each=2)
+    with pytest.raises(BadInput, match="more than 2 recordings"):
+        evaluate_adapting(windows, [Stranger("A", {"float": truth}, Recorder())], times)

@@ -1,0 +1,50 @@
+"""Sentences of the reports."""
+
+from __future__ import annotations
+
+import pytest
+
+from plushsense.reports import wording
+
+
+@pytest.mark.parametrize(
+    ("split", "said"),
+    [
+        ("leave-one-subject-out", "never saw the person"),
+        ("by-subject:5", "5 folds"),
+        ("by-recording:4", "people are known"),
+        ("windows:3", "at random"),
+        ("holdout", "70 %"),
+        ("something-new", "“something-new”"),
+    ],
+)
+def test_every_split_is_told_in_words(split, said):
+    assert said in wording.describe_split(split)[0]
+
+
+@pytest.mark.parametrize(
+    ("evaluation", "said"),
+    [
+        ({"over": "subjects", "subjects": [{}] * 7, "folds": [{}] * 3}, "over 7 people;"),
+        ({"over": "folds", "subjects": [{}] * 7, "folds": [{}] * 3}, "over 3 folds;"),
+        ({"split": "by-subject:3", "subjects": [{}] * 7, "folds": [{}] * 3}, "over 7 people;"),
+        ({"split": "by-recording:3", "subjects": [{}] * 7, "folds": [{}] * 3}, "over 3 folds;"),
+        ({"over": "folds", "subjects": [{}] * 7, "folds": [{}]}, "Of 1 fold: there is no spread"),
+        ({"over": "subjects", "subjects": []}, "over the people;"),
+    ],
+)
+def test_over_what_a_mean_is_taken(evaluation, said):
+    assert said in wording.describe_spread(evaluation)
+    assert ("too narrow" in wording.describe_spread(evaluation)) == ("3 folds;" in said)
+
+
+def test_the_two_contexts_are_told_apart():
+    told = dict(
+        wording.describe_protocol({"split": "by-subject:5", "context": "stream", "train_context": "loop", "folds": []})
+    )
+    assert told["Trained on"].startswith("looped") and told["Scored on"].startswith("real context")
+    assert "overlaps" in told["Leak"]
+    assert "At rest" not in told
+    assert "Leak" not in dict(wording.describe_protocol({"split": "windows:5", "leaky": True}))
+    title = wording.evaluation_title({"split": "by-subject:5", "context": "stream", "train_context": "loop"})
+    assert title == "by-subject:5, trained on loops, scored on real context"

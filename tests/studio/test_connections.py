@@ -1,0 +1,268 @@
+"""Connections that ask for nothing are bounded, and the studio has files left to record with."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import re
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+
+from plushsense.core.recorder_csv import STREAM_NAME
+from plushsense.studio.app import guard
+from plushsense.studio.app.guard import ConnectionLimits, Guard, Visitors, limited_protocol, peer_of
+from support.browsing import connected
+from support.recording_pages import CALM, begun, files, showing, take, until
+
+Fixture = Callable[..., Any]
+HALF = b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX-Half: "
+WHOLE = b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+WAIT_S = 60.0
+OPEN_FILES = 256
+"""The soft limit of macOS."""
+
+
+@pytest.mark.parametrize(
+    ("client", "server", "peer"),
+    [
+        ("127.0.0.1", "127.0.0.1", ""),
+        ("127.3.2.1", "127.0.0.1", ""),
+        ("::1", "::1", ""),
+        ("::ffff:127.0.0.1", "::ffff:127.0.0.1", ""),
+        ("192.168.1.5", "192.168.1.5", ""),
+        ("192.168.1.6", "192.168.1.5", "192.168.1.6"),
+        ("::ffff:192.168.1.6", "::ffff:192.168.1.5", "192.168.1.6"),
+        ("2001:db8:1:2:3::4", "2001:db8:1:2::1", "2001:db8:1:2::/64"),
+        ("fe80::5%eth0", "fe80::1%eth0", "fe80::/64"),
+        ("?", "", "?"),
+    ],
+)
+def test_peers(client: str, server: str, peer: str) -> None:
+    assert peer_of(client, server) == peer
+
+
+def test_limits_leave_files_for_everything_else() -> None:
+    resource = pytest.importorskip("resource")
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    try:
+        for files, total, per_peer, backlog in ((256, 64, 32, 32), (400, 100, 32, 50), (64, 16, 8, 8)):
+            resource.setrlimit(resource.RLIMIT_NOFILE, (files, before[1]))
+            limits = ConnectionLimits.of_process()
+            assert (limits.total, limits.per_peer, limits.backlog) == (total, per_peer, backlog)
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)
+
+
+# A server of this process ------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def serving(limits: ConnectionLimits, app: Any) -> Iterator[int]:
+    """Serve ``app`` behind the guard with these limits; its port."""
+    uvicorn = pytest.importorskip("uvicorn")
+    visitors = Visitors("127.0.0.1")
+    with socket.create_server(("0.0.0.0", 0)) as reader:
+        config = uvicorn.Config(
+            Guard(app, visitors),
+            http=limited_protocol(limits),
+            ws="none",
+            lifespan="off",
+            log_level="error",
+            timeout_keep_alive=limits.keep_alive_s,
+            backlog=limits.backlog,
+        )
+        server = uvicorn.Server(config)
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [reader]}, daemon=True)
+        thread.start()
+        try:
+            until(lambda: server.started, WAIT_S)
+            yield int(reader.getsockname()[1])
+        finally:
+            server.should_exit = True
+            thread.join(WAIT_S)
+
+
+async def length(scope: Any, receive: Any, send: Any) -> None:
+    """Answer with the length of the body; ``/wait`` only when the client has gone."""
+    body, more = b"", True
+    while more or scope["path"] == "/wait":
+        message = await receive()
+        if message["type"] == "http.disconnect":
+            return
+        body += message["body"]
+        more = message["more_body"]
+    await send({"type": "http.response.start", "status": 200, "headers": []})
+    await send({"type": "http.response.body", "body": str(len(body)).encode()})
+
+
+def connect(stack: contextlib.ExitStack, port: int, data: bytes, source: str = "127.0.0.1") -> socket.socket:
+    made = stack.enter_context(socket.create_connection(("127.0.0.1", port), WAIT_S, (source, 0)))
+    made.sendall(data)
+    return made
+
+
+def ended(connection: socket.socket) -> bool:
+    """Wait until the server has closed the connection; whether it did so without an answer."""
+    try:
+        return connection.recv(65536) == b""
+    except ConnectionError:
+        return True
+
+
+def answered(connection: socket.socket) -> bool:
+    return connection.recv(65536).startswith(b"HTTP/1.1 200")
+
+
+@pytest.mark.parametrize("data", [b"", HALF, WHOLE], ids=["nothing", "half a head", "an answered request"])
+def test_a_head_that_does_not_arrive_ends_the_connection(data: bytes) -> None:
+    with serving(ConnectionLimits(head_s=0.5, keep_alive_s=600), length) as port, contextlib.ExitStack() as stack:
+        connection = connect(stack, port, data)
+        assert data != WHOLE or answered(connection)
+        assert ended(connection)
+
+
+def test_a_head_that_comes_a_byte_at_a_time_is_no_excuse() -> None:
+    with serving(ConnectionLimits(head_s=0.5), length) as port, contextlib.ExitStack() as stack:
+        connection, limit = connect(stack, port, HALF), time.monotonic() + WAIT_S
+        connection.settimeout(0.05)
+        while True:
+            assert time.monotonic() < limit
+            with contextlib.suppress(TimeoutError):
+                try:
+                    connection.sendall(b"x")
+                    assert connection.recv(1) == b""
+                except ConnectionError:
+                    pass
+                break
+
+
+def test_a_body_that_does_not_arrive_ends_the_connection_and_one_that_does_is_read() -> None:
+    head = b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 12\r\n\r\n"
+    limits = ConnectionLimits(head_s=2.0, body_s=4.0)
+    with serving(limits, length) as port, contextlib.ExitStack() as stack:
+        assert ended(connect(stack, port, head + b"x"))
+        slow, start = connect(stack, port, head), time.monotonic()
+        slow.settimeout(0.5)
+        # Longer than either limit, but never without data for long.
+        for _ in range(12):
+            with contextlib.suppress(TimeoutError):
+                assert slow.recv(65536).startswith(b"HTTP/1.1 200"), "ended too soon"
+                break
+            slow.sendall(b"x")
+        slow.settimeout(WAIT_S)
+        assert answered(slow)
+        assert time.monotonic() - start > limits.body_s
+
+
+def test_a_new_connection_takes_the_place_of_the_one_that_waits_longest() -> None:
+    with serving(ConnectionLimits(per_peer=4, head_s=600), length) as port, contextlib.ExitStack() as stack:
+        busy = [connect(stack, port, b"GET /wait HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n") for _ in range(2)]
+        idle = [connect(stack, port, WHOLE)]
+        assert answered(idle[0])
+        idle.append(connect(stack, port, WHOLE))
+        assert answered(idle[1])
+        for n in range(4):
+            idle.append(connect(stack, port, WHOLE))
+            assert answered(idle[-1])
+            assert ended(idle[n])
+        # Where all are being answered, nobody is sent away for a newcomer.
+        busy += [connect(stack, port, b"GET /wait HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n") for _ in range(2)]
+        assert ended(idle[4]) and ended(idle[5])
+        assert ended(connect(stack, port, WHOLE))
+        busy.pop().close()
+
+        def room() -> bool:
+            with contextlib.suppress(ConnectionError):
+                return answered(connect(stack, port, WHOLE))
+            return False
+
+        until(room, WAIT_S)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux has all addresses of 127.0.0.0/8")
+def test_peers_share_what_this_machine_leaves(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(guard, "peer_of", lambda client, _server: "" if client == "127.0.0.1" else client)
+    wait = b"GET /wait HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+    limits = ConnectionLimits(total=8, per_peer=3, head_s=600)
+    with serving(limits, length) as port, contextlib.ExitStack() as stack:
+        for peer in (2, 2, 2, 3, 3):
+            connect(stack, port, wait, f"127.0.0.{peer}")
+        for peer in (2, 3, 4):
+            assert ended(connect(stack, port, WHOLE, f"127.0.0.{peer}"))
+        for _ in range(2):
+            connect(stack, port, wait)
+        assert answered(connect(stack, port, WHOLE))
+
+
+# Against the real server ------------------------------------------------------------------------------------------
+
+
+def flood(stack: contextlib.ExitStack, port: int, count: int) -> None:
+    """Send this many halves of requests; those that the studio ends at once have been sent, too."""
+
+    def send(_: int) -> None:
+        with contextlib.suppress(ConnectionError):
+            connect(stack, port, HALF)
+
+    # Side by side: a connection beyond the backlog waits for a second.
+    with ThreadPoolExecutor(16) as pool:
+        list(pool.map(send, range(count)))
+
+
+def status(port: int, **headers: str) -> int:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=WAIT_S)
+    with contextlib.closing(connection):
+        connection.request("GET", "/", headers=headers)
+        return connection.getresponse().status
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no limit on open files")
+def test_half_requests_of_a_stranger_end_no_recording(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
+    """More halves of requests than the studio may open files: the recording is saved, and a visitor is answered."""
+    import resource
+
+    home, count = tmp_path / "home", OPEN_FILES + 64
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(before[0], min(4096, before[1])), before[1]))
+    try:
+        options = ("--host", "0.0.0.0", "--device", CALM, "--speed", "2")
+        server, browser = studio(*options, open_files=OPEN_FILES), look()
+        at = f"http://127.0.0.1:{server.port}"
+        page = browser.open(f"{at}/?{urlsplit(server.url).query}")
+        page = begun(page, at, "S01")
+        take(page, 0, 0.8)
+        with contextlib.ExitStack() as stack:
+            page.keyboard.press("Space")
+            showing(page, "recording.1.")
+            flood(stack, server.port, count)
+            page.keyboard.press("Space")
+            showing(page, "idle.2.2.")
+            assert status(server.port) == 401
+            flood(stack, server.port, count)
+            take(page, 2, 0.8)
+            second = browser.context.new_page()
+            second.goto(at)
+            connected(second)
+            take(page, 3, 0.8)
+            showing(page, "finished.")
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)
+    folder = home / "recordings" / "S01" / "1"
+    stream = (folder / STREAM_NAME).read_text("utf-8").splitlines()
+    kept = files(home)
+    assert [k["gaps"] for k in kept] == [[]] * 4
+    for beside in kept:
+        rows = (folder / beside["file"]).read_text("utf-8").splitlines()[1:]
+        assert len(rows) == beside["rows"] > 0
+        assert rows == stream[beside["stream_row"] : beside["stream_row"] + len(rows)]
+        assert re.search(rf"_{len(rows)}\.csv$", beside["file"])
+    assert browser.complaints == []

@@ -1,0 +1,61 @@
+"""A page of the studio is one folder and one line in the registry."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("nicegui")
+
+PAGE = """
+from nicegui import ui
+
+def show(page):
+    ui.label(page.words("hello.greeting"))
+"""
+TEXTS = """
+[pages]
+hello = "Hello"
+[hello]
+title = "A page of its own"
+greeting = "Greetings from a new page"
+"""
+STUDIO = """
+import sys
+from plushsense.cli.main import main
+from plushsense.studio import pages
+from plushsense.studio.app import shell
+
+pages.__path__.append(sys.argv[1])
+shell.PAGES["hello"] = "/hello"
+sys.exit(main(["studio", "--home", sys.argv[2], "--port", "0", "--no-show", "--json"]))
+"""
+
+
+def test_a_page_is_one_folder_and_one_line(tmp_path: Path) -> None:
+    folder = tmp_path / "pages" / "hello"
+    folder.mkdir(parents=True)
+    (folder / "__init__.py").write_text("")
+    (folder / "page.py").write_text(PAGE)
+    for language in ("en", "lv"):
+        (folder / f"{language}.toml").write_text(TEXTS)
+    env = {k: v for k, v in os.environ.items() if not k.startswith(("NICEGUI_", "PYTEST_"))}
+    command = [sys.executable, "-c", STUDIO, str(folder.parent), str(tmp_path / "home")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=env) as studio:
+        try:
+            assert studio.stdout is not None
+            url = json.loads(studio.stdout.readline())["url"]
+            with urllib.request.urlopen(f"{url}hello", timeout=120) as answer:
+                hello = answer.read().decode()
+            with urllib.request.urlopen(url, timeout=120) as answer:
+                home = answer.read().decode()
+        finally:
+            studio.terminate()
+    assert "A page of its own" in hello and "Greetings from a new page" in hello
+    assert "/hello" in home

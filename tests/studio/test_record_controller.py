@@ -1,0 +1,230 @@
+"""The controller without a browser: sessions that are begun, taken up and ended, and commands that come late."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from plushsense.core.errors import ConfigError, DatasetError, DeviceError, PlushSenseError
+from plushsense.devices.virtual.device import VirtualDevice
+from plushsense.recording.session import OpenSession
+from plushsense.recording.session_files import read_events
+from plushsense.recording.setup import SessionRequest
+from plushsense.studio.app.workspace import Workspace
+from plushsense.studio.pages.record.controller import NO_CONSENT, PSEUDO, ActiveSession, RecordController
+from support.recording_pages import CALM, until
+
+SPEED = 30.0
+QUICK = SessionRequest(CALM, "S01", "quick", speed=SPEED)
+
+
+@pytest.fixture
+def controller(tmp_path: Path) -> Iterator[RecordController]:
+    """An empty studio's."""
+    workspace = Workspace(tmp_path, toy=CALM, speed=SPEED)
+    made = workspace.part(RecordController)
+    yield made
+    workspace.close()
+    assert made.active_sessions() == []
+
+
+def press(session: ActiveSession, key: str = " ") -> bool:
+    """Upon what is to be seen now."""
+    return session.press(key, session.status().seen)
+
+
+def take(session: ActiveSession) -> None:
+    """One recording of two seconds."""
+    until(lambda: session.status().signal not in ("none", "unreadable"))
+    assert press(session)
+    until(lambda: session.status().state == "recording" and session.status().elapsed_s > 2)
+    assert press(session)
+    until(lambda: session.status().state in ("idle", "finished"))
+
+
+def test_a_session_from_its_beginning_to_its_end(controller: RecordController, tmp_path: Path) -> None:
+    changes: list[int] = []
+    loop = asyncio.new_event_loop()
+    # In a thread of its own, as Playwright's loop may run in this one.
+    hearing = threading.Thread(target=loop.run_forever)
+    hearing.start()
+    end = controller.changed.subscribe(lambda: changes.append(1), loop)
+    session = controller.begin(QUICK)
+    assert (session.name, session.head.simulated, session.notices, session.mended) == ("S01/1", True, (), ())
+    assert controller.begin(QUICK) is session, "a second tab gets the same session"
+    assert controller.resume("S01/1") is session
+    assert controller.get("S01/1") is session
+    toy = session.device.inner
+    assert isinstance(toy, VirtualDevice)
+    until(lambda: bool(changes))
+    begun = len(changes)
+    for _ in range(4):
+        take(session)
+    assert session.status().state == "finished"
+    until(lambda: len(changes) > begun)
+    end()
+    loop.call_soon_threadsafe(loop.stop)
+    hearing.join(10)
+    loop.close()
+    # The person does what is asked for; the last one may have been stopped before the hand came.
+    asked = ["Back stroke 1", "Head stroke 1", "Hold strong", "Tail tap 1"]
+    assert [p.label for p in toy.performed][:3] == asked[:3]
+    assert [bool(s.file) for s in session.steps()] == [True] * 4
+    # The tap sees what the recorder gets.
+    assert session.device.buffer.count == pytest.approx(session.status().rows, abs=400)
+    # The next session of this person makes the finished one way.
+    again = controller.begin(QUICK)
+    assert (again.name, [s.name for s in controller.active_sessions()]) == ("S01/2", ["S01/2"])
+    controller.close_session("S01/2")
+    controller.close_session("S01/2")
+    assert [(s.folder.name, s.finished) for s in controller.sessions()] == [("2", False), ("1", True)]
+    with pytest.raises(ConfigError, match="finished"):
+        controller.resume("S01/1")
+
+
+def test_a_command_counts_once(controller: RecordController, tmp_path: Path) -> None:
+    session = controller.begin(QUICK)
+    until(lambda: session.status().signal not in ("none", "unreadable"))
+    seen = session.status().seen
+    answers: list[bool] = []
+    threads = [threading.Thread(target=lambda: answers.append(session.press(" ", seen))) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(answers) == [False] * 7 + [True]
+    until(lambda: session.status().state == "recording")
+    for stale in (seen, "", "recording.1.0.0.0"):
+        assert not session.press(" ", stale)
+    assert session.status().state == "recording"
+    for key in ("x", "", "go:", "go:4", "go:-1", "q"):
+        with pytest.raises(ConfigError, match="is not a command"):
+            session.press(key, session.status().seen)
+    assert press(session, "r")
+    assert press(session, "go:2")
+    assert session.status().step.number == 2
+    assert press(session, "b")
+    assert press(session, "p")
+    assert session.status().state == "paused"
+    assert press(session, "p")
+    assert press(session, "s")
+    assert [e.what for e in read_events(tmp_path / "recordings" / "S01" / "1")].count("countdown") <= 1
+
+
+def test_two_tabs_begin_one_session(controller: RecordController) -> None:
+    made: list[ActiveSession] = []
+    threads = [threading.Thread(target=lambda: made.append(controller.begin(QUICK, anew=True))) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(made) == 4
+    assert {id(s) for s in made} == {id(made[0])}
+    assert len(controller.sessions()) == 1
+
+
+def test_an_unfinished_session_is_gone_on_with(controller: RecordController, tmp_path: Path) -> None:
+    session = controller.begin(QUICK)
+    take(session)
+    press(session)
+    until(lambda: session.status().state == "recording")
+    controller.close_session("S01/1")
+    with pytest.raises(ConfigError, match="S01 has an unfinished session, 1"):
+        controller.begin(QUICK)
+    assert controller.active_sessions() == []
+    again = controller.resume("S01/1")
+    assert (again.status().done, again.request.speed, again.request.device) == (1, SPEED, CALM)
+    controller.close_session("S01/1")
+    assert controller.begin(QUICK, anew=True).name == "S01/2"
+
+
+def test_what_is_refused_leaves_nothing(controller: RecordController, tmp_path: Path) -> None:
+    outside = tmp_path.parent / "outside.toml"
+    outside.write_text('name = "x"\ngesture_set = "plush-18"\n', encoding="utf-8")
+    refused: list[tuple[SessionRequest, str]] = [
+        (SessionRequest(CALM, "Anna", "quick"), "no code"),
+        (SessionRequest(CALM, "../S01", "quick"), "no code"),
+        (SessionRequest(CALM, "", "quick"), "Whose session"),
+        (SessionRequest(CALM, "S01", str(outside)), "not a protocol of this studio"),
+        (SessionRequest(CALM, "S01", "quick", layout=str(outside)), "not a layout of this studio"),
+        (SessionRequest(CALM, "S01", "quick", words="xx"), "no wording"),
+        (SessionRequest(f"{CALM}&layout={outside}", "S01"), "names a file"),
+        (SessionRequest("replay:///etc/passwd", "S01"), "names a file"),
+        (SessionRequest("/etc/passwd", "S01"), "names a file"),
+        (SessionRequest("serial:///dev/nowhere", "S01"), "there is no port"),
+        (SessionRequest("telepathy://x", "S01"), "no scheme"),
+        (SessionRequest(CALM, "S01", speed=-1.0), "0 .* to 1000"),
+    ]
+    for wanted, said in refused:
+        with pytest.raises(PlushSenseError, match=said):
+            controller.begin(wanted)
+    for name in ("S01/1", "../x", "..", "/etc", "S01", ""):
+        with pytest.raises(ConfigError):
+            controller.resume(name)
+    assert controller.active_sessions() == []
+    assert controller.sessions() == []
+
+
+def test_a_users_own_protocol_and_layout(controller: RecordController, tmp_path: Path) -> None:
+    (tmp_path / "protocols").mkdir()
+    own = tmp_path / "protocols" / "mine.toml"
+    own.write_text('name = "mine"\ngesture_set = "plush-18"\ngestures = ["Tail pull"]\nrepetitions = 2\n', "utf-8")
+    assert next(iter(controller.protocols())) == "plush-17"
+    assert controller.protocols()[str(own)] == "mine.toml"
+    assert "plush-14" in controller.layouts()
+    session = controller.begin(SessionRequest(CALM, "S02", str(own), layout="plush-14", speed=SPEED))
+    assert [s.step.gesture for s in session.steps()] == ["Tail pull"] * 2
+    assert session.device.layout.name == "plush-14"
+    controller.close_session("S02/1")
+    # The protocol and the layout are the session's: the files may be gone.
+    own.unlink()
+    assert controller.resume("S02/1").device.layout.name == "plush-14"
+
+
+def test_a_real_session_never_goes_on_with_a_virtual_toy(controller: RecordController, tmp_path: Path) -> None:
+    from plushsense.devices.virtual.server import serve_tcp
+
+    stop, ready, urls = threading.Event(), threading.Event(), list[str]()
+
+    def on_ready(url: str) -> None:
+        urls.append(url)
+        ready.set()
+
+    toy = threading.Thread(target=lambda: serve_tcp(0, on_ready=on_ready, stop=stop), daemon=True)
+    toy.start()
+    assert ready.wait(10)
+    try:
+        assert controller.speed_for(urls[0], False) == 1.0
+        assert controller.speed_for(urls[0], True) == SPEED
+        assert controller.speed_for("virtual://?speed=3", False) == 3.0
+        session = controller.begin(SessionRequest(urls[0], "S03", "quick"))
+        assert (session.head.simulated, session.notices) == (False, (NO_CONSENT,))
+        controller.close_session("S03/1")
+        with pytest.raises(DatasetError, match="begun with a real toy"):
+            controller.resume("S03/1", CALM)
+        assert controller.active_sessions() == []
+        assert controller.resume("S03/1").name == "S03/1"
+        controller.close_session("S03/1")
+    finally:
+        stop.set()
+        toy.join(10)
+    with pytest.raises(DeviceError):
+        controller.resume("S03/1")
+    assert PSEUDO == "pseudo"
+
+
+def test_a_session_that_another_program_has(controller: RecordController, tmp_path: Path) -> None:
+    controller.begin(QUICK)
+    controller.close_session("S01/1")
+    held = OpenSession(tmp_path / "recordings" / "S01" / "1")
+    try:
+        with pytest.raises(DatasetError, match="Another program is recording"):
+            controller.resume("S01/1")
+        assert controller.active_sessions() == []
+    finally:
+        held.close()
+    assert controller.resume("S01/1").status().state == "idle"

@@ -1,0 +1,1 @@
+"""Models, data sets, devices and browsers that several tests share."""

@@ -1,0 +1,94 @@
+"""What tests of the record page share."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from plushsense.recording.session_files import SessionEvent, read_events
+from support.browsing import connected, marked
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
+
+CALM = "virtual://?person=7&lost=0&garbled=0&glitch=0"
+"""A virtual toy that loses nothing."""
+
+
+def showing(page: Page, *starts: str) -> str:
+    """Wait until the page shows one of these states, such as ``idle.3.``; what it shows."""
+    found = page.wait_for_function(
+        "starts => { const at = document.querySelector('[data-seen]'); const seen = at ? at.dataset.seen : '';"
+        " return starts.some(s => seen.startsWith(s)) ? seen : null }",
+        arg=list(starts),
+    )
+    return str(found.json_value())
+
+
+def heard(page: Page) -> None:
+    """Wait until the toy can be heard: a space before it is only answered with a sentence."""
+    page.wait_for_selector('[data-signal="good"], [data-signal="fair"], [data-signal="poor"]')
+
+
+def begun(page: Page, url: str, code: str, protocol: str = "quick") -> Page:
+    """A new session on this page, its toy heard."""
+    page.goto(url + "/record?new=1")
+    connected(page)
+    marked(page, "code").fill(code)
+    if protocol != "plush-17":
+        choose(page, "protocol", "To try it" if protocol == "quick" else protocol)
+    marked(page, "begin").click()
+    sat(page, f"{code}/1")
+    return page
+
+
+def choose(page: Page, field: str, text: str) -> None:
+    """Choose in a list."""
+    marked(page, field).click()
+    page.get_by_role("option").filter(has_text=text).first.click()
+
+
+def sat(page: Page, name: str) -> None:
+    """The session of this name is shown, and its toy is heard."""
+    page.wait_for_url(f"**/record?session={name}")
+    page.wait_for_selector('[data-test="state-box"]')
+    connected(page)
+    heard(page)
+
+
+def take(page: Page, number: int, seconds: float = 0.0) -> None:
+    """Make a recording by the space bar; a stop within half a second of the toy's time would be taken for a slip."""
+    showing(page, f"idle.{number}.")
+    page.keyboard.press("Space")
+    showing(page, f"recording.{number}.")
+    page.wait_for_timeout(1000.0 * seconds)
+    page.keyboard.press("Space")
+    showing(page, "idle.", "finished.")
+
+
+def events(home: Path, name: str = "S01/1") -> list[SessionEvent]:
+    """What the session's log says."""
+    return list(read_events(home / "recordings" / name))
+
+
+def whats(home: Path, name: str = "S01/1") -> list[str]:
+    """What happened, in words."""
+    return [e.what for e in events(home, name)]
+
+
+def files(home: Path, name: str = "S01/1") -> list[dict[str, Any]]:
+    """The sidecars of its recordings, by time."""
+    folder = home / "recordings" / name
+    beside = [json.loads(p.with_suffix(".json").read_text("utf-8")) for p in folder.glob("*_*_*.csv")]
+    return sorted(beside, key=lambda b: int(b["stream_row"]))
+
+
+def until(true: Callable[[], bool], limit_s: float = 20.0) -> None:
+    """Wait for something outside the page."""
+    end = time.monotonic() + limit_s
+    while not true():
+        assert time.monotonic() < end
+        time.sleep(0.02)

@@ -1,0 +1,16 @@
+"""Skip a test for what this machine lacks, or fail where it must be here."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+
+REQUIRED = {word.strip() for word in os.environ.get("PLUSHSENSE_REQUIRE", "").split(",") if word.strip()}
+
+
+def missing(what: str, reason: str) -> None:
+    """Skip for something this machine lacks, or fail where PLUSHSENSE_REQUIRE says that it must be here."""
+    if what in REQUIRED:
+        pytest.fail(f"{what} is required here (PLUSHSENSE_REQUIRE): {reason}")
+    pytest.skip(reason)

@@ -1,0 +1,102 @@
+"""A small data set, a trained bundle, and the command line as a user meets it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from plushsense.cli.main import main
+from plushsense.core.layouts import load_layout
+from plushsense.core.recorder_csv import Frames, format_rows, write_recording
+from plushsense.dataset.importing.importers import import_recordings
+from plushsense.dataset.store import Dataset
+
+ACCEL = load_layout("accel-3")
+GESTURES = {"Rest": 0.0, "Slow": 1.0, "Fast": 4.0}
+
+
+@dataclass
+class Ran:
+    status: int
+    out: str
+    err: str
+
+    @property
+    def json(self) -> dict[str, Any]:
+        """Standard output, which must be one JSON object and nothing else."""
+        lines = self.out.splitlines()
+        assert len(lines) == 1, self.out
+        found: dict[str, Any] = json.loads(lines[0])
+        return found
+
+
+Cli = Callable[..., Ran]
+
+
+@pytest.fixture
+def cli(capsys: pytest.CaptureFixture[str]) -> Cli:
+    def run(*words: object) -> Ran:
+        status = main([str(w) for w in words])
+        captured = capsys.readouterr()
+        return Ran(status, captured.out, captured.err)
+
+    return run
+
+
+def session(folder: Path, seed: int) -> None:
+    """One person waving at three speeds, two recordings each, between stretches of rest; with the stream."""
+    rng = np.random.default_rng(seed)
+    folder.mkdir(parents=True)
+    pieces, cuts, at = [], [], 0
+    for label, hz in GESTURES.items():
+        for _ in range(2):
+            for name, speed, rows in (("", 0.0, 300), (label, hz * rng.uniform(0.9, 1.1), int(rng.integers(160, 330)))):
+                t = np.arange(rows) / 100
+                wave = 3000 * np.sin(2 * np.pi * speed * t + rng.uniform(0, 6)) if speed else np.zeros(rows)
+                x = np.stack([wave, 0.5 * wave, 8000 + 0 * wave], axis=1) + rng.normal(0, 80, (rows, 3))
+                pieces.append(np.round(x).astype(np.int64))
+                if name:
+                    cuts.append((name, at, rows))
+                at += rows
+    clock = np.arange(at, dtype=np.int64) * 10 + 1000
+    stream = Frames(np.concatenate(pieces), clock, clock + 1_700_000_000_000)
+    (folder / "fulldatastream.csv").write_text(format_rows(stream, ACCEL))
+    for label, first, rows in cuts:
+        assert stream.host_ms is not None
+        name = f"{label}_{int(stream.host_ms[first + rows - 1])}_{rows}.csv"
+        write_recording(folder / name, stream.slice(first, first + rows), ACCEL)
+
+
+@pytest.fixture(scope="session")
+def make_session() -> Callable[[Path, int], None]:
+    """``session``, for a test that needs people of its own."""
+    return session
+
+
+@pytest.fixture(scope="session")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recordings")
+    for person in range(5):
+        session(folder / f"P{person + 1}", person)
+    return folder
+
+
+@pytest.fixture
+def dataset(recordings: Path, tmp_path: Path) -> Dataset:
+    """A data set of one's own: evaluations keep their folds in it."""
+    return import_recordings(recordings, tmp_path / "DS", layout="accel-3").dataset
+
+
+@pytest.fixture(scope="session")
+def bundle(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    import plushsense as ps
+
+    folder = tmp_path_factory.mktemp("bundle")
+    made = ps.import_recordings(recordings, folder / "DS", layout="accel-3").dataset
+    return ps.train(made, epochs=10, filters=(4, 4, 4)).save(folder / "model.plush")

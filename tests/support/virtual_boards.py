@@ -1,0 +1,80 @@
+"""The example firmware on made-up boards: built with the compilers of this machine, and played."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from pathlib import Path
+
+import numpy as np
+
+from plushsense.core.layouts import Layout
+from plushsense.deploy.golden import ANSWER
+from plushsense.deploy.package import ARDUINO, IDF, IDF_EXAMPLE, SKETCH
+from plushsense.devices.wire import LineParser
+from plushsense.runtime.image import IntegerModel
+
+BOARDS = Path(__file__).parents[1] / "deploy" / "boards"
+WARNINGS = ("-Wall", "-Wextra", "-Werror")
+SECONDS = 14
+
+
+def run(*words: object) -> None:
+    done = subprocess.run([str(w) for w in words], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def arduino(out: Path, to: Path, *defines: str, compiler: tuple[str, str] = ("gcc", "g++")) -> Path:
+    """PlushToy and the library, built for the made-up Arduino."""
+    src, sketch, program = out / ARDUINO / "src", out / SKETCH, to / "toy"
+    sources = [*sorted(src.glob("*.c")), *sorted(sketch.glob("*.c"))]
+    objects = [to / f"{source.stem}.o" for source in sources]
+    for source, built in zip(sources, objects, strict=True):
+        if not built.exists():
+            run(compiler[0], "-std=c99", "-Wpedantic", *WARNINGS, "-O1", f"-I{src}", "-c", source, "-o", built)
+    # The Arduino IDE takes a sketch for C++ and puts Arduino.h before it.
+    includes = [f"-I{p}" for p in (BOARDS / "arduino", src, sketch)]
+    esp32 = ["-DARDUINO_ARCH_ESP32"]
+    words = [compiler[1], "-std=c++17", *WARNINGS, "-O1", *esp32, *(f"-D{d}" for d in defines), *includes]
+    run(*words, BOARDS / "arduino" / "run.cpp", *objects, "-o", program)
+    return program
+
+
+def idf(out: Path, to: Path, *defines: str, compiler: str = "gcc") -> Path:
+    """The ESP-IDF example and the component, built for the made-up ESP-IDF, from the files that CMake is told."""
+    sources = []
+    for folder in (out / IDF, out / IDF_EXAMPLE / "main"):
+        sources += [folder / name for name in re.findall(r'"([^"]+\.c)"', (folder / "CMakeLists.txt").read_text())]
+    includes = [f"-I{p}" for p in (BOARDS / "idf", out / IDF / "include")]
+    words = [compiler, "-std=gnu17", *WARNINGS, "-O1", *(f"-D{d}" for d in defines), *includes]
+    run(*words, *sources, BOARDS / "idf" / "run.c", "-o", to / "toy")
+    return to / "toy"
+
+
+BUILDS = {"arduino": arduino, "idf": idf}
+
+
+def play(program: Path, *words: object, seconds: float = SECONDS) -> tuple[bytes, list[list[int]]]:
+    """What the toy sent, and what changed on its pins: rows of ms, pin, value."""
+    done = subprocess.run([str(w) for w in (program, seconds, *words)], capture_output=True)
+    assert done.returncode == 0, done.stderr.decode()
+    return done.stdout, [[int(v) for v in row.split()] for row in done.stderr.decode().splitlines()]
+
+
+def frames_of(layout: Layout, sent: bytes) -> np.ndarray:
+    """The frames (n, 1 + C) that the computer reads of what the toy sent."""
+    parser = LineParser(layout)
+    found = parser.feed(sent)
+    parser.finish()
+    assert parser.counters.malformed == 0
+    return np.array([[f.device_ms, *f.values] for f in found], dtype=np.int64)
+
+
+def told(answers: np.ndarray, model: IntegerModel, since: int = 0) -> list[str]:
+    """Answers as the example tells them."""
+    labels = model.gestures.labels
+    return [
+        f"{(ms - since) & 0xFFFFFFFF} {f'{gesture} {sure}/32768 {labels[gesture]}' if state else 'warming'}"
+        for kind, _, ms, _, state, gesture, _, sure, *_ in answers.astype(np.int64).tolist()
+        if kind == ANSWER
+    ]

@@ -1,0 +1,95 @@
+"""Hold the rules of the code base that no linter knows: see *House rules* in CONTRIBUTING.md."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections import Counter, defaultdict
+from functools import cache
+from pathlib import Path
+
+SRC = Path(__file__).resolve().parents[1] / "src" / "plushsense"
+MODULES = sorted(SRC.rglob("*.py"))
+
+LONGEST = 600
+SHORT = 80
+# One implementation of a layer each, or a fact with one owner; merging them would hide the concept.
+SHORT_ON_PURPOSE = {"training/fast/threads.py"}
+BANNED = re.compile(r"(^|_)(said|told|heard|shown|wanted|felt)(_|$)")
+NOT_IMPERATIVE = re.compile(r"(What|How|Whether|Who|Whose|Where|Of|One|All|Those|That|The|A|An|Every|Each)\b")
+
+Definition = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
+
+
+@cache
+def tree(module: Path) -> ast.Module:
+    return ast.parse(module.read_text(encoding="utf-8"))
+
+
+def name(module: Path) -> str:
+    return module.relative_to(SRC).as_posix()
+
+
+def dotted(module: Path) -> str:
+    parts = ("plushsense", *module.relative_to(SRC).with_suffix("").parts)
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def definitions() -> list[tuple[Path, Definition]]:
+    kinds = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
+    return [(module, node) for module in MODULES for node in ast.walk(tree(module)) if isinstance(node, kinds)]
+
+
+def test_no_module_is_longer_than_600_lines() -> None:
+    lines = {name(module): len(module.read_text(encoding="utf-8").splitlines()) for module in MODULES}
+    assert {module: n for module, n in lines.items() if n > LONGEST} == {}
+
+
+def test_three_modules_with_one_prefix_are_a_package() -> None:
+    families = Counter((m.parent, m.stem.split("_")[0]) for m in MODULES if "_" in m.stem.strip("_"))
+    assert [f"{name(folder)}/{prefix}_*" for (folder, prefix), n in families.items() if n >= 3] == []
+
+
+def test_no_two_public_classes_have_one_name() -> None:
+    owners: dict[str, list[str]] = defaultdict(list)
+    for module, node in definitions():
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+            owners[node.name].append(name(module))
+    assert {cls: modules for cls, modules in owners.items() if len(modules) > 1} == {}
+
+
+def test_no_name_uses_a_banned_word() -> None:
+    assert [f"{name(module)}: {node.name}" for module, node in definitions() if BANNED.search(node.name)] == []
+
+
+def test_docstrings_of_functions_begin_with_what_the_function_does() -> None:
+    odd = [
+        f"{name(module)}: {node.name}: {first}"
+        for module, node in definitions()
+        if not isinstance(node, ast.ClassDef) and not any("property" in ast.unparse(d) for d in node.decorator_list)
+        for first in [(ast.get_docstring(node) or "").partition("\n")[0]]
+        if NOT_IMPERATIVE.match(first)
+    ]
+    assert odd == []
+
+
+def test_a_short_module_with_a_single_importer_belongs_into_it() -> None:
+    # A name in quotes counts, too: a registry loads its modules by name.
+    importers: Counter[str] = Counter()
+    known = {dotted(module) for module in MODULES}
+    for module in MODULES:
+        used: set[str] = set()
+        for node in ast.walk(tree(module)):
+            if isinstance(node, ast.ImportFrom) and node.module:
+                used |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+            elif isinstance(node, ast.Import):
+                used |= {alias.name for alias in node.names}
+        importers.update(used & known)
+    short = [
+        name(module)
+        for module in MODULES
+        if module.name != "__init__.py"
+        and importers[dotted(module)] == 1
+        and len(module.read_text(encoding="utf-8").splitlines()) < SHORT
+    ]
+    assert set(short) - SHORT_ON_PURPOSE == set()

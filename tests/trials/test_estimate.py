@@ -1,0 +1,49 @@
+"""What work would take, before it is begun."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import plushsense as ps
+from plushsense.dataset.store import Dataset
+from plushsense.experiments.search.run import preview_search
+from plushsense.experiments.sweep.run import preview
+from plushsense.trials.estimate import preview_evaluation, preview_training
+from plushsense.trials.plan import PASSES
+from plushsense.workflow.config import from_settings
+
+CONFIG = from_settings(filters=(4, 4, 4), context="loop", epochs=2)
+
+
+def test_a_training_is_told_as_it_then_is(dataset: Dataset) -> None:
+    told = preview_training(dataset, CONFIG)
+    done = ps.train(dataset, CONFIG, fit_decisions=False)
+    arch = done.bundle.arch
+    assert told["parameters"] == arch.parameters
+    assert told["classes"] == len(done.bundle.gestures)
+    assert (told["split"], told["leaky"], told["epochs"]) == (done.scores["split"], False, 2)
+    trained = told["windows"] - done.scores["windows"]
+    assert told["macs"] == PASSES * arch.macs_per_window * trained * 2
+    assert told["seconds"] > 0
+    longer = preview_training(dataset, replace(CONFIG, training=replace(CONFIG.training, epochs=200)))
+    assert longer["macs"] == 100 * told["macs"]
+
+
+def test_an_evaluation_is_told_as_it_then_is(dataset: Dataset) -> None:
+    config = replace(CONFIG, evaluation=replace(CONFIG.evaluation, split="windows:3", workers=1))
+    told = preview_evaluation(dataset, config)
+    done = ps.evaluate(dataset, config)
+    sizes = [fold["train_windows"] for fold in done.table["folds"]]
+    assert (told["split"], told["leaky"], told["folds"]) == ("windows:3", True, len(sizes))
+    arch = config.model.build(dataset.layout, told["classes"], 2.5, config.padding)
+    assert told["macs"] == PASSES * arch.macs_per_window * sum(sizes) * 2
+
+
+def test_grids_are_measured_where_it_is_asked_for(dataset: Dataset) -> None:
+    small = {"architectures": "14d1_5d1", "filters": "4,4", "epochs": "1,2", "batches": "full", "split": "by-subject:2"}
+    assert "seconds" not in preview(dataset, **small)
+    told = preview(dataset, measure=True, **small)
+    assert told["problems"] == [] and told["seconds"] > 0
+    asked = {"batches": "full", "architectures": "14d1_5d1,9d1_5d1,5d1_5d1", "filters": "4,4", "split": "by-subject:2"}
+    found = preview_search(dataset, asked={"rungs": "1,2"}, changes=asked, measure=True)
+    assert found["seconds"] > 0

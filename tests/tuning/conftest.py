@@ -1,0 +1,3 @@
+"""Small models and streams with every trouble that a real one has."""
+
+from support.streams import bundle, frames  # noqa: F401

@@ -1,0 +1,153 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import plushsense as ps
+from plushsense.core.errors import ConfigError, DatasetError
+from plushsense.dataset.store import Dataset
+
+
+def test_the_face_is_small_and_all_of_its_names_load() -> None:
+    assert len(ps.__all__) <= 30
+    for name in ps.__all__:
+        assert getattr(ps, name) is not None
+    with pytest.raises(AttributeError, match="it offers"):
+        _ = ps.trian
+
+
+def test_train_keeps_whole_people_apart_and_says_on_whom(dataset: Dataset) -> None:
+    trained = ps.train(dataset, epochs=2, filters=(4, 4, 4))
+    inside, watching = (set(trained.bundle.provenance[k]) for k in ("subjects", "validation_subjects"))
+    assert inside & watching == set()
+    assert inside | watching == set(dataset.subjects)
+    assert trained.scores["split"] == "validation-subjects"
+    assert next(iter(watching)) in trained.scores["said"]
+    assert trained.bundle.provenance["dataset_hash"] == dataset.hash
+    assert trained.figure().axes
+
+
+def test_the_search_preset_is_leaky_and_says_so(dataset: Dataset) -> None:
+    trained = ps.train(dataset, preset="search", epochs=1, filters=(4, 4, 4))
+    assert trained.scores["leaky"]
+    assert "leaky" in trained.scores["said"]
+
+
+def test_same_seed_same_weights(dataset: Dataset) -> None:
+    one, two, other = (ps.train(dataset, epochs=2, filters=(4, 4, 4), seed=s).bundle.weights for s in (3, 3, 4))
+    assert all(np.array_equal(one[k], two[k]) for k in one)
+    assert any(not np.array_equal(one[k], other[k]) for k in one)
+
+
+def test_the_papers_preset_is_mirrored_loops(dataset: Dataset) -> None:
+    bundle = ps.train(dataset, preset="paper", epochs=1, filters=(4, 4, 4)).bundle
+    assert bundle.arch.padding == "mirror"
+    assert bundle.windowing["context"] == "loop"
+
+
+def test_trained_anywhere_knows_idleness_and_is_scored_on_gestures(dataset: Dataset) -> None:
+    said: list[str] = []
+    kwargs = {"epochs": 1, "filters": (4, 4, 4), "pool_s": 0.5}
+    trained = ps.train(dataset, context="anywhere", every_s=0.5, idle_share=0.25, warn=said.append, **kwargs)
+    bundle = trained.bundle
+    assert bundle.gestures.labels == ("Fast", "Rest", "Slow", "Idle")
+    assert bundle.gestures.get("Idle").idle
+    assert "added a class for what happens between gestures: Idle" in said
+    assert bundle.arch.pool == 50
+    assert bundle.provenance["context"]["anywhere"] > 50
+    assert (bundle.windowing["context"], bundle.windowing["anywhere"]["idle_share"]) == ("anywhere", 0.25)
+    inside, watching = (set(bundle.provenance[k]) for k in ("subjects", "validation_subjects"))
+    assert inside & watching == set() and inside | watching == set(dataset.subjects)
+    ordinary = ps.train(dataset, **kwargs)
+    assert trained.scores["windows"] == ordinary.scores["windows"], "gestures with their real past, nothing else"
+
+
+def test_evaluated_anywhere_is_scored_on_the_real_past(dataset: Dataset) -> None:
+    kwargs = {"split": "by-subject:2", "epochs": 1, "filters": (4, 4, 4), "workers": 1}
+    one = ps.evaluate(dataset, context="anywhere", **kwargs)
+    assert (one.train_context, one.context) == ("anywhere", "stream")
+    other = ps.evaluate(dataset, train_context="anywhere", **kwargs)
+    assert other.table["accuracy"] == one.table["accuracy"]
+    with pytest.raises(ConfigError, match="divides windows"):
+        ps.evaluate(dataset, context="anywhere", **{**kwargs, "split": "windows:2"})
+
+
+def test_the_ranges_of_a_network_trained_anywhere_come_from_its_own_windows(dataset: Dataset) -> None:
+    from plushsense.windows.anywhere import AnywhereSpec, cut_anywhere
+    from plushsense.windows.cut import WindowSpec
+    from plushsense.workflow.export import training_windows
+
+    bundle = ps.train(dataset, context="anywhere", every_s=0.5, epochs=1, filters=(4, 4, 4)).bundle
+    cut = cut_anywhere(dataset, WindowSpec(context="anywhere"), bundle.gestures, AnywhereSpec(every_s=0.5))
+    mine = cut.x[np.isin(cut.subject, bundle.provenance["subjects"])]
+    assert np.array_equal(training_windows(bundle, dataset), mine)
+
+
+def test_a_long_receptive_field_gets_the_past_it_needs(dataset: Dataset) -> None:
+    bundle = ps.train(dataset, arch="14d1_39d2_41d4", filters=(2, 2, 2), epochs=1).bundle
+    assert bundle.arch.span == 499
+
+
+def test_unknown_settings_and_too_few_classes_are_refused(dataset: Dataset) -> None:
+    with pytest.raises(ConfigError, match="Did you mean 'epochs'"):
+        ps.train(dataset, epoch=2)
+    with pytest.raises(DatasetError, match="Only 1 gesture"):
+        ps.train(dataset, classes="Slow")
+
+
+def test_notebook_faces(dataset: Dataset, bundle: Path) -> None:
+    assert "30 recordings, 5 people" in repr(dataset)
+    assert "<table>" in dataset._repr_html_()
+    assert "30 recordings" in repr(ps.cut_windows(dataset))
+    assert "14d1_19d2_19d4" in repr(ps.load(bundle))
+
+
+def long_recordings(folder: Path, people: int, recordings: int) -> Dataset:
+    """Recordings of several windows each, without a stream."""
+    from plushsense.core.layouts import load_layout
+    from plushsense.core.recorder_csv import Frames, write_recording
+    from plushsense.dataset.importing.importers import import_recordings
+
+    layout, rng = load_layout("accel-3"), np.random.default_rng(0)
+    for person in range(people):
+        (folder / "src" / f"P{person}").mkdir(parents=True)
+        for number in range(recordings):
+            for label in ("Slow", "Fast"):
+                clock = np.arange(500, dtype=np.int64) * 10
+                name = f"{label}_{1000 * person + number}_500.csv"
+                frames = Frames(rng.integers(-900, 900, (500, 3)), clock, clock)
+                write_recording(folder / "src" / f"P{person}" / name, frames, layout)
+    return import_recordings(folder / "src", folder / "DS", layout="accel-3").dataset
+
+
+@pytest.mark.parametrize(
+    ("people", "kind"), [(1, "validation-recordings"), (2, "validation-recordings"), (3, "validation-subjects")]
+)
+def test_nothing_that_is_scored_was_trained_on(people: int, kind: str, tmp_path: Path) -> None:
+    from plushsense.workflow.config import resolve
+    from plushsense.workflow.preparation import divide
+
+    dataset = long_recordings(tmp_path, people, 4)
+    windows = ps.cut_windows(dataset)
+    assert len(windows) == 6 * len(dataset.recordings), "several windows a recording"
+    division = divide(windows, resolve(None))
+    trained, scored = (set(windows.recording[i].tolist()) for i in (division.train, division.fold.test))
+    assert trained
+    assert scored
+    assert not trained & scored
+    trained = ps.train(dataset, epochs=1, filters=(2, 2, 2))
+    assert trained.scores["split"] == kind
+    assert not trained.scores["leaky"]
+    if people < 3:
+        assert "flattering" in trained.scores["said"]
+
+
+def test_the_toy_at_rest_does_not_flatter_a_training(tmp_path: Path) -> None:
+    ps.simulate(tmp_path / "raw", people=3, repetitions=1)
+    dataset = ps.import_recordings(tmp_path / "raw", tmp_path / "DS", layout="plush-15").dataset
+    scores = ps.train(dataset, epochs=1, filters=(2, 2, 2)).scores
+    assert scores["simulated"]
+    assert scores["nobody"]["windows"] > 0
+    assert scores["accuracy"] < 0.6, "after one epoch only rest is known, and rest is nobody's"

@@ -1,0 +1,60 @@
+"""The demo and the quickstart, small: that they run, say that they simulate, and can be run again."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from plushsense.workflow import demo
+from plushsense.workflow.demo import DemoSize
+
+REPO = Path(__file__).resolve().parents[2]
+TINY = DemoSize(people=4, repetitions=1, epochs=2, folds=2, live_s=25.0)
+
+
+def test_demo_twice(cli: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(demo, "QUICK", TINY)
+    out = tmp_path / "demo"
+    ran = cli("demo", "--quick", "--out", out, "--json")
+    assert ran.status == 0, ran.err
+    found = ran.json
+    assert {"dataset", "bundle", "report", "export", "scores"} <= set(found)
+    assert found["scores"]["split"] == "by-subject:2"
+    assert [g["affect"] for g in found["live"]["gestures"]]
+    assert (Path(found["export"]) / "plushsense.c").is_file()
+    assert "say nothing about a real toy" in ran.err
+    assert "simulation" in Path(found["report"]).read_text().lower()
+    again = cli("demo", "--quick", "--out", out)
+    assert again.status == 0
+    assert again.out.count("SIMULATION") >= 1
+    leftovers = [p.name for p in out.rglob("*") if p.name.endswith(".part") or "-unfinished-" in p.name]
+    assert leftovers == []
+
+
+def test_demo_touches_no_folder_of_yours(cli: Callable[..., Any], tmp_path: Path) -> None:
+    (tmp_path / "thesis.txt").write_text("x")
+    ran = cli("demo", "--quick", "--out", tmp_path)
+    assert ran.status == 2
+    assert "not a demo" in ran.err
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["thesis.txt"]
+
+
+def test_the_quickstart_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = REPO / "examples" / "quickstart.py"
+    assert len(path.read_text().splitlines()) <= 40
+    spec = importlib.util.spec_from_file_location("quickstart", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    module.main(tmp_path, people=4, epochs=2, seconds=6.0)
+    said = capsys.readouterr().out
+    assert "33520 multiply-accumulates" in said
+    assert (tmp_path / "model.plush").is_file()
+    assert (tmp_path / "report.html").is_file()
+    assert json.loads((tmp_path / "evaluation" / "evaluation.json").read_text())["split"] == "by-subject:2"

@@ -1,0 +1,324 @@
+"""PlushClassifier as users of scikit-learn meet it."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import plushsense as ps
+from plushsense.core.errors import ArchError, ArrayError, ConfigError
+from plushsense.dataset.store import Dataset
+from plushsense.models.reference import softmax
+
+sklearn = pytest.importorskip("sklearn", minversion="1.6")
+
+from sklearn.base import clone
+from sklearn.exceptions import NotFittedError
+from sklearn.model_selection import GridSearchCV, GroupKFold, LeaveOneGroupOut, cross_val_score
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
+from sklearn.utils.estimator_checks import parametrize_with_checks
+
+SRC = Path(__file__).resolve().parents[2] / "src"
+
+# The checks' windows have 2 to 20 samples: any padding but ``stream``, and no ``mirror``, whose mean over two mirrored
+# samples cannot tell which came first.
+TINY: dict[str, Any] = {"arch": "3", "filters": (4,), "padding": "causal", "epochs": 20, "learning_rate": 0.03}
+
+
+# None of the checks is expected to fail.
+@parametrize_with_checks([ps.PlushClassifier(**TINY)])
+def test_scikit_learns_own_checks(estimator: Any, check: Callable[[Any], None]) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        check(estimator)
+
+
+def waves(n: int = 60, seed: int = 0, samples: int = 60) -> tuple[Any, Any, Any]:
+    """Slow and fast waves of two channels (N, 2, T), which is which, and whose of six people."""
+    rng = np.random.default_rng(seed)
+    y = np.arange(n) % 2
+    t = np.arange(samples) / 20
+    x = np.stack([np.sin(2 * np.pi * (1 + 3 * k) * t + rng.uniform(0, 6)) for k in y])[:, None, :]
+    return np.concatenate([x, rng.normal(0, 0.1, x.shape)], axis=1), y, np.arange(n) // 2 % 6
+
+
+def small(**settings: Any) -> ps.PlushClassifier:
+    return ps.PlushClassifier(**{"arch": "9", "filters": (4,), "epochs": 15, "learning_rate": 0.03, **settings})
+
+
+def test_it_learns_and_answers_in_every_form() -> None:
+    x, y, _ = waves()
+    test, truth, _ = waves(20, seed=1)
+    model = small().fit(x, y)
+    assert model.score(test, truth) > 0.9
+    assert model.n_features_in_ == 120
+    probabilities = model.predict_proba(test)
+    assert np.allclose(probabilities.sum(axis=1), 1)
+    assert np.array_equal(model.decision_function(test) > 0, model.predict(test) == 1)
+    assert np.array_equal(model.predict_proba(test.reshape(20, -1)), probabilities), "rows are channel after channel"
+    rows = small(channels=2).fit(x.reshape(60, -1), y)
+    assert np.array_equal(rows.predict_proba(test), probabilities)
+    three = small().fit(x, np.arange(60) % 3)
+    assert three.decision_function(test).shape == (20, 3)
+    assert np.allclose(softmax(three.decision_function(test)), three.predict_proba(test))
+
+
+@pytest.mark.parametrize(
+    "labels",
+    [
+        np.array(["slow", "fast"]),
+        np.array([7, -2]),
+        np.array([False, True]),
+        np.array([1.0, 2.0]),
+        np.array(["a", "A"]),
+        np.array(["", "x"]),
+        np.array(["slow", "fast"], dtype=object),
+    ],
+    ids=["text", "int", "bool", "float", "case", "empty", "object"],
+)
+def test_labels_keep_their_type(labels: Any, tmp_path: Path) -> None:
+    x, y, _ = waves()
+    model = small().fit(x, labels[y])
+    assert set(model.classes_.tolist()) == set(labels.tolist())
+    again = ps.PlushClassifier.from_bundle(model.save(tmp_path / "m.plush"))
+    for one in (model, pickle.loads(pickle.dumps(model)), again):
+        assert one.predict(x).dtype == model.classes_.dtype == labels.dtype
+        assert one.score(x, labels[y]) > 0.9
+
+
+def test_the_same_random_state_gives_the_same_bundle() -> None:
+    x, y, _ = waves()
+    one, two, other = (small(random_state=s).fit(x, y).bundle_.to_bytes() for s in (3, 3, 4))
+    assert one == two != other
+    first, second = (small(random_state=np.random.RandomState(5)).fit(x, y) for _ in range(2))
+    assert first.bundle_.to_bytes() == second.bundle_.to_bytes()
+    assert np.array_equal(
+        clone(first.set_params(random_state=3)).fit(x, y).predict_proba(x),
+        small(random_state=3).fit(x, y).predict_proba(x),
+    )
+
+
+def test_whole_numbers_are_read_as_they_are_and_floats_finely_at_any_scale() -> None:
+    x, y, _ = waves()
+    counts = np.round(5000 * x).astype(np.int32)
+    model = small().fit(counts, y)
+    assert [c.step for c in model.bundle_.layout.channels] == [1.0, 1.0]
+    assert np.array_equal(model.bundle_.scaler.offset, counts.mean(axis=(0, 2)))
+    assert np.allclose(
+        small().fit(counts.astype(float), y).predict_proba(x * 5000), model.predict_proba(counts), atol=1e-3
+    )
+    plain = small().fit(x, y).predict_proba(x)
+    for moved in (1e-9 * x, 1e12 * x, 1000.0 + x, np.float32(3) * x.astype(np.float32)):
+        assert np.allclose(small().fit(moved, y).predict_proba(moved), plain, atol=0.01)
+    flat = np.where([[True], [False]], x, 0.1)
+    assert small().fit(flat, y).score(flat, y) > 0.9, "a constant channel does no harm"
+    assert np.isfinite(model.predict_proba(1e12 * x)).all()
+    assert small().fit(1000.0 + x, y).bundle_.layout.channels[0].step <= x[:, 0].std() / 2**16
+
+
+def test_groups_choose_folds_and_who_decides_when_to_stop() -> None:
+    x, y, people = waves()
+    scores = cross_val_score(small(), x, y, groups=people, cv=LeaveOneGroupOut(), error_score="raise")
+    assert len(scores) == 6
+    assert scores.mean() > 0.9
+    stopped = small(preset="loso").fit(x, y, groups=people).bundle_.provenance
+    assert len(stopped["validation_subjects"]) == 1
+    assert set(stopped["subjects"]) | set(stopped["validation_subjects"]) == {str(p) for p in range(6)}
+    assert small().fit(x, y, groups=people).bundle_.provenance["validation_subjects"] == [], "nobody is held back"
+
+
+def test_metadata_routing_brings_groups_to_fit() -> None:
+    x, y, people = waves()
+    seen: list[Any] = []
+
+    class Watched(ps.PlushClassifier):
+        def fit(self, X: Any, y: Any, groups: Any = None) -> Any:
+            seen.append(groups)
+            return super().fit(X, y, groups=groups)
+
+    with sklearn.config_context(enable_metadata_routing=True):
+        for model in (Watched(**TINY), Watched(**TINY).set_fit_request(groups=False)):
+            cross_val_score(model, x, y, params={"groups": people}, cv=GroupKFold(3), error_score="raise")
+        chain = make_pipeline(StandardScaler(), Watched(channels=2, **TINY))
+        cross_val_score(chain, x.reshape(60, -1), y, params={"groups": people}, cv=GroupKFold(3), error_score="raise")
+    told = [g is not None for g in seen]
+    assert told == [True] * 3 + [False] * 3 + [True] * 3
+    assert all(len(np.unique(g)) == 4 for g in seen if g is not None)
+
+
+def test_pipelines_and_grids() -> None:
+    x, y, people = waves()
+    chain = make_pipeline(StandardScaler(), small(channels=2))
+    grid = {
+        "plushclassifier__arch": ["9", "3_3"],
+        "plushclassifier__filters": [(4, 4), "2,2"],
+        "plushclassifier__epochs": np.array([1, 12]),
+    }
+    found = GridSearchCV(chain, grid, cv=GroupKFold(2), error_score="raise").fit(x.reshape(60, -1), y, groups=people)
+    assert found.best_score_ > 0.9
+    assert found.best_params_["plushclassifier__epochs"] == 12
+    assert len(found.cv_results_["params"]) == 8
+
+
+def test_a_classifier_of_cut_windows_is_a_bundle_that_reads_the_toy(
+    dataset: Dataset, recordings: Path, tmp_path: Path, cli: Any
+) -> None:
+    windows = ps.cut_windows(dataset)
+    y = np.array(windows.labels)[windows.y]
+    model = ps.PlushClassifier(filters=(4, 4, 4), epochs=10, layout=dataset.layout)
+    assert len(cross_val_score(model, windows.x, y, groups=windows.subject, cv=LeaveOneGroupOut())) == 5
+    path = model.fit(windows.x, y, groups=windows.subject).save(tmp_path / "m.plush", gestures=dataset.gestures)
+    bundle = ps.load(path)
+    assert bundle.layout == dataset.layout
+    assert bundle.gestures.labels == tuple(model.classes_)
+    assert bundle.provenance["subjects"] == sorted(dataset.subjects)
+    reference = bundle.network().probabilities(bundle.scaler.apply(windows.x))
+    ours = model.predict_proba(windows.x)
+    assert np.abs(reference - ours).max() < 1e-5
+
+    from plushsense.training.fit import predict
+
+    torch = predict(bundle.arch, dict(bundle.weights), bundle.scaler, windows)
+    assert np.abs(torch - ours).max() < 1e-5
+    again = ps.PlushClassifier.from_bundle(path)
+    assert np.array_equal(again.predict_proba(windows.x), ours)
+    assert clone(again).get_params()["epochs"] == 10
+    stream = recordings / "P1" / "fulldatastream.csv"
+    ran = cli("live", "--device", f"replay://{stream}?speed=0&layout=accel-3", "--model", path, "--json")
+    assert ran.status == 0, ran.err
+    assert '"tracking"' in ran.out
+
+
+def test_any_bundle_becomes_a_classifier(bundle: Path, dataset: Dataset) -> None:
+    windows = ps.cut_windows(dataset)
+    model = ps.PlushClassifier.from_bundle(bundle)
+    loaded = ps.load(bundle)
+    assert model.classes_.tolist() == list(loaded.gestures.labels)
+    assert np.allclose(model.predict_proba(windows.x), loaded.network().probabilities(loaded.scaler.apply(windows.x)))
+    assert set(model.predict(windows.x)) <= set(windows.labels)
+
+
+def test_affects_come_from_the_gesture_set() -> None:
+    x, y, _ = waves()
+    model = small().fit(x, np.array(["Tail pull", "head stroke 1"])[y])
+    assert model.to_bundle().gestures.affects == ("none", "none")
+    named = model.to_bundle(ps.load_gestures("plush-18"))
+    assert (named.gestures.labels, named.gestures.affects) == (("Tail pull", "head stroke 1"), ("negative", "positive"))
+
+
+def test_a_pickle_holds_a_bundle_and_nothing_of_pytorch(tmp_path: Path) -> None:
+    x, y, _ = waves()
+    model = small().fit(x, y)
+    data = pickle.dumps(model)
+    assert b"torch" not in data
+    assert model.bundle_.to_bytes() in data
+    assert np.array_equal(pickle.loads(data).predict_proba(x), model.predict_proba(x))
+    (tmp_path / "m.pickle").write_bytes(data)
+    np.save(tmp_path / "x.npy", x)
+    code = (
+        "import sys, pickle\n"
+        "class NoTorch:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name == 'torch': raise ModuleNotFoundError('no torch', name='torch')\n"
+        "sys.meta_path.insert(0, NoTorch())\n"
+        "import numpy as np\n"
+        "model, x = pickle.load(open('m.pickle', 'rb')), np.load('x.npy')\n"
+        "print(model.score(x, np.arange(60) % 2))\n"
+        "from plushsense.core.errors import MissingExtraError\n"
+        "try:\n    model.fit(x, np.arange(60) % 2)\n"
+        "except MissingExtraError as error:\n    print(error)\n"
+    )
+    out = alone(code, tmp_path)
+    assert float(out.splitlines()[0]) > 0.9
+    assert "pip install 'plushsense[train]'" in out
+
+
+def test_without_scikit_learn_the_name_loads_and_the_class_says_what_to_install(tmp_path: Path) -> None:
+    code = (
+        "import sys; import plushsense as ps\n"
+        "assert not {'numpy', 'sklearn', 'torch'} & set(sys.modules)\n"
+        "sys.modules['sklearn'] = None\n"
+        "from plushsense import *\n"
+        "try:\n    PlushClassifier()\nexcept ps.core.errors.MissingExtraError as error:\n    print(error)\n"
+    )
+    assert "pip install 'plushsense[baselines]'" in alone(code, tmp_path)
+
+
+def alone(code: str, where: Path) -> str:
+    """What a Python of its own prints."""
+    paths = os.pathsep.join([str(SRC), os.environ.get("PYTHONPATH", "")])
+    ran = subprocess.run(
+        [sys.executable, "-c", code], cwd=where, env={**os.environ, "PYTHONPATH": paths}, capture_output=True, text=True
+    )
+    assert ran.returncode == 0, ran.stderr
+    return ran.stdout
+
+
+def test_what_does_not_fit_is_refused_in_a_sentence() -> None:
+    x, y, people = waves()
+    rows = x.reshape(60, -1)
+    holes = x.copy()
+    holes[4, 1, 7] = np.nan
+    accel = ps.load_layout("accel-3")
+    three = np.round(1000 * np.concatenate([x, x[:, :1]], axis=1))
+    for match, model, X, labels, groups in (
+        (r"1 of 60 windows, first in window 4, channel 1, sample 7", small(), holes, y, None),
+        (r"NaN or infinity in 60", small(), np.full_like(x, np.inf), y, None),
+        (r"expected \(N, C, T\)", small(), x[None], y, None),
+        (r"n_features = 120, which 7 channels", small(channels=7), rows, y, None),
+        (r"windows of 2 channels, but channels or layout say 3", small(channels=3), x, y, None),
+        (r"channels is 0", small(channels=0), rows, y, None),
+        (r"channels is 2, but the layout 'accel-3' has 3", small(channels=2, layout=accel), three, y, None),
+        (r"not whole numbers, but with the layout 'accel-3'", small(layout="accel-3"), three + 0.5, y, None),
+        (r"beyond 32 bits", small(layout="accel-3"), three * 1e9, y, None),
+        (r"at least 2 samples", small(channels=120), rows, y, None),
+        (r"one class \(0\)", small(), x, np.zeros(60, dtype=int), None),
+        (r"groups has the shape \(59,\)", small(), x, y, people[:-1]),
+        (r"60 samples, but 80 under the padding 'stream' sees", small(arch="80"), x, y, None),
+        (r"Unknown label type", small(), x, y + 0.5 * np.pi * np.arange(60), None),
+    ):
+        with pytest.raises(ValueError, match=match) as refused:
+            model.fit(X, labels, groups=groups)
+        if "label type" not in match:
+            assert isinstance(refused.value, ArrayError)
+    for kind, match, settings in (
+        (ConfigError, "Unknown preset 'peple'", {"preset": "peple"}),
+        (ConfigError, "epochs is 0", {"epochs": 0}),
+        (ArchError, "filter counts", {"arch": "3_3"}),
+    ):
+        with pytest.raises(kind, match=match):
+            small(**settings).fit(x, y)
+    with pytest.raises(NotFittedError):
+        small().predict(x)
+    with pytest.raises(NotFittedError):
+        small().to_bundle()
+    model = small().fit(x, y)
+    with pytest.raises(ArrayError, match=r"\(60, 1, 60\): expected \(N, 2, 60\), as in fit"):
+        model.predict(x[:, :1])
+    with pytest.raises(ValueError, match="expecting 120 features"):
+        model.predict(rows[:, :60])
+    with pytest.raises(ArrayError, match="window 4"):
+        model.predict(holes)
+    with pytest.raises(TypeError, match="sample_weight"):
+        model.fit(x, y, sample_weight=np.ones(60))
+
+
+def test_forget_finds_a_classifier_that_was_told_whose_windows_they_are(dataset: Dataset, tmp_path: Path) -> None:
+    from plushsense.workflow.datasets import trained_on
+
+    windows = ps.cut_windows(dataset)
+    model = ps.PlushClassifier(filters=(2, 2, 2), epochs=1, layout="accel-3")
+    model.fit(windows.x, windows.y, groups=windows.subject).save(tmp_path / "m.plush")
+    found = trained_on(dataset.path, "P2", [tmp_path])
+    assert [f.certain for f in found] == [False]
+    assert "arrays given to PlushClassifier" in found[0].message

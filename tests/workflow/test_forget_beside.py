@@ -1,0 +1,190 @@
+"""A person is taken out of a data set while something runs on it: nothing of theirs is written afterwards."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import polars
+import pytest
+
+import plushsense as ps
+from plushsense.core.errors import ForgottenError
+from plushsense.dataset.importing.importers import import_recordings
+from plushsense.dataset.index import open_dataset
+from plushsense.dataset.privacy.forget import forget
+from plushsense.dataset.store import Dataset
+from plushsense.experiments.abstention import abstaining
+from plushsense.experiments.adaptation import evaluate_adapting
+from plushsense.experiments.baselines.run import baselines
+from plushsense.experiments.search.run import search
+from plushsense.experiments.streams.run import stream_benchmark
+from plushsense.experiments.sweep.run import sweep
+from plushsense.workflow.api import unfinished
+
+PERSON = "Yv0nne-77"
+SMALL: dict[str, Any] = {"filters": (2, 3, 3), "context": "loop", "epochs": 2, "workers": 1}
+GRID: dict[str, Any] = {
+    "architectures": ("5", "9"), "filters": ((2, 3, 3, 3),), "batches": ("full",), "classes": "shared", "workers": 1,
+}  # fmt: skip
+Cli = Callable[..., Any]
+# Called wherever a program says how far it is.
+Hook = Callable[..., None]
+
+
+def traces(folder: Path) -> list[str]:
+    """Where the person stands in a data set folder: in a name, in any byte, in any row; and every result kept."""
+    found = []
+    for path in folder.rglob("*"):
+        where = path.relative_to(folder).as_posix()
+        if PERSON in where or path.suffix in (".npz", ".plush", ".part", ".png"):
+            # What holds weights and probabilities does not say whose they are.
+            found.append(where)
+        elif path.suffix == ".parquet":
+            rows = polars.read_parquet(path)
+            said = rows.select(polars.any_horizontal(polars.col(polars.String).str.contains(PERSON).any()))
+            found += [where] if said.item() else []
+        elif path.is_file() and PERSON.encode() in path.read_bytes():
+            found.append(where)
+    return found
+
+
+def run_evaluate(ds: Dataset, out: Path, hook: Hook) -> None:
+    ps.evaluate(ds, split="leave-one-subject-out", out=out, progress=hook, **SMALL)
+
+
+def run_evaluate_in_processes(ds: Dataset, out: Path, hook: Hook) -> None:
+    ps.evaluate(ds, split="by-subject:3", out=out, progress=hook, **{**SMALL, "workers": 2})
+
+
+def run_baselines(ds: Dataset, out: Path, hook: Hook) -> None:
+    baselines(
+        ds, splits=("by-subject:2",), models="knn,tree", pca="no", out=out, progress=hook, context="loop", workers=1
+    )
+
+
+def run_sweep(ds: Dataset, out: Path, hook: Hook) -> None:
+    sweep(ds, epochs=(1, 2), split="by-subject:2", out=out, progress=hook, **GRID)
+
+
+def run_search(ds: Dataset, out: Path, hook: Hook) -> None:
+    search(ds, rungs=(1, 2), share=1.0, split="by-subject:2", out=out, progress=hook, **GRID)
+
+
+def run_streams(ds: Dataset, out: Path, hook: Hook) -> None:
+    stream_benchmark(ds, split="by-subject:2", systems=("argmax", "hysteresis"), out=out, progress=hook, **SMALL)
+
+
+def run_abstaining(ds: Dataset, out: Path, hook: Hook) -> None:
+    abstaining(ds, split="by-subject:2", out=out, progress=hook, **SMALL)
+
+
+def run_adapting(ds: Dataset, out: Path, hook: Hook) -> None:
+    evaluate_adapting(ds, split="by-subject:2", progress=hook, **SMALL)
+
+
+def run_train(ds: Dataset, out: Path, hook: Hook) -> None:
+    out.mkdir(parents=True)
+    ps.train(ds, journal=unfinished(ds.path), progress=hook, **SMALL).save(out / "model.plush")
+
+
+RUNS = (
+    run_evaluate, run_evaluate_in_processes, run_baselines, run_sweep, run_search, run_streams, run_abstaining,
+)  # fmt: skip
+
+
+def ended(*at: Any) -> bool:
+    """Whether all trainings are done, so that only tables are left to be written."""
+    if len(at) > 1:
+        return bool(at[0] == at[1])
+    (now,) = at
+    if getattr(now, "rung", 0) < getattr(now, "rungs", 0):
+        return False
+    return bool(now.done == next(getattr(now, name) for name in ("folds", "jobs", "trainings") if hasattr(now, name)))
+
+
+@pytest.fixture
+def folder(recordings: Path, tmp_path: Path) -> Path:
+    """A data set with a person whose code stands nowhere by chance."""
+    shutil.copytree(recordings, tmp_path / "src")
+    (tmp_path / "src" / "P2").rename(tmp_path / "src" / PERSON)
+    return import_recordings(tmp_path / "src", tmp_path / "DS", layout="accel-3").dataset.path
+
+
+def forgetting(folder: Path, when: Callable[..., bool]) -> Hook:
+    """A hook that takes the person out when it is time, once."""
+    done = list[bool]()
+
+    def hook(*at: Any) -> None:
+        if not done and when(*at):
+            done.append(True)
+            forget(folder, PERSON)
+
+    return hook
+
+
+REFUSED = r"taken out of '.*' \(plushsense forget\) while this ran.*run it again"
+
+
+@pytest.mark.parametrize("when", [lambda *_: True, ended], ids=["early", "late"])
+@pytest.mark.parametrize("run", RUNS, ids=lambda run: run.__name__.removeprefix("run_"))
+def test_who_is_forgotten_meanwhile_does_not_come_back(
+    folder: Path, run: Callable[[Dataset, Path, Hook], None], when: Callable[..., bool]
+) -> None:
+    assert traces(folder) != []
+    with pytest.raises(ForgottenError, match=REFUSED):
+        run(open_dataset(folder), folder / "evaluations" / "mine", forgetting(folder, when))
+    assert traces(folder) == []
+    assert not (folder / "evaluations" / "mine").exists()
+
+
+@pytest.mark.parametrize("run", [run_adapting, run_train], ids=lambda run: run.__name__.removeprefix("run_"))
+def test_nor_in_the_state_of_a_training(
+    folder: Path, run: Callable[[Dataset, Path, Hook], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("plushsense.workflow.api._SAVE_EVERY_S", 0.0)
+    hook = forgetting(folder, lambda *_: True)
+    with pytest.raises(ForgottenError, match=REFUSED):
+        run(open_dataset(folder), folder / "evaluations" / "mine", hook)
+    assert traces(folder) == []
+
+
+def test_a_training_that_ends_after_it_gives_no_bundle(folder: Path) -> None:
+    last = forgetting(folder, lambda epoch, epochs, _: epoch == epochs)
+    with pytest.raises(ForgottenError, match=REFUSED):
+        ps.train(folder, progress=last, fit_decisions=False, **SMALL)
+
+
+def test_done_again_it_is_without_the_person(folder: Path) -> None:
+    out = folder / "evaluations" / "mine"
+    with pytest.raises(ForgottenError):
+        run_evaluate(open_dataset(folder), out, forgetting(folder, ended))
+    run_evaluate(open_dataset(folder), out, lambda *_: None)
+    people = polars.read_parquet(out / "predictions.parquet")["subject"].unique().to_list()
+    assert sorted(people) == ["P1", "P3", "P4", "P5"]
+    assert not [t for t in traces(folder) if not t.endswith(".npz")]
+
+
+def test_the_command_says_so_and_forget_can_be_given_again(
+    folder: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("plushsense.cli.evaluate.report_folds", lambda _: forgetting(folder, ended))
+    ran = cli("evaluate", folder, "--filters", "2,3,3", "--context", "loop", "--epochs", 1, "--workers", 1)
+    assert ran.status == 2
+    assert [line for line in ran.err.splitlines() if "while this ran" in line]
+    assert traces(folder) == []
+    stones = (folder / "forgotten.jsonl").read_bytes()
+    ran = cli("forget", folder, PERSON, "--yes")
+    assert ran.status == 0, ran.err
+    assert f"'{PERSON}' is not in the data set" in ran.out and "0 evaluations" in ran.out
+    (folder / "evaluations" / "old").mkdir(parents=True)
+    left = folder.parent / ".DS-unfinished-abc"
+    left.mkdir()
+    found = cli("forget", folder, PERSON, "--json")
+    assert found.status == 1 and left.exists()
+    found = cli("forget", folder, PERSON, "--yes", "--json").json
+    assert (found["evaluations"], found["leftovers"]) == (["evaluations/old"], ["../.DS-unfinished-abc"])
+    assert found["absent"] and found["done"] and not left.exists()
+    assert (folder / "forgotten.jsonl").read_bytes() == stones
