@@ -166,8 +166,8 @@ def _row(page: Page, clips: Clips, clip: Clip, opened: Any) -> None:
         ui.label(state).classes("flex-grow")
         if clip.head.simulated:
             ui.label(words("live.simulated_short")).classes("ps-simulated")
-        look = ui.button(words("live.opened"), on_click=opened).props("flat dense no-caps")
-        named(look, f"{words('live.opened')} {clip.key}").set_enabled(clip.key != clips.recording)
+        look = ui.button(words("live.clip_open"), on_click=opened).props("flat dense no-caps")
+        named(look, f"{words('live.clip_open')} {clip.key}").set_enabled(clip.key != clips.recording)
 
 
 class _ClipEditor:
