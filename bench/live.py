@@ -1,19 +1,21 @@
 """Measure the cost of a live step from bytes to event, against `continual-inference`, and of a hundred toys at once.
 
-    pip install continual-inference      (brings PyTorch; without it its rows are left out)
+    pip install continual-inference      (installs PyTorch; without it its rows are left out)
     python bench/live.py [--bundle BUNDLE] [--rounds 15] [--toys 100 --seconds 30] [--json]
 
-1. Bytes to event: lines of the virtual toy through the wire parser, health, clock, derived channels, gate, network and
-   events, float and int8, one toy on one thread. A step's time goes from the bytes of its last frame to the decision.
-2. Against continual-inference, the PyTorch library of networks that keep their state: the same weights in both, checked
-   to give the same logits; five samples a step (it computes an answer at every sample, by `forward_step` and, in one
-   call, `forward_steps`), in turn, round by round; a ratio is taken within its round. It has no dilation in time: the
-   taps of a dilated layer are spread over a longer kernel, with zeros between, which costs it 2.8 times as many
-   multiply-accumulates for the default network. So a network without dilation stands beside it.
-3. Toys at 100 Hz in one process and one thread, in real time. A decision is late when it comes more than one step after
-   its frame was due. What the virtual toys send is worked out before.
+1. Bytes to event: lines of the virtual toy pass through wire parser, health, clock, derived channels, gate, network and
+   events, in float and int8, for one toy on one thread. The time of a step is measured from the bytes of its last frame
+   to the decision.
+2. Against continual-inference, a PyTorch library for networks that keep their state. Both have the same weights and are
+   checked to give the same logits. A step has five samples; continual-inference computes an answer at every sample,
+   with `forward_step` or, in one call, `forward_steps`. The methods run in turn, and ratios are taken within a round.
+   continual-inference has no dilation in time: the taps of a dilated layer are spread over a longer kernel with zeros
+   in between, which takes 2.8 times as many multiply-accumulates for the default network. Therefore a network without
+   dilation is measured too.
+3. Many toys at 100 Hz in one process and one thread, in real time. A decision is late when it comes more than one step
+   after its frame was due. The bytes of the virtual toys are computed beforehand.
 
-Without `--bundle` the weights are made up: costs hardly depend on them. What the virtual toy plays is a simulation.
+Without `--bundle` the weights are random: costs hardly depend on them. The data of the virtual toy are a simulation.
 """
 
 from __future__ import annotations
@@ -58,7 +60,7 @@ def lines_of(layout: Layout, count: int) -> list[bytes]:
 
 
 def samples_of(layout: Layout, lines: list[bytes]) -> np.ndarray:
-    """Return the samples (T, I) that a network reads from them."""
+    """Return the samples (T, I) that a network reads from these lines."""
     parser, clock, inputs = LineParser(layout), SampleClock(layout), SampleInputs(layout)
     frames = [frame for line in lines for frame in parser.feed(line)]
     return np.array([inputs(row) for frame in frames for row in clock.rows(frame.device_ms, frame.values)])
@@ -74,7 +76,7 @@ def made_up(layout: Layout, symbol: str = "14d1_19d2_19d4") -> Bundle:
 
 
 def bytes_to_event(reader: StreamReader, lines: list[bytes]) -> dict[str, Any]:
-    """Measure the steps with a decision, in ms of wall-clock and processor time, and processor microseconds a frame."""
+    """Measure steps with a decision in ms of wall-clock and processor time, and processor microseconds per frame."""
     parser = LineParser(reader.layout)
     wall, own = [], []
     began = time.process_time()
@@ -123,7 +125,7 @@ def theirs(bundle: Bundle) -> tuple[Any, Any]:
 
 
 def beside(bundle: Bundle, lines: list[bytes], rounds: int) -> dict[str, Any]:
-    """Measure microseconds a step of ours and theirs, ratios within a round, and the difference of the logits."""
+    """Measure microseconds per step of both libraries, ratios within a round, and the difference of the logits."""
     arch, step = bundle.arch, bundle.arch.step
     raw = samples_of(bundle.layout, lines)
     whole, scaled = raw.astype(np.int64), bundle.scaler.apply_sample(raw)
@@ -161,7 +163,7 @@ def beside(bundle: Bundle, lines: list[bytes], rounds: int) -> dict[str, Any]:
             stepper.reset()
             begin()
             mine = np.array(stepper.push(scaled[: blocks[-1].stop]))
-            shift = (arch.span - 1) % step  # ours answers every step, theirs every sample
+            shift = (arch.span - 1) % step  # PlushSense answers at every step, continual-inference at every sample
             begin()
             for at in blocks:
                 out = net.forward_steps(x[:, :, at])[0].numpy().T
@@ -170,7 +172,7 @@ def beside(bundle: Bundle, lines: list[bytes], rounds: int) -> dict[str, Any]:
                         expected = mine[(t + 1 - arch.span) // step]
                         apart = max(apart, float(np.abs(out[t - at.start] - expected).max()))
             if not apart < 1e-3:
-                raise SystemExit(f"The two networks do not answer alike: their logits are {apart} apart.")
+                raise SystemExit(f"The two networks do not agree: their logits differ by {apart}.")
             times = timed(ways, blocks, rounds)
     else:
         times = timed(ways, blocks, rounds)
@@ -189,7 +191,7 @@ def beside(bundle: Bundle, lines: list[bytes], rounds: int) -> dict[str, Any]:
 
 
 def timed(ways: dict[str, Any], blocks: list[slice], rounds: int) -> dict[str, list[float]]:
-    """Measure seconds a step of each method in each round; the first round warms up and does not count."""
+    """Measure seconds per step of each method in each round; the first round is for warming up and is not counted."""
     times: dict[str, list[float]] = {name: [] for name in ways}
     for _ in range(rounds + 1):
         for name, (begin, push) in ways.items():
@@ -202,14 +204,14 @@ def timed(ways: dict[str, Any], blocks: list[slice], rounds: int) -> dict[str, l
 
 
 def many(bundle: Bundle, toys: int, seconds: float) -> dict[str, Any]:
-    """Virtual toys in real time, in this thread; what they send was worked out before."""
+    """Run virtual toys in real time in this thread; their bytes are computed beforehand."""
     urls = [f"virtual://?person={n + 1}&seed={n + 1}&seconds={seconds}" for n in range(toys)]
     devices = [open_device(url, bundle.layout) for url in urls]
     for device in devices:
         assert isinstance(device, VirtualDevice)
         device.play_ahead()
     gc.collect()
-    gc.freeze()  # what is there stays: looking through it again and again would cost tens of ms each time
+    gc.freeze()  # existing objects live on; scanning them at every collection would take tens of ms
     live = run_many([(device, StreamClassifier(bundle)) for device in devices])
     for _ in live:
         pass
@@ -251,15 +253,15 @@ def main() -> None:
                 f"bytes to event, {engine:<6} p50 {ms['p50']} ms, p95 {ms['p95']} ms, p99 {ms['p99']} ms, longest "
                 f"{ms['longest']} ms {of}, {one['steps']} steps"
             )
-        print(f"{'':<22} {one['us_a_frame']} µs of the processor a frame")
+        print(f"{'':<22} {one['us_a_frame']} µs of processor time per frame")
     for one in report["network_only"]:
-        title = f"{one['network']} alone, five samples a step"
-        print(f"\n{title:<44}{'µs a step':>10}   times ours, float (min, median, max)")
+        title = f"{one['network']} alone, five samples per step"
+        print(f"\n{title:<44}{'µs/step':>10}   times our float step (min, median, max)")
         for row in one["rows"]:
             low, middle, high = row["times_slower"]
             print(f"{row['name']:<44}{row['us_a_step']:>10}   {low} {middle} {high}")
         apart = one["logits_apart"]
-        print("continual-inference is not here" if apart is None else f"logits at most {apart:.1e} apart")
+        print("continual-inference is not installed" if apart is None else f"logits differ by at most {apart:.1e}")
     if report["many"]:
         one = report["many"]
         ms = one["latency_ms"]

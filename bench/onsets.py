@@ -2,8 +2,8 @@
 
     python bench/onsets.py RECORDINGS [--marks tests/dataset/onsets.csv] [--simulation] [--json]
 
-RECORDINGS is the folder makeability-gestures; it is imported into a temporary folder. With --simulation also six
-virtual people (seed 11), whose truth is when the hand comes near, begins to work, stops, and is away again.
+RECORDINGS is the folder makeability-gestures, which is imported into a temporary folder. With --simulation, six virtual
+people (seed 11) are measured too; for them it is known when the hand comes near, begins to touch, stops, and is away.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ SURE = (0.0, 0.5, 0.8, 1.01)
 
 @dataclass(frozen=True)
 class Compared:
-    """A suggested edge against a marked one: seconds too late, and the confidence."""
+    """Error of a suggested edge in seconds (above 0: too late), and its confidence."""
 
     recording: str
     error_s: float
@@ -41,7 +41,7 @@ class Compared:
 
 
 def share(errors: list[float]) -> dict[str, float | int]:
-    """Median absolute error, share within 0.2 s, and the bias (above 0: too late)."""
+    """Return the median absolute error, the share within 0.2 s, and the bias (above 0: too late)."""
     e = np.array(errors)
     if not len(e):
         return {"n": 0}
@@ -63,7 +63,7 @@ def by_confidence(compared: list[Compared]) -> dict[str, dict[str, float | int]]
 
 
 def edges(trim: Trim) -> dict[str, tuple[float, float, bool]]:
-    """Return suggested seconds, confidence and visibility of both edges; else the recording's own edge."""
+    """Return seconds, confidence and visibility of both suggested edges, or the recording's own edge without one."""
     s = trim.suggestion
     return {
         "onset": (float(trim.seconds[s.start]), s.onset_confidence, s.onset_visible),
@@ -98,7 +98,7 @@ def against_marks(dataset: Dataset, marks: Path) -> dict[str, object]:
 
 
 def against_simulation(work: Path) -> dict[str, object]:
-    """Compare with the virtual toy's known movements.
+    """Compare suggestions with the known movements of the virtual toy.
 
     This says nothing about a real toy."""
     simulate(work / "recordings", PEOPLE, SEED, REPETITIONS)
@@ -113,7 +113,7 @@ def against_simulation(work: Path) -> dict[str, object]:
         for label in GESTURES:
             marks = session.perform(label, REPETITIONS).marks
             takes = sorted(mine[f"P{who:02d}", label], key=lambda t: t.recording.epoch_ms)
-            # Who holds the toy in both hands comes near and works at once.
+            # A gesture with both hands comes near and begins to touch at the same time.
             hold = label.startswith("Hold")
             for mark, t in zip(marks, takes, strict=True):
                 found, end = edges(t), float(t.seconds[-1])

@@ -3,19 +3,21 @@
     THERE/bin/pip install tflite-micro ai-edge-litert ai-edge-quantizer torch==2.13.0 executorch onnxruntime onnx
     python bench/peers.py --python THERE/bin/python [--onnx2c PATH] [--json]
 
-The other runtimes are best installed apart from PlushSense (they bring PyTorch and much else); `--python` names their
-interpreter, and without it the one that runs this is asked. What is not installed stands in the table as "not here".
-gcc is needed; valgrind (with its headers) for the instructions; onnx2c is built from github.com/kraiskil/onnx2c.
+Install the other runtimes in an environment of their own (they install PyTorch and other large packages); `--python`
+names its interpreter (default: the one that runs this program). Runtimes that are not installed are listed as "not
+here". gcc is required, and valgrind with its headers to count instructions; onnx2c is built from
+github.com/kraiskil/onnx2c.
 
-Every runtime gets the same weights, normalisation folded in, quantized by its own tool on the same windows, one thread,
-warm, input already in place: only its own call is timed and counted. The others are given the windowed network:
-each decision computes its window again. They could stream, with state as variables or as inputs and outputs, in another
-graph; that is not measured. They may read the window in the form that takes fewer multiply-accumulates (`--form`):
-`window`, 250 samples with zeros before the first, or `span`, exactly the samples that our streaming decision knows;
-where the two differ, each answer is checked against the float answer of its own form. Our C reads five frames
-(validity, clock, magnitude, scaling), runs the network, smooths and decides. Times are taken in turn, round by round;
-ratios are of the same round. Instructions are callgrind's, of 2N decisions less those of N; callgrind's processor has
-AVX2 and nothing beyond. All frames and (without `--bundle`) all weights are made up: costs hardly depend on them.
+Every runtime gets the same weights, with the normalisation folded in, quantized by its own tool on the same windows. It
+runs on one thread, warm, with the input already in place; only its own call is timed and counted. The other runtimes
+get the windowed network, which computes its window again at each decision. They could stream too, with the state as
+variables or as inputs and outputs, in another graph; that is not measured. They read the window in the form that takes
+fewer multiply-accumulates (`--form`): `window`, 250 samples with zeros before the first, or `span`, exactly the samples
+that our streaming decision reads. Where the two differ, each answer is checked against the float answer of its own
+form. Our C reads five frames (validity, clock, magnitude, scaling), runs the network, smooths and decides. The runtimes
+are timed in turn, and ratios are taken within a round. Instructions are counted by callgrind for 2N decisions less
+those for N; callgrind's processor has AVX2 at most. All frames and (without `--bundle`) all weights are generated:
+costs hardly depend on them.
 """
 
 from __future__ import annotations
@@ -57,13 +59,13 @@ PEERS: dict[str, tuple[str, str, str]] = {
 }
 OUR_ROW = "PlushSense C -O2, frames to answer"
 PLAIN_ROW = f"{OUR_ROW}, plain C"
-# family, how many times fewer instructions ours shall take, who that is, which of ours: plain C against plain C
+# family, target ratio of instructions, what is compared, which of our programs: plain C against plain C
 TARGETS = (
     ("portable C", 20.0, "the best portable C of a peer (onnx2c, TensorFlow Lite Micro)", PLAIN_ROW),
     ("xnnpack", 5.0, "XNNPACK's hand-vectorised window (LiteRT, ExecuTorch)", OUR_ROW),
     ("xnnpack", 5.0, "XNNPACK's hand-vectorised window, by our plain C", PLAIN_ROW),
 )
-FAITHFUL = 0.8  # share of decisions as the floats', below which a peer is called broken
+FAITHFUL = 0.8  # share of decisions that equal the float ones, below which a runtime is reported as broken
 
 
 def say(text: str) -> None:
@@ -93,7 +95,7 @@ def python_entry(peer: str, python: str, shop: Workshop) -> Entry:
 
 
 def entries(args: argparse.Namespace, case: Case, shop: Workshop) -> tuple[list[Entry], dict[str, str]]:
-    """Return what can be run here, and the reasons for what cannot."""
+    """Return the entries that can run on this machine, and for each other one the reason."""
     peers = args.only.split(",") if args.only else [*PEERS, "onnx2c", "plain"]
     found, absent = programs.ours(case, shop), {}
     for peer in (p for p in PEERS if p in peers):
@@ -116,7 +118,7 @@ def entries(args: argparse.Namespace, case: Case, shop: Workshop) -> tuple[list[
 
 
 def checked(entry: Entry, process: Running, case: Case) -> dict[str, float] | None:
-    """Compare its logits with the float ones; None for the network alone, which reads random inputs."""
+    """Compare the logits of an entry with the float ones; None for the network alone, which reads random inputs."""
     if entry.reads == "stream":
         return None
     logits = process.check(Path(entry.command[-1]), case.arch.classes)
@@ -169,7 +171,7 @@ def measure(found: list[Entry], absent: dict[str, str], args: argparse.Namespace
 
 
 def compare(rows: list[dict[str, Any]]) -> None:
-    """Return medians, spreads, and ratios to ours."""
+    """Return medians, spreads, and ratios to our C."""
     ours = next(row for row in rows if row["name"] == OUR_ROW)
     for row in rows:
         us = 1e6 * np.array(row["seconds"])
@@ -185,7 +187,7 @@ def compare(rows: list[dict[str, Any]]) -> None:
 
 
 def verdicts(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Compare with this library's targets, on the fewest instructions of any such runtime."""
+    """Compare with the targets of our C, by the runtime of each family that takes the fewest instructions."""
     results = []
     for family, least, who, ours in TARGETS:
         mine = next(row for row in rows if row["name"] == ours)["instructions"]
@@ -228,7 +230,7 @@ def table(report: dict[str, Any]) -> Iterable[str]:
         f"{case['step_ms']:g} ms, one thread"
     )
     yield (
-        f"ours {case['macs_ours']:,} multiply-accumulates a decision; the others recompute {case['samples']} samples "
+        f"ours: {case['macs_ours']:,} multiply-accumulates per decision; others recompute {case['samples']} samples "
         f"({case['form']}): {case['macs']:,}"
     )
     yield ""
@@ -251,12 +253,12 @@ def table(report: dict[str, Any]) -> Iterable[str]:
         yield f"{name:<47}  {reason}"
     yield ""
     yield (
-        f"×: times '{OUR_ROW}'. as float: decisions like the float network's, of {case['checked']}; error: of the "
-        "logits, against their spread."
+        f"×: ratio to '{OUR_ROW}'. as float: decisions equal to the float network's, of {case['checked']}; error: of "
+        "the logits, divided by their spread."
     )
     yield (
-        "code B of C without a model file holds the weights; a runtime's own library is not counted, nor memory that "
-        "it does not tell."
+        "code B of C without a model file includes the weights; a runtime's own library is not counted, nor memory "
+        "that it does not report."
     )
     yield "The others run the windowed network: each decision computes its whole window; streaming was not tried."
     for row in report["rows"]:

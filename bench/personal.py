@@ -3,8 +3,9 @@
     plushsense adapt --evaluate DATASET --split by-subject:5     (once: trains the networks that this reads)
     python bench/personal.py DATASET [--choices 3] [--json]
 
-The networks are those in DATASET/cache/adapting; strangers are the people whom a network has neither trained nor
-validated on. Two recordings of a gesture adapt, the others test; every line says how many recordings more are right.
+The networks are those in DATASET/cache/adapting. New people are those on whom a network was neither trained nor
+validated. Two recordings of each gesture adapt the network and the others test it; each line of the table states how
+many more recordings are correct.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ def choices(mine: WindowSet, many: int, draw: np.random.Generator) -> list[np.nd
 
 
 class Cases:
-    """The outcomes by case: accepted or not, and how many more recordings were right."""
+    """Results of each case: whether the adaptation was accepted, and how many more recordings are correct."""
 
     def __init__(self) -> None:
         self.rows: dict[str, list[tuple[bool, int]]] = {}
@@ -112,9 +113,9 @@ class Cases:
         }
 
     def __str__(self) -> str:
-        head = f"{'case':<34}{'n':>5}{'adapted':>9}{'more right':>12}{'worst':>7}{'< -1':>7}"
+        head = f"{'case':<34}{'n':>5}{'adapted':>9}{'more correct':>14}{'worst':>7}{'< -1':>7}"
         lines = [
-            f"{name:<34}{r['cases']:>5}{r['adapted']:>9.0%}{r['more_right']:>12.1f}{r['worst']:>7}"
+            f"{name:<34}{r['cases']:>5}{r['adapted']:>9.0%}{r['more_right']:>14.1f}{r['worst']:>7}"
             f"{r['worse_by_more_than_one']:>7.1%}"
             for name, r in self.to_dict().items()
         ]

@@ -1,12 +1,12 @@
 """Measure the time of reading recordings, against `np.loadtxt` alone and within the whole import.
 
-1326 recordings of 700 rows × 15 columns, as many as the paper's, are written once. In every round each way reads all of
-them in turn; a ratio is taken within its round, so that a machine whose speed drifts does not matter much. The import
-(copying, checksums, checks, index) is timed in the same rounds.
+1326 recordings of 700 rows × 15 columns, as many as in the paper, are written once. In every round each method reads
+all of them in turn. Ratios are taken within a round, so that slow changes of the machine's speed have little effect.
+The import (copying, checksums, checks, index) is timed in the same rounds.
 
     python bench/reading.py [--rounds 7] [--files 1326] [--folder RECORDINGS --layout NAME] [--json]
 
-With ``--folder`` a folder of your own is read in place of the written files.
+With ``--folder`` a folder of your own is read instead of the generated files.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ PEOPLE = 26
 
 
 def write(folder: Path, files: int, layout: Layout) -> None:
-    """Write recordings with the noise of a toy at rest: the time to parse a number depends on its digits."""
+    """Write recordings with the noise of a toy at rest, because the time to parse a number depends on its digits."""
     rng = np.random.default_rng(0)
     for number in range(files):
         person = folder / f"P{number % PEOPLE:02d}"
@@ -43,12 +43,12 @@ def write(folder: Path, files: int, layout: Layout) -> None:
 
 
 def layout_gesture(number: int) -> str:
-    """Return a gesture of plush-18, in turn."""
+    """Return the gestures of plush-18 in turn."""
     return ("Tail pull", "Hold strong", "Back stroke 1", "Ear scratch 2")[number % 4]
 
 
 def loadtxt_all(files: list[Path]) -> None:
-    """Read with NumPy alone, given header and delimiter: the lower bound."""
+    """Read with NumPy alone, with header and delimiter given, as a lower bound."""
     for path in files:
         with path.open() as file:
             separator = ";" if ";" in file.readline() else ","
@@ -94,7 +94,7 @@ def main() -> None:
                 times[name].append(timed(work))
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
-    # The first round warms the disk's cache.
+    # The first round fills the disk cache.
     floor = times["np.loadtxt alone"][1:]
     rows = [
         {
@@ -109,7 +109,7 @@ def main() -> None:
     if args.json:
         print(json.dumps(rows))
         return
-    print(f"{len(files)} files, {args.rounds} rounds; least / median / most seconds, speed against np.loadtxt alone")
+    print(f"{len(files)} files, {args.rounds} rounds; seconds (minimum / median / maximum), speed against np.loadtxt")
     for row in rows:
         least, median, most = row["seconds"]  # type: ignore[misc]
         print(f"{row['way']:<18} {least:7.3f} {median:7.3f} {most:7.3f}   {row['speed_of_loadtxt']}")

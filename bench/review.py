@@ -2,8 +2,8 @@
 
     python bench/review.py DATASET [--recordings 200]
 
-The data set is copied; nothing of it changes. Counted in the browser with ``performance.now()``, from the key event to
-the frame after the plot was drawn, after all was looked at in the background.
+The data set is copied and does not change. The time is measured in the browser with ``performance.now()``, from the key
+event to the frame after the plot was drawn, once the background analysis of all recordings is finished.
 """
 
 from __future__ import annotations

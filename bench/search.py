@@ -2,19 +2,21 @@
 
     python bench/search.py DATASET [--epochs 60] [--rungs 4,15,60] [--split by-subject:3] [--seeds 3] [--workers 2]
 
-The paper's 13 networks × 2 filter sets, trained by subject with the preset people: the whole grid with three seeds,
-one search with the same three seeds, and for each seed one search that has that seed alone. All of it goes through the
-journal of the data set: kill it at any time and start it again. The grid trains apart from the searches, and is scored
-at the rungs too, so that the two can be compared number by number, and other settings be replayed without training.
+The paper's 13 networks × 2 filter sets are trained by subject with the preset people: the whole grid with three seeds,
+one search with the same three seeds, and for each seed one search with that seed alone. All trainings are kept in the
+journal of the data set, so the program can be killed at any time and resumed. The grid is trained separately from the
+searches and is scored at the rungs too, so that the two can be compared number by number, and other settings of the
+search can be replayed without training.
 
-What is compared: F(n, s) is the macro-F1 of network n with seed s, mean over the folds, after all epochs. The grid's
-best has the highest mean of F over the seeds; what a search found is judged by the same mean. One standard error is
-that of such a mean, from the spread of F over seeds, pooled over all networks. The verdict is on the search with all
-seeds, which has the same data, folds and seeds as the grid and a quarter of its cost. The grid's best is the highest
-of 26 noisy means and so flattered: the gap is rather too large than too small. Beside it stand the searches with one
-seed, which lack two thirds of what the grid knows; of them also a gap that nothing flatters: the network that the whole
-grid would choose with that seed against the one that the search chose, both judged by the other seeds. All scores are
-on people who took no part in the training of that fold; they chose the network, though, in grid and search alike.
+F(n, s) is the macro-F1 of network n with seed s after all epochs, averaged over the folds. The best network of the grid
+has the highest mean of F over the seeds, and the result of a search is scored by the same mean. The standard error is
+that of such a mean, estimated from the spread of F over seeds, pooled over all networks. The verdict is on the search
+with all seeds, which has the same data, folds and seeds as the grid and a quarter of its cost. The grid's best is the
+highest of 26 noisy means, so its score, and thus the gap, is too large rather than too small. The searches with one
+seed are reported too; they lack two thirds of the information of the grid. For them there is also an unbiased gap: the
+network that the whole grid would choose with that seed against the one that the search chose, both scored with the
+other seeds. All scores are on people who took no part in the training of that fold, but who did influence the choice of
+the network, in the grid as in the search.
 """
 
 import argparse
@@ -40,7 +42,7 @@ from plushsense.models.arch import PAPER_ARCHITECTURES
 from plushsense.trials.grid import GridSpec
 
 FILTERS = "4/6/8/8,8/12/16/16"
-# Other ways to search, replayed where the grid was scored at their rungs: rungs as (first, second), eta, folds.
+# Other settings, replayed where the grid was scored at their rungs: rungs as (first, second), eta, folds.
 OTHERS: tuple[tuple[tuple[int, ...], float, tuple[int, ...]], ...] = (
     ((4, 15), 3.0, ()),
     ((4, 15), 2.0, (1, 3)),
@@ -62,7 +64,7 @@ def say(text: str) -> None:
 
 
 class Scored:
-    """macro-F1 of the whole grid by epochs: (networks, seeds, folds)."""
+    """Macro-F1 of the whole grid by epochs: (networks, seeds, folds)."""
 
     def __init__(self, found: Sweep, names: list[tuple[str, str]], folds: list[str], seeds: int) -> None:
         runs = polars.read_parquet(found.out / "runs.parquet")
@@ -110,7 +112,7 @@ def compare(final: NDArray[np.float64], joint: int, chosen: list[int]) -> dict[s
         "single_gaps": gaps,
         "single_gap": float(np.mean(gaps)),
         "single_ranks": [int((means > means[network]).sum()) + 1 for network in chosen],
-        # What choosing by one seed loses even after the whole grid.
+        # The loss from choosing with one seed, even after the whole grid.
         "single_gap_of_grid": float(np.mean([means[best] - means[int(of.argmax())] for of in final.T])),
         "fair_gaps": fair,
         "fair_gap": float(np.mean(fair)),
@@ -185,7 +187,7 @@ def prove(args: argparse.Namespace) -> int:
 
     joint, *chosen = [names.index((s["winner"]["arch"], s["winner"]["filters"])) for s in searches]
     found_of = compare(final, joint, chosen)
-    # Every score that a search saw, against the grid's own training without a stop.
+    # Compare every score of a search with the grid's own uninterrupted training.
     apart = 0.0
     for seeds, s in zip((list(every), *([seed] for seed in every)), searches, strict=True):
         for rung in s["rungs"]:
@@ -223,7 +225,7 @@ def prove(args: argparse.Namespace) -> int:
     print(f"networks at random, trained to the end for the same cost: gap {chance:.4f} on average")
     print(f"scores of the searches against the grid's own trainings: {apart:.1e} apart at most")
     if dataset.head.simulated:
-        print("SIMULATION: of the virtual toy; says nothing about a real one.")
+        print("SIMULATION: these scores are of the virtual toy and say nothing about a real one.")
     reached = found_of["gap"] <= found_of["standard_error"] and max(shares) <= args.share + 1e-9
     figures = {
         "reached": reached, "names": labels, "final": final.tolist(), "joint": joint, "chosen": chosen, **found_of,

@@ -1,7 +1,7 @@
 """Measure the cost of a live decision: a network that keeps its state against one that recomputes its window.
 
-Both run in the NumPy reference, in turn, on the same samples; the ratio of a round is taken within it, so that a
-machine whose speed drifts does not matter much. Counts of multiply-accumulates stand beside the times.
+Both run in the NumPy reference, in turn, on the same samples. Ratios are taken within a round, so that slow changes of
+the machine's speed have little effect. The numbers of multiply-accumulates are printed beside the times.
 
     python bench/streaming.py [--rounds 15] [--json]
 """
@@ -60,7 +60,7 @@ def main() -> None:
     if args.json:
         print(json.dumps(rows))
         return
-    print(f"{'network':<18}{'MAC a step':>12}{'fewer':>8}{'µs a decision':>15}   times faster (min, median, max)")
+    print(f"{'network':<18}{'MAC/step':>12}{'fewer':>8}{'µs/decision':>15}   times faster (min, median, max)")
     for row in rows:
         low, middle, high = row["times_faster"]
         print(

@@ -5,14 +5,15 @@
 A virtual toy in a process of its own (13 channels, 100 Hz) sends over TCP; the studio reads it in another; Chromium,
 headless, shows the page. All three and this program share the machine, whose load is reported with the results.
 
-1. Real time, for `--seconds`: messages and drawings a second; processor time of the studio's process (all its threads:
-   reading, deciding, sending); from the arrival of the bytes in the studio to the message in the page, and to the end
-   of drawing it, by the one clock of the machine.
-2. Memory, for `--minutes` of the toy's time at `--speed`: resident memory of the studio and the heap of the page, after
-   a forced collection, every few seconds; the growth is that of the last two thirds, by a straight line.
-   `--soak-hours` does the same at real time for so long.
+1. Real time, for `--seconds`: messages and drawings per second; processor time of the studio's process (all threads,
+   for reading, deciding and sending); time from the arrival of the bytes in the studio to the message in the page, and
+   to the end of drawing it, all by the clock of the machine.
+2. Memory, for `--minutes` of the toy's time at `--speed`: resident memory of the studio and heap of the page, after a
+   forced garbage collection, every few seconds; the growth is the slope of a straight line through the last two thirds.
+   `--soak-hours` does the same in real time for that many hours.
 
-Linux (/proc), Debian's Chromium and Playwright are needed. The virtual toy's scores mean nothing here, only its lines.
+Linux (/proc), Debian's Chromium and Playwright are required. Only the lines of the virtual toy matter here, not its
+scores.
 """
 
 from __future__ import annotations
@@ -37,13 +38,13 @@ _LOOK = "() => { const s = window.plushsenseLive; return {...s, delays: [...s.de
 
 
 def processor_s(pid: int) -> float:
-    """Processor time that a process has used so far, all its threads, in seconds."""
+    """Return the processor time that all threads of a process have used so far, in seconds."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def resident_bytes(pid: int) -> int:
-    """Resident memory of a process."""
+    """Return the resident memory of a process."""
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
@@ -57,7 +58,7 @@ def heap_bytes(page: Any) -> int:
 
 
 def growth(points: list[tuple[float, float]]) -> dict[str, float]:
-    """Return, from (seconds, bytes), the means of the outer thirds and the slope of the last two in kB a minute."""
+    """Return the means of the first and last third of (seconds, bytes), and the slope of the last two in kB/minute."""
     late = np.array(points[len(points) // 3 :])
     third = max(1, len(points) // 3)
     slope = float(np.polyfit(late[:, 0], late[:, 1], 1)[0]) if len(late) > 2 else 0.0
@@ -74,7 +75,7 @@ def quantiles(values: list[float]) -> dict[str, float]:
 
 
 class Program:
-    """A verb of plushsense in a process of its own, whose first line of JSON has its address."""
+    """A plushsense command in a process of its own; its first line of JSON contains its address."""
 
     def __init__(self, *options: str, cwd: Path) -> None:
         self.process = subprocess.Popen(
@@ -97,14 +98,14 @@ class Program:
 
 
 def begin(page: Any) -> None:
-    """Start the toy that is chosen, and wait until the page shows it."""
+    """Start the selected toy, and wait until the page shows it."""
     page.wait_for_function("() => window.socket && window.socket.connected && window.plushsenseLive")
     page.locator('[data-test="start"]').click()
     page.wait_for_function("() => window.plushsenseLive.updates > 40", timeout=60_000)
 
 
 def at_real_time(page: Any, pid: int, seconds: float) -> dict[str, Any]:
-    """Measure updates, processor time and delays over so many seconds."""
+    """Measure updates, processor time and delays for a number of seconds."""
     page.evaluate("() => { window.plushsenseLive.delays.length = 0; window.plushsenseLive.shown.length = 0; }")
     before, used, began = page.evaluate(_LOOK), processor_s(pid), time.perf_counter()
     delays: list[float] = []
@@ -132,7 +133,7 @@ def at_real_time(page: Any, pid: int, seconds: float) -> dict[str, Any]:
 
 
 def memory(page: Any, pid: int, seconds: float, every_s: float = 5.0) -> dict[str, Any]:
-    """Memory of both sides over so many seconds of real time."""
+    """Measure the memory of server and page for a number of seconds of real time."""
     server: list[tuple[float, float]] = []
     heap: list[tuple[float, float]] = []
     began = time.perf_counter()
@@ -186,11 +187,13 @@ def measure(model: Path, speed: float, seconds: float, watched: str, tabs: int =
 def main() -> None:
     parser = argparse.ArgumentParser(description="What the live page costs.")
     parser.add_argument("--model", required=True, type=Path, metavar="BUNDLE")
-    parser.add_argument("--seconds", type=float, default=30.0, help="of real time for the first part (30)")
-    parser.add_argument("--minutes", type=float, default=10.0, help="of the toy's time for the second (10); 0: not")
-    parser.add_argument("--speed", type=float, default=6.0, help="times real time of the second (6)")
-    parser.add_argument("--soak-hours", type=float, default=0.0, help="of real time, for an hour's soak (0)")
-    parser.add_argument("--tabs", type=int, default=1, help="pages that look at once (1)")
+    parser.add_argument("--seconds", type=float, default=30.0, help="duration of the first part in real time (30)")
+    parser.add_argument(
+        "--minutes", type=float, default=10.0, help="duration of the second part in toy time (10); 0: none"
+    )
+    parser.add_argument("--speed", type=float, default=6.0, help="speed of the second part, times real time (6)")
+    parser.add_argument("--soak-hours", type=float, default=0.0, help="duration of a soak test in real time (0)")
+    parser.add_argument("--tabs", type=int, default=1, help="pages open at the same time (1)")
     parser.add_argument("--json", action="store_true", help="one JSON object, nothing else")
     args = parser.parse_args()
     result: dict[str, Any] = {"cores": os.cpu_count()}

@@ -1,15 +1,15 @@
-"""Measure the cost of the paper's grid with our training and with a plain PyTorch loop, and that both learn alike.
+"""Compare our training with a plain PyTorch loop: cost of the paper's grid, losses, and final accuracies.
 
     python bench/sweep.py steps [--cores 1] [--filters 0,1,2,3] [--batches 64,256,3936] [--repeats 5]
     python bench/sweep.py losses DATASET        first 50 steps of all 52 networks, from the same weights and batches
     python bench/sweep.py trials DATASET        20 paired trainings: are the final accuracies different?
 
-The plain loop is what a careful person would write: nn.Conv1d, nn.ReLU, nn.BatchNorm1d, F.pad with reflection, the
-data in memory as one tensor, fused Adam, no number read out within an epoch, one training at a time. Both are timed in
-turn, step by step, with the same batch and as many cores: on one, a thread each; on several, the plain loop's one
-training has as many threads, and ours are as many trainings side by side, as a sweep runs them. The fastest step of
-each counts: what else runs on the machine only ever slows one down. The grid: 52 networks × batch 64, 256, full × 100,
-250 and 1000 epochs; trained apart that is 1350 epochs, nested 1000.
+The plain loop is a careful standard implementation: nn.Conv1d, nn.ReLU, nn.BatchNorm1d, F.pad with reflection, the data
+in memory as one tensor, fused Adam, no value read out within an epoch, one training at a time. Both are timed in turn,
+step by step, with the same batch and number of cores. On one core each uses one thread. On several cores, the plain
+loop runs one training with that many threads, and ours runs that many trainings side by side, as a sweep does. The
+fastest step of each is used, because other programs on the machine can only slow it down. The grid has 52 networks ×
+batch 64, 256, full × 100, 250 and 1000 epochs; trained separately these are 1350 epochs, nested 1000.
 """
 
 import argparse
@@ -39,7 +39,7 @@ RATE = 0.001
 
 
 class Mirror(nn.Module):
-    """Left padding by reflection; again where the samples do not suffice."""
+    """Left padding by reflection, repeated where there are not enough samples."""
 
     def __init__(self, reach: int) -> None:
         super().__init__()
@@ -137,7 +137,7 @@ def named(arch: Arch) -> str:
 
 
 def noise() -> tuple[Tensor, Tensor]:
-    """Return random windows as many as the paper's training set; their content does not change the time."""
+    """Return as many random windows as the paper's training set has; their content does not change the time."""
     random = torch.Generator().manual_seed(1)
     x = torch.randn(WINDOWS, CHANNELS, SAMPLES, generator=random)
     return x, torch.randint(0, CLASSES, (WINDOWS,), generator=random)
@@ -160,7 +160,7 @@ def training_apart(pipe: Connection) -> None:
 
 
 class Beside:
-    """As many trainings side by side as there are cores, each on one thread; a step costs its share of the time."""
+    """One training for each core, side by side, each on one thread; the time of a step is divided by their number."""
 
     def __init__(self, cores: int) -> None:
         context = multiprocessing.get_context("spawn")
@@ -197,7 +197,7 @@ def steps(args: argparse.Namespace) -> None:
             loops = Loops(arch, x, y, batch, args.cores)
             if beside is not None:
                 beside.all((arch, batch))
-            # A full batch of a large network takes half a minute: fewer of those.
+            # A full batch of a large network takes half a minute, so fewer of them are timed.
             few = batch > 512
             took: tuple[list[float], list[float]] = ([], [])
             for turn in range(max(1, args.repeats // 3) if few else args.repeats + 1):
@@ -244,8 +244,11 @@ def data(path: str) -> tuple[Tensor, Tensor, Any]:
 
 
 def losses(args: argparse.Namespace) -> None:
-    """Lock step: both from the plain loop's weights at every step. Free: each from its own, as in a training, where
-    rounding grows; the plain loop in double precision says what rounding alone does to either."""
+    """Compare the losses of both loops.
+
+    In lock step, both start each step from the plain loop's weights. Free, each continues from its own, as in a
+    training, and rounding errors grow; the plain loop in double precision shows the effect of rounding alone.
+    """
     x, y, windows = data(args.dataset)
     table = []
     print(f"{'largest relative difference in 50 steps':38s} {'lock step':>9s} {'free':>9s}   from double precision:")
@@ -321,9 +324,7 @@ def main() -> int:
     parser.add_argument("what", choices=("steps", "losses", "trials"))
     parser.add_argument("dataset", nargs="?", help="for losses and trials")
     parser.add_argument("--cores", type=int, default=1, help="for steps: see above")
-    parser.add_argument(
-        "--filters", default="0,1,2,3", help="which of the paper's four filter sets, from small to large"
-    )
+    parser.add_argument("--filters", default="0,1,2,3", help="the paper's filter sets to include: 0 (smallest) to 3")
     parser.add_argument("--batches", default="64,256,3936")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--epochs", type=int, default=30)

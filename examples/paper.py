@@ -1,13 +1,13 @@
-"""The table of the paper beside ours, from the paper's published archive.
+"""Compute the results of the paper from its published archive, and print them beside the paper's.
 
     python examples/paper.py ARCHIVE [--subjects map.csv] [--out DIR] [--seeds 3] [--quick]
 
-ARCHIVE is the folder as the authors' scripts leave it: a folder a gesture, files <label>_<7 digits>_<rows>.csv. Its
-file names hold no person, so that the figures over people need a mapping (CSV: file,subject), if the authors have one.
-Stopped, the same command goes on where it stood.
+ARCHIVE is the folder that the authors' scripts write: one folder for each gesture, with files
+<label>_<7 digits>_<rows>.csv. The file names do not contain the person, so the results over people need a mapping (CSV:
+file,subject), if the authors have one. An interrupted run is resumed by the same command.
 
-Untested on the original: nobody of this project had the archive. It was tried on one of the same form, of virtual
-people.
+This program is untested on the original, because the archive was not available to this project. It was tested on an
+archive of the same form with virtual people.
 """
 
 import argparse
@@ -24,8 +24,8 @@ import plushsense as ps
 from plushsense.core.errors import PlushSenseError
 from plushsense.trials.paper import CHOSEN, TABLE4
 
-UNTESTED = "Untested on the original archive: nobody of this project had it. Whoever runs this is the first."
-LEAKY = "leaky: windows of one recording stand on both sides"
+UNTESTED = "Untested on the original archive, which was not available to this project."
+LEAKY = "leaky: windows of one recording are in both the training and the test set"
 
 # Section 4.4: the chosen network, leave one subject out over 25 people; mean and standard deviation over the folds.
 LOSO = {"accuracy": (0.850, 0.072), "macro_recall": (0.717, 0.111), "macro_f1_all_classes": (0.687, 0.114)}
@@ -39,7 +39,7 @@ F1 = {
     "Tail scratch 2": 0.498,
     "Tail hit 2": 0.465,
 }
-# Section 4.5: 5 random folds over windows, in percent: (model, what it reads, with PCA).
+# Section 4.5: 5 random folds over windows, in percent: (model, features, with PCA).
 BASELINES = {
     ("forest", "statistics", False): 95.9,
     ("forest", "statistics", True): 66.3,
@@ -58,7 +58,7 @@ MEASURES = {
 
 @dataclass(frozen=True)
 class Row:
-    """A line of the table; ``ours`` and ``paper`` as they are printed, ``n`` what ours were taken over."""
+    """A row of the table: ``paper`` and ``ours`` are printed results, ``n`` describes the data of ours."""
 
     section: str
     what: str
@@ -71,12 +71,12 @@ def share(values: list[float]) -> str:
     return f"{statistics.mean(values):.3f}"
 
 
-def seeds_said(seeds: int) -> str:
+def seeds_text(seeds: int) -> str:
     return f"{seeds} seed{'s' if seeds > 1 else ''}"
 
 
 class Paper:
-    """The data set at ``out/DS``, and one method a part of the table."""
+    """The data set at ``out/DS``, with one method for each part of the table."""
 
     def __init__(self, archive: Path, subjects: Path | None, out: Path, seeds: int, quick: bool) -> None:
         self.out, self.seeds, self.quick = out, seeds, quick
@@ -87,7 +87,7 @@ class Paper:
             for entry in done.rejected:
                 say(f"rejected: {entry['file']}: {entry['reason']}")
         else:
-            say(f"going on with the data set '{folder}' that an earlier run imported")
+            say(f"using the data set '{folder}' that an earlier run imported")
         self.dataset = ps.open_dataset(folder)
         if subjects is not None and not self.dataset.subjects:
             raise PlushSenseError(
@@ -107,23 +107,23 @@ class Paper:
     def search(self) -> list[Row]:
         rows = []
         for symbol in (CHOSEN[0],) if self.quick else dict.fromkeys(symbol for symbol, _ in TABLE4):
-            asked = [
+            filter_sets = [
                 filters for other, filters in TABLE4 if other == symbol and (filters == CHOSEN[1] or not self.quick)
             ]
-            say(f"{symbol} with {', '.join(asked)}")
-            # The paper's grid, cut down to what its Table 4 holds.
-            found = ps.sweep(
+            say(f"{symbol} with {', '.join(filter_sets)}")
+            # The paper's grid, reduced to the trials of its Table 4.
+            swept = ps.sweep(
                 self.dataset,
                 "paper",
                 architectures=(symbol,),
-                filters=",".join(asked),
+                filters=",".join(filter_sets),
                 epochs=(2,) if self.quick else (250,),
                 batches=(64,),
                 seeds=tuple(range(self.seeds)),
                 out=self.out / "sweeps" / f"{symbol}-{self.seeds}{'-quick' * self.quick}",
             )
-            tested = found.runs["test_windows"][0]
-            for trial in found.trials.iter_rows(named=True):
+            tested = swept.runs["test_windows"][0]
+            for trial in swept.trials.iter_rows(named=True):
                 spread = f" ± {100 * trial['accuracy_sd']:.1f}" if self.seeds > 1 else ""
                 rows.append(
                     Row(
@@ -131,7 +131,7 @@ class Paper:
                         f"{symbol} {trial['filters']}, accuracy ({LEAKY})",
                         f"{100 * TABLE4[symbol, trial['filters']].highest:.1f} %",
                         f"{100 * trial['accuracy']:.1f} %{spread}",
-                        f"{seeds_said(self.seeds)}, {tested} windows",
+                        f"{seeds_text(self.seeds)}, {tested} windows",
                     )
                 )
         return sorted(rows, key=lambda row: row.paper, reverse=True)
@@ -141,7 +141,7 @@ class Paper:
             need = "needs --subjects map.csv"
             return [Row("loso", f"{m}, leave one person out", f"{a:.3f} ± {s:.3f}", need) for m, (a, s) in LOSO.items()]
         runs = [self._one_out(seed) for seed in range(self.seeds)]
-        n = f"{seeds_said(self.seeds)}, {len(self.dataset.subjects)} people"
+        n = f"{seeds_text(self.seeds)}, {len(self.dataset.subjects)} people"
         rows = []
         for measure, (mean, sd) in LOSO.items():
             ours = f"{share([r[measure]['mean'] for r in runs])} ± {share([r[measure]['sd'] for r in runs])}"
@@ -155,7 +155,7 @@ class Paper:
         return rows
 
     def baselines(self) -> list[Row]:
-        found = ps.baselines(
+        result = ps.baselines(
             self.dataset,
             splits=("windows:5",),
             models=dict.fromkeys(("forest",) if self.quick else (name for name, _, _ in BASELINES)),
@@ -164,21 +164,21 @@ class Paper:
             context="loop",
             classes="all",
         )
-        ours = {(row["name"], row["features"], row["pca"]): row for row in found["models"]}
+        ours = {(row["name"], row["features"], row["pca"]): row for row in result["models"]}
         return [
             Row(
                 "baselines",
                 f"{row['title']} on {features}{', PCA' * pca} ({LEAKY})",
                 f"{printed:.1f} %",
                 f"{100 * row['accuracy']['mean']:.1f} % ± {100 * row['accuracy']['sd']:.1f}",
-                f"{row['folds']} folds, {found['windows']} windows",
+                f"{row['folds']} folds, {result['windows']} windows",
             )
             for (name, features, pca), printed in BASELINES.items()
             if (row := ours.get((name, features, pca)))
         ]
 
     def _one_out(self, seed: int) -> dict[str, Any]:
-        """The chosen network in the paper's own form: mirror padding, looped windows, all 18 gestures."""
+        """Evaluate the chosen network as in the paper: mirror padding, looped windows, all 18 gestures."""
         symbol, filters = CHOSEN
         more: dict[str, Any] = {"epochs": 2} if self.quick else {}
         say(f"{symbol} {filters}, leave one person out, seed {seed}")
@@ -205,15 +205,15 @@ def say(text: str) -> None:
 def remarks(paper: Paper) -> list[str]:
     out = [UNTESTED]
     if paper.simulated:
-        out.insert(0, "SIMULATION: these recordings are of virtual people; the figures say nothing about a real toy.")
+        out.insert(0, "SIMULATION: these recordings are of virtual people; the results say nothing about a real toy.")
     if paper.quick:
-        out.append("--quick: two epochs a training; these figures are to try the script, not to compare.")
+        out.append("--quick: two epochs per training, to test the program; do not compare these results.")
     out += [
-        "Table 4 of the paper holds the best of nine schedules a network; ours is one (250 epochs, batches of 64).",
-        "The mean macro-F1 over the people counts all 18 classes, as the paper's; ± is the standard deviation: of the "
-        "people where one is left out (mean over the seeds), of the seeds or folds elsewhere.",
-        "The mean accuracy and recall over the people leave out nobody's recordings at rest; the paper does not say "
-        "where it counts them.",
+        "Table 4 of the paper shows the best of nine schedules per network; ours is one (250 epochs, batches of 64).",
+        "The mean macro-F1 over the people counts all 18 classes, as in the paper. ± is the standard deviation: over "
+        "the people where one is left out (mean over the seeds), over the seeds or folds elsewhere.",
+        "The mean accuracy and recall over the people do not include recordings at rest without a person; the paper "
+        "does not state where it counts them.",
     ]
     return out
 
@@ -234,7 +234,7 @@ def as_html(rows: list[Row], notes: list[str]) -> str:
         + "</tr>\n"
         for r in rows
     )
-    said = "".join(f"<p>{html.escape(n)}</p>" for n in notes)
+    paragraphs = "".join(f"<p>{html.escape(n)}</p>" for n in notes)
     style = (
         "body{font:15px/1.5 sans-serif;max-width:75em;margin:2em auto;padding:0 1em}"
         "td,th{padding:.2em .8em;text-align:left}td:nth-child(n+3){white-space:nowrap}"
@@ -242,17 +242,19 @@ def as_html(rows: list[Row], notes: list[str]) -> str:
     title = "The paper beside ours"
     return (
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><style>{style}</style>'
-        f"<h1>{title}</h1>{said}<table><tr>{head}</tr>\n{body}</table></html>\n"
+        f"<h1>{title}</h1>{paragraphs}<table><tr>{head}</tr>\n{body}</table></html>\n"
     )
 
 
 def main(words: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description="The table of the paper beside ours, from its published archive.")
-    parser.add_argument("archive", type=Path, help="the archive's folder: a folder a gesture")
-    parser.add_argument("--subjects", type=Path, metavar="CSV", help="who made which file: columns file,subject")
-    parser.add_argument("--out", type=Path, default=Path("paper-out"), help="where the data set and the table go")
-    parser.add_argument("--seeds", type=int, default=1, help="trainings of each network (1)")
-    parser.add_argument("--quick", action="store_true", help="two epochs and one network: to try the script")
+    parser = argparse.ArgumentParser(
+        description="Compute the results of the paper from its published archive, and print them beside the paper's."
+    )
+    parser.add_argument("archive", type=Path, help="folder of the archive, with one folder for each gesture")
+    parser.add_argument("--subjects", type=Path, metavar="CSV", help="person of each file: columns file,subject")
+    parser.add_argument("--out", type=Path, default=Path("paper-out"), help="folder for the data set and the table")
+    parser.add_argument("--seeds", type=int, default=1, help="number of trainings of each network (1)")
+    parser.add_argument("--quick", action="store_true", help="two epochs and one network, to test the program")
     args = parser.parse_args(words)
     try:
         paper = Paper(args.archive, args.subjects, args.out, max(1, args.seeds), args.quick)
@@ -260,7 +262,7 @@ def main(words: list[str] | None = None) -> int:
         parts: list[Callable[[], list[Row]]] = [paper.data, paper.loso, paper.search, paper.baselines]
         for part in parts:
             rows += part()
-            # Written after each part: the rest takes hours.
+            # Write after each part, because the next one may take hours.
             notes = remarks(paper)
             with (args.out / "paper.csv").open("w", encoding="utf-8", newline="") as file:
                 table = csv.writer(file)

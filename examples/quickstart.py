@@ -1,7 +1,7 @@
-"""The main path in Python: recordings → data set → network → how good on people it never met → live.
+"""Record, import, train, evaluate on people left out, and read a live toy, in Python.
 
-Runs on virtual people, so that everybody can try it: what it prints is of a simulation, not of a real toy.
-For your own recordings, leave out `simulate` and name your folder.
+The example uses virtual people and needs no hardware: its scores are of a simulation, not of a real toy. For your own
+recordings, leave out `simulate` and give the name of your folder.
 """
 
 import sys

@@ -28,8 +28,8 @@ FORMS = ("cheapest", "window", "span")
 class Case:
     """A network, and the windows to run through it.
 
-    ``frames`` (n, 1 + C) int32 are what the toy measures: ms and raw values. Ours reads them as a stream. The others
-    read ``windows`` (N, F, T) float32, which end where a decision of the stream falls; ``ours`` (N,) says which one.
+    ``frames`` (n, 1 + C) int32 are readings of the toy: ms and raw values. Our C reads them as a stream. The others
+    read ``windows`` (N, F, T) float32, each of which ends at a decision of the stream; ``ours`` (N,) are their indices.
     ``stream_logits`` and ``window_logits`` (N, K) are the float answers to each.
     """
 
@@ -46,16 +46,16 @@ class Case:
 
     @property
     def length(self) -> int:
-        """Samples that an opponent reads for one decision."""
+        """Number of samples that an opponent reads for one decision."""
         return int(self.windows.shape[2])
 
     @property
     def macs(self) -> int:
-        """Multiply-accumulates of an opponent's decision."""
+        """Number of multiply-accumulates of one decision of an opponent."""
         return macs_of(self.arch, self.form)
 
     def save(self, folder: Path) -> None:
-        """Save everything an opponent needs, without PlushSense."""
+        """Save everything that an opponent needs, so that it can run without PlushSense."""
         facts = {f"dilation{i}": np.int64(layer.dilation) for i, layer in enumerate(self.arch.layers)}
         np.savez(
             folder / "case.npz",
@@ -71,7 +71,7 @@ class Case:
 
 
 def macs_of(arch: Arch, form: str) -> int:
-    """Multiply-accumulates of one decision that computes everything again, without the dense layer."""
+    """Return the multiply-accumulates of one decision that recomputes everything, without the dense layer."""
     positions = (arch.window,) * len(arch.layers) if form == "window" else arch.positions
     each = zip(arch.layers, arch.inputs, positions, strict=True)
     return sum(layer.kernel * read * layer.filters * n for layer, read, n in each)
@@ -115,7 +115,7 @@ def _filled(
     seed: int,
 ) -> Case:
     length = arch.window if form == "window" else arch.span
-    first = -(-max(length - arch.span, 0) // arch.step)  # the first decision that has a whole window behind it
+    first = -(-max(length - arch.span, 0) // arch.step)  # the first decision with a whole window before it
     decisions = first + APART * (CALIBRATED + CHECKED)
     frames = made_up_frames(layout, scaler, arch.span + arch.step * decisions, seed)
     x = network_inputs(frames[:, 1:].astype(np.int64), layout)
@@ -130,7 +130,7 @@ def _filled(
     plain = fold(arch, weights)
     apart = np.abs(forward(arch, plain, scaler.apply(spans[CALIBRATED:][:4]), padded=False) - stream[:4]).max()
     if apart > 1e-3 * np.abs(stream).max():
-        raise ArchError(f"Folding the normalisation of {arch.title} changed its answers by {apart:.2g}: a fault here.")
+        raise ArchError(f"Folding the normalisation of {arch.title} changed its answers by {apart:.2g}: a bug here.")
     answers = forward(arch, plain, windows[CALIBRATED:], padded=form == "window")
     return Case(
         arch, model, form, plain, frames, windows[:CALIBRATED], windows[CALIBRATED:], at[CALIBRATED:], stream, answers
@@ -138,7 +138,7 @@ def _filled(
 
 
 def made_up_frames(layout: Layout, scaler: Scaler | None, n: int, seed: int) -> NDArray[np.int32]:
-    """Return frames (n, 1 + C) every 10 ms: level and variance of all channels change every few seconds."""
+    """Return frames (n, 1 + C), one every 10 ms, whose levels and variances change every few seconds."""
     rng = np.random.default_rng(seed)
     channels = len(layout.channels)
     level, size = np.empty((n, channels)), np.empty((n, channels))

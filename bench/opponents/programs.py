@@ -1,4 +1,4 @@
-"""The opponents that are C: ours, the plain window, and what onnx2c writes. Each becomes a program for `running`."""
+"""Programs in C to compare: PlushSense, the plain window, and the output of onnx2c; `running` runs them."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ STRICT = ("-std=gnu99", "-Wall", "-Wextra", "-Werror")
 
 
 class CannotBuild(Exception):
-    """A program that cannot be built: what is missing, or the compiler's message."""
+    """A program cannot be built; the message states what is missing, or is that of the compiler."""
 
 
 @dataclass(frozen=True)
 class Entry:
     """A row of the table.
 
-    ``reads`` says what a decision starts from: ``frames``, ``stream`` (network only) or ``window``. Sizes in bytes;
-    None where they are not known.
+    ``reads`` is the input of a decision: ``frames``, ``stream`` (network only) or ``window``. Sizes are in bytes, None
+    where they are not known.
     """
 
     name: str
@@ -50,7 +50,7 @@ def _call(command: list[str], folder: Path) -> str:
 
 
 def _sizes(path: Path) -> tuple[int, int]:
-    """Code with constants, and written memory."""
+    """Return the bytes of code with constants, and of written memory."""
     text, data, bss = _call(["size", path.name], path.parent).splitlines()[1].split()[:3]
     return int(text) + int(data), int(data) + int(bss)
 
@@ -73,7 +73,7 @@ class Workshop:
         return _call([self.cc, "--version"], self.folder).splitlines()[0]
 
     def program(self, name: str, objects: list[Path]) -> list[str]:
-        """Link objects with the loop."""
+        """Link objects with the loop of `loop.c`."""
         out = self.folder / name
         parts = [str(HERE / "loop.c"), *self.marks, *map(str, objects), "-lm", "-o", str(out)]
         _call([self.cc, "-O2", *STRICT, *parts], self.folder)
@@ -87,7 +87,7 @@ class Workshop:
 
 
 def ours(case: Case, shop: Workshop) -> list[Entry]:
-    """PlushSense's C as it is and held to plain C (PLUSH_PLAIN), frames in; as it is also the network alone."""
+    """Return the entries of PlushSense's C: default build, plain C (PLUSH_PLAIN), and the network alone."""
     (shop.folder / "model.bin").write_bytes(case.model.to_bytes())
     model = (shop.folder / "model.bin").stat().st_size
     entries = []
@@ -109,7 +109,7 @@ def ours(case: Case, shop: Workshop) -> list[Entry]:
 
 
 def _asking(shop: Workshop, sources: Path) -> list[str]:
-    """Return a program that prints how much memory the model takes, its struct included."""
+    """Return a program that prints the memory of the model, including its struct."""
     out = shop.folder / "memory"
     if not out.exists():
         source = shop.folder / "memory.c"
@@ -150,7 +150,7 @@ def _header(case: Case) -> str:
 
 
 def plain_window(case: Case, shop: Workshop) -> list[Entry]:
-    """Build the bench's own float C: simple loops over the whole window."""
+    """Build the float C of this bench: simple loops over the whole window."""
     (shop.folder / "network.h").write_text(_header(case))
     entries = []
     for level in ("-O2", "-O3"):
@@ -167,7 +167,7 @@ def onnx2c(case: Case, shop: Workshop, tool: str, model: Path) -> list[Entry]:
     """Build what onnx2c generates from ``model``."""
     found = shutil.which(tool)
     if found is None:
-        raise CannotBuild("no program onnx2c: build github.com/kraiskil/onnx2c and give --onnx2c PATH")
+        raise CannotBuild("onnx2c was not found: build github.com/kraiskil/onnx2c and give --onnx2c PATH")
     source = shop.folder / "onnx2c.c"
     source.write_text(_call([found, str(model)], shop.folder))
     (shop.folder / "network.h").write_text(_header(case))

@@ -1,4 +1,4 @@
-"""A program that decides when it is told to: timed, counted by callgrind, checked. Its words are those of loop.c."""
+"""Run, time and check a program that decides on request, and count its instructions; loop.c has the requests."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ CALLGRIND = ("valgrind", "--tool=callgrind", "--instr-atstart=no")
 
 
 class Died(Exception):
-    """The program ended, or said something else than it should; holds the end of what it wrote."""
+    """The program ended or gave an unexpected reply; the message contains the end of its output."""
 
 
 class Running:
-    """A process that answers each line with one line."""
+    """A process that replies to each line with one line."""
 
     def __init__(self, command: list[str], folder: Path) -> None:
         self._errors = tempfile.TemporaryFile()
@@ -46,7 +46,7 @@ class Running:
         return answer.strip()
 
     def run(self, decisions: int) -> float:
-        """Return the seconds a decision takes."""
+        """Return the seconds per decision."""
         return float(self.ask(f"run {decisions}")) / decisions
 
     def check(self, folder: Path, classes: int) -> NDArray[np.float64]:
@@ -56,7 +56,7 @@ class Running:
         return np.fromfile(path, dtype=np.float64).reshape(-1, classes)
 
     def close(self) -> None:
-        """End it."""
+        """End the process."""
         assert self._process.stdin is not None and self._process.stdout is not None
         with contextlib.suppress(BrokenPipeError):
             self._process.stdin.close()
@@ -79,7 +79,7 @@ def instructions(command: list[str], folder: Path, decisions: int) -> float:
     """Return the instructions of a decision: those of 2N decisions less those of N, so that overhead cancels.
 
     Raises:
-        Died: when the program does, or callgrind cannot be had.
+        Died: when the program ends early or callgrind is not available.
     """
     if shutil.which(CALLGRIND[0]) is None:
         raise Died("valgrind is not installed: apt-get install valgrind")

@@ -1,4 +1,4 @@
-"""The network as a float .tflite, written with the schema that LiteRT brings; its own quantizer takes it from there."""
+"""Write the network as a float .tflite file with LiteRT's schema, and quantize it with LiteRT's own tool."""
 
 from __future__ import annotations
 
@@ -93,8 +93,8 @@ def float_model(case: Mapping[str, NDArray[Any]]) -> bytes:
 def quantized(model: bytes, case: Mapping[str, NDArray[Any]]) -> bytes:
     """Quantize with ai-edge-quantizer: int8 weights by channel and int8 activations.
 
-    Its calibration takes a moving mean of each window's extremes, which cuts off what is rare; the extremes of all
-    windows, which it offers too, come closer to the floats here.
+    By default it calibrates with a moving mean of each window's extremes, which clips rare values. The extremes of all
+    windows, which it also offers, give answers closer to the float ones here.
     """
     from ai_edge_quantizer import calibrator, quantizer, recipe, recipe_manager
     from ai_edge_quantizer.utils import qsv_utils

@@ -1,11 +1,11 @@
-"""One Python opponent, in the interpreter that has it.
+"""Run one Python runtime in the interpreter in which it is installed.
 
-Needs NumPy and the opponent, not PlushSense.
+This needs NumPy and the runtime, but not PlushSense.
 
-    python worker.py make PEER FOLDER     writes the opponent's model from FOLDER/case.npz; prints facts as JSON
-    python worker.py run PEER FOLDER      decides when told to: the words of loop.c
+    python worker.py make PEER FOLDER     writes the runtime's model from FOLDER/case.npz; prints facts as JSON
+    python worker.py run PEER FOLDER      decides on request, with the requests of loop.c
 
-The model's input is set once: what is timed and counted is the runtime's own call and nothing else.
+The model's input is set once, so that only the runtime's own call is timed and counted.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 Case = Mapping[str, NDArray[Any]]
 Facts = dict[str, Any]
-# Sets a window (C, T), decides, gives logits (K,).
+# Set a window (C, T); decide; return the logits (K,).
 Answer = Callable[[NDArray[np.float32]], NDArray[np.float64]]
 
 
@@ -213,7 +213,7 @@ def make_executorch(case: Case, folder: Path) -> Facts:
     from torchao.quantization.pt2e.quantize_pt2e import convert_pt2e, prepare_pt2e
 
     class Window(torch.nn.Module):  # type: ignore[misc]
-        """(1, C, 1, T) → (1, K)."""
+        """The network from (1, C, 1, T) to (1, K)."""
 
         def __init__(self) -> None:
             super().__init__()
@@ -272,7 +272,7 @@ def run_executorch(folder: Path, facts: Facts) -> tuple[Callable[[], Any], Answe
     return decide, answer
 
 
-# ---- Which there are --------------------------------------------------------------------------------------------
+# ---- All runtimes -----------------------------------------------------------------------------------------------
 
 Make = Callable[[Case, Path], Facts]
 Run = Callable[[Path, Facts], tuple[Callable[[], Any], Answer]]
@@ -305,7 +305,7 @@ def make(peer: str, folder: Path) -> Facts:
 
 
 def serve(peer: str, folder: Path, say: Callable[[str], None]) -> None:
-    """Answer requests until there are no more."""
+    """Reply to requests until the input ends."""
     decide, answer = PEERS[peer][1](folder, json.loads((folder / f"{peer}.json").read_text()))
     marks = ctypes.CDLL(str(folder / "marks.so")) if (folder / "marks.so").exists() else None
     with np.load(folder / "case.npz") as case:
@@ -331,7 +331,7 @@ def serve(peer: str, folder: Path, say: Callable[[str], None]) -> None:
 
 def main() -> None:
     word, peer, folder = sys.argv[1:]
-    # Runtimes talk on standard output: only our answers go there.
+    # Runtimes print to standard output; keep it for the replies.
     out = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
 
