@@ -12,7 +12,8 @@ import pytest
 
 from plushsense.core.errors import BadInput
 from plushsense.core.gestures import GestureSet
-from plushsense.deploy.emit import TOY_BYTES, c_names, comment, emit, read_facts, without_people
+from plushsense.core.templates import c_comment
+from plushsense.deploy.emit import TOY_BYTES, c_names, emit, read_facts, without_people
 from plushsense.deploy.golden import answers_of, column, golden_frames, read_golden
 from plushsense.deploy.quantize import integer_model
 from plushsense.models.bundle import Bundle
@@ -84,7 +85,7 @@ def test_nobody_is_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("label", ["*\\", "*/*", "/*/", "\u202eRTL", "a\rb\n", "\u2066x"])
 def test_no_label_ends_a_comment_or_turns_it_round(label: str) -> None:
-    text = comment(label)
+    text = c_comment(label)
     assert "*/" not in text and "/*" not in text and "\\" not in text and text.isprintable()
 
 

@@ -16,9 +16,8 @@ from plushsense.core.errors import LayoutError
 from plushsense.core.gestures import Gesture, GestureSet
 from plushsense.core.layouts import Channel, load_layout
 from plushsense.deploy.emit import emit
-from plushsense.deploy.firmware import TEMPLATES, firmware
 from plushsense.deploy.golden import answers_of, column, read_golden
-from plushsense.deploy.package import ARDUINO, SKETCH, changed_copies, copies, package
+from plushsense.deploy.package import ARDUINO, FIRMWARE, SKETCH, changed_copies, copies, firmware, package
 from plushsense.deploy.quantize import integer_model
 from plushsense.devices.wire import LineParser, format_line
 from plushsense.runtime.image import IntegerModel
@@ -266,7 +265,7 @@ def test_channels_that_no_pad_measures_are_marked() -> None:
         layout = replace(plain, channels=channels, wire=wire, inputs=names, vectors=(), csv=csv)
         facts = {"title": "t", "classes": 2, "span": 10}
         files = firmware(layout, Scaler(np.zeros(len(names)), np.ones(len(names))), facts)
-        assert set(files) == set(TEMPLATES)
+        assert set(files) == set(FIRMWARE)
         assert note in files["PlushToy.ino"] and note in files["main.c"]
 
 

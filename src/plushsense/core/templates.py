@@ -2,26 +2,43 @@
 
 from __future__ import annotations
 
+import json
+from functools import cache, partial
 from importlib import resources
 from typing import Any
 
-from plushsense.core.errors import need
-
 
 def fill_text(package: str, template: str, **values: Any) -> str:
-    """Fill the template of a plain-text or Markdown document; values are inserted as they are.
+    """Fill the template of a text document; values are inserted as they are.
+
+    Filters: ``cell`` (of a Markdown table), ``c_comment`` (see `c_comment`), ``json``.
 
     Args:
-        package: the package whose folder holds ``template``.
-
-    Raises:
-        MissingExtraError: when jinja2 is not installed.
+        package: the package whose folder holds ``template`` and the templates that it includes.
     """
-    jinja2 = need("jinja2", "publish")
+    text: str = _environment(package).get_template(template).render(**values)
+    return text
+
+
+@cache
+def _environment(package: str) -> Any:
+    import jinja2
+
+    folder = resources.files(package)
     environment = jinja2.Environment(
-        undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
+        loader=jinja2.FunctionLoader(lambda name: folder.joinpath(name).read_text(encoding="utf-8")),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
     )
     environment.filters["cell"] = lambda text: text.replace("|", "\\|").replace("\n", " ")
-    source = resources.files(package).joinpath(template).read_text(encoding="utf-8")
-    text: str = environment.from_string(source).render(**values)
-    return text
+    environment.filters["c_comment"] = c_comment
+    environment.filters["json"] = partial(json.dumps, ensure_ascii=False)
+    return environment
+
+
+def c_comment(text: str) -> str:
+    """Make a text safe for a C comment: without its delimiters, backslashes and unprintable characters."""
+    plain = "".join(c if c.isprintable() else " " for c in text)
+    return plain.replace("\\", "/").replace("*/", "* /").replace("/*", "/ *")

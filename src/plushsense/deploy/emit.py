@@ -14,6 +14,7 @@ from typing import Any
 from plushsense.core.errors import BadInput
 from plushsense.core.files import new_folder
 from plushsense.core.gestures import NOBODY
+from plushsense.core.templates import fill_text
 from plushsense.deploy.golden import write_golden
 from plushsense.live.adaptation import without_subject
 from plushsense.models.bundle import Bundle
@@ -27,7 +28,6 @@ MODEL = ("plush_model.h", "plush_model.c")
 GOLDEN = "golden"
 TOY_BYTES = 452  # of a plush_toy where pointers have 32 bits (a test compiles it)
 _PEOPLE = ("subjects", "validation_subjects")
-_PER_LINE = 16
 
 Extra = Callable[[Path, dict[str, Any]], object]
 
@@ -123,7 +123,7 @@ def code_files(model: IntegerModel, bundle: Bundle) -> dict[str, bytes]:
     return {
         **{name: (library / name).read_bytes() for name in LIBRARY},
         MODEL[0]: _header(facts).encode(),
-        MODEL[1]: _source(model, facts).encode(),
+        MODEL[1]: _source(model, facts["title"]).encode(),
         IMAGE: image,
     }
 
@@ -200,81 +200,25 @@ def c_names(labels: Sequence[str]) -> tuple[str, ...]:
     return tuple(found)
 
 
-def comment(text: str) -> str:
-    """Make a text safe for a C comment: without its delimiters, backslashes and unprintable characters."""
-    plain = "".join(c if c.isprintable() else " " for c in text)
-    return plain.replace("\\", "/").replace("*/", "* /").replace("/*", "/ *")
-
-
-def _header(facts: dict[str, Any]) -> str:
-    gestures = "".join(
-        f"    PLUSH_GESTURE_{g['c_name']} = {i}, /* {comment(g['label'])}: {g['affect']} */\n"
-        for i, g in enumerate(facts["gestures"])
+def _header(facts: Mapping[str, Any]) -> str:
+    channels = facts["channels"]
+    names = c_names([c["name"] for c in channels])
+    return fill_text(
+        "plushsense.deploy",
+        "templates/plush_model.h.j2",
+        facts=facts,
+        channels=list(zip(names, channels, strict=True)),
     )
-    channels = "".join(
-        f"    PLUSH_CHANNEL_{name} = {i}, /* {comment(c['name'])}, {comment(c['unit'])} */\n"
-        for i, (name, c) in enumerate(
-            zip(c_names([c["name"] for c in facts["channels"]]), facts["channels"], strict=True)
-        )
-    )
-    simulated = "\n * Trained on a simulation: it knows no real person's touch." if facts["simulated"] else ""
-    return f"""/*
- * The model {comment(facts["title"])}, as plushsense.c reads it. Made by PlushSense {facts["code_version"]}.
- * A step of {facts["step_ms"]:g} ms; warming for {facts["span"]} samples at {facts["rate_hz"]:g} Hz.{simulated}
- */
-#ifndef PLUSH_MODEL_H
-#define PLUSH_MODEL_H
-
-#include <stdint.h>
-
-#ifdef __cplusplus
-extern "C" {{
-#endif
-
-#define PLUSH_MODEL_BYTES {facts["model_bytes"]}u
-#define PLUSH_MODEL_MEMORY_BYTES {facts["memory_bytes"]}u /* what a toy with this model remembers in */
-#define PLUSH_MODEL_MEMORY_WORDS (PLUSH_MODEL_MEMORY_BYTES / 4u)
-#define PLUSH_MODEL_CHANNELS {len(facts["channels"])}
-#define PLUSH_MODEL_LAYOUT {facts["layout_check"]}u /* toy.layout of every model for these channels */
-#define PLUSH_MODEL_CLASSES {facts["classes"]}
-#define PLUSH_MODEL_PERIOD_US {facts["period_us"]}
-#define PLUSH_MODEL_STEP {facts["step"]} /* samples from one answer to the next */
-#define PLUSH_MODEL_SPAN {facts["span"]} /* samples until the first answer */
-
-/* The order of the values that plush_push() takes, in the layout '{comment(facts["layout"])}'. */
-enum {{
-{channels}}};
-
-/* The classes. */
-enum {{
-{gestures}}};
-
-extern const uint8_t plush_model[PLUSH_MODEL_BYTES];
-
-#ifdef __cplusplus
-}}
-#endif
-#endif
-"""
 
 
-def _source(model: IntegerModel, facts: dict[str, Any]) -> str:
+def _source(model: IntegerModel, title: str) -> str:
     sections = model.sections()
-    top = image_head(b"".join(piece for _, piece in sections))
-    lines = [
-        "/*",
-        f" * The model {comment(facts['title'])}: the bytes of {IMAGE}, section by section.",
-        " * Numbers of more than one byte are little-endian; weights stand with 128 added, for four filters at a time:",
-        " * for every tap, for every four channels, 4 weights of each filter. The format is told in PlushSense's",
-        " * models/image.",
-        " */",
-        '#include "plush_model.h"',
-        "",
-        "const uint8_t plush_model[PLUSH_MODEL_BYTES] = {",
-    ]
-    for what, piece in [(f"head: PLSH, version, bytes, CRC-32 of what follows ({HEAD_BYTES} bytes)", top), *sections]:
-        if what:
-            lines.append(f"    /* {comment(what)} */")
-        for at in range(0, len(piece), _PER_LINE):
-            lines.append("    " + " ".join(f"{v}," for v in piece[at : at + _PER_LINE]))
-    return "\n".join([*lines, "};", ""])
+    head = image_head(b"".join(data for _, data in sections))
+    description = f"head: PLSH, version, bytes, CRC-32 of what follows ({HEAD_BYTES} bytes)"
+    return fill_text(
+        "plushsense.deploy",
+        "templates/plush_model.c.j2",
+        title=title,
+        image=IMAGE,
+        sections=[(description, head), *sections],
+    )

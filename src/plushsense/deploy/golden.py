@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import BadInput
 from plushsense.core.layouts import MAGNITUDE_FRACTION_BITS, Layout
+from plushsense.core.templates import fill_text
 from plushsense.runtime.events import AFFECT_CODES
 from plushsense.runtime.fixed import InputScale
 from plushsense.runtime.health import HealthSettings
@@ -383,28 +384,19 @@ def write_golden(model: IntegerModel, scaler: Scaler, folder: Path) -> list[Path
     folder.mkdir(parents=True, exist_ok=True)
     (folder / FRAMES).write_bytes((frames & 0xFFFFFFFF).astype("<u4").tobytes())
     (folder / ANSWERS).write_bytes(answers.astype("<i4").tobytes())
-    classes = model.network.arch.classes
-    kinds = "\n".join(f"  - {kind}, {what}: {', '.join(COLUMNS[kind][1:])}" for kind, what in _KINDS.items())
-    (folder / "README.md").write_text(
-        f"""# Golden vectors
-
-Made up, no person's recording: {len(frames)} frames with blows, lost frames, garbage, gaps, clock resets, sensors that
-fail and a wrap of the clock, and the {len(answers)} rows that PlushSense says to them. `plushsense verify` feeds them
-to the C in this export and compares every number.
-
-- `{FRAMES}`: rows of 32-bit little-endian numbers: the toy's clock in ms (unsigned), then the measured channels
-  ({", ".join(model.layout.names)}).
-- `{ANSWERS}`: rows of {HEAD + 2 * classes} 32-bit little-endian numbers. The first is the row's kind, and tells what
-  the next {HEAD - 1} are:
-{kinds}
-
-  `frame` is the frame that brought it about. After them stand {classes} logits in steps of 1/256 and {classes} smoothed
-  probabilities in steps of 2^-27. From gesture to known, logits and probabilities are 0 while warming; the last two are
-  0 in rows of another kind than {ANSWER}.
-""",
-        encoding="utf-8",
-        newline="\n",
+    readme = fill_text(
+        "plushsense.deploy",
+        "templates/golden.md.j2",
+        frames=len(frames),
+        rows=len(answers),
+        frames_file=FRAMES,
+        answers_file=ANSWERS,
+        channels=model.layout.names,
+        classes=model.network.arch.classes,
+        head=HEAD,
+        kinds=[(kind, description, COLUMNS[kind][1:]) for kind, description in _KINDS.items()],
     )
+    (folder / "README.md").write_text(readme, "utf-8", newline="\n")
     return [folder / FRAMES, folder / ANSWERS, folder / "README.md"]
 
 

@@ -6,6 +6,7 @@ import re
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import BadInput, ProgramError, ToolError
+from plushsense.core.toml import load_table, read_toml
 from plushsense.deploy.emit import GOLDEN, LIBRARY, MODEL, read_facts
 from plushsense.deploy.golden import read_golden
 from plushsense.deploy.proof.vectors import Export
@@ -32,11 +34,7 @@ from plushsense.models.arch import Arch
 
 @dataclass(frozen=True)
 class Core:
-    """A chip: its clock, the target on which instructions are counted, and bounds of cycles per instruction.
-
-    ``flash_mb_s`` is set where code and model lie in flash behind a serial bus and a small cache: how fast that bus
-    fills the cache, in MB/s. ``why`` says where the two bounds come from.
-    """
+    """A chip, as ``cores.toml`` describes it."""
 
     name: str
     title: str
@@ -58,52 +56,16 @@ class Core:
         )
 
 
-_LX = (
-    "counted on lx106, a sibling without zero-overhead loops and with division in software, so the count is rather too "
-    "high; seven pipeline stages (ESP32 datasheet), so what was just loaded or multiplied is there one or two cycles "
-    "late, and in the inner loop nearly every instruction waits for it; the S3's vector unit is not used"
-)
-# 2 bits at 80 MHz are 20 MB/s (esptool, SPI flash modes: DIO), less command, address and waiting of each cache line.
-_DIO = 15.0
+@dataclass(frozen=True)
+class _CoresFile:
+    cores: tuple[Core, ...]
 
-CORES: dict[str, Core] = {
-    "esp32": Core("esp32", "ESP32 (Xtensa LX6)", 240, "xtensa", 1.3, 2.4, _LX, _DIO),
-    "esp32-s2": Core("esp32-s2", "ESP32-S2 (Xtensa LX7)", 240, "xtensa", 1.3, 2.4, _LX, _DIO),
-    "esp32-s3": Core("esp32-s3", "ESP32-S3 (Xtensa LX7)", 240, "xtensa", 1.3, 2.4, _LX, _DIO),
-    "esp32-c3": Core(
-        "esp32-c3",
-        "ESP32-C3 (RV32IMC)",
-        160,
-        "riscv32",
-        1.1,
-        2.0,
-        "its own instruction set; four pipeline stages in order (technical reference manual), so what was just loaded "
-        "is there about one cycle late, and a taken branch costs one or two cycles more",
-        _DIO,
-    ),
-    "nrf52": Core(
-        "nrf52",
-        "nRF52 (Cortex-M4)",
-        64,
-        "cortex-m4",
-        1.2,
-        2.2,
-        "its own instruction set; a load takes one or two cycles and a taken branch two to four (Arm, Cortex-M4 "
-        "technical reference manual, table of instructions); high adds two cycles of waiting for the flash to each "
-        "load of weights",
-    ),
-    "rp2040": Core(
-        "rp2040",
-        "RP2040 (Cortex-M0+)",
-        133,
-        "cortex-m0",
-        1.4,
-        2.0,
-        "its own instruction set, counted on a core that runs it too; a load takes two cycles, a taken branch two, "
-        "a product one (Arm, Cortex-M0+ instruction summary)",
-        12.0,
-    ),
-}
+
+@cache
+def cores() -> tuple[Core, ...]:
+    """Read the chips of ``cores.toml``."""
+    path = Path(__file__).with_name("cores.toml")
+    return load_table(read_toml(path, "cores", BadInput), _CoresFile, path.name, BadInput).cores
 
 
 @dataclass(frozen=True)
@@ -507,8 +469,8 @@ def profile(
     if progress is not None:
         progress(len(installed), len(installed))
     estimates = {
-        name: estimate(core, cost.step, cost.flash_bytes, arch.step, float(facts["step_ms"]))
-        for name, core in CORES.items()
+        core.name: estimate(core, cost.step, cost.flash_bytes, arch.step, float(facts["step_ms"]))
+        for core in cores()
         if (cost := costs.get(core.target)) is not None and cost.step is not None
     }
     return Profile(facts, arch, optimise, costs, estimates, missing)
