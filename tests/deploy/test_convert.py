@@ -16,10 +16,9 @@ from plushsense.core.errors import ArchError, BadInput, BundleError, ConfigError
 from plushsense.core.gestures import load_gestures
 from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import read_stream
-from plushsense.deploy.convert import convert
+from plushsense.deploy.convert import ConversionJob, compared, convert, made_up_windows
 from plushsense.deploy.convert import onnx as as_onnx
 from plushsense.deploy.convert import tflite as as_tflite
-from plushsense.deploy.convert.facts import ConversionJob, compare, made_up_windows
 from plushsense.deploy.quantize import calibrated, integer_network
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
@@ -159,7 +158,8 @@ def test_a_file_that_answers_otherwise_is_refused(tmp_path: Path, onnx_here: Non
     other = Bundle(bundle.arch, changed, bundle.layout, bundle.scaler, bundle.gestures)
     job = ConversionJob.of(bundle, None)
     with pytest.raises(BundleError, match="answers otherwise"):
-        compare(as_onnx.answers(as_onnx.float_model(other), job.windows), job, "ONNX")
+        data = as_onnx.float_model(other)
+        compared(job, data, as_onnx.answers(data, job.windows), "ONNX")
 
 
 def test_given_windows_are_tried_too(tmp_path: Path, onnx_here: None) -> None:

@@ -1,4 +1,4 @@
-"""Optional converters of the network to formats of other runtimes.
+"""Optional converters of the network to formats of other runtimes, and what they share.
 
 They compute a whole window for each decision; the C of the export computes each sample once. The caller provides the
 clock, the derived channels, the validity rule and the smoothing.
@@ -6,44 +6,81 @@ clock, the derived channels, the validity rule and the smoothing.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
+import importlib
+import json
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import BadInput, ConfigError, nearest
+from plushsense.core.errors import BadInput, BundleError, ConfigError, nearest
 from plushsense.core.files import write_file
-from plushsense.deploy.convert.espdl import to_espdl
-from plushsense.deploy.convert.facts import Conversion, ConversionJob, Converted
-from plushsense.deploy.convert.onnx import to_integer_onnx, to_onnx
-from plushsense.deploy.convert.tflite import to_integer_tflite, to_tflite
 from plushsense.models.bundle import Bundle
+from plushsense.models.reference import check_windows
+from plushsense.runtime.fixed import LOGIT_LIMIT
+from plushsense.runtime.integer import IntegerNetwork
+from plushsense.windows.features import Scaler
 
-__all__ = ["CONVERTERS", "Converted", "Format", "check_format", "convert"]
+Floats = NDArray[np.float32]
+Windows = NDArray[np.int64]
+
+RAW = "raw"
+LOGITS = "logits"
+PROBABILITIES = "probabilities"
+LIMIT = LOGIT_LIMIT / 256  # of logits in the network in whole numbers
+# Logits in float32 against the reference in float64, relative to the largest logit; above it nothing is written.
+TOLERANCE = 1e-4
+NOT_EXACT = (
+    "Compared with the network in whole numbers, which the C in the toy equals bit for bit; this file only comes "
+    "close: a code may differ by 1 where this runtime rounds the other way."
+)
 
 
 @dataclass(frozen=True)
-class Format:
-    """A format: its file name, a description of the contents, and the converter."""
+class Converted:
+    """A file for another runtime.
+
+    ``largest_difference`` is between its logits and those of the network it came from (`Network.forward`, or
+    `IntegerNetwork.forward` / 256 for the int8 formats) on the windows tried; None where the runtime that could tell
+    is not installed. ``notes`` are sentences for the person who uses the file.
+    """
+
+    path: Path
+    bytes: int
+    largest_difference: float | None
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """Result of a converter: the bytes of the file; the other fields as in `Converted`."""
+
+    data: bytes
+    largest_difference: float | None
+    notes: tuple[str, ...]
+
+
+class Format(NamedTuple):
+    """A format: its file name, a description of the contents, and the converter as ``module:function``.
+
+    The module is one of this package; the function takes a `ConversionJob` and returns a `Conversion`.
+    """
 
     file_name: str
     holds: str
-    write: Callable[[ConversionJob], Conversion]
+    converter: str
 
 
 CONVERTERS: dict[str, Format] = {
-    "onnx": Format("model.onnx", "ONNX, floats", to_onnx),
-    "onnx-int8": Format("model.int8.onnx", "ONNX, int8 with QuantizeLinear", to_integer_onnx),
-    "tflite": Format("model.tflite", "LiteRT, floats", to_tflite),
-    "tflite-int8": Format("model.int8.tflite", "LiteRT, int8 convolutions", to_integer_tflite),
-    "espdl": Format("model.espdl", "ESP-DL for the ESP32-S3, int8", to_espdl),
-    "espdl-esp32": Format("model.esp32.espdl", "ESP-DL for the ESP32, int8", partial(to_espdl, target="esp32")),
-    "espdl-esp32p4": Format(
-        "model.esp32p4.espdl", "ESP-DL for the ESP32-P4, int8", partial(to_espdl, target="esp32p4")
-    ),
+    "onnx": Format("model.onnx", "ONNX, floats", "onnx:to_onnx"),
+    "onnx-int8": Format("model.int8.onnx", "ONNX, int8 with QuantizeLinear", "onnx:to_integer_onnx"),
+    "tflite": Format("model.tflite", "LiteRT, floats", "tflite:to_tflite"),
+    "tflite-int8": Format("model.int8.tflite", "LiteRT, int8 convolutions", "tflite:to_integer_tflite"),
+    "espdl": Format("model.espdl", "ESP-DL for the ESP32-S3, int8", "espdl:to_esp32s3"),
+    "espdl-esp32": Format("model.esp32.espdl", "ESP-DL for the ESP32, int8", "espdl:to_esp32"),
+    "espdl-esp32p4": Format("model.esp32p4.espdl", "ESP-DL for the ESP32-P4, int8", "espdl:to_esp32p4"),
 }
 
 
@@ -53,13 +90,7 @@ def check_format(name: str) -> None:
         raise ConfigError(f"Unknown format '{name}': accepted are {', '.join(CONVERTERS)}.{nearest(name, CONVERTERS)}")
 
 
-def convert(
-    bundle: Bundle,
-    path: str | Path,
-    format_name: str,
-    *,
-    windows: NDArray[Any] | None = None,
-) -> Converted:
+def convert(bundle: Bundle, path: str | Path, format_name: str, *, windows: NDArray[Any] | None = None) -> Converted:
     """Write ``bundle`` to ``path`` in a format of `CONVERTERS`, tried in that format's runtime before it is written.
 
     Args:
@@ -72,7 +103,9 @@ def convert(
         BundleError: when the result does not give the network's answers; for int8, a bundle without calibration.
     """
     check_format(format_name)
-    result = CONVERTERS[format_name].write(ConversionJob.of(bundle, windows))
+    module, function = CONVERTERS[format_name].converter.split(":")
+    converter = getattr(importlib.import_module(f"{__name__}.{module}"), function)
+    result: Conversion = converter(ConversionJob.of(bundle, windows))
     path = Path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -80,3 +113,143 @@ def convert(
     except OSError as cause:
         raise BadInput(f"'{path}' cannot be written ({cause}): choose another path.") from None
     return Converted(path, len(result.data), result.largest_difference, result.notes)
+
+
+@dataclass(frozen=True)
+class ConversionJob:
+    """Input of a converter: the bundle and raw windows (N, C, T), of which the first ``given`` came from the caller.
+
+    The windows serve to calibrate and to compare; the others are generated.
+    """
+
+    bundle: Bundle
+    windows: Windows
+    given: int
+
+    @classmethod
+    def of(cls, bundle: Bundle, windows: NDArray[Any] | None) -> ConversionJob:
+        """Return the job with generated windows after the given ones.
+
+        Raises:
+            BadInput: for windows of another shape.
+        """
+        tried = made_up_windows(bundle)
+        if windows is not None:
+            check_windows(bundle.arch, windows.shape)
+            given = windows[:, :, windows.shape[2] - bundle.arch.span :].astype(np.int64)
+            tried = np.concatenate([given, tried])
+        return cls(bundle, tried, 0 if windows is None else len(windows))
+
+    def thinned(self, most: int) -> ConversionJob:
+        """Return the job with at most ``most`` of the given windows, evenly spaced, and all generated ones."""
+        given = self.windows[: self.given][:: max(1, -(-self.given // most))]
+        return replace(self, windows=np.concatenate([given, self.windows[self.given :]]), given=len(given))
+
+    @property
+    def tried(self) -> str:
+        """Number of windows as text."""
+        made = len(self.windows) - self.given
+        return f"{made} made-up windows" if not self.given else f"{self.given} given and {made} made-up windows"
+
+    def reference(self) -> NDArray[np.float64]:
+        """Return the logits (N, K) of the float network."""
+        return self.bundle.network().forward(self.bundle.scaler.apply(self.windows))
+
+
+def made_up_windows(bundle: Bundle, n: int = 24) -> Windows:
+    """Generate raw windows (n, C, span): random walks and noise around the mean of each channel."""
+    rng = np.random.default_rng(20)
+    shape = (n, bundle.arch.channels, bundle.arch.span)
+    walk = np.cumsum(rng.normal(size=shape), axis=2) / np.sqrt(shape[2] / 4) + rng.normal(size=(*shape[:2], 1))
+    scaled = (
+        np.where(np.arange(n)[:, None, None] % 3 == 0, rng.normal(size=shape), walk)
+        * rng.choice([0.5, 1, 3], n)[:, None, None]
+    )
+    scaler = bundle.scaler
+    unit = 1 / np.where(scaler.scale == 0, 1.0, scaler.scale)
+    raw: Windows = np.rint(scaler.offset[:, None] + scaled * unit[:, None]).astype(np.int64)
+    return raw
+
+
+def scaling(scaler: Scaler) -> tuple[Floats, Floats, Floats]:
+    """Return (whole, scale, rest), each (C,), with which ``(raw - whole) * scale + rest`` is the scaler in float32.
+
+    Subtracting a whole number first keeps the last digits of a large offset.
+    """
+    whole = np.rint(scaler.offset)
+    rest = (whole - scaler.offset) * scaler.scale
+    return whole.astype(np.float32), scaler.scale.astype(np.float32), rest.astype(np.float32)
+
+
+def input_codes(network: IntegerNetwork) -> tuple[Floats, Floats, Floats]:
+    """Return (offset, gain, start), each (C,): ``(raw - offset) * gain + start``, rounded and clipped to 0…255.
+
+    This is the input of the first layer; it may differ from `InputScale` by 1 where that rounds the other way.
+    """
+    scale = network.inputs
+    unit = np.ldexp(1.0, -scale.after)
+    gain = scale.multiplier * unit * np.ldexp(1.0, -scale.before)
+    return scale.offset.astype(np.float32), gain.astype(np.float32), (scale.bias * unit - 0.5).astype(np.float32)
+
+
+def sum_scales(multiplier: NDArray[Any], before: NDArray[Any], after: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the factors of a layer's sums; at least 2^-32, because runtimes refuse 0."""
+    return np.asarray(np.maximum(multiplier * np.ldexp(1.0, -(before + after)), 2.0**-32))
+
+
+def describe(bundle: Bundle) -> dict[str, str]:
+    """Return the metadata to write into a file, as texts (`metadata_props` of ONNX, metadata of a .tflite)."""
+    arch, layout = bundle.arch, bundle.layout
+    provenance = bundle.provenance
+    facts: dict[str, Any] = {
+        "title": arch.title,
+        "padding": arch.padding,
+        "norm": arch.norm,
+        "layout": layout.name,
+        "channels": list(layout.inputs),
+        "gestures": list(bundle.gestures.labels),
+        "affect": [g.affect for g in bundle.gestures.gestures],
+        "span": arch.span,
+        "step": arch.step,
+        "rate_hz": layout.rate_hz,
+        "input": (
+            f"'{RAW}': integers as the toy measures them, at {layout.rate_hz:g} Hz after the clock rule, derived "
+            "channels included, not scaled; the newest sample is the last"
+        ),
+        "simulated": bool(provenance.get("simulated", False)),
+        "code_version": str(provenance.get("code_version", "")),
+    }
+    return {k: v if isinstance(v, str) else json.dumps(v, ensure_ascii=False) for k, v in facts.items()}
+
+
+def compared(
+    job: ConversionJob,
+    data: bytes,
+    logits: NDArray[Any],
+    title: str,
+    expected: NDArray[np.float64] | None = None,
+    note: str = NOT_EXACT,
+) -> Conversion:
+    """Compare the logits (N, K) of a file with the expected ones and return the conversion.
+
+    Args:
+        expected: logits that the file only approximates; None: those of the float network, from which a difference
+            beyond rounding is refused.
+        note: a sentence about the file.
+
+    Raises:
+        BundleError: when a float file does not give the network's answers.
+    """
+    exact = expected is None
+    reference = job.reference() if expected is None else expected
+    largest = float(np.abs(logits - reference).max())
+    same = int((logits.argmax(axis=1) == reference.argmax(axis=1)).sum())
+    if exact and not largest <= TOLERANCE * max(1.0, float(np.abs(reference).max())):
+        raise BundleError(
+            f"The {title} file answers otherwise than the bundle (logits differ by up to {largest:.3g}) and is not "
+            "written: please report this with the bundle."
+        )
+    sentence = (
+        f"On {job.tried}: logits differ by at most {largest:.2g}, the same gesture in {same} of {len(reference)}."
+    )
+    return Conversion(data, largest, (sentence, note))

@@ -12,6 +12,8 @@ import io
 import json
 import tempfile
 import warnings
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import BundleError, need
-from plushsense.deploy.convert.facts import LOGITS, Conversion, ConversionJob, Floats, compare, describe
+from plushsense.deploy.convert import LOGITS, Conversion, ConversionJob, Floats, compared, describe
+from plushsense.deploy.convert.onnx import IR_VERSION, OPSET, OnnxGraph
 from plushsense.deploy.quantize import Ranges, folded, refuse_undeployable
 from plushsense.models.bundle import Bundle
 
@@ -31,47 +34,31 @@ _MOST = 128  # windows: esp-ppq simulates a few dozen a second
 
 def plain_model(bundle: Bundle) -> Any:
     """Return the folded network as an ONNX model for esp-ppq: only Conv, Relu, GlobalAveragePool, Flatten and Gemm."""
-    onnx, arch = need("onnx", "espdl"), bundle.arch
-    make, real = onnx.helper.make_node, onnx.TensorProto.FLOAT
-    nodes, constants, z = [], [], SCALED
+    g, arch, z = OnnxGraph("espdl"), bundle.arch, SCALED
     # Filters keep their own sizes: made even by their ranges they agreed less with the floats on the S3.
     *convolutions, dense = [tuple(v.astype(np.float32) for v in part) for part in folded(arch, bundle.weights)]
-    for i, (layer, (w, b)) in enumerate(zip(arch.layers, convolutions, strict=True)):
-        constants += [onnx.numpy_helper.from_array(w, f"w{i}"), onnx.numpy_helper.from_array(b, f"b{i}")]
-        nodes += [
-            make(
-                "Conv",
-                [z, f"w{i}", f"b{i}"],
-                [f"conv{i}"],
-                name=f"conv{i}",
-                kernel_shape=[layer.kernel],
-                dilations=[layer.dilation],
-                pads=[0, 0],
-                strides=[1],
-                group=1,
-            ),
-            make("Relu", [f"conv{i}"], [f"relu{i}"], name=f"relu{i}"),
-        ]
-        z = f"relu{i}"
-    constants += [onnx.numpy_helper.from_array(v, n) for v, n in zip(dense, ("w", "b"), strict=True)]
-    nodes += [
-        make("GlobalAveragePool", [z], ["mean"], name="mean"),
-        make("Flatten", ["mean"], ["pooled"], name="pooled", axis=1),
-        make("Gemm", ["pooled", "w", "b"], [LOGITS], name="dense", transB=1),
-    ]
+    for i, (layer, (weights, bias)) in enumerate(zip(arch.layers, convolutions, strict=True)):
+        w, b = g.constant(f"w{i}", weights), g.constant(f"b{i}", bias)
+        shape = {"kernel_shape": [layer.kernel], "dilations": [layer.dilation], "pads": [0, 0], "strides": [1]}
+        z = g.add("Relu", f"relu{i}", g.add("Conv", f"conv{i}", z, w, b, **shape, group=1))
+    w, b = (g.constant(name, values) for name, values in zip("wb", dense, strict=True))
+    z = g.add("Flatten", "pooled", g.add("GlobalAveragePool", "mean", z), axis=1)
+    g.add("Gemm", LOGITS, z, w, b, name="dense", transB=1)
+    onnx, real = g.onnx, g.onnx.TensorProto.FLOAT
     graph = onnx.helper.make_graph(
-        nodes,
+        g.nodes,
         "plushsense",
         [onnx.helper.make_tensor_value_info(SCALED, real, [1, arch.channels, arch.span])],
         [onnx.helper.make_tensor_value_info(LOGITS, real, [1, arch.classes])],
-        constants,
+        g.constants,
     )
-    model = onnx.helper.make_model(graph, ir_version=9, opset_imports=[onnx.helper.make_opsetid("", 18)])
+    opset = [onnx.helper.make_opsetid("", OPSET)]
+    model = onnx.helper.make_model(graph, ir_version=IR_VERSION, opset_imports=opset)
     onnx.checker.check_model(model, full_check=True)
     return model
 
 
-def to_espdl(job: ConversionJob, target: str = "esp32s3") -> Conversion:
+def to_espdl(job: ConversionJob, target: str) -> Conversion:
     """Convert the network for ``target`` (esp32, esp32s3, esp32c3, esp32p4 …); each has its own weight layout.
 
     The file holds one made-up window and its answer, with which ESP-DL's ``model->test()`` tries it on the chip.
@@ -88,19 +75,20 @@ def to_espdl(job: ConversionJob, target: str = "esp32s3") -> Conversion:
     facts = describe(bundle) | {"input": f"'{SCALED}': (value - offset) * scale a channel, (1, C, span)"}
     facts |= {k: json.dumps(v) for k, v in bundle.scaler.to_dict().items()}
     data, logits = _quantized(bundle, model, some, scaled, target, facts)
-    largest, sentence = compare(logits, job, "ESP-DL", exact=False)
-    whose = (
+    origin = (
         f"{len(some)} given windows" if job.given else "made-up windows only, so give windows of the training people"
     )
-    return Conversion(
-        data,
-        largest,
-        (
-            f"For {target}, quantized by esp-ppq with ranges from {whose}; compared in esp-ppq's simulation with the "
-            "float network, not run on a chip.",
-            sentence,
-        ),
+    note = (
+        f"For {target}, quantized by esp-ppq with ranges from {origin}; compared in esp-ppq's simulation with the "
+        "float network, not run on a chip."
     )
+    result = compared(job, data, logits, "ESP-DL", job.reference(), note)
+    return replace(result, notes=result.notes[::-1])
+
+
+to_esp32 = partial(to_espdl, target="esp32")
+to_esp32s3 = partial(to_espdl, target="esp32s3")
+to_esp32p4 = partial(to_espdl, target="esp32p4")
 
 
 def _quantized(

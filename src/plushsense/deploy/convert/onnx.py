@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import need
-from plushsense.deploy.convert.facts import (
+from plushsense.deploy.convert import (
     LIMIT,
     LOGITS,
     NOT_EXACT,
@@ -22,7 +22,7 @@ from plushsense.deploy.convert.facts import (
     Conversion,
     ConversionJob,
     Floats,
-    compare,
+    compared,
     describe,
     input_codes,
     scaling,
@@ -37,11 +37,11 @@ OPSET = 18
 IR_VERSION = 9
 
 
-class _OnnxGraph:
-    """Nodes in the order in which they are added; each has one output, whose name is the node's."""
+class OnnxGraph:
+    """Nodes in the order in which they are added; each has one output, whose name is the node's unless one is given."""
 
-    def __init__(self) -> None:
-        self.onnx = need("onnx", "onnx")
+    def __init__(self, extra: str = "onnx") -> None:
+        self.onnx = need("onnx", extra)
         self.nodes: list[Any] = []
         self.constants: list[Any] = []
 
@@ -50,7 +50,7 @@ class _OnnxGraph:
         return name
 
     def add(self, kind: str, out: str, *read: str, **settings: Any) -> str:
-        self.nodes.append(self.onnx.helper.make_node(kind, list(read), [out], name=out, **settings))
+        self.nodes.append(self.onnx.helper.make_node(kind, list(read), [out], **{"name": out, **settings}))
         return out
 
     def columns(self, name: str, values: Floats) -> str:
@@ -80,15 +80,13 @@ class _OnnxGraph:
         return bytes(model.SerializeToString(deterministic=True))
 
 
-def float_model(bundle: Bundle, scaled: bool = False) -> bytes:
-    """Return the float network as ONNX; with ``scaled`` its input is already scaled."""
-    g, arch = _OnnxGraph(), bundle.arch
-    z = RAW
-    if not scaled:
-        whole, scale, rest = scaling(bundle.scaler)
-        z = g.add("Sub", "shifted", z, g.columns("scaler.offset", whole))
-        z = g.add("Mul", "sized", z, g.columns("scaler.scale", scale))
-        z = g.add("Add", "scaled", z, g.columns("scaler.rest", rest))
+def float_model(bundle: Bundle) -> bytes:
+    """Return the float network as ONNX."""
+    g, arch = OnnxGraph(), bundle.arch
+    whole, scale, rest = scaling(bundle.scaler)
+    z = g.add("Sub", "shifted", RAW, g.columns("scaler.offset", whole))
+    z = g.add("Mul", "sized", z, g.columns("scaler.scale", scale))
+    z = g.add("Add", "scaled", z, g.columns("scaler.rest", rest))
     for i, layer in enumerate(arch.layers):
         z, pads = _padding(g, i, arch, layer, z)
         w, b = (g.constant(n, bundle.weights[n]) for n in (f"conv{i}.weight", f"conv{i}.bias"))
@@ -109,7 +107,7 @@ def float_model(bundle: Bundle, scaled: bool = False) -> bytes:
     return g.model(bundle)
 
 
-def _padding(g: _OnnxGraph, i: int, arch: Arch, layer: ConvLayer, z: str) -> tuple[str, list[int]]:
+def _padding(g: OnnxGraph, i: int, arch: Arch, layer: ConvLayer, z: str) -> tuple[str, list[int]]:
     if arch.padding == "stream" or not layer.reach:
         return z, [0, 0]
     if arch.padding == "causal":
@@ -122,7 +120,7 @@ def _padding(g: _OnnxGraph, i: int, arch: Arch, layer: ConvLayer, z: str) -> tup
     return g.add("Gather", f"mirror{i}", z, g.constant(f"mirror{i}.places", places), axis=2), [0, 0]
 
 
-def _mean(g: _OnnxGraph, z: str) -> str:
+def _mean(g: OnnxGraph, z: str) -> str:
     return g.add("ReduceMean", "pooled", z, g.constant("time", np.array([2], dtype=np.int64)), keepdims=0)
 
 
@@ -132,7 +130,7 @@ def integer_model(bundle: Bundle, network: IntegerNetwork) -> bytes:
     Activations keep the codes of `IntegerNetwork` (uint8, scale 1): a filter's own scale stands with its int8
     weights. Means over time and the dense layer are in floats, on weights that are int8.
     """
-    g, arch = _OnnxGraph(), network.arch
+    g, arch = OnnxGraph(), network.arch
     one = g.constant("code.scale", np.array(1, dtype=np.float32))
     zero = g.constant("code.zero", np.array(0, dtype=np.uint8))
 
@@ -190,17 +188,19 @@ _UNCHECKED = "Not tried: run  pip install 'plushsense[onnx]'  to have it compare
 
 def to_onnx(job: ConversionJob) -> Conversion:
     """Convert the float network."""
-    model = float_model(job.bundle)
-    logits = answers(model, job.windows)
-    largest, sentence = (None, _UNCHECKED) if logits is None else compare(logits, job, "ONNX")
-    return Conversion(model, largest, (sentence, f"Input '{RAW}' (N, {job.bundle.arch.channels}, span)."))
+    note = f"Input '{RAW}' (N, {job.bundle.arch.channels}, span)."
+    return _conversion(job, float_model(job.bundle), None, note)
 
 
 def to_integer_onnx(job: ConversionJob) -> Conversion:
     """Convert the integer network; close to the exported C, not equal in every bit."""
     network = integer_network(job.bundle)
     model = integer_model(job.bundle, network)
+    return _conversion(job, model, network.forward(job.windows) / 256, NOT_EXACT)
+
+
+def _conversion(job: ConversionJob, model: bytes, expected: NDArray[np.float64] | None, note: str) -> Conversion:
     logits = answers(model, job.windows)
-    expected = network.forward(job.windows) / 256
-    largest, sentence = (None, _UNCHECKED) if logits is None else compare(logits, job, "ONNX", expected, exact=False)
-    return Conversion(model, largest, (sentence, NOT_EXACT))
+    if logits is None:
+        return Conversion(model, None, (_UNCHECKED, note))
+    return compared(job, model, logits, "ONNX", expected, note)

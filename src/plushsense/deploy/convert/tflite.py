@@ -16,16 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import need
-from plushsense.deploy.convert.facts import (
+from plushsense.deploy.convert import (
     LIMIT,
     LOGITS,
-    NOT_EXACT,
     PROBABILITIES,
     RAW,
     Conversion,
     ConversionJob,
     Floats,
-    compare,
+    compared,
     describe,
     input_codes,
     scaling,
@@ -270,14 +269,12 @@ def answers(model: bytes, windows: NDArray[Any]) -> NDArray[np.float32]:
 def to_tflite(job: ConversionJob) -> Conversion:
     """Convert the float network."""
     model = float_model(job.bundle)
-    largest, sentence = compare(answers(model, job.windows), job, "LiteRT")
-    return Conversion(model, largest, (sentence, f"Input '{RAW}' (1, span, {job.bundle.arch.channels})."))
+    note = f"Input '{RAW}' (1, span, {job.bundle.arch.channels})."
+    return compared(job, model, answers(model, job.windows), "LiteRT", note=note)
 
 
 def to_integer_tflite(job: ConversionJob) -> Conversion:
     """Convert the network with int8 convolutions; close to the exported C, not equal in every bit."""
     network = integer_network(job.bundle)
     model = integer_model(job.bundle, network)
-    expected = network.forward(job.windows) / 256
-    largest, sentence = compare(answers(model, job.windows), job, "LiteRT", expected, exact=False)
-    return Conversion(model, largest, (sentence, NOT_EXACT))
+    return compared(job, model, answers(model, job.windows), "LiteRT", network.forward(job.windows) / 256)
