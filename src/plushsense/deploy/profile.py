@@ -6,7 +6,7 @@ import re
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -226,26 +226,19 @@ def count(
     even, jittered = _streams(folder, facts)
     with tempfile.TemporaryDirectory(prefix="plushsense-profile-") as temporary:
         work = Path(temporary)
-        blobs = {"EVEN": _written(even, work / "even"), "JITTERED": _written(jittered, work / "jittered")}
+        blobs = {"EVEN": work / "even", "JITTERED": work / "jittered"}
+        for frames, file in zip((even, jittered), blobs.values(), strict=True):
+            file.write_bytes(frames.astype("<i4").tobytes())
         sources = [C_FOLDER / "profile.c", code / MODEL[1]]
-        whole = build(
-            target,
-            [*sources, code / LIBRARY[1]],
-            work / "whole",
-            include=[code],
-            optimise=optimise,
-            blobs=blobs,
-            flags=["-fstack-usage"],
-        )
+        same = partial(build, target, include=[code], optimise=optimise, blobs=blobs)
+        whole = same([*sources, code / LIBRARY[1]], work / "whole", flags=["-fstack-usage"])
         head, rows_even, rows_jittered = _whole(whole, step)
         counts = TARGETS[target].counts
         stages: dict[str, int] = {}
         if counts:
-            defines = {"PLUSH_STAGES": 1}
-            staged = build(
-                target, sources, work / "stages", include=[code], defines=defines, optimise=optimise, blobs=blobs
-            )
-            stages = _stages(staged)
+            staged = same(sources, work / "stages", defines={"PLUSH_STAGES": 1})
+            rows = np.frombuffer(staged.run(), dtype="<i4").astype(np.int64).reshape(-1, len(STAGES))
+            stages = {name: _mean(rows[:, i]) for i, name in enumerate(STAGES)}
             stages = {"clock": _mean(rows_jittered[:-1, 0]) - sum(stages.values()), **stages}
         objects = {"plushsense": whole.objects[2], "plush_model": whole.objects[1]}
         return Cost(
@@ -293,11 +286,6 @@ def _streams(folder: Path, facts: Mapping[str, Any]) -> tuple[Ints, Ints]:
     return even, np.vstack([jittered, last])
 
 
-def _written(frames: Ints, file: Path) -> Path:
-    file.write_bytes(frames.astype("<i4").tobytes())
-    return file
-
-
 def _whole(program: Program, step: int) -> tuple[list[int], Ints, Ints]:
     """Run the program: return six numbers about the toy, and two tables of rows (`STEPS`, 3).
 
@@ -317,11 +305,6 @@ def _whole(program: Program, step: int) -> tuple[list[int], Ints, Ints]:
             "samples should: plushsense verify says where it goes wrong."
         )
     return numbers[:6].tolist(), even, jittered
-
-
-def _stages(program: Program) -> dict[str, int]:
-    rows = np.frombuffer(program.run(), dtype="<i4").astype(np.int64).reshape(-1, len(STAGES))
-    return {name: _mean(rows[:, i]) for i, name in enumerate(STAGES)}
 
 
 def _sections(target: str, file: Path) -> dict[str, int]:
@@ -443,8 +426,8 @@ def profile(
     """
     folder = Path(folder)
     facts = read_facts(folder)
-    arch = _arch(folder, facts)
     export = Export(folder)
+    arch = export.model.network.arch
     if not trust:
         export.require_unchanged()
     names = list(dict.fromkeys(targets)) or [name for name, target in TARGETS.items() if target.counts]
@@ -474,18 +457,3 @@ def profile(
         if (cost := costs.get(core.target)) is not None and cost.step is not None
     }
     return Profile(facts, arch, optimise, costs, estimates, missing)
-
-
-def _arch(folder: Path, facts: Mapping[str, Any]) -> Arch:
-    try:
-        return Arch.parse(
-            facts["symbol"],
-            facts["filters"],
-            channels=len(facts["inputs"]),
-            classes=facts["classes"],
-            step=facts["step"],
-            pool=facts["pool"],
-            window=max(facts["span"], facts["step"]),
-        )
-    except (KeyError, TypeError):
-        raise BadInput(f"The facts in '{folder}' do not describe a network: export the model again.") from None

@@ -1,4 +1,4 @@
-"""Three methods of convolving a chunk of windows, forward and backward, in reused memory.
+"""Three methods of convolving a chunk of windows, forward and backward, in reused memory, by several threads.
 
 Rows are (T, N, C). Weights are (taps, channels read, filters). A method prepares its weights once in
 a step; then each chunk is passed forward and backward, and the gradients of the weights are summed over the chunks.
@@ -6,7 +6,10 @@ a step; then each chunk is passed forward and backward, and the gradients of the
 
 from __future__ import annotations
 
-from typing import Protocol
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -32,27 +35,63 @@ class BufferPool:
         return held[:size].view(shape)
 
 
-class Way(Protocol):
+# Sums over chunks are formed in this many lanes and then added in order: equal for any number of threads.
+LANES = 8
+
+Out = TypeVar("Out")
+
+
+def _alone() -> None:
+    torch.set_num_threads(1)
+    torch.set_grad_enabled(False)
+
+
+class ThreadPool:
+    """Threads that call a function for each chunk as (chunk, lane, thread)."""
+
+    def __init__(self, threads: int) -> None:
+        self.threads = min(threads, LANES)
+        self._pool = ThreadPoolExecutor(self.threads, "plushsense-chunks", _alone) if self.threads > 1 else None
+
+    def each(self, work: Callable[[int, int, int], Out], chunks: int) -> list[Out]:
+        """Call ``work`` for each chunk and return the results in their order."""
+        if self._pool is None or chunks == 1:
+            return [work(i, i % LANES, 0) for i in range(chunks)]
+
+        def share(thread: int) -> list[tuple[int, Out]]:
+            return [(i, work(i, i % LANES, thread)) for i in range(chunks) if i % LANES % self.threads == thread]
+
+        found = [pair for part in self._pool.map(share, range(self.threads)) for pair in part]
+        return [out for _, out in sorted(found, key=lambda pair: pair[0])]
+
+    def close(self) -> None:
+        """End the threads."""
+        if self._pool is not None:
+            self._pool.shutdown()
+
+
+class Way(ABC):
     """A method of computing a layer. ``spectrum`` is memory that the forward pass leaves for the backward pass."""
 
-    plan: LayerPlan
+    def __init__(self, plan: LayerPlan) -> None:
+        self.plan = plan
 
     def weights(self, w: Tensor, space: BufferPool, name: object) -> Tensor:
         """Return the weights (taps, C, F) in the form that this method uses."""
-        ...
-
-    def forward(self, x: Tensor, w: Tensor, bias: Tensor, out: Tensor, scratch: BufferPool, spectrum: Tensor) -> None:
-        """Compute ``out`` (writes, N, F) from ``x`` (needs or more, N, C)."""
-        ...
+        return w
 
     def spectrum_shape(self, windows: int) -> tuple[int, ...]:
         """Return the shape of the memory that the forward pass leaves."""
-        ...
+        return (0,)
 
-    def spectrum(self, x: Tensor, scratch: BufferPool, out: Tensor) -> None:
+    def spectrum(self, x: Tensor, scratch: BufferPool, out: Tensor) -> None:  # noqa: B027
         """Compute that memory again where it was not kept."""
-        ...
 
+    @abstractmethod
+    def forward(self, x: Tensor, w: Tensor, bias: Tensor, out: Tensor, scratch: BufferPool, spectrum: Tensor) -> None:
+        """Compute ``out`` (writes, N, F) from ``x`` (needs or more, N, C)."""
+
+    @abstractmethod
     def backward(
         self,
         dz: Tensor,
@@ -69,27 +108,17 @@ class Way(Protocol):
         The gradient of the weights is added to ``total`` (in the form of `weights`; ``fresh``: overwrites it), that of
         the input rows is written to ``dx`` (needs, N, C); returns that of the bias (F,).
         """
-        ...
 
     def gradient(self, total: Tensor) -> Tensor:
         """Return the gradient of the weights (taps, C, F) from ``total``."""
-        ...
+        return total
 
 
-class Pointwise:
+class Pointwise(Way):
     """A convolution with one tap: a matrix product of all rows."""
-
-    def __init__(self, plan: LayerPlan) -> None:
-        self.plan = plan
 
     def weights(self, w: Tensor, space: BufferPool, name: object) -> Tensor:
         return w[0]
-
-    def spectrum_shape(self, windows: int) -> tuple[int, ...]:
-        return (0,)
-
-    def spectrum(self, x: Tensor, scratch: BufferPool, out: Tensor) -> None:
-        """Do nothing: backward needs only the input."""
 
     def forward(self, x: Tensor, w: Tensor, bias: Tensor, out: Tensor, scratch: BufferPool, spectrum: Tensor) -> None:
         p = self.plan
@@ -117,20 +146,8 @@ class Pointwise:
         return total[None]
 
 
-class Direct:
+class Direct(Way):
     """A convolution with few taps: one matrix product for each, on shifted views of the rows."""
-
-    def __init__(self, plan: LayerPlan) -> None:
-        self.plan = plan
-
-    def weights(self, w: Tensor, space: BufferPool, name: object) -> Tensor:
-        return w
-
-    def spectrum_shape(self, windows: int) -> tuple[int, ...]:
-        return (0,)
-
-    def spectrum(self, x: Tensor, scratch: BufferPool, out: Tensor) -> None:
-        """Do nothing: backward needs only the input."""
 
     def _rows(self, x: Tensor, tap: int) -> Tensor:
         start = tap * self.plan.dilation
@@ -162,16 +179,14 @@ class Direct:
                 self._rows(dx, tap).addmm_(rows, w[tap].t())
         return rows.sum(0)
 
-    def gradient(self, total: Tensor) -> Tensor:
-        return total
 
-
-class Spectral:
+class Spectral(Way):
     """A convolution with many taps: transform, one product for each plane, inverse transform."""
 
     def __init__(self, plan: LayerPlan) -> None:
+        super().__init__(plan)
         assert plan.lengths is not None
-        self.plan, self.lengths = plan, plan.lengths
+        self.lengths = plan.lengths
         found = matrices(plan.lengths, plan.taps, plan.rows)
         self.d1, self.d2, self.g, self.a2, self.a1 = (
             torch.from_numpy(m) for m in (found.d1, found.d2, found.g, found.a2, found.a1)
@@ -248,9 +263,5 @@ class Spectral:
 
 def way(plan: LayerPlan) -> Way:
     """Return the method that a plan chose."""
-    made: dict[str, type[Pointwise] | type[Direct] | type[Spectral]] = {
-        "pointwise": Pointwise,
-        "direct": Direct,
-        "spectral": Spectral,
-    }
-    return made[plan.way](plan)
+    ways: dict[str, type[Way]] = {"pointwise": Pointwise, "direct": Direct, "spectral": Spectral}
+    return ways[plan.way](plan)

@@ -18,9 +18,8 @@ from torch.nn import functional as F
 
 from plushsense.models.arch import NORM_EPSILON, Arch, reflected
 from plushsense.models.net import Net
-from plushsense.training.fast.conv import BufferPool, Way, way
+from plushsense.training.fast.conv import LANES, BufferPool, ThreadPool, Way, way
 from plushsense.training.fast.plan import CHUNK, plan_net
-from plushsense.training.fast.threads import LANES, ThreadPool
 
 MOMENTUM = 0.1
 
