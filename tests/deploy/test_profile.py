@@ -133,7 +133,9 @@ def test_nothing_to_count_on(small: Path, monkeypatch: pytest.MonkeyPatch, tmp_p
 
 
 def test_estimates_are_a_band_and_a_verdict() -> None:
-    core = replace(next(c for c in cores() if c.name == "esp32"), mhz=100, cycles_low=1.0, cycles_high=2.0, flash_mb_s=None)
+    core = replace(
+        next(c for c in cores() if c.name == "esp32"), mhz=100, cycles_low=1.0, cycles_high=2.0, flash_mb_s=None
+    )
     found = estimate(core, 1_000_000, 20_000, 5, 50.0)
     assert (found.low_ms, found.high_ms, found.fits) == (10.0, 20.0, "yes")
     assert found.verdict == "fits 20 Hz: yes, uses about 20 to 40 % of the core, 30 ms left a step"

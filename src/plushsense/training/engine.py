@@ -9,14 +9,12 @@ PyTorch's layers and gradients, for everything else: layer normalisation, ``caus
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
-from torch.nn import functional as F
 
 from plushsense.models.arch import Arch
 from plushsense.models.net import Net
@@ -24,6 +22,10 @@ from plushsense.training.augment import Transform
 from plushsense.training.fast.net import FastNet, can_train
 from plushsense.training.fast.plan import plan_net
 from plushsense.training.spec import TrainSpec
+
+import torch  # isort: skip - after models.net, which says how to install it
+from torch import Tensor
+from torch.nn import functional as F
 
 _WEIGHT, _MEAN, _SQUARE, _KEPT, _BEST = "weight:", "mean:", "square:", "kept:", "best:"
 
@@ -89,33 +91,6 @@ class FitState:
 _READ = 512
 
 
-class Engine(Protocol):
-    """A network on its device that can compute a training step."""
-
-    @property
-    def parameters(self) -> Sequence[Tensor]:
-        """The tensors that the optimizer updates."""
-        ...
-
-    def step(
-        self, x: Windows, batch: Tensor, y: Tensor, augment: Transform | None, random: torch.Generator
-    ) -> tuple[Tensor, Tensor]:
-        """Return mean loss and logits (n, K) of the windows ``batch`` with truth ``y``, and compute the gradients."""
-        ...
-
-    def logits(self, x: Windows) -> Tensor:
-        """Return the logits (N, K) in evaluation mode."""
-        ...
-
-    def export_weights(self) -> dict[str, NDArray[np.float32]]:
-        """Return a copy of the weights, as ``models/reference`` takes them."""
-        ...
-
-    def close(self) -> None:
-        """End the threads."""
-        ...
-
-
 class Windows:
     """Scaled windows (N, C, T) on the device, in the memory layout of the engine."""
 
@@ -141,16 +116,6 @@ def step_bytes(arch: Arch, spec: TrainSpec) -> int | None:
     return plan_net(arch, spec.batch).bytes if is_fast(arch, torch.device(spec.device)) else None
 
 
-def engine(arch: Arch, net: Net, device: torch.device, batch: int, threads: int) -> Engine:
-    """Return the engine for a network; the weights are taken from ``net``.
-
-    Args:
-        batch: windows in a batch, at most.
-        threads: on the CPU.
-    """
-    return Fast(net, batch, threads) if is_fast(arch, device) else Plain(net, device)
-
-
 class Plain:
     """Training with PyTorch's layers and autograd."""
 
@@ -159,11 +124,13 @@ class Plain:
 
     @property
     def parameters(self) -> Sequence[Tensor]:
+        """The tensors that the optimizer updates."""
         return list(self._net.parameters())
 
     def step(
         self, x: Windows, batch: Tensor, y: Tensor, augment: Transform | None, random: torch.Generator
     ) -> tuple[Tensor, Tensor]:
+        """Return mean loss and logits (n, K) of the windows ``batch`` with truth ``y``, and compute the gradients."""
         self._net.train()
         windows = x.whole[batch]
         logits = self._net(windows if augment is None else augment(windows, random))
@@ -173,12 +140,14 @@ class Plain:
         return loss.detach(), logits.detach()
 
     def logits(self, x: Windows) -> Tensor:
+        """Return the logits (N, K) in evaluation mode."""
         self._net.eval()
         with torch.no_grad():
             parts = [self._net(x.whole[at]) for at in slices(len(x), _READ)]
         return torch.cat(parts) if parts else torch.zeros(0, self._net.arch.classes)
 
     def export_weights(self) -> dict[str, NDArray[np.float32]]:
+        """Return a copy of the weights, as ``models/reference`` takes them."""
         return self._net.export_weights()
 
     def close(self) -> None:
@@ -186,7 +155,7 @@ class Plain:
 
 
 class Fast:
-    """Training with ``training/fast``."""
+    """Training with ``training/fast``; methods as in `Plain`."""
 
     def __init__(self, net: Net, batch: int, threads: int) -> None:
         self._net = FastNet(net, batch, threads)
@@ -226,6 +195,30 @@ class Fast:
 
     def close(self) -> None:
         self._net.close()
+
+
+Engine = Plain | Fast
+
+
+def engine(arch: Arch, net: Net, device: torch.device, batch: int, threads: int) -> Engine:
+    """Return the engine for a network; the weights are taken from ``net``.
+
+    Args:
+        batch: windows in a batch, at most.
+        threads: on the CPU.
+    """
+    return Fast(net, batch, threads) if is_fast(arch, device) else Plain(net, device)
+
+
+@contextmanager
+def torch_threads(threads: int) -> Iterator[None]:
+    """Set the number of PyTorch's threads, and restore it at the end of the block."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def slices(n: int, size: int) -> Iterator[slice]:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
+from collections.abc import Callable, Collection, Mapping
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -15,7 +15,7 @@ from plushsense.core.errors import DivergedError, TrainingError
 from plushsense.models.arch import Arch
 from plushsense.models.net import Net
 from plushsense.training.augment import Channels, Transform, augmentations
-from plushsense.training.engine import Engine, FitState, Windows, engine, is_fast, slices
+from plushsense.training.engine import Engine, FitState, Windows, engine, is_fast, slices, torch_threads
 from plushsense.training.spec import TrainSpec
 from plushsense.windows.cut import WindowSet
 from plushsense.windows.features import Scaler
@@ -82,7 +82,9 @@ def fit(
         raise TrainingError(
             "A training with early stopping cannot go on from a state that holds no best weights: leave patience out."
         )
-    with torch.random.fork_rng(devices=[]), _repeatable(device), _threads(spec.threads, arch, device):
+    # The fast engine has its own threads, each with one of PyTorch's.
+    threads = 1 if is_fast(arch, device) else spec.threads
+    with torch.random.fork_rng(devices=[]), _repeatable(device), torch_threads(threads):
         torch.manual_seed(spec.seed)
         fresh = Net(arch)
         if start is not None:
@@ -181,7 +183,7 @@ def predict(
     net = Net(arch)
     net.import_weights(weights)
     x, _ = _tensors(windows, scaler, arch, place)
-    with _threads(1, arch, place):
+    with torch_threads(1):
         reader = engine(arch, net, place, 1, 1)
         found: NDArray[np.float32] = F.softmax(reader.logits(x), dim=1).cpu().numpy()
     return found
@@ -266,17 +268,6 @@ def _device(name: str) -> torch.device:
     if name == "cuda" and not torch.cuda.is_available():
         raise TrainingError("There is no CUDA device to train on: use the device 'auto' or 'cpu'.")
     return torch.device(name)
-
-
-@contextmanager
-def _threads(threads: int, arch: Arch, device: torch.device) -> Iterator[None]:
-    before = torch.get_num_threads()
-    # The fast engine has its own threads, each with one of PyTorch's.
-    torch.set_num_threads(1 if is_fast(arch, device) else threads)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _repeatable(device: torch.device) -> AbstractContextManager[Any]:

@@ -9,8 +9,7 @@ that a few epochs on the training windows do not overfit.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,7 +20,7 @@ from plushsense.core.errors import TrainingError
 from plushsense.models.arch import NORM_EPSILON, Arch
 from plushsense.models.net import Net
 from plushsense.runtime.integer import deployable
-from plushsense.training.engine import slices
+from plushsense.training.engine import slices, torch_threads
 from plushsense.training.spec import TrainSpec
 from plushsense.windows.cut import WindowSet
 from plushsense.windows.features import Scaler
@@ -75,7 +74,7 @@ def fine_tune(
     x = torch.from_numpy(scaler.apply(train.x[:, :, train.x.shape[2] - arch.span :]))
     highest = spec.learning_rate_at(spec.epochs) / _SLOWER
     history: list[dict[str, Any]] = []
-    with torch.random.fork_rng(devices=[]), _threads(spec.threads):
+    with torch.random.fork_rng(devices=[]), torch_threads(spec.threads):
         teacher = Net(arch)
         teacher.import_weights(weights)
         teacher.eval()
@@ -100,16 +99,6 @@ def fine_tune(
             if progress is not None:
                 progress(epoch, epochs, history[-1] | {"what": "fine-tuning for 8 bits", "validation_accuracy": None})
     return FineTuned(network.export_weights(), history)
-
-
-@contextmanager
-def _threads(threads: int) -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 class Rounded:

@@ -14,19 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save
 
-from plushsense.core.errors import TrainingError, need
+from plushsense.core.errors import TrainingError
+from plushsense.training.augment import Channels, Transform, augmentations
+from plushsense.training.engine import slices, torch_threads
+from plushsense.training.fit import resolve_device
 from plushsense.training.spec import TrainSpec
 from plushsense.windows.cut import WindowSet
 from plushsense.windows.features import Scaler
 
-need("torch", extra="train")
-
-import torch  # noqa: E402
-from torch import Tensor, nn  # noqa: E402
-from torch.nn import functional as F  # noqa: E402
-
-from plushsense.training.augment import Channels, Transform, augmentations  # noqa: E402
-from plushsense.training.fit import resolve_device  # noqa: E402
+import torch  # isort: skip - after training.engine, which says how to install it
+from torch import Tensor, nn
+from torch.nn import functional as F
 
 # Part of every training's id: raise it when the same settings train differently.
 RECURRENT_VERSION = 1
@@ -66,7 +64,7 @@ class RecurrentReader:
         device = self.net.dense.weight.device
         x = torch.from_numpy(self.scaler.apply(windows.x[:, :, -self.samples :])).to(device)
         with torch.no_grad():
-            parts = [F.softmax(self.net(x[at : at + _READ]), dim=1) for at in range(0, len(x), _READ)]
+            parts = [F.softmax(self.net(x[at]), dim=1) for at in slices(len(x), _READ)]
         if not parts:
             return np.zeros((0, len(windows.labels)), dtype=np.float32)
         found: NDArray[np.float32] = torch.cat(parts).cpu().numpy()
@@ -90,21 +88,16 @@ def fit_recurrent(
     scaler = Scaler.fit(train.x[:, :, -samples:])
     x = torch.from_numpy(scaler.apply(train.x[:, :, -samples:])).to(device)
     y = torch.from_numpy(train.y).to(device)
-    before = torch.get_num_threads()
-    torch.set_num_threads(spec.threads)
-    try:
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(spec.seed)
-            net = Recurrent(x.shape[1], len(train.labels), units, both_ways).to(device)
-            order = torch.Generator().manual_seed(spec.seed)
-            augment = augmentations(spec.augment, Channels(train.vectors, scaler, device))
-            adam = torch.optim.Adam(net.parameters(), lr=spec.learning_rate)
-            for epoch in range(1, spec.epochs + 1):
-                for group in adam.param_groups:
-                    group["lr"] = spec.learning_rate_at(epoch)
-                _epoch(net, adam, x, y, spec.batch, order, augment, epoch)
-    finally:
-        torch.set_num_threads(before)
+    with torch.random.fork_rng(devices=[]), torch_threads(spec.threads):
+        torch.manual_seed(spec.seed)
+        net = Recurrent(x.shape[1], len(train.labels), units, both_ways).to(device)
+        order = torch.Generator().manual_seed(spec.seed)
+        augment = augmentations(spec.augment, Channels(train.vectors, scaler, device))
+        adam = torch.optim.Adam(net.parameters(), lr=spec.learning_rate)
+        for epoch in range(1, spec.epochs + 1):
+            for group in adam.param_groups:
+                group["lr"] = spec.learning_rate_at(epoch)
+            _epoch(net, adam, x, y, spec.batch, order, augment, epoch)
     return RecurrentReader(net.eval(), scaler, samples, time.perf_counter() - began)
 
 
