@@ -38,8 +38,7 @@ from plushsense.core.layouts import Layout, load_layout
 from plushsense.deploy.quantize import calibrated, integer_model
 from plushsense.devices.base import Frame
 from plushsense.devices.opening import open_device
-from plushsense.devices.virtual.device import VirtualDevice
-from plushsense.devices.virtual.stream import ToySpec, ToyStream
+from plushsense.devices.virtual.stream import ToySpec, ToyStream, VirtualDevice
 from plushsense.devices.wire import LineParser
 from plushsense.live.loop import run_many
 from plushsense.models.arch import NORM_EPSILON, Arch

@@ -8,6 +8,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -17,7 +18,7 @@ from plushsense.core.errors import ConfigError, DeviceError, MissingExtraError
 from plushsense.core.layouts import load_layout
 from plushsense.devices import ble
 from plushsense.devices.ble import UART_SERVICE, UART_TX, BleBackends, BleDevice, BleTarget
-from plushsense.devices.opening import open_device, parse_url
+from plushsense.devices.opening import list_devices, open_device, parse_url
 from plushsense.devices.reconnect import ReconnectingDevice
 from plushsense.devices.virtual.stream import ToySpec, ToyStream
 from plushsense.devices.wire import LineParser
@@ -337,21 +338,20 @@ def test_without_bleak(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         open_device(f"ble://{ADDRESS}")
 
 
-def test_toys_are_listed_by_service_or_by_name() -> None:
-    from plushsense.devices.listing import list_devices
-
+def test_toys_are_listed_by_service_or_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ble, "search_bluetooth", partial(ble.search_bluetooth, backends=FAKE))
     Air.devices = [
         ("11:22:33:44:55:66", "Lamp", []),
         (ADDRESS, None, [UART_SERVICE.upper()]),
         ("C0:FF:EE:00:00:02", "MyTeddy", []),
     ]
-    listing = list_devices(0.1, FAKE)
+    listing = list_devices(0.1)
     toys = {d.url: d for d in listing.devices if d.kind == "ble"}
     assert set(toys) == {f"ble://{ADDRESS}", "ble://C0:FF:EE:00:00:02"}
     assert toys[f"ble://{ADDRESS}"].description == "-60 dBm, Nordic UART service"
     assert toys["ble://C0:FF:EE:00:00:02"].name == "MyTeddy"
     assert "Bluetooth: 1 more device advertises, by name and service no toy; ble://ADDRESS opens any." in listing.notes
     Air.fault = FileNotFoundError(2, "No such file or directory")
-    listing = list_devices(0.1, FAKE)
+    listing = list_devices(0.1)
     assert [d for d in listing.devices if d.kind == "ble"] == []
     assert sum("Bluetooth cannot be used here" in note for note in listing.notes) == 1

@@ -10,10 +10,9 @@ import pytest
 
 from plushsense.core.errors import ConfigError
 from plushsense.core.layouts import load_layout
-from plushsense.devices import listing as room
-from plushsense.devices.listing import list_devices
+from plushsense.devices import ble, bytestreams, opening
 from plushsense.devices.lsl import LslOutlet
-from plushsense.devices.opening import open_device, parse_url
+from plushsense.devices.opening import list_devices, open_device, parse_url
 
 
 def test_the_virtual_toy_is_always_there_and_every_url_is_one() -> None:
@@ -37,17 +36,17 @@ def test_without_the_optional_packages(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_serial_ports(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(room, "serial_ports", lambda: [("/dev/ttyUSB0", "CP2102 USB to UART"), ("COM3", "n/a")])
+    monkeypatch.setattr(bytestreams, "serial_ports", lambda: [("/dev/ttyUSB0", "CP2102 USB to UART"), ("COM3", "n/a")])
     found = [(d.url, d.description) for d in list_devices(0.1).devices if d.kind == "serial"]
     assert found == [("serial:///dev/ttyUSB0", "CP2102 USB to UART"), ("serial://COM3", "")]
-    monkeypatch.setattr(room, "serial_ports", list)
+    monkeypatch.setattr(bytestreams, "serial_ports", list)
     assert "This computer has no serial port now." in list_devices(0.1).notes
 
 
 def test_what_hangs_or_breaks_hides_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(room, "_GRACE_S", 0.2)
-    monkeypatch.setattr(room, "scan", lambda *_: time.sleep(30))
-    monkeypatch.setattr(room, "serial_ports", lambda: 1 / 0)
+    monkeypatch.setattr(opening, "_GRACE_S", 0.2)
+    monkeypatch.setattr(ble, "scan", lambda *_: time.sleep(30))
+    monkeypatch.setattr(bytestreams, "serial_ports", lambda: 1 / 0)
     begun = time.monotonic()
     listing = list_devices(0.1)
     assert time.monotonic() - begun < 5

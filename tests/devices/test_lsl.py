@@ -18,6 +18,7 @@ from plushsense.devices.base import Device, Frame
 from plushsense.devices.lsl import LslDevice, LslOutlet, forward, load_pylsl, match_columns, name_url, serve_lsl
 from plushsense.devices.opening import open_device
 from plushsense.devices.reconnect import ReconnectingDevice
+from plushsense.devices.virtual.server import ToyServer
 from plushsense.devices.virtual.stream import ToySpec
 
 PLUSH = load_layout("plush-15")
@@ -277,10 +278,8 @@ def test_the_virtual_toy_on_lsl_says_what_the_virtual_toy_says(name: str) -> Non
         urls.append(url)
         ready.set()
 
-    thread = threading.Thread(
-        target=lambda: serve_lsl(name, spec, speed=20, on_ready=on_ready, on_performed=performed.append, stop=stop),
-        daemon=True,
-    )
+    server = ToyServer(spec, speed=20, on_ready=on_ready, on_performed=performed.append, stop=stop)
+    thread = threading.Thread(target=serve_lsl, args=(name, server), daemon=True)
     thread.start()
     try:
         assert ready.wait(5)
@@ -312,7 +311,7 @@ def test_an_outlet_needs_a_name() -> None:
     with pytest.raises(ConfigError, match="needs a name"):
         LslOutlet(WIDE, " ")
     with pytest.raises(ConfigError, match="must be above 0"):
-        serve_lsl("x", speed=0)
+        serve_lsl("x", ToyServer(speed=0))
 
 
 def test_without_pylsl(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from plushsense.core.layouts import load_layout
 from plushsense.devices.opening import open_device
-from plushsense.devices.virtual.device import VirtualDevice
-from plushsense.devices.virtual.stream import LogPrompts, Prompt, ToySpec, ToyStream
+from plushsense.devices.virtual.stream import LogPrompts, Prompt, ToySpec, ToyStream, VirtualDevice
 
 
 def event(what: str, **more: object) -> str:

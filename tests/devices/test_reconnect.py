@@ -17,7 +17,7 @@ from plushsense.core.layouts import load_layout
 from plushsense.devices.base import Device, Frame
 from plushsense.devices.opening import open_device
 from plushsense.devices.reconnect import ReconnectingDevice
-from plushsense.devices.virtual.server import serve_tcp
+from plushsense.devices.virtual.server import ToyServer
 from plushsense.devices.virtual.stream import ToySpec
 
 PLUSH = load_layout("plush-15")
@@ -82,7 +82,9 @@ def tcp_toy(port: int = 0) -> Iterator[str]:
         url[0] = text
         ready.set()
 
-    thread = threading.Thread(target=lambda: serve_tcp(port, CLEAN, speed=5, on_ready=on_ready, stop=stop), daemon=True)
+    thread = threading.Thread(
+        target=lambda: ToyServer(CLEAN, speed=5, on_ready=on_ready, stop=stop).serve_tcp(port), daemon=True
+    )
     thread.start()
     assert ready.wait(5)
     try:

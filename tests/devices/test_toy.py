@@ -15,7 +15,7 @@ import pytest
 
 from plushsense.core.errors import ConfigError, DeviceError
 from plushsense.devices.opening import open_device
-from plushsense.devices.virtual.server import ToyCounters, serve_pty, serve_tcp
+from plushsense.devices.virtual.server import ToyCounters, ToyServer
 from plushsense.devices.virtual.stream import PerformedGesture, ToySpec
 
 needs_pty = pytest.mark.usefixtures("pty_possible")
@@ -31,7 +31,7 @@ class Running:
 
 
 @contextmanager
-def toy(serve: Callable[..., ToyCounters], *args: Any, **options: Any) -> Iterator[Running]:
+def toy(serve: Callable[[ToyServer], ToyCounters], *args: Any, **options: Any) -> Iterator[Running]:
     running, ready, stop = Running(), threading.Event(), threading.Event()
 
     def on_ready(url: str) -> None:
@@ -39,7 +39,9 @@ def toy(serve: Callable[..., ToyCounters], *args: Any, **options: Any) -> Iterat
         ready.set()
 
     def work() -> None:
-        running.counters = serve(*args, on_ready=on_ready, on_performed=running.performed.append, stop=stop, **options)
+        running.counters = serve(
+            ToyServer(*args, on_ready=on_ready, on_performed=running.performed.append, stop=stop, **options)
+        )
 
     thread = threading.Thread(target=work, daemon=True)
     thread.start()
@@ -52,9 +54,13 @@ def toy(serve: Callable[..., ToyCounters], *args: Any, **options: Any) -> Iterat
         assert not thread.is_alive()
 
 
+def over_tcp(server: ToyServer) -> ToyCounters:
+    return server.serve_tcp(0)
+
+
 def test_tcp_serves_every_line_and_the_truth() -> None:
     spec = ToySpec(person=3, lost=0.0, garbled=0.0, gestures=("Tail hit 1", "Hold strong"))
-    with toy(serve_tcp, 0, spec, speed=0, seconds=60) as running:
+    with toy(over_tcp, spec, speed=0, seconds=60) as running:
         with open_device(running.url) as device:
             frames = list(device)
         assert device.counters.to_dict() | {"garbage": 0} == {
@@ -74,7 +80,7 @@ def test_tcp_serves_every_line_and_the_truth() -> None:
 
 def test_tcp_counts_what_the_line_loses() -> None:
     with (
-        toy(serve_tcp, 0, ToySpec(lost=0.02, garbled=0.02), speed=0, seconds=120) as running,
+        toy(over_tcp, ToySpec(lost=0.02, garbled=0.02), speed=0, seconds=120) as running,
         open_device(running.url) as device,
     ):
         for _ in device:
@@ -86,7 +92,7 @@ def test_tcp_counts_what_the_line_loses() -> None:
 
 
 def test_one_reader_after_another() -> None:
-    with toy(serve_tcp, 0, speed=20) as running:
+    with toy(over_tcp, speed=20) as running:
         last = 0
         for _ in range(3):
             with open_device(running.url) as device:
@@ -100,7 +106,7 @@ def test_one_reader_after_another() -> None:
 
 def test_pace_does_not_drift() -> None:
     with (
-        toy(serve_tcp, 0, ToySpec(lost=0.0, garbled=0.0), speed=5) as running,
+        toy(over_tcp, ToySpec(lost=0.0, garbled=0.0), speed=5) as running,
         open_device(running.url) as device,
     ):
         iterator = iter(device)
@@ -121,11 +127,11 @@ def test_a_taken_port_is_one_sentence() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(DeviceError, match=f"port {port}"):
-            serve_tcp(port)
+            ToyServer().serve_tcp(port)
     with pytest.raises(ConfigError, match="65535"):
-        serve_tcp(70_000)
+        ToyServer().serve_tcp(70_000)
     with pytest.raises(ConfigError, match="speed"):
-        serve_tcp(0, speed=-1)
+        ToyServer(speed=-1).serve_tcp(0)
 
 
 def test_a_broken_connection() -> None:
@@ -148,7 +154,7 @@ def test_a_broken_connection() -> None:
 
 @needs_pty
 def test_pty_with_two_readers_in_turn() -> None:
-    with toy(serve_pty, ToySpec(lost=0.0, garbled=0.0), speed=10) as running:
+    with toy(ToyServer.serve_pty, ToySpec(lost=0.0, garbled=0.0), speed=10) as running:
         assert running.url.startswith("serial:///")
         for _ in range(2):
             with open_device(running.url + "?baud=115200") as device:
@@ -166,7 +172,7 @@ def test_pty_with_two_readers_in_turn() -> None:
 @needs_pty
 def test_a_second_reader_of_a_serial_port_is_refused() -> None:
     with (
-        toy(serve_pty, speed=1) as running,
+        toy(ToyServer.serve_pty, speed=1) as running,
         open_device(running.url),
         pytest.raises(DeviceError, match="another program is using"),
     ):
@@ -194,10 +200,10 @@ def test_an_unplugged_toy_is_one_sentence() -> None:
 @needs_pty
 def test_pty_speed_must_be_above_zero() -> None:
     with pytest.raises(ConfigError, match="above 0"):
-        serve_pty(speed=0)
+        ToyServer(speed=0).serve_pty()
 
 
 def test_windows_has_no_pty(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "platform", "win32")
     with pytest.raises(DeviceError, match="toy --tcp"):
-        serve_pty()
+        ToyServer().serve_pty()

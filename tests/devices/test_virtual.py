@@ -13,10 +13,9 @@ from plushsense.core.gestures import load_gestures
 from plushsense.core.layouts import load_layout
 from plushsense.devices.base import Frame
 from plushsense.devices.opening import open_device
-from plushsense.devices.virtual.device import VirtualDevice
 from plushsense.devices.virtual.motions import AT_REST, DURATIONS, MOTIONS, split_label
 from plushsense.devices.virtual.session import GESTURES, VirtualSession
-from plushsense.devices.virtual.stream import ToySpec, ToyStream
+from plushsense.devices.virtual.stream import ToySpec, ToyStream, VirtualDevice
 from plushsense.devices.virtual.world import CHANNELS, WORLD, ZONES, draw_person
 
 PLUSH = load_layout("plush-15")

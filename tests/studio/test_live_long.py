@@ -18,7 +18,7 @@ import pytest
 import studio as bench
 from plushsense.core.gestures import load_gestures
 from plushsense.devices.opening import open_device
-from plushsense.devices.virtual.device import VirtualDevice
+from plushsense.devices.virtual.stream import VirtualDevice
 from plushsense.live.loop import run_live
 from plushsense.models.bundle import Bundle
 from plushsense.workflow.export import classifier_of

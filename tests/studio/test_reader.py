@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from plushsense.core.errors import BundleError, ConfigError, DeviceError, PlushSenseError
-from plushsense.devices.virtual.server import serve_tcp
+from plushsense.devices.virtual.server import ToyServer
 from plushsense.devices.virtual.stream import ToySpec
 from plushsense.live.reactions import Reactor, load_reactions
 from plushsense.runtime.classifier import Decision, GestureEvent
@@ -149,7 +149,7 @@ def test_a_toy_that_nobody_looks_at_is_let_go(workspace: Workspace, monkeypatch:
 def test_a_toy_that_goes_away_comes_back(workspace: Workspace) -> None:
     def serve(port: int, stop: threading.Event, ready: Callable[[str], None]) -> threading.Thread:
         thread = threading.Thread(
-            target=serve_tcp, args=(port, ToySpec(31)), kwargs={"on_ready": ready, "stop": stop}, daemon=True
+            target=ToyServer(ToySpec(31), on_ready=ready, stop=stop).serve_tcp, args=(port,), daemon=True
         )
         thread.start()
         return thread
@@ -178,9 +178,8 @@ def test_a_toy_that_goes_away_comes_back(workspace: Workspace) -> None:
 def test_lines_that_are_no_frames_are_told(workspace: Workspace) -> None:
     stop, urls = threading.Event(), list[str]()
     threading.Thread(
-        target=serve_tcp,
-        args=(0, ToySpec(31)),
-        kwargs={"on_ready": urls.append, "stop": stop, "speed": 20.0},
+        target=ToyServer(ToySpec(31), speed=20.0, on_ready=urls.append, stop=stop).serve_tcp,
+        args=(0,),
         daemon=True,
     ).start()
     until(lambda: urls)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from plushsense.core.errors import ConfigError, DatasetError, DeviceError, PlushSenseError
-from plushsense.devices.virtual.device import VirtualDevice
+from plushsense.devices.virtual.stream import VirtualDevice
 from plushsense.recording.session import OpenSession
 from plushsense.recording.session_files import read_events
 from plushsense.recording.setup import SessionRequest
@@ -186,7 +186,7 @@ def test_a_users_own_protocol_and_layout(controller: RecordController, tmp_path:
 
 
 def test_a_real_session_never_goes_on_with_a_virtual_toy(controller: RecordController, tmp_path: Path) -> None:
-    from plushsense.devices.virtual.server import serve_tcp
+    from plushsense.devices.virtual.server import ToyServer
 
     stop, ready, urls = threading.Event(), threading.Event(), list[str]()
 
@@ -194,7 +194,7 @@ def test_a_real_session_never_goes_on_with_a_virtual_toy(controller: RecordContr
         urls.append(url)
         ready.set()
 
-    toy = threading.Thread(target=lambda: serve_tcp(0, on_ready=on_ready, stop=stop), daemon=True)
+    toy = threading.Thread(target=lambda: ToyServer(on_ready=on_ready, stop=stop).serve_tcp(0), daemon=True)
     toy.start()
     assert ready.wait(10)
     try:

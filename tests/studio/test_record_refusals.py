@@ -14,7 +14,7 @@ import pytest
 from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import STREAM_NAME, read_stream
 from plushsense.devices.opening import open_device
-from plushsense.devices.virtual.server import serve_tcp
+from plushsense.devices.virtual.server import ToyServer
 from plushsense.devices.virtual.stream import ToySpec
 from plushsense.recording.session import OpenSession
 from support.browsing import axe, connected, marked
@@ -34,7 +34,7 @@ def tcp_toy(port: int = 0, speed: float = 1.0, layout: str = "plush-15", spec: T
         ready.set()
 
     options: dict[str, Any] = {"layout": load_layout(layout), "speed": speed, "on_ready": on_ready, "stop": stop}
-    thread = threading.Thread(target=lambda: serve_tcp(port, spec, **options), daemon=True)
+    thread = threading.Thread(target=lambda: ToyServer(spec, **options).serve_tcp(port), daemon=True)
     thread.start()
     assert ready.wait(10)
     try:

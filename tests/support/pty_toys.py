@@ -12,7 +12,7 @@ from pathlib import Path
 
 from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import STREAM_NAME, parse_name, read_recording, read_stream
-from plushsense.devices.virtual.server import serve_pty
+from plushsense.devices.virtual.server import ToyServer
 from plushsense.devices.virtual.stream import LogPrompts, PerformedGesture, ToySpec
 
 LAYOUT = load_layout("plush-15")
@@ -50,10 +50,10 @@ def pty_toy(log: Path, speed: float, spec: ToySpec = QUIET) -> Iterator[Toy]:
         ready.set()
 
     def work() -> None:
-        serve_pty(
+        ToyServer(
             spec, speed=speed, on_ready=on_ready, on_sent=toy.pieces.append, on_performed=toy.performed.append,
             prompts=LogPrompts(log), stop=stop,
-        )  # fmt: skip
+        ).serve_pty()  # fmt: skip
 
     thread = threading.Thread(target=work, daemon=True)
     thread.start()

@@ -26,7 +26,7 @@ def run(args: argparse.Namespace) -> int:
         return _publish(args)
     if args.lsl_name is not None or args.layout is not None:
         raise ConfigError("--lsl-name and --layout belong to --lsl-out URL: add it, or leave them out.")
-    from plushsense.devices.listing import list_devices
+    from plushsense.devices.opening import list_devices
 
     listing = list_devices(args.scan_s)
     rows = [(d.url, d.name, d.description) for d in listing.devices]

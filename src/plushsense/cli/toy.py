@@ -59,10 +59,8 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from functools import partial
-
     from plushsense.core.layouts import load_layout
-    from plushsense.devices.virtual.server import ToyCounters, serve_pty, serve_tcp
+    from plushsense.devices.virtual.server import ToyServer
     from plushsense.devices.virtual.stream import LogPrompts, PerformedGesture, ToySpec
 
     gestures = tuple(g.strip() for g in args.gestures.split(",")) if args.gestures else ()
@@ -82,24 +80,22 @@ def run(args: argparse.Namespace) -> int:
             truth.write(json.dumps(gesture.to_dict(), ensure_ascii=False) + "\n")
             truth.flush()
 
-    serve = serve_pty if args.serial_pty else partial(serve_tcp, args.tcp)
-    if args.lsl is not None:
-        from plushsense.devices.lsl import serve_lsl
-
-        serve = partial(serve_lsl, args.lsl)
-    layout = load_layout(args.layout)
-    counters = ToyCounters()
-    prompts = LogPrompts(args.follow) if args.follow else None
+    server = ToyServer(
+        spec,
+        load_layout(args.layout),
+        args.speed,
+        args.seconds,
+        on_ready=ready,
+        on_performed=performed,
+        prompts=LogPrompts(args.follow) if args.follow else None,
+    )
     try:
-        counters = serve(
-            spec,
-            layout=layout,
-            speed=args.speed,
-            seconds=args.seconds,
-            on_ready=ready,
-            on_performed=performed,
-            prompts=prompts,
-        )
+        if args.lsl is not None:
+            from plushsense.devices.lsl import serve_lsl
+
+            counters = serve_lsl(args.lsl, server)
+        else:
+            counters = server.serve_pty() if args.serial_pty else server.serve_tcp(args.tcp)
     except KeyboardInterrupt:
         say("stopped")
         return 0

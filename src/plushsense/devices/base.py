@@ -169,3 +169,43 @@ class Pacer:
             self._passed_ms += step if 0 <= step <= self._longest_ms else 0.0
         self._last = device_ms
         return self._start + self._passed_ms / 1000.0 / self._speed - time.monotonic()
+
+
+class PacedDevice(Device):
+    """A device whose frames are there already, and are due by their own clock, ``speed`` times as fast as it.
+
+    Args:
+        speed: 1 real time, 0 as fast as frames are taken.
+    """
+
+    def __init__(self, url: str, layout: Layout, speed: float) -> None:
+        super().__init__(url, layout)
+        self._pacer = Pacer(speed)
+        self._due_s: float | None = None
+
+    @abstractmethod
+    def _next_ms(self) -> int | None:
+        """Return the device time of the next item; None at the end."""
+
+    def _due(self, most: int) -> Iterator[int]:
+        """Yield the device times of the items that are due, at most ``most``; wait for the first about ``wait_s``.
+
+        The caller takes the item before it asks for the next one.
+        """
+        until = time.monotonic() + self.wait_s
+        for n in range(most):
+            device_ms = None if self.closed else self._next_ms()
+            if device_ms is None:
+                return
+            if self._due_s is None:
+                self._due_s = time.monotonic() + self._pacer.due_s(device_ms)
+            while (wait := self._due_s - time.monotonic()) > 0.0:
+                if n:
+                    return
+                time.sleep(min(wait, max(0.0, until - time.monotonic())))
+                if time.monotonic() >= until or self.closed:
+                    return
+            self._due_s = None
+            if not n:
+                self.arrived_s = time.perf_counter() + wait
+            yield device_ms

@@ -18,7 +18,7 @@ from urllib.parse import unquote
 from plushsense.core.errors import ConfigError, DeviceError, need
 from plushsense.core.layouts import Layout
 from plushsense.devices.base import Device, Frame, now_ms
-from plushsense.devices.opening import DeviceAddress
+from plushsense.devices.opening import DeviceAddress, DeviceInfo, DeviceListing
 from plushsense.devices.wire import LineParser
 
 UART_SERVICE = "6e400001-b5a3-f393-e0a9-e50e24dcca9e"
@@ -26,6 +26,7 @@ UART_TX = "6e400003-b5a3-f393-e0a9-e50e24dcca9e"
 """Nordic UART service and its notifying characteristic (Nordic Semiconductor, nRF Connect SDK, "NUS")."""
 
 FIND_S = 10.0
+_TOY_WORDS = ("plush", "toy", "teddy", "bear")
 _CONNECT_S = 20.0
 _MAC = re.compile(r"[0-9A-F]{2}(?:[:-][0-9A-F]{2}){5}\Z", re.IGNORECASE)
 _UUID = re.compile(r"[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{12}\Z")
@@ -263,6 +264,22 @@ def scan(seconds: float, backends: BleBackends | None = None) -> list[BleAdverti
         words = in_words(cause)
         raise DeviceError(f"{words[0].upper()}{words[1:]}.") from None
     return sorted(seen.values(), key=lambda s: (-s.rssi, s.name, s.address))
+
+
+def search_bluetooth(scan_s: float, backends: BleBackends | None = None) -> DeviceListing:
+    """List the devices that advertise the Nordic UART service or have a name like a toy's."""
+    seen = scan(scan_s, backends)
+    toys = []
+    for device in seen:
+        uart = UART_SERVICE in device.services
+        if uart or any(word in device.name.lower() for word in _TOY_WORDS):
+            about = f"{device.rssi} dBm, {'Nordic UART service' if uart else 'advertises no Nordic UART service'}"
+            toys.append(DeviceInfo(f"ble://{device.address}", "ble", device.name or device.address, about))
+    others = len(seen) - len(toys)
+    if not others:
+        return DeviceListing(toys)
+    who = "1 more device advertises" if others == 1 else f"{others} more devices advertise"
+    return DeviceListing(toys, [f"Bluetooth: {who}, by name and service no toy; ble://ADDRESS opens any."])
 
 
 def _scanner(bleak: ModuleType, backends: BleBackends, advertised: Callable[[Any, Any], None]) -> Any:

@@ -16,7 +16,7 @@ from serial.tools import list_ports
 from plushsense.core.errors import DeviceError
 from plushsense.core.layouts import Layout
 from plushsense.devices.base import Device, Frame, now_ms
-from plushsense.devices.opening import DeviceAddress
+from plushsense.devices.opening import DeviceAddress, DeviceInfo, DeviceListing
 from plushsense.devices.wire import LineParser
 
 BAUD = 115_200
@@ -32,6 +32,13 @@ if sys.platform != "win32":
 def serial_ports() -> list[tuple[str, str]]:
     """Return name and description of each serial port of this computer."""
     return sorted((str(p.device), str(p.description or "")) for p in list_ports.comports())
+
+
+def search_serial(_: float) -> DeviceListing:
+    """List the serial ports."""
+    ports = [(name, "" if about == "n/a" else about) for name, about in serial_ports()]
+    notes = [] if ports else ["This computer has no serial port now."]
+    return DeviceListing([DeviceInfo(f"serial://{name}", "serial", name, about) for name, about in ports], notes)
 
 
 class SerialDevice(Device):

@@ -7,7 +7,8 @@ import os
 import socket
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -15,12 +16,11 @@ from typing import Any
 from urllib.parse import quote, unquote
 
 from plushsense.core.errors import ConfigError, DeviceError, need
-from plushsense.core.layouts import DEVICE_MS, Layout, load_layout
+from plushsense.core.layouts import DEVICE_MS, Layout
 from plushsense.devices.base import Device, Frame, LossCounter, now_ms
-from plushsense.devices.opening import DeviceAddress
-from plushsense.devices.virtual.device import VirtualDevice
-from plushsense.devices.virtual.server import ToyCounters
-from plushsense.devices.virtual.stream import PerformedGesture, Prompts, ToySpec
+from plushsense.devices.opening import DeviceAddress, DeviceInfo, DeviceListing
+from plushsense.devices.virtual.server import ToyCounters, ToyServer
+from plushsense.devices.virtual.stream import PerformedGesture, VirtualDevice
 
 FIND_S = 5.0
 KEYS = {"name": "name", "type": "type", "source": "source_id"}
@@ -233,6 +233,22 @@ def stream_url(info: Any, *, unique_name: bool = True) -> str:
     return name_url(info.name()) if unique_name or not source else f"lsl://source:{quote(source)}"
 
 
+def search_streams(scan_s: float) -> DeviceListing:
+    """List all LSL streams."""
+    streams = {s.uid(): s for s in load_pylsl().resolve_streams(scan_s)}.values()
+    names = Counter(s.name() for s in streams)
+    found = [
+        DeviceInfo(
+            stream_url(s, unique_name=names[s.name()] == 1),
+            "lsl",
+            s.name(),
+            f"{s.type() or 'no type'}, {s.channel_count()} channels, {s.nominal_srate():g} Hz, on {s.hostname()}",
+        )
+        for s in streams
+    ]
+    return DeviceListing(sorted(found, key=lambda d: (d.name, d.url)))
+
+
 def open_lsl(address: DeviceAddress, layout: Layout) -> LslDevice:
     """Open ``lsl://NAME``, ``lsl://type:EEG`` or ``lsl://source:ID``; ``?find_s=5`` bounds the search."""
     address.check_keys(("find_s",))
@@ -357,40 +373,27 @@ def forward(device: Device, outlet: LslOutlet, stop: threading.Event | None = No
     return count
 
 
-def serve_lsl(
-    name: str,
-    spec: ToySpec | None = None,
-    *,
-    layout: Layout | None = None,
-    speed: float = 1.0,
-    seconds: float = 0.0,
-    on_ready: Callable[[str], None] | None = None,
-    on_performed: Callable[[PerformedGesture], None] | None = None,
-    prompts: Prompts | None = None,
-    stop: threading.Event | None = None,
-) -> ToyCounters:
-    """Publish the virtual toy as an LSL stream until ``stop`` is set; arguments as in `serve_tcp`.
+def serve_lsl(name: str, server: ToyServer) -> ToyCounters:
+    """Publish the virtual toy as an LSL stream until ``server.stop`` is set.
 
     Lines that the toy loses or corrupts are missing from the stream.
 
     Raises:
         ConfigError: for a speed of 0: a stream has no reader who would hold it back.
     """
-    if not speed > 0.0:
-        raise ConfigError(f"The toy's speed on LSL is {speed:g}; it must be above 0.")
+    if not server.speed > 0.0:
+        raise ConfigError(f"The toy's speed on LSL is {server.speed:g}; it must be above 0.")
     counters = ToyCounters()
 
     def begun(gesture: PerformedGesture) -> None:
         counters.gestures += 1
-        if on_performed is not None:
-            on_performed(gesture)
+        server.on_performed(gesture)
 
-    toy = VirtualDevice("virtual://", layout or load_layout("plush-15"), spec or ToySpec(), speed, seconds)
+    toy = VirtualDevice("virtual://", server.layout, server.spec, server.speed, server.seconds)
     toy.on_performed = begun
-    if prompts is not None:
-        toy.follow(prompts)
+    if server.prompts is not None:
+        toy.follow(server.prompts)
     with toy, LslOutlet(toy.layout, name) as outlet:
-        if on_ready is not None:
-            on_ready(outlet.url)
-        counters.sent = forward(toy, outlet, stop)
+        server.on_ready(outlet.url)
+        counters.sent = forward(toy, outlet, server.stop)
     return counters

@@ -1,4 +1,4 @@
-"""Open devices by URL."""
+"""Open devices by URL, and search for those that are there: serial ports, Bluetooth, LSL streams, the virtual toy."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ import importlib
 import math
 import os
 import re
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+import threading
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote
 
-from plushsense.core.errors import ConfigError, DeviceError, nearest
+from plushsense.core.errors import ConfigError, DeviceError, MissingExtraError, PlushSenseError, nearest
 from plushsense.core.layouts import Layout, load_layout
 from plushsense.devices.base import Device
 from plushsense.devices.reconnect import ReconnectingDevice
@@ -24,9 +26,16 @@ SCHEMES: dict[str, str] = {
     "tcp": "plushsense.devices.bytestreams:open_tcp",
     "lsl": "plushsense.devices.lsl:open_lsl",
     "replay": "plushsense.devices.replay:open_replay",
-    "virtual": "plushsense.devices.virtual.device:open_virtual",
+    "virtual": "plushsense.devices.virtual.stream:open_virtual",
 }
 """Scheme to ``module:function``; the function takes (address, layout) and returns the open `Device`."""
+
+SEARCHES: dict[str, str] = {
+    "Serial ports": "plushsense.devices.bytestreams:search_serial",
+    "Bluetooth": "plushsense.devices.ble:search_bluetooth",
+    "LSL": "plushsense.devices.lsl:search_streams",
+}
+"""Transport to ``module:function``; the function takes the seconds to search for and returns a `DeviceListing`."""
 
 EXAMPLES = (
     "serial:///dev/ttyUSB0?baud=115200, serial://COM3, ble://AA:BB:CC:DD:EE:FF, ble://name:PlushName, tcp://host:port, "
@@ -149,8 +158,7 @@ def open_device(
     address = parse_url(os.fspath(url))
     chosen: Layout | str = address.query.get("layout") or layout or DEFAULT_LAYOUT
     resolved = chosen if isinstance(chosen, Layout) else load_layout(chosen)
-    module, function = SCHEMES[address.scheme].split(":")
-    open_address = getattr(importlib.import_module(module), function)
+    open_address = _loaded(SCHEMES[address.scheme])
 
     def opened() -> Device:
         device = open_address(address, resolved)
@@ -161,3 +169,71 @@ def open_device(
     if not reconnect:
         return opened()
     return ReconnectingDevice(address.url, resolved, opened, for_s=reconnect_s, ends=address.scheme in _ENDING)
+
+
+def _loaded(name: str) -> Callable[..., Any]:
+    module, function = name.split(":")
+    loaded: Callable[..., Any] = getattr(importlib.import_module(module), function)
+    return loaded
+
+
+SCAN_S = 3.0
+_GRACE_S = 2.0
+
+
+@dataclass(frozen=True)
+class DeviceInfo:
+    """A possible toy: ``url`` opens it, ``kind`` is serial, ble, lsl or virtual."""
+
+    url: str
+    kind: str
+    name: str
+    description: str
+
+
+@dataclass
+class DeviceListing:
+    """The devices found, and a sentence for each kind of device that could not be searched."""
+
+    devices: list[DeviceInfo] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        return asdict(self)
+
+
+def list_devices(scan_s: float = SCAN_S) -> DeviceListing:
+    """Search for toys on all transports at once, for ``scan_s`` seconds.
+
+    Bluetooth devices are listed when they advertise the Nordic UART service or have a name like a toy's; all LSL
+    streams are. A missing package or adapter is a note, not an error.
+
+    Raises:
+        ConfigError: for a time that is not above 0 and at most 600 s.
+    """
+    if not 0.0 < scan_s <= 600.0:
+        raise ConfigError(f"The time to look for toys is {scan_s:g} s; accepted is above 0 to 600.")
+    results: dict[str, DeviceListing] = {}
+
+    def look(what: str, search: str) -> None:
+        try:
+            results[what] = _loaded(search)(scan_s)
+        except MissingExtraError as refusal:
+            results[what] = DeviceListing(notes=[f"{what}: not looked at. {refusal}"])
+        except PlushSenseError as refusal:
+            results[what] = DeviceListing(notes=[str(refusal)])
+        except Exception as cause:  # noqa: BLE001, RUF100
+            results[what] = DeviceListing(notes=[f"{what} cannot be used: {' '.join(str(cause).split())}."])
+
+    threads = [threading.Thread(target=look, args=item, daemon=True) for item in SEARCHES.items()]
+    for thread in threads:
+        thread.start()
+    listing = DeviceListing()
+    for thread, what in zip(threads, SEARCHES, strict=True):
+        thread.join(scan_s + _GRACE_S)
+        part = results.get(what) or DeviceListing(notes=[f"{what} did not answer within {scan_s + _GRACE_S:g} s."])
+        listing.devices += part.devices
+        listing.notes += part.notes
+    listing.devices.append(DeviceInfo("virtual://?person=7", "virtual", "virtual toy", "in this program; a simulation"))
+    return listing

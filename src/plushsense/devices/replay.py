@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import time
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -12,20 +11,20 @@ import numpy as np
 from plushsense.core.errors import DeviceError, FileFormatError
 from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import Frames, parse_name, read_recording, read_stream
-from plushsense.devices.base import Device, Frame, LossCounter, Pacer, now_ms
+from plushsense.devices.base import Frame, LossCounter, PacedDevice, now_ms
 from plushsense.devices.opening import DeviceAddress
 
 _BLOCK = 500
 
 
-class ReplayDevice(Device):
+class ReplayDevice(PacedDevice):
     """Frames of a file, at the pace of the device clock (``speed`` 1), faster, or without waiting (0).
 
     ``host_ms`` is the one in the file where there is one. ``warnings`` are those of the file.
     """
 
     def __init__(self, url: str, layout: Layout, path: Path, speed: float = 1.0) -> None:
-        super().__init__(url, layout)
+        super().__init__(url, layout, speed)
         try:
             result = (read_recording if parse_name(path.name) else read_stream)(path, layout)
         except FileFormatError as cause:
@@ -36,39 +35,24 @@ class ReplayDevice(Device):
         self._frames: Frames = result.frames
         self._at = 0
         self._loss = LossCounter()
-        self._pacer = Pacer(speed)
-        self._wait_s: float | None = None
         low, high = layout.valid_min_int, layout.valid_max_int
         self._garbage = np.any((result.frames.values < low) | (result.frames.values > high), axis=1)
+
+    def _next_ms(self) -> int | None:
+        return int(self._frames.device_ms[self._at]) if self._at < len(self._frames) else None
 
     def read(self) -> list[Frame] | None:
         """Return the frames that are due, waiting at most about ``wait_s``; return None at the end of the file."""
         frames: list[Frame] = []
-        until = time.monotonic() + self.wait_s
-        while len(frames) < _BLOCK and not self.closed:
-            if self._at >= len(self._frames):
-                return frames or None
-            device_ms = int(self._frames.device_ms[self._at])
-            if self._wait_s is None:
-                self._wait_s = time.monotonic() + self._pacer.due_s(device_ms)
-            wait = self._wait_s - time.monotonic()
-            if wait > 0.0:
-                if frames:
-                    break
-                time.sleep(min(wait, max(0.0, until - time.monotonic())))
-                if time.monotonic() >= until:
-                    break
-                continue
-            self._wait_s = None
-            if not frames:
-                self.arrived_s = time.perf_counter() + wait
-            host = now_ms() if self._frames.host_ms is None else int(self._frames.host_ms[self._at])
-            frames.append(Frame(host, device_ms, tuple(self._frames.values[self._at].tolist())))
+        for device_ms in self._due(_BLOCK):
+            at = self._at
+            host = now_ms() if self._frames.host_ms is None else int(self._frames.host_ms[at])
+            frames.append(Frame(host, device_ms, tuple(self._frames.values[at].tolist())))
             self.counters.frames += 1
-            self.counters.garbage += int(self._garbage[self._at])
+            self.counters.garbage += int(self._garbage[at])
             self.counters.lost += self._loss.push(device_ms)
             self._at += 1
-        return frames
+        return frames if frames or self._next_ms() is not None else None
 
 
 def _path(place: str) -> Path:

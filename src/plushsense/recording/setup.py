@@ -13,7 +13,7 @@ from plushsense.core.gestures import NOBODY
 from plushsense.core.layouts import Layout
 from plushsense.devices.base import Device, now_ms
 from plushsense.devices.opening import open_device, parse_url
-from plushsense.devices.virtual.device import VirtualDevice
+from plushsense.devices.virtual.stream import VirtualDevice
 from plushsense.recording.plan import load_protocol
 from plushsense.recording.recorder import Recorder
 from plushsense.recording.session import check_session, check_subject, new_session, next_session

@@ -16,7 +16,7 @@ from plushsense.dataset.index import open_dataset
 from plushsense.dataset.store import Dataset
 from plushsense.deploy.emit import FACTS
 from plushsense.devices.opening import open_device
-from plushsense.devices.virtual.device import VirtualDevice
+from plushsense.devices.virtual.stream import VirtualDevice
 from plushsense.live.loop import run_live as run_loop
 from plushsense.models.bundle import Bundle
 from plushsense.runtime.classifier import StreamClassifier

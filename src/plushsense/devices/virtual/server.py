@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from plushsense.core.errors import ConfigError, DeviceError
 from plushsense.core.layouts import Layout, load_layout
@@ -81,139 +81,173 @@ class _Outlet:
         return True
 
 
-def serve_tcp(
-    port: int,
-    spec: ToySpec | None = None,
-    *,
-    layout: Layout | None = None,
-    speed: float = 1.0,
-    seconds: float = 0.0,
-    on_ready: Callable[[str], None] | None = None,
-    on_performed: Callable[[PerformedGesture], None] | None = None,
-    on_sent: Callable[[bytes], None] | None = None,
-    prompts: Prompts | None = None,
-    stop: threading.Event | None = None,
-) -> ToyCounters:
-    """Serve the virtual toy on ``127.0.0.1:port``, to one reader after another, until ``stop`` is set.
+def _ignore(_: object) -> None:
+    """Do nothing."""
 
-    The toy goes on while nobody listens, as a real one does.
 
-    Args:
-        port: 0 takes a free one; ``on_ready`` gets the URL.
+@dataclass
+class ToyServer:
+    """The virtual toy for other programs: how it behaves, and who is told of it.
+
+    Attributes:
         spec: which toy; the default is person 1.
+        layout: of the lines.
         speed: 1 real time, 0 as fast as the reader takes it (the toy then waits for a reader).
         seconds: of device time after which it ends; 0: never.
+        on_ready: called with the URL when the toy can be opened.
         on_performed: called with each gesture as it begins.
         on_sent: called with the lines that were sent, without the dropped ones.
         prompts: gestures for the person to make; None: random gestures.
-
-    Raises:
-        DeviceError: when the port is taken or not allowed.
-        ConfigError: for a layout that the virtual toy does not speak.
+        stop: ends the toy when it is set.
     """
-    spec, layout = spec or ToySpec(), layout or load_layout("plush-15")
-    if not 0 <= port <= 65535:
-        raise ConfigError(f"The port is {port}; a whole number from 0 (a free one) to 65535 is accepted.")
-    if not speed >= 0.0:
-        raise ConfigError(f"The toy's speed is {speed}; it must be 0 (as fast as possible) or above.")
-    stream = ToyStream(spec, layout, prompts)
-    try:
-        server = socket.create_server((HOST, port))
-    except OSError as cause:
-        raise DeviceError(
-            f"The toy cannot listen on port {port} of {HOST}: {cause.strerror or cause}; choose another port."
-        ) from None
-    counters = ToyCounters()
-    stop = stop or threading.Event()
-    with server:
-        server.setblocking(False)
-        if on_ready is not None:
-            on_ready(f"tcp://{HOST}:{server.getsockname()[1]}")
-        client: socket.socket | None = None
-        outlet: _Outlet | None = None
 
-        def send(data: bytes) -> bool:
-            nonlocal client, outlet
-            while client is None and not stop.is_set():
-                try:
-                    client, _ = server.accept()
-                except BlockingIOError:
-                    if speed > 0.0:
-                        return False
-                    select.select([server], [], [], 0.05)
-                    continue
-                client.setblocking(False)
-                client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                outlet = _Outlet(client.send, client.fileno(), stall_s=_stall_s(speed))
-                counters.connections += 1
-            if client is None or outlet is None:
-                return False
-            try:
-                return outlet.send(data, stop)
-            except OSError:  # the reader has gone: the next one may come
-                client.close()
-                client = outlet = None
-                return False
+    spec: ToySpec = field(default_factory=ToySpec)
+    layout: Layout = field(default_factory=lambda: load_layout("plush-15"))
+    speed: float = 1.0
+    seconds: float = 0.0
+    on_ready: Callable[[str], None] = _ignore
+    on_performed: Callable[[PerformedGesture], None] = _ignore
+    on_sent: Callable[[bytes], None] = _ignore
+    prompts: Prompts | None = None
+    stop: threading.Event = field(default_factory=threading.Event)
 
+    def serve_tcp(self, port: int) -> ToyCounters:
+        """Serve on ``127.0.0.1:port`` (0: a free one), to one reader after another, until `stop` is set.
+
+        The toy goes on while nobody listens, as a real one does.
+
+        Raises:
+            DeviceError: when the port is taken or not allowed.
+            ConfigError: for a layout that the virtual toy does not speak.
+        """
+        if not 0 <= port <= 65535:
+            raise ConfigError(f"The port is {port}; a whole number from 0 (a free one) to 65535 is accepted.")
+        if not self.speed >= 0.0:
+            raise ConfigError(f"The toy's speed is {self.speed}; it must be 0 (as fast as possible) or above.")
+        stream = ToyStream(self.spec, self.layout, self.prompts)
         try:
-            _run(stream, send, counters, speed, seconds, on_performed, on_sent, stop)
-        finally:
-            if client is not None:
-                client.close()
-    return counters
-
-
-def serve_pty(
-    spec: ToySpec | None = None,
-    *,
-    layout: Layout | None = None,
-    speed: float = 1.0,
-    seconds: float = 0.0,
-    on_ready: Callable[[str], None] | None = None,
-    on_performed: Callable[[PerformedGesture], None] | None = None,
-    on_sent: Callable[[bytes], None] | None = None,
-    prompts: Prompts | None = None,
-    stop: threading.Event | None = None,
-) -> ToyCounters:
-    """Serve the virtual toy on a pseudo terminal that looks like a serial port, until ``stop`` is set.
-
-    Linux and macOS. ``on_ready`` gets the URL (``serial:///dev/pts/5``). Arguments and errors otherwise as
-    `serve_tcp`, but speed 0 is not for a port that nobody may be reading. A toy faster than real time waits up to 10 s
-    for a slow reader, so that its speed causes no losses.
-
-    Raises:
-        DeviceError: on Windows, which has no pseudo terminals.
-    """
-    if sys.platform == "win32":
-        raise DeviceError("Windows has no pseudo terminals: serve the toy over TCP instead (toy --tcp PORT).")
-    import pty
-    import tty
-
-    if not speed > 0.0:
-        raise ConfigError(f"The toy's speed on a pseudo terminal is {speed:g}; it must be above 0.")
-    stream = ToyStream(spec or ToySpec(), layout or load_layout("plush-15"), prompts)
-    master, slave = pty.openpty()
-    try:
-        # Raw mode: no echo, unchanged line ends. The slave stays open, so that readers may come and go.
-        tty.setraw(slave)
-        os.set_blocking(master, False)
+            server = socket.create_server((HOST, port))
+        except OSError as cause:
+            raise DeviceError(
+                f"The toy cannot listen on port {port} of {HOST}: {cause.strerror or cause}; choose another port."
+            ) from None
         counters = ToyCounters()
-        stop = stop or threading.Event()
-        fast = speed > 1.0
-        outlet = _Outlet(
-            lambda data: os.write(master, data),
-            master,
-            absent=not fast,
-            stall_s=_stall_s(speed),
-            unread=(lambda: _unread(slave)) if fast else None,
-        )
-        if on_ready is not None:
-            on_ready(f"serial://{os.ttyname(slave)}")
-        _run(stream, lambda data: outlet.send(data, stop), counters, speed, seconds, on_performed, on_sent, stop)
-    finally:
-        os.close(master)
-        os.close(slave)
-    return counters
+        with server:
+            server.setblocking(False)
+            self.on_ready(f"tcp://{HOST}:{server.getsockname()[1]}")
+            client: socket.socket | None = None
+            outlet: _Outlet | None = None
+
+            def send(data: bytes) -> bool:
+                nonlocal client, outlet
+                while client is None and not self.stop.is_set():
+                    try:
+                        client, _ = server.accept()
+                    except BlockingIOError:
+                        if self.speed > 0.0:
+                            return False
+                        select.select([server], [], [], 0.05)
+                        continue
+                    client.setblocking(False)
+                    client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                    outlet = _Outlet(client.send, client.fileno(), stall_s=self._stall_s)
+                    counters.connections += 1
+                if client is None or outlet is None:
+                    return False
+                try:
+                    return outlet.send(data, self.stop)
+                except OSError:  # the reader has gone: the next one may come
+                    client.close()
+                    client = outlet = None
+                    return False
+
+            try:
+                self._run(stream, send, counters)
+            finally:
+                if client is not None:
+                    client.close()
+        return counters
+
+    def serve_pty(self) -> ToyCounters:
+        """Serve on a pseudo terminal that looks like a serial port, until `stop` is set. Linux and macOS.
+
+        Speed 0 is not for a port that nobody may be reading. A toy faster than real time waits up to 10 s for a slow
+        reader, so that its speed causes no losses.
+
+        Raises:
+            DeviceError: on Windows, which has no pseudo terminals.
+            ConfigError: for a speed of 0, or a layout that the virtual toy does not speak.
+        """
+        if sys.platform == "win32":
+            raise DeviceError("Windows has no pseudo terminals: serve the toy over TCP instead (toy --tcp PORT).")
+        import pty
+        import tty
+
+        if not self.speed > 0.0:
+            raise ConfigError(f"The toy's speed on a pseudo terminal is {self.speed:g}; it must be above 0.")
+        stream = ToyStream(self.spec, self.layout, self.prompts)
+        counters = ToyCounters()
+        master, slave = pty.openpty()
+        try:
+            # Raw mode: no echo, unchanged line ends. The slave stays open, so that readers may come and go.
+            tty.setraw(slave)
+            os.set_blocking(master, False)
+            fast = self.speed > 1.0
+            outlet = _Outlet(
+                lambda data: os.write(master, data),
+                master,
+                absent=not fast,
+                stall_s=self._stall_s,
+                unread=(lambda: _unread(slave)) if fast else None,
+            )
+            self.on_ready(f"serial://{os.ttyname(slave)}")
+            self._run(stream, lambda data: outlet.send(data, self.stop), counters)
+        finally:
+            os.close(master)
+            os.close(slave)
+        return counters
+
+    @property
+    def _stall_s(self) -> float:
+        return _STALL_S if self.speed <= 1.0 else _FAST_STALL_S
+
+    def _run(self, stream: ToyStream, send: Callable[[bytes], bool], counters: ToyCounters) -> None:
+        """Send each line when it is due by the device clock."""
+        pacer = Pacer(self.speed)
+        first_ms: int | None = None
+        batch, lines = bytearray(), 0
+        largest = 4096 if self.speed <= 1.0 else _FAST_QUEUE
+
+        def flush() -> None:
+            nonlocal lines
+            if not batch:
+                return
+            if send(bytes(batch)):
+                counters.sent += lines
+                self.on_sent(bytes(batch))
+            else:
+                counters.dropped += lines
+            batch.clear()
+            lines = 0
+
+        for line in stream:
+            if self.stop.is_set():
+                break
+            if first_ms is None:
+                first_ms = line.device_ms
+            if self.seconds and line.device_ms - first_ms >= self.seconds * 1000.0:
+                break
+            due = pacer.due_s(line.device_ms)
+            if due > 0.0 or len(batch) > largest:
+                flush()
+                if due > 0.0 and self.stop.wait(due):
+                    break
+            if line.begins is not None:
+                counters.gestures += 1
+                self.on_performed(line.begins)
+            batch += line.data
+            lines += bool(line.data)
+        flush()
 
 
 def _unread(slave: int) -> int:
@@ -226,57 +260,3 @@ def _unread(slave: int) -> int:
 
     waiting = fcntl.ioctl(slave, termios.FIONREAD, b"\0" * 4)
     return int(struct.unpack("i", waiting)[0])
-
-
-def _stall_s(speed: float) -> float:
-    return _STALL_S if speed <= 1.0 else _FAST_STALL_S
-
-
-def _run(
-    stream: ToyStream,
-    send: Callable[[bytes], bool],
-    counters: ToyCounters,
-    speed: float,
-    seconds: float,
-    on_performed: Callable[[PerformedGesture], None] | None,
-    on_sent: Callable[[bytes], None] | None,
-    stop: threading.Event,
-) -> None:
-    """Send each line when it is due by the device clock."""
-    pacer = Pacer(speed)
-    first_ms: int | None = None
-    batch, lines = bytearray(), 0
-
-    largest = 4096 if speed <= 1.0 else _FAST_QUEUE
-
-    def flush() -> None:
-        nonlocal lines
-        if batch:
-            if send(bytes(batch)):
-                counters.sent += lines
-                if on_sent is not None:
-                    on_sent(bytes(batch))
-            else:
-                counters.dropped += lines
-            batch.clear()
-            lines = 0
-
-    for line in stream:
-        if stop.is_set():
-            break
-        if first_ms is None:
-            first_ms = line.device_ms
-        if seconds and line.device_ms - first_ms >= seconds * 1000.0:
-            break
-        due = pacer.due_s(line.device_ms)
-        if due > 0.0 or len(batch) > largest:
-            flush()
-            if due > 0.0 and stop.wait(due):
-                break
-        if line.begins is not None:
-            counters.gestures += 1
-            if on_performed is not None:
-                on_performed(line.begins)
-        batch += line.data
-        lines += bool(line.data)
-    flush()

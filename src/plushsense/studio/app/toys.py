@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from plushsense.core.errors import ConfigError, DeviceError, PlushSenseError
 from plushsense.core.layouts import layout_names
 from plushsense.devices.base import Device, Frame
-from plushsense.devices.listing import SCAN_S, DeviceListing, list_devices
-from plushsense.devices.opening import open_device, parse_url
+from plushsense.devices.opening import SCAN_S, DeviceListing, list_devices, open_device, parse_url
 from plushsense.devices.reconnect import ConnectionGap
 from plushsense.recording.setup import is_virtual, speed_of, with_speed
 from plushsense.studio.app.workspace import ChangeSignal, Workspace

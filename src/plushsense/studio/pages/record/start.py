@@ -9,7 +9,7 @@ from urllib.parse import quote
 from nicegui import run, ui
 
 from plushsense.core.errors import ConfigError, PlushSenseError
-from plushsense.devices.listing import list_devices
+from plushsense.devices.opening import list_devices
 from plushsense.recording.plan import DEFAULT, wordings
 from plushsense.recording.session import SessionSummary
 from plushsense.recording.setup import PROTOCOL, SessionRequest, is_virtual
