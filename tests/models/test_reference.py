@@ -100,7 +100,7 @@ def test_blocks_of_any_size_decide_alike(padding: str, sizes: list[int], step: i
     stream = np.random.default_rng(5).normal(size=(sum(sizes), 3))
     stepper, at, found = network.stepper(), 0, []
     for size in sizes:
-        found += stepper.push(stream[at : at + size])
+        found.extend(stepper.push(stream[at : at + size]))
         at += size
     ends = range(arch.span, len(stream) + 1, step)
     assert len(found) == len(ends)
@@ -118,9 +118,9 @@ def test_step_and_push_mix_and_reset_starts_anew(padding: str) -> None:
     used.push(1e3 * stream[:77])
     used.reset()
     assert (used.seen, used.state) == (0, "warming")
-    mixed = used.push(stream[:31])
+    mixed = list(used.push(stream[:31]))
     mixed += [logits for sample in stream[31:90] if (logits := used.step(sample)) is not None]
-    mixed += used.push(stream[90:])
+    mixed.extend(used.push(stream[90:]))
     np.testing.assert_allclose(mixed, fresh, atol=1e-9)
     assert used.seen == 150
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import numpy as np
 import pytest
 
-from plushsense.core.errors import BundleError
+from plushsense.core.errors import BundleError, ConfigError
+from plushsense.runtime.decisions import DecideSpec
 from plushsense.runtime.gate import HELD, JERK, LEVEL, Gate, GateSettings, Rule, Signal, Term
 from plushsense.tuning.gate import signal_sizes
 
@@ -147,7 +150,7 @@ def test_a_term_of_a_signal_that_is_not_there_is_refused() -> None:
 
 
 def test_plain_values_and_back() -> None:
-    assert GateSettings.from_dict(LEVELS.to_dict()) == LEVELS
-    assert GateSettings.from_dict({}) == GateSettings()
-    with pytest.raises(BundleError, match="train again"):
-        GateSettings.from_dict({"signals": [{"kind": 0}]})
+    assert DecideSpec.from_dict({"gate": asdict(LEVELS)}).gate == LEVELS
+    assert DecideSpec.from_dict({"gate": {}}).gate == GateSettings()
+    with pytest.raises(ConfigError, match=r"gate\.signals\[0\]\.inputs is missing"):
+        DecideSpec.from_dict({"gate": {"signals": [{"kind": 0}]}})

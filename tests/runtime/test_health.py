@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import pytest
 
-from plushsense.core.errors import BundleError
+from plushsense.core.errors import BundleError, ConfigError
 from plushsense.core.layouts import load_layout
+from plushsense.runtime.decisions import DecideSpec
 from plushsense.runtime.health import MOST_MS, Health, HealthSettings
 
 ACCEL = load_layout("accel-3")
@@ -138,12 +139,12 @@ def test_after_a_gap_all_times_are_counted_anew_but_a_fault_goes_on() -> None:
 
 
 def test_plain_values_and_back() -> None:
-    assert HealthSettings.from_dict(PLAN.to_dict()) == PLAN
-    assert HealthSettings.from_dict({}) == HealthSettings()
-    with pytest.raises(BundleError, match="train again"):
-        HealthSettings.from_dict({"fault": 3})
-    with pytest.raises(BundleError, match="train again"):
-        HealthSettings.from_dict({"low": 3, "high": 4})
+    assert DecideSpec.from_dict({"health": asdict(PLAN)}).health == PLAN
+    assert DecideSpec.from_dict({"health": {}}).health == HealthSettings()
+    with pytest.raises(ConfigError, match="Unknown key 'fault' in decision settings, health"):
+        DecideSpec.from_dict({"health": {"fault": 3}})
+    with pytest.raises(ConfigError, match=r"health\.low is 3: accepted is a list of whole numbers"):
+        DecideSpec.from_dict({"health": {"low": 3, "high": 4}})
 
 
 @pytest.mark.parametrize(

@@ -178,7 +178,7 @@ def test_what_a_toy_that_knows_its_touches_tells(library: Any) -> None:
 
 def test_both_engines_are_counted_against_each_other() -> None:
     bundle = model_for("accel-3")
-    both = BothEngines(IntegerClassifier(integer_model(bundle)), StreamClassifier(bundle))
+    both = BothEngines(integer_model(bundle), StreamClassifier(bundle))
     with open_device("virtual://?person=4&seed=3&lost=0.01&speed=0", bundle.layout) as device:
         live = run_live(device, both, seconds=60)
         decided = list(live)
@@ -201,7 +201,7 @@ def test_a_decision_of_another_model_counts_as_one_that_differs() -> None:
     stranger = Bundle(
         bundle.arch, random_weights(bundle.arch, 8), bundle.layout, bundle.scaler, bundle.gestures, decision={}
     )
-    both = BothEngines(IntegerClassifier(integer_model(bundle)), StreamClassifier(stranger))
+    both = BothEngines(integer_model(bundle), StreamClassifier(stranger))
     with open_device("virtual://?person=4&seed=3&speed=0", bundle.layout) as device:
         list(run_live(device, both, seconds=30))
     assert both.agreement()["gesture"] < 0.6

@@ -18,6 +18,7 @@ from plushsense.dataset.store import Dataset
 from plushsense.devices.virtual.session import GESTURES, GestureMark, VirtualSession
 from plushsense.devices.virtual.stream import channel_columns
 from plushsense.devices.virtual.world import WORLD, World, draw_person
+from plushsense.runtime.decisions import DecideSpec
 from plushsense.runtime.events import AFFECT_CODES
 from plushsense.runtime.gate import JERK, LEVEL, Gate, GateSettings, Rule, Signal, Term
 from plushsense.tuning.gate import GateFit, fit_gate, measure_gate, signal_sizes
@@ -176,7 +177,7 @@ def test_where_nothing_is_energetic_there_is_no_gate(virtual: Dataset) -> None:
 
 
 def test_a_plan_from_plain_values_is_the_same(fitted: GateFit) -> None:
-    assert GateSettings.from_dict(fitted.plan.to_dict()) == fitted.plan
+    assert DecideSpec.from_dict({"gate": dataclasses.asdict(fitted.plan)}).gate == fitted.plan
 
 
 def test_on_real_people(real_data: Path, tmp_path: Path) -> None:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
 from plushsense.core.errors import ConfigError
 from plushsense.devices.base import Device, Frame
-from plushsense.runtime.classifier import BothEngines, Decision, StreamReader, check_layout
+from plushsense.runtime.classifier import Decision, StreamReader, check_layout
 
 _KEPT = 72_000  # latencies kept: the last hour at 20 decisions a second
 SILENCE_S = 0.75
@@ -55,21 +55,8 @@ class LiveSummary:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
-        return {
-            "decisions": self.decisions,
-            "warming": self.warming,
-            "seconds": round(self.seconds, 3),
-            "wall_s": round(self.wall_s, 3),
-            "decisions_per_s": round(self.decisions_per_s, 3),
-            "restarts": self.restarts,
-            "invalid": self.invalid,
-            "counters": dict(self.counters),
-            "latency_ms": dict(self.latency_ms),
-            "late": self.late,
-            "events": self.events,
-            "no_signal": self.no_signal,
-            "faults": self.faults,
-        }
+        rounded = {name: round(getattr(self, name), 3) for name in ("seconds", "wall_s", "decisions_per_s")}
+        return asdict(self) | rounded
 
 
 class LiveRun(Iterator[Decision]):
@@ -81,12 +68,13 @@ class LiveRun(Iterator[Decision]):
     Attributes:
         over: whether it came to its end.
         latency_s: from the newest bytes that brought a decision to that decision; None before the first.
+        latencies_s: the same for all decisions of the last hour.
     """
 
     def __init__(
         self,
         device: Device,
-        classifier: StreamReader | BothEngines,
+        classifier: StreamReader,
         seconds: float | None,
         silence_s: float = SILENCE_S,
     ) -> None:
@@ -96,7 +84,7 @@ class LiveRun(Iterator[Decision]):
         self._begun = self._last_frames_s = time.perf_counter()
         self._silent = False
         self._decisions = self._warming = self._late = self._events = self._no_signal = 0
-        self._latencies: list[float] = []
+        self.latencies_s: deque[float] = deque(maxlen=_KEPT)
         self.latency_s: float | None = None
         self._due: deque[Decision] = deque()
         self.over = False
@@ -158,15 +146,7 @@ class LiveRun(Iterator[Decision]):
     def _note_latency(self, latency_s: float) -> None:
         self.latency_s = latency_s
         self._late += latency_s > self.classifier.step_s
-        if len(self._latencies) < _KEPT:
-            self._latencies.append(latency_s)
-        else:
-            self._latencies[self._decisions % _KEPT] = latency_s
-
-    @property
-    def latencies_s(self) -> list[float]:
-        """Latencies from bytes to decision, of the last hour, in no order."""
-        return list(self._latencies)
+        self.latencies_s.append(latency_s)
 
     def summary(self) -> LiveSummary:
         """Return the figures so far."""
@@ -180,7 +160,7 @@ class LiveRun(Iterator[Decision]):
             self.classifier.restarts,
             self.classifier.invalid,
             self.device.counters.to_dict(),
-            percentiles_ms(self._latencies),
+            percentiles_ms(self.latencies_s),
             self._late,
             self._events,
             self._no_signal,
@@ -198,7 +178,7 @@ def percentiles_ms(latencies_s: Sequence[float]) -> dict[str, float | None]:
 
 def run_live(
     device: Device,
-    classifier: StreamReader | BothEngines,
+    classifier: StreamReader,
     *,
     seconds: float | None = None,
     silence_s: float = SILENCE_S,
@@ -305,7 +285,7 @@ class ManyRun(Iterator[tuple[int, Decision]]):
         )
 
 
-def run_many(toys: Sequence[tuple[Device, StreamReader | BothEngines]], *, seconds: float | None = None) -> ManyRun:
+def run_many(toys: Sequence[tuple[Device, StreamReader]], *, seconds: float | None = None) -> ManyRun:
     """Run a model on each of many open devices, in one thread.
 
     Args:

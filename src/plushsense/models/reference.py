@@ -254,43 +254,38 @@ def check_windows(arch: Arch, shape: tuple[int, ...]) -> None:
 
 
 class Stepper(ABC):
-    """Reads scaled samples as they come; decides when the span has come, then every ``arch.step`` samples.
+    """Reads samples as they come; decides when the span has come, then every ``arch.step`` samples.
 
-    A value that is not finite spoils the decisions that see it and none after.
+    ``seen`` counts the samples since the start or the last reset.
     """
 
-    def __init__(self, network: Network) -> None:
-        self.network = network
-        self.arch = network.arch
-        self.seen = 0
+    def __init__(self, arch: Arch) -> None:
+        self.arch = arch
         self.reset()
 
-    def step(self, sample: ArrayLike) -> Floats | None:
+    def step(self, sample: ArrayLike) -> NDArray[Any] | None:
         """Read one sample (C,); return logits (K,) when a decision is due, else None."""
-        one = np.asarray(sample, dtype=np.float64)
-        if one.shape != (self.arch.channels,):
-            raise BadInput(
-                f"A sample of the shape {one.shape} does not fit: {self.arch.symbol} reads "
-                f"{self.arch.channels} channels."
-            )
-        self.seen += 1
-        due = self._advance(one[None])
+        due = self.push(np.asarray(sample)[None])
         return due[0] if len(due) else None
 
-    def push(self, samples: ArrayLike) -> list[Floats]:
-        """Read samples (n, C) at once; return the logits of every decision that ``step`` would have made, in order."""
-        block = np.asarray(samples, dtype=np.float64)
+    def push(self, samples: ArrayLike) -> NDArray[Any]:
+        """Read samples (n, C); return the logits (m, K) of the decisions now due, the same in pieces of any size.
+
+        Raises:
+            BadInput: for samples of another shape, or of values that the network does not read.
+        """
+        block = self._values(samples)
         if block.ndim != 2 or block.shape[1] != self.arch.channels:
             raise BadInput(
                 f"Samples of the shape {block.shape} do not fit: {self.arch.symbol} reads "
                 f"(samples, {self.arch.channels} channels)."
             )
-        due: list[Floats] = []
+        due = []
         for at in range(0, len(block), CHUNK):
             chunk = block[at : at + CHUNK]
             self.seen += len(chunk)
-            due.extend(self._advance(chunk))
-        return due
+            due.append(self._advance(chunk))
+        return due[0] if len(due) == 1 else np.concatenate([self._advance(block[:0]), *due])
 
     @property
     def state(self) -> Literal["warming", "ready"]:
@@ -306,17 +301,30 @@ class Stepper(ABC):
     def _clear(self) -> None: ...
 
     @abstractmethod
-    def _advance(self, chunk: Floats) -> Floats:
+    def _values(self, samples: ArrayLike) -> NDArray[Any]:
+        """Return the samples as an array that the network reads."""
+
+    @abstractmethod
+    def _advance(self, chunk: NDArray[Any]) -> NDArray[Any]:
         """Read at most CHUNK samples; return logits (decisions, K)."""
 
 
-class _Streaming(Stepper):
+class _FloatStepper(Stepper):
+    """Reads scaled samples. A value that is not finite spoils the decisions that see it and none after."""
+
+    def __init__(self, network: Network) -> None:
+        self.network = network
+        super().__init__(network.arch)
+
+    def _values(self, samples: ArrayLike) -> Floats:
+        return np.asarray(samples, dtype=np.float64)
+
+
+class _Streaming(_FloatStepper):
     """``stream``: every sample is computed once."""
 
     def _clear(self) -> None:
-        arch = self.arch
-        self._rings = [SampleRing(layer, read) for layer, read in zip(arch.layers, arch.inputs, strict=True)]
-        self._pool = Pool(arch.step, arch.pooled // arch.step, arch.filters[-1])
+        self._rings, self._pool = stream_state(self.arch)
 
     def _advance(self, chunk: Floats) -> Floats:
         for ring, block in zip(self._rings, self.network.blocks, strict=True):
@@ -324,11 +332,10 @@ class _Streaming(Stepper):
             if not len(taps):
                 return np.empty((0, self.arch.classes))
             chunk = block(taps)
-        due = self._pool.feed(chunk)
-        return self.network.classify(due) if len(due) else np.empty((0, self.arch.classes))
+        return self.network.classify(self._pool.feed(chunk))
 
 
-class _Recomputing(Stepper):
+class _Recomputing(_FloatStepper):
     """``mirror`` and ``causal``: each decision computes the whole window again."""
 
     def _clear(self) -> None:
@@ -339,6 +346,12 @@ class _Recomputing(Stepper):
         ends = np.arange(self.seen - len(windows), self.seen) + 1 - self.arch.window
         due = windows[ends % self.arch.step == 0].reshape(-1, self.arch.window, self.arch.channels)
         return self.network.forward(due.transpose(0, 2, 1)) if len(due) else np.empty((0, self.arch.classes))
+
+
+def stream_state(arch: Arch) -> tuple[list[SampleRing], Pool]:
+    """Return what a ``stream`` network remembers between samples: a ring before each layer, and the pooling."""
+    rings = [SampleRing(layer, read) for layer, read in zip(arch.layers, arch.inputs, strict=True)]
+    return rings, Pool(arch.step, arch.pooled // arch.step, arch.filters[-1])
 
 
 def random_weights(arch: Arch, seed: int) -> dict[str, NDArray[np.float32]]:

@@ -251,55 +251,33 @@ class IntegerClassifier(StreamReader):
         self.model = model
 
 
-class BothEngines:
+class BothEngines(IntegerClassifier):
     """The deployed model and its float original on the same frames: decides as the first, counts where they differ."""
 
-    def __init__(self, integer: IntegerClassifier, original: StreamReader) -> None:
-        self.integer, self.original = integer, original
-        self.layout, self.step_s = integer.layout, integer.step_s
-        self._has_affects = any(g.affect != "none" for g in integer.model.gestures.gestures)
-        self.reset()
-
-    @property
-    def restarts(self) -> int:
-        """Number of restarts of the deployed model."""
-        return self.integer.restarts
-
-    @property
-    def invalid(self) -> int:
-        """Number of invalid values, as of the deployed model."""
-        return self.integer.invalid
-
-    @property
-    def faults(self) -> int:
-        """Number of sensor faults, as of the deployed model."""
-        return self.integer.faults
-
-    @property
-    def in_event(self) -> bool:
-        """Whether an event is going on, as of the deployed model."""
-        return self.integer.in_event
-
-    @property
-    def time_s(self) -> float:
-        """Device time of the newest frame, as of the deployed model."""
-        return self.integer.time_s
+    def __init__(self, model: IntegerModel, original: StreamReader) -> None:
+        super().__init__(model)
+        self.original = original
+        self._has_affects = any(g.affect != "none" for g in model.gestures.gestures)
+        self._clear_counts()
 
     def silence(self) -> Decision:
         """End the event that is going on, as `StreamReader.silence` does; return the deployed model's decision."""
         self.original.silence()
-        return self.integer.silence()
+        return super().silence()
 
     def reset(self) -> None:
         """Begin a new stream, with every count at 0."""
-        self.integer.reset()
+        super().reset()
         self.original.reset()
+        self._clear_counts()
+
+    def _clear_counts(self) -> None:
         self._compared = self._gesture = self._affect = 0
         self._far = 0.0
 
     def push(self, frame: Frame) -> list[Decision]:
         """Read one frame; return the deployed model's decisions that it completes."""
-        decisions = self.integer.push(frame)
+        decisions = super().push(frame)
         answered = [d for d in decisions if d.probabilities is not None]
         others = [d for d in self.original.push(frame) if d.probabilities is not None]
         for one, other in zip(answered, others, strict=True):

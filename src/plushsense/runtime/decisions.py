@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from plushsense.core.errors import ConfigError
-from plushsense.core.toml import refuse_unknown
+from plushsense.core.toml import load_table
 from plushsense.runtime.events import MOST_STEPS, ONE, EventSettings
 from plushsense.runtime.fixed import LOGIT_LIMIT
 from plushsense.runtime.gate import GateSettings
@@ -112,16 +112,9 @@ class DecideSpec:
         """Return settings from plain values (a bundle, a configuration file); what is left out keeps its default.
 
         Raises:
-            ConfigError: for an unknown key or a value out of range.
-            BundleError: for a gate or health settings that do not fit.
+            ConfigError: for an unknown key, or a value that does not fit.
         """
-        refuse_unknown(dict(table), cls.__dataclass_fields__, "decision settings", ConfigError)
-        values = dict(table)
-        if "gate" in values:
-            values["gate"] = GateSettings.from_dict(values["gate"])
-        if "health" in values:
-            values["health"] = HealthSettings.from_dict(values["health"])
-        return cls(**values)
+        return load_table(table, cls, "decision settings", ConfigError)
 
 
 def argmax_spec(smoothing_s: float = 0.0) -> DecideSpec:

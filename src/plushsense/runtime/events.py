@@ -82,10 +82,6 @@ class EventSettings:
             if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
                 raise BundleError(f"The event setting {field.name} is {value!r}; accepted are {low} to {high}.")
 
-    def to_dict(self) -> dict[str, int]:
-        """Return plain values, ready for JSON."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
-
 
 RANGES = {
     **dict.fromkeys(("enter", "leave", "enter_affect", "leave_affect", "sure"), (0, ONE + 1)),

@@ -23,9 +23,8 @@ jumps to its end stop and back is broken, not hit.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 from plushsense.core.errors import BundleError
 
@@ -111,24 +110,6 @@ class GateSettings:
                 _within("threshold", term.threshold, 1, MOST_SIZE)
                 _within("sign", term.sign, -1, 1)
                 _within("times", term.times, 1, 255)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values, ready for JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, table: Mapping[str, Any]) -> GateSettings:
-        """Return settings from plain values.
-
-        Raises:
-            BundleError: for values that do not fit.
-        """
-        try:
-            signals = tuple(Signal(**{**s, "inputs": tuple(s["inputs"])}) for s in table.get("signals", ()))
-            rules = tuple(Rule(**{**r, "terms": tuple(Term(**t) for t in r["terms"])}) for r in table.get("rules", ()))
-            return cls(signals, rules)
-        except (KeyError, TypeError, AttributeError) as cause:
-            raise BundleError(f"The gate's plan does not fit ({cause}): train again.") from None
 
 
 def _within(what: str, value: int, low: int, high: int) -> None:

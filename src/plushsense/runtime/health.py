@@ -14,9 +14,8 @@ This module defines it; ``deploy/c/plushsense.c`` repeats it. It sees every fram
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 from plushsense.core.errors import BundleError
 from plushsense.core.layouts import Layout
@@ -50,23 +49,6 @@ class HealthSettings:
             not _INT32[0] <= a <= b <= _INT32[1] for a, b in zip(self.low, self.high, strict=False)
         ):
             raise BundleError(f"The health limits {self.low} to {self.high} do not fit: train again.")
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values, ready for JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, table: Mapping[str, Any]) -> HealthSettings:
-        """Return settings from plain values.
-
-        Raises:
-            BundleError: for values that do not fit.
-        """
-        try:
-            limits = {name: tuple(table.get(name, ())) for name in ("low", "high")}
-            return cls(**{**table, **limits})
-        except TypeError as cause:
-            raise BundleError(f"The health settings do not fit ({cause}): train again.") from None
 
 
 class Health:

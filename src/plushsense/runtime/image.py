@@ -33,7 +33,7 @@ import json
 import math
 import struct
 import zlib
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -193,9 +193,9 @@ class IntegerModel:
 
 def _rules(rules: Rules) -> list[tuple[str, bytes]]:
     events, health, gate = rules.events, rules.health, rules.gate
-    row = {"known": "h"}
-    plan = b"".join(struct.pack("<" + row.get(name, "H"), value) for name, value in events.to_dict().items())
-    found = [(f"events: {', '.join(events.to_dict())}", plan)]
+    settings = asdict(events)
+    plan = b"".join(struct.pack("<h" if name == "known" else "<H", value) for name, value in settings.items())
+    found = [(f"events: {', '.join(settings)}", plan)]
     times = struct.pack("<HHHBB", health.fault_ms, health.still_ms, health.recover_ms, bool(health.low), 0)
     found.append(("health: fault, still, recover (ms), whether limits follow", times))
     if health.low:

@@ -11,14 +11,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from plushsense.core.errors import BadInput, BundleError
 from plushsense.models.arch import Arch
-from plushsense.models.reference import CHUNK, Floats, Pool, SampleRing, check_windows, taps_of
+from plushsense.models.reference import Floats, Stepper, check_windows, stream_state, taps_of
 from plushsense.runtime.fixed import Bytes, InputScale, Ints, LogitScale, Requantize
 
 _SUM_LIMIT = (1 << 31) - 1
@@ -160,51 +160,25 @@ def _whole(x: ArrayLike) -> NDArray[Any]:
     return values
 
 
-class IntegerStepper:
-    """Reads raw samples as they come; decides when the span has come, then every ``arch.step`` samples."""
+class IntegerStepper(Stepper):
+    """Reads raw integer samples as they come; logits are in steps of 1/256."""
 
     def __init__(self, network: IntegerNetwork) -> None:
         self.network = network
-        self.arch = network.arch
-        self.reset()
+        super().__init__(network.arch)
 
-    def reset(self) -> None:
-        """Forget the past: after a gap, a clock reset, a reconnection."""
-        arch = self.arch
-        self.seen = 0
-        self._rings = [SampleRing(layer, read) for layer, read in zip(arch.layers, arch.inputs, strict=True)]
-        self._pool = Pool(arch.step, arch.pooled // arch.step, arch.filters[-1])
+    def _clear(self) -> None:
+        self._rings, self._pool = stream_state(self.arch)
 
-    @property
-    def state(self) -> Literal["warming", "ready"]:
-        """``warming`` until ``arch.span`` samples have come since the start or the last reset."""
-        return "ready" if self.seen >= self.arch.span else "warming"
-
-    def push(self, samples: ArrayLike) -> Ints:
-        """Read raw integer samples (n, C); return the logits (m, K), in steps of 1/256, of the decisions now due.
-
-        Raises:
-            BadInput: for samples of another shape, or not whole numbers.
-        """
-        block = _whole(samples)
-        if block.ndim != 2 or block.shape[1] != self.arch.channels:
-            raise BadInput(
-                f"Samples of the shape {block.shape} do not fit: {self.arch.symbol} reads "
-                f"(samples, {self.arch.channels} channels)."
-            )
-        due = [self._advance(block[at : at + CHUNK]) for at in range(0, len(block), CHUNK)]
-        return due[0] if len(due) == 1 else np.concatenate([self.network._none(), *due])
+    def _values(self, samples: ArrayLike) -> NDArray[Any]:
+        return _whole(samples)
 
     def _advance(self, chunk: NDArray[Any]) -> Ints:
-        self.seen += len(chunk)
         z = self.network.inputs.apply(chunk).astype(np.float64)
         for ring, part in zip(self._rings, self.network.layers, strict=True):
             taps = ring.feed(z)
             if not len(taps):
                 return self.network._none()
             z = part.apply(taps)
-        due = self._pool.feed(z)
-        if not len(due):
-            return self.network._none()
         # The pool gives means; a whole number times pool / pool is that number again, once rounded.
-        return self.network.dense.apply(np.rint(due * self.arch.pooled))
+        return self.network.dense.apply(np.rint(self._pool.feed(z) * self.arch.pooled))

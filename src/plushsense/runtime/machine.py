@@ -64,8 +64,7 @@ class FloatLogits:
 
     def push(self, samples: InputRows) -> Ints:
         """Read raw integer inputs (n, I); return the logits (m, K) of the decisions now due."""
-        due = self._stepper.push(self._scaler.apply_sample(np.asarray(samples, dtype=np.int64)))
-        return integer_logits(np.array(due).reshape(len(due), self.arch.classes))
+        return integer_logits(self._stepper.push(self._scaler.apply_sample(np.asarray(samples, dtype=np.int64))))
 
 
 class Sample(NamedTuple):

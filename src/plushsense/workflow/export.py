@@ -26,7 +26,7 @@ from plushsense.workflow.preparation import Warn, silent, windows_for
 
 if TYPE_CHECKING:
     from plushsense.models.bundle import Bundle
-    from plushsense.runtime.classifier import BothEngines, StreamReader
+    from plushsense.runtime.classifier import StreamReader
     from plushsense.runtime.decisions import DecideSpec
 
 
@@ -153,7 +153,7 @@ def export(
 ENGINES = ("float", "int8", "both")
 
 
-def classifier_of(bundle: Bundle, decide: DecideSpec | None, engine: str) -> StreamReader | BothEngines:
+def classifier_of(bundle: Bundle, decide: DecideSpec | None, engine: str) -> StreamReader:
     """Build the stream classifier of a bundle; ``engine`` is one of `ENGINES`.
 
     Raises:
@@ -164,5 +164,5 @@ def classifier_of(bundle: Bundle, decide: DecideSpec | None, engine: str) -> Str
 
     if engine == "float":
         return StreamClassifier(bundle, decide)
-    integer = IntegerClassifier(integer_model(bundle, decide))
-    return integer if engine == "int8" else BothEngines(integer, StreamClassifier(bundle, decide))
+    model = integer_model(bundle, decide)
+    return IntegerClassifier(model) if engine == "int8" else BothEngines(model, StreamClassifier(bundle, decide))

@@ -7,7 +7,7 @@ import os
 import tempfile
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -85,7 +85,7 @@ class TrainStreams:
         if not self.gate:
             return Fitted(networks)
         fitted = fit_gate(dataset, next(iter(networks.values())).gestures, fold.train)
-        return Fitted(networks, fitted.plan, {"gate": fitted.report, "plan": fitted.plan.to_dict()})
+        return Fitted(networks, fitted.plan, {"gate": fitted.report, "plan": asdict(fitted.plan)})
 
     def _network(self, recipe: Recipe, dataset: Dataset, fold: PeopleFold, progress: EpochProgress) -> Bundle:
         path = self.folder / f"{job_id({**recipe.key(), 'data': dataset.hash, 'fold': vars(fold)})}.plush"
