@@ -331,7 +331,7 @@ class _RowTable:
 
     def read(self, frames: Ints, silences: Container[int] = ()) -> None:
         """Feed frames to the toy and add all that comes of them."""
-        health = self.toy.frames
+        health = self.toy.frames.health
         for ms, *values in frames.tolist():
             before = health.fault, health.suspect
             for moment in self.toy.push(ms, values):
@@ -363,15 +363,15 @@ class _RowTable:
 
     def add_health(self, ms: int) -> None:
         """Add the current state of the health check."""
-        frames = self.toy.frames
-        state = FAULT if frames.fault else WARMING if self.toy.samples.warming else TRACKING
-        self._add(HEALTH, ms, frames.faults, state, int(frames.suspect))
+        health = self.toy.frames.health
+        state = FAULT if health.fault else WARMING if self.toy.samples.warming else TRACKING
+        self._add(HEALTH, ms, health.faults, state, int(health.suspect))
 
     def _ms(self, time_us: int) -> int:
         return (time_us + self.toy.frames.zero_us) // 1000
 
     def _add(self, kind: int, ms: int, *what: int, numbers: Sequence[int] = ()) -> None:
-        counts = self.toy.frames.restarts, self.toy.frames.invalid
+        counts = self.toy.frames.clock.restarts, self.toy.frames.clock.invalid
         row = [kind, self.frame, ms, *what, *[0] * (HEAD - 5 - len(what)), *counts, *numbers]
         self.rows.append(row + [0] * (HEAD + 2 * len(self.affects) - len(row)))
 

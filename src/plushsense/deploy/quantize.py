@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import ArchError, BundleError
-from plushsense.models.arch import NORM_EPSILON, Arch
+from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
-from plushsense.models.reference import Network
+from plushsense.models.reference import Network, affine
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.runtime.fixed import (
     PROBABILITY_BITS,
@@ -130,8 +130,7 @@ def folded(arch: Arch, weights: Mapping[str, NDArray[Any]]) -> list[tuple[Floats
     for i in range(len(arch.layers)):
         w = weights[f"conv{i}.weight"].astype(np.float64)
         parts.append((w * gain[:, None], weights[f"conv{i}.bias"] + w.sum(axis=2) @ shift))
-        gain = weights[f"norm{i}.gain"] / np.sqrt(weights[f"norm{i}.var"].astype(np.float64) + NORM_EPSILON)
-        shift = weights[f"norm{i}.shift"] - weights[f"norm{i}.mean"] * gain
+        gain, shift = affine(arch, i, weights)
     w = weights["dense.weight"].astype(np.float64)
     return [*parts, (w * gain, weights["dense.bias"] + w @ shift)]
 
@@ -153,8 +152,8 @@ def quantize(arch: Arch, weights: Mapping[str, NDArray[Any]], scaler: Scaler, ra
         whole, bias, size = _eight_bits(w * unit[:, None], b + w.sum(axis=2) @ start, _codes(mean, start, unit))
         top = np.maximum(top, 1e-6)
         layers.append(IntegerLayer(whole, bias, Requantize(*_split(size / (top / 255), 255))))
-        gain = weights[f"norm{i}.gain"] / np.sqrt(weights[f"norm{i}.var"].astype(np.float64) + NORM_EPSILON)
-        unit, start = gain * top / 255, weights[f"norm{i}.shift"] - weights[f"norm{i}.mean"] * gain
+        gain, start = affine(arch, i, weights)
+        unit = gain * top / 255
         mean = gain * ranges.means[i + 1] + start
     w, b = weights["dense.weight"].astype(np.float64), weights["dense.bias"].astype(np.float64)
     whole, bias, size = _eight_bits(w * unit / arch.pooled, b + w @ start, _codes(mean, start, unit) * arch.pooled)

@@ -115,6 +115,17 @@ def check_weights(arch: Arch, weights: Mapping[str, NDArray[Any]]) -> None:
             raise BundleError(f"The weights '{name}' hold a negative variance: train again.")
 
 
+def affine(arch: Arch, i: int, weights: Weights) -> tuple[Floats, Floats]:
+    """Return gain and shift (F,) of the normalisation of layer ``i``; those of batch normalisation hold its mean and
+    variance.
+    """
+    gain, shift = (weights[f"norm{i}.{name}"].astype(np.float64) for name in ("gain", "shift"))
+    if arch.norm == "batch":
+        gain = gain / np.sqrt(weights[f"norm{i}.var"].astype(np.float64) + NORM_EPSILON)
+        shift = shift - weights[f"norm{i}.mean"] * gain
+    return gain, shift
+
+
 @dataclass(frozen=True)
 class _Block:
     """Layer ready to compute: ``matrix`` (kernel · channels, filters), taps outermost."""
@@ -130,13 +141,8 @@ class _Block:
     def of(cls, arch: Arch, i: int, weights: Weights) -> _Block:
         layer, read = arch.layers[i], arch.inputs[i]
         matrix = weights[f"conv{i}.weight"].transpose(2, 1, 0).reshape(layer.kernel * read, layer.filters)
-        bias, gain, shift = (
-            weights[name].astype(np.float64) for name in (f"conv{i}.bias", f"norm{i}.gain", f"norm{i}.shift")
-        )
-        if arch.norm == "batch":
-            gain = gain / np.sqrt(weights[f"norm{i}.var"].astype(np.float64) + NORM_EPSILON)
-            shift = shift - weights[f"norm{i}.mean"] * gain
-        return cls(layer, matrix.astype(np.float64), bias, gain, shift, arch.norm == "layer")
+        bias = weights[f"conv{i}.bias"].astype(np.float64)
+        return cls(layer, matrix.astype(np.float64), bias, *affine(arch, i, weights), arch.norm == "layer")
 
     def rectified(self, taps: Floats) -> Floats:
         """Compute convolution and ReLU: taps (n, kernel · channels) → (n, filters)."""

@@ -6,7 +6,7 @@ A `StreamReader` drives the one `plushsense.runtime.machine.ToyMachine` and puts
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 from plushsense.core.errors import ConfigError
@@ -48,15 +48,7 @@ class GestureEvent:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
-        return {
-            "what": self.what,
-            "number": self.number,
-            "affect": self.affect,
-            "gesture": self.gesture,
-            "source": self.source,
-            "since_s": round(self.since_s, _DECIMALS),
-            "t_s": round(self.t_s, _DECIMALS),
-        }
+        return asdict(self) | {"since_s": round(self.since_s, _DECIMALS), "t_s": round(self.t_s, _DECIMALS)}
 
 
 State = Literal["warming", "tracking", "no signal", "sensor fault"]
@@ -132,17 +124,17 @@ class StreamReader:
     @property
     def restarts(self) -> int:
         """Number of gaps and clock resets after which everything began again."""
-        return self._machine.frames.restarts
+        return self._machine.frames.clock.restarts
 
     @property
     def invalid(self) -> int:
         """Number of values outside their channel's valid range, replaced by the last valid one."""
-        return self._machine.frames.invalid
+        return self._machine.frames.clock.invalid
 
     @property
     def faults(self) -> int:
         """Number of sensor faults."""
-        return self._machine.frames.faults
+        return self._machine.frames.health.faults
 
     @property
     def in_event(self) -> bool:
@@ -175,7 +167,7 @@ class StreamReader:
             for moment in self._machine.push(frame.device_ms, frame.values)
             if not (silent and moment.cause == "no signal")  # it was reported by `silence`
         ]
-        if silent and not decisions and self._machine.frames.fault:
+        if silent and not decisions and self._machine.frames.health.fault:
             decisions.append(Decision(self.time_s, None, None, None, "cnn", "sensor fault", None))
         return decisions
 

@@ -91,54 +91,31 @@ class FrameReader:
     Attributes:
         zero_us: device time at which the time of the stream is 0; it changes when the device clock is reset.
         time_us: time of the newest frame.
+        clock: counts restarts and invalid values.
+        health: says whether sensors are at fault, and counts faults.
     """
 
     def __init__(self, layout: Layout, health: HealthSettings) -> None:
         self.layout = layout
         self._inputs = SampleInputs(layout)
-        self._health = Health(health, layout)
+        self.health = Health(health, layout)
         self.reset()
 
     def reset(self) -> None:
         """Begin a new stream at time 0, with every count at 0."""
-        self._clock = SampleClock(self.layout)
-        self._health.reset()
+        self.clock = SampleClock(self.layout)
+        self.health.reset()
         self._begun = False
         self.zero_us = self.time_us = 0
 
     def count_from(self, other: FrameReader) -> None:
         """Go on with the counts of another reader."""
-        self._health.faults = other.faults
-        self._clock.restarts, self._clock.invalid = other.restarts, other.invalid
-
-    @property
-    def restarts(self) -> int:
-        """Number of gaps and clock resets after which everything began again."""
-        return self._clock.restarts
-
-    @property
-    def invalid(self) -> int:
-        """Number of values outside their channel's valid range, replaced by the last valid one."""
-        return self._clock.invalid
-
-    @property
-    def faults(self) -> int:
-        """Number of sensor faults."""
-        return self._health.faults
-
-    @property
-    def fault(self) -> bool:
-        """Whether sensors are at fault now."""
-        return self._health.fault
-
-    @property
-    def suspect(self) -> bool:
-        """Whether the newest frame is suspect."""
-        return self._health.suspect
+        self.health.faults = other.health.faults
+        self.clock.restarts, self.clock.invalid = other.clock.restarts, other.clock.invalid
 
     def push(self, device_ms: int, values: Sequence[int]) -> Iterator[Sample | Break]:
         """Read one frame; yield what it brings about. Counts and ``zero_us`` are those of the item just yielded."""
-        clock, health = self._clock, self._health
+        clock, health = self.clock, self.health
         device_us = int(device_ms) * 1000
         if not self._begun:
             self._begun, self.zero_us = True, device_us

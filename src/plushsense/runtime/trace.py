@@ -109,7 +109,7 @@ def trace_of(frames: Frames, model: Bundle | IntegerModel, health: HealthSetting
                 end(item.time_us)
     end(reader.time_us)
     first_ms = int(frames.device_ms[0]) if len(frames) else 0
-    return Trace(network.arch, model.layout.period_us, model.gestures, first_ms, tuple(parts), reader.faults)
+    return Trace(network.arch, model.layout.period_us, model.gestures, first_ms, tuple(parts), reader.health.faults)
 
 
 @dataclass(frozen=True, eq=False)

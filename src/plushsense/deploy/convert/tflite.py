@@ -33,6 +33,7 @@ from plushsense.deploy.convert import (
 from plushsense.deploy.quantize import integer_network
 from plushsense.models.arch import NORM_EPSILON, Arch, ConvLayer, reflected
 from plushsense.models.bundle import Bundle
+from plushsense.models.reference import affine
 from plushsense.runtime.integer import IntegerNetwork
 
 SCHEMA_VERSION = 3
@@ -206,12 +207,8 @@ def _padded(g: _TfliteGraph, i: int, arch: Arch, layer: ConvLayer, z: int) -> in
 
 
 def _normed(g: _TfliteGraph, i: int, bundle: Bundle, z: int, shape: tuple[int, ...]) -> int:
-    w = bundle.weights
-    gain, shift = (w[f"norm{i}.{n}"].astype(np.float64) for n in ("gain", "shift"))
-    if bundle.arch.norm == "batch":
-        gain = gain / np.sqrt(w[f"norm{i}.var"].astype(np.float64) + NORM_EPSILON)
-        shift = shift - w[f"norm{i}.mean"] * gain
-    else:
+    gain, shift = affine(bundle.arch, i, bundle.weights)
+    if bundle.arch.norm == "layer":
         row = (*shape[:3], 1)
         mean = g.mean(f"mean{i}", z, (3,), *row, keep=True)
         squares = g.add("SQUARED_DIFFERENCE", g.value(f"squares{i}", *shape), z, mean)

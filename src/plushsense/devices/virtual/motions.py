@@ -417,31 +417,19 @@ def _hold(canvas: Canvas, trial: Performance, rng: np.random.Generator, world: W
 
 Motion = Callable[[Canvas, Performance, np.random.Generator, World], None]
 
-MOTIONS: dict[str, Motion] = {
-    "Back stroke": lambda c, t, r, w: _stroke(c, t, r, w, w.back_path),
-    "Head stroke": lambda c, t, r, w: _stroke(c, t, r, w, w.head_path),
-    "Ear scratch": lambda c, t, r, w: _scratch(c, t, r, w, w.ear_place),
-    "Neck scratch": lambda c, t, r, w: _scratch(c, t, r, w, w.neck_place),
-    "Tail scratch": lambda c, t, r, w: _scratch(c, t, r, w, w.tail_place),
-    "Tail tap": lambda c, t, r, w: _tap(c, t, r, w, w.tail_place),
-    "Tail hit": _hit,
-    "Tail pull": _pull,
-    "Hold strong": _hug,
-    "Hold in hands": _hold,
+MOTIONS: dict[str, tuple[str, Motion]] = {
+    "Back stroke": ("stroke_s", lambda c, t, r, w: _stroke(c, t, r, w, w.back_path)),
+    "Head stroke": ("stroke_s", lambda c, t, r, w: _stroke(c, t, r, w, w.head_path)),
+    "Ear scratch": ("scratch_s", lambda c, t, r, w: _scratch(c, t, r, w, w.ear_place)),
+    "Neck scratch": ("scratch_s", lambda c, t, r, w: _scratch(c, t, r, w, w.neck_place)),
+    "Tail scratch": ("scratch_s", lambda c, t, r, w: _scratch(c, t, r, w, w.tail_place)),
+    "Tail tap": ("tap_s", lambda c, t, r, w: _tap(c, t, r, w, w.tail_place)),
+    "Tail hit": ("hit_s", _hit),
+    "Tail pull": ("pull_s", _pull),
+    "Hold strong": ("hold_s", _hug),
+    "Hold in hands": ("hold_s", _hold),
 }
-
-DURATIONS: dict[str, str] = {
-    "Back stroke": "stroke_s",
-    "Head stroke": "stroke_s",
-    "Ear scratch": "scratch_s",
-    "Neck scratch": "scratch_s",
-    "Tail scratch": "scratch_s",
-    "Tail tap": "tap_s",
-    "Tail hit": "hit_s",
-    "Tail pull": "pull_s",
-    "Hold strong": "hold_s",
-    "Hold in hands": "hold_s",
-}
+"""The field of `World` that has a family's duration, and the function that simulates it."""
 
 AT_REST = "At rest"
 

@@ -17,7 +17,6 @@ from plushsense.core.errors import ConfigError, nearest
 from plushsense.devices.virtual.motions import (
     APPROACH_S,
     AT_REST,
-    DURATIONS,
     MOTIONS,
     PICK_S,
     PUT_S,
@@ -153,7 +152,7 @@ class VirtualSession:
                 self._hands.approach(canvas, plan)
             if plan.steadied and not in_hands:
                 self._hands.steady(canvas, plan)
-            MOTIONS[family](canvas, trial, rng, world)
+            MOTIONS[family][1](canvas, trial, rng, world)
         at = self.samples
         marks = []
         for p in plans:
@@ -194,7 +193,7 @@ class VirtualSession:
 
     def _plan(self, family: str, record_start: int) -> RepetitionPlan:
         rng, who, world = self._rng, self._who, self.world
-        median, spread = getattr(world, DURATIONS[family])
+        median, spread = getattr(world, MOTIONS[family][0])
         latency = max(0.1, who.latency_s + 0.5 * world.latency_s[1] * rng.standard_normal())
         active = max(0.5, median * who.pace * math.exp(spread * rng.standard_normal()))
         stop = max(0.05, world.stop_s[0] + world.stop_s[1] * rng.standard_normal())
