@@ -29,6 +29,7 @@ from plushsense.deploy.targets import C_FOLDER, TARGETS, build, missing_tools, r
 
 Progress = Callable[[int, int], None]
 Stream = tuple[Vectors, ...]  # what one program runs, one after the other
+Cases = tuple[Stream, Path]  # a stream, and the file that holds it for the harness
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror")
 SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-g")
 HARNESS = C_FOLDER / "harness.c"
@@ -111,14 +112,8 @@ class MutantResult:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as plain values for JSON."""
-        return {
-            "target": self.target,
-            "kind": self.kind,
-            "fault": self.name,
-            "caught": self.caught,
-            "first": self.first,
-            "silent": self.silent,
-        }
+        values = {"fault" if key == "name" else key: value for key, value in vars(self).items()}
+        return values | {"silent": self.silent}
 
 
 @dataclass(frozen=True)
@@ -213,42 +208,31 @@ def verify(
         selected = [m for m in mutants_of(export.image, export.source.decode(_ENCODING)) if mutants(m)]
     chosen = list(dict.fromkeys(s.target for s in settings))
     total, done = len(settings) + len(selected) * len(chosen), 0
-    jobs = jobs or os.cpu_count() or 1
     runs: list[SettingResult] = []
     results: list[MutantResult] = []
+
+    def report() -> None:
+        nonlocal done
+        done += 1
+        if progress:
+            progress(done, total)
+
     with (
         tempfile.TemporaryDirectory(prefix="plushsense-verify-", ignore_cleanup_errors=True) as work,
-        ThreadPoolExecutor(jobs) as pool,
+        ThreadPoolExecutor(jobs or os.cpu_count() or 1) as pool,
     ):
-        folder = Path(work)
-        code = export.code(folder / "code")
-        for n, stream in enumerate(streams):
-            (folder / f"cases-{n}.bin").write_bytes(b"".join(v.to_bytes() for v in stream))
-
-        def report() -> None:
-            nonlocal done
-            done += 1
-            if progress:
-                progress(done, total)
-
-        def run(n: int, setting: Setting) -> SettingResult:
-            return _run(export, code, setting, list(enumerate(streams)), folder, folder / f"run-{n}")
-
-        for found in pool.map(run, range(len(settings)), settings):
+        runner = _Runner(export, Path(work))
+        cases = [runner.write_cases(stream) for stream in streams]
+        for found in pool.map(runner.run, settings, repeat(cases)):
             runs.append(found)
             report()
         # In C that is wrong already every mutant would count as caught.
         if any(r.mismatches for r in runs):
             selected = []
-
         first_of = {target: next(s for s in settings if s.target == target) for target in chosen}
-
-        def run_mutant(n: int, cases: Sequence[tuple[int, Stream]]) -> MutantResult:
-            mutant, target = pairs[n]
-            return _run_mutant(export, code, mutant, first_of[target], cases, folder, folder / f"mutant-{n}")
-
-        pairs = [(mutant, target) for mutant in selected for target in chosen]
-        for each in pool.map(run_mutant, range(len(pairs)), repeat(list(enumerate(streams))[: 1 + bool(scenarios)])):
+        pairs = [(mutant, first_of[target]) for mutant in selected for target in chosen]
+        shown = cases[: 1 + bool(scenarios)]
+        for each in pool.map(runner.run_mutant, *zip(*pairs, strict=True), repeat(shown)) if pairs else ():
             results.append(each)
             report()
         # A mutant that needs a rare sequence of steps may show in other scenarios.
@@ -256,16 +240,13 @@ def verify(
             missed = [n for n, result in enumerate(results) if result.silent]
             if not missed:
                 break
-            n, stream = len(streams) + again, tuple(export.scenarios(again))
-            (folder / f"cases-{n}.bin").write_bytes(b"".join(v.to_bytes() for v in stream))
-            unchanged = [
-                _run(export, code, first_of[target], [(n, stream)], folder, folder / f"again-{target}")
-                for target in chosen
-            ]
+            more = [runner.write_cases(tuple(export.scenarios(again)))]
+            unchanged = [runner.run(first_of[target], more) for target in chosen]
             if any(r.mismatches for r in unchanged):
                 runs += unchanged
                 break
-            for at, each in zip(missed, pool.map(run_mutant, missed, repeat([(n, stream)])), strict=True):
+            repeated = pool.map(lambda n: runner.run_mutant(*pairs[n], more), missed)  # noqa: B023
+            for at, each in zip(missed, repeated, strict=True):
                 results[at] = each
     every = [v for stream in streams for v in stream]
     # Scenarios have models of their own.
@@ -321,100 +302,104 @@ def _no_sanitizers(setting: Setting) -> str:
     return ""
 
 
-def _run(
-    export: Export, code: Path, setting: Setting, streams: Iterable[tuple[int, Stream]], work: Path, out: Path
-) -> SettingResult:
-    began = time.monotonic()
-    compared = []
-    for n, stream in streams:
+class _Runner:
+    """Compiles and runs the C of an export in a work folder; programs may run at the same time."""
+
+    def __init__(self, export: Export, work: Path) -> None:
+        self.export, self.work = export, work
+        self.code = export.code(work / "code")
+
+    def write_cases(self, stream: Stream) -> Cases:
+        """Write a stream to a file as the harness reads it."""
+        path = self._new_folder() / "cases.bin"
+        path.write_bytes(b"".join(v.to_bytes() for v in stream))
+        return stream, path
+
+    def _new_folder(self) -> Path:
+        return Path(tempfile.mkdtemp(dir=self.work))
+
+    def run(self, setting: Setting, streams: Iterable[Cases]) -> SettingResult:
+        """Compile with one setting and compare the answers to each stream."""
+        began, out = time.monotonic(), self._new_folder()
+        compared = []
+        for cases in streams:
+            try:
+                compared.append(self._attempt(self.code, setting, cases, out, both=True))
+            except BuildError as cause:
+                count = sum(len(v.answers) for v in cases[0])
+                compared.append(RowComparison(count, count, 0, f"On {setting.target} ({setting.options}): {cause}"))
+        shutil.rmtree(out, ignore_errors=True)
+        return SettingResult(
+            setting.target,
+            setting.compiler,
+            setting.options,
+            sum(c.vectors for c in compared),
+            sum(c.mismatches for c in compared),
+            max(c.max_abs_diff for c in compared),
+            time.monotonic() - began,
+            next((c.first for c in compared if c.first), None),
+        )
+
+    def run_mutant(self, mutant: Mutant, setting: Setting, streams: Sequence[Cases]) -> MutantResult:
+        """Build a copy with one mutant and compare its answers to the golden vectors and the test scenarios.
+
+        Scenarios have models of their own and cannot show a mutant of the export's model.
+        """
+        out = self._new_folder()
+        copy = out / "export"
+        copy.mkdir()
+        for name in (*LIBRARY, *MODEL, IMAGE):
+            shutil.copyfile(self.code / name, copy / name)
+        if mutant.image is not None:
+            (copy / IMAGE).write_bytes(mutant.image)
+        if mutant.source is not None:
+            (copy / LIBRARY[1]).write_text(mutant.source, _ENCODING)
+        # On the host compiling takes longer than running.
+        optimise = "-O1" if setting.target == "host" else "-O2"
+        plain = replace(setting, optimise=optimise, flags=("-std=c99",), image=mutant.image is not None)
+        streams = streams[: 1 if mutant.image is not None else None]
+        # Mutants of the rules show in the scenarios first.
+        for cases in reversed(streams) if mutant.kind in RULES else streams:
+            result = self._attempt(copy, plain, cases, out)
+            if result.mismatches:
+                break
+        shutil.rmtree(out, ignore_errors=True)
+        return MutantResult(setting.target, mutant.kind, mutant.name, result.mismatches > 0, result.first)
+
+    def _attempt(self, code: Path, setting: Setting, cases: Cases, out: Path, *, both: bool = False) -> RowComparison:
+        """Run one program on one stream; ``first`` of the result is a whole sentence.
+
+        ``both``: a program that reads plush_model.bin also checks that plush_model.c holds the same bytes.
+        """
+        stream, path = cases
+        labels = self.export.labels
+        where = f"On {setting.target} ({setting.compiler} {setting.options}), {stream[0].name}"
+        expected = np.concatenate([v.answers for v in stream])
+        # A copy, because the compiler would find PlushSense's own plushsense.h beside the original first.
+        harness = out / ("harness.cpp" if setting.cpp else "harness.c")
+        shutil.copyfile(HARNESS, harness)
+        both = both and setting.image
+        defines = {
+            "PLUSH_HARNESS_CHANNELS": stream[0].frames.shape[1] - 1,
+            "PLUSH_HARNESS_CLASSES": len(labels),
+            "PLUSH_HARNESS_MEMORY_BYTES": max(v.memory_bytes for v in stream),
+            **({"PLUSH_HARNESS_IMAGE": 1} if setting.image else {}),
+            **({"PLUSH_HARNESS_BOTH": 1} if both else {}),
+        }
+        program = build(
+            setting.target,
+            [code / LIBRARY[1], harness, *([code / MODEL[1]] if both or not setting.image else [])],
+            out,
+            include=[code],
+            defines=defines,
+            optimise=setting.optimise,
+            blobs={"cases": path, **({"image": code / IMAGE} if setting.image else {})},
+            cc=setting.cc,
+            flags=setting.flags,
+        )
         try:
-            compared.append(_attempt(export, code, setting, stream, work / f"cases-{n}.bin", out, both=True))
-        except BuildError as cause:
-            count = sum(len(v.answers) for v in stream)
-            compared.append(RowComparison(count, count, 0, f"On {setting.target} ({setting.options}): {cause}"))
-    shutil.rmtree(out, ignore_errors=True)
-    return SettingResult(
-        setting.target,
-        setting.compiler,
-        setting.options,
-        sum(c.vectors for c in compared),
-        sum(c.mismatches for c in compared),
-        max(c.max_abs_diff for c in compared),
-        time.monotonic() - began,
-        next((c.first for c in compared if c.first), None),
-    )
-
-
-def _attempt(
-    export: Export, folder: Path, setting: Setting, stream: Stream, cases: Path, out: Path, *, both: bool = False
-) -> RowComparison:
-    """Run one program on one stream; ``first`` of the result is a whole sentence.
-
-    ``both``: a program that reads plush_model.bin also checks that plush_model.c holds the same bytes.
-    """
-    where = f"On {setting.target} ({setting.compiler} {setting.options}), {stream[0].name}"
-    expected = np.concatenate([v.answers for v in stream])
-    out.mkdir(parents=True, exist_ok=True)
-    # A copy, because the compiler would find PlushSense's own plushsense.h beside the original first.
-    harness = out / ("harness.cpp" if setting.cpp else "harness.c")
-    shutil.copyfile(HARNESS, harness)
-    both = both and setting.image
-    sources = [folder / LIBRARY[1], harness] + ([folder / MODEL[1]] if both or not setting.image else [])
-    blobs = {"cases": cases} | ({"image": folder / IMAGE} if setting.image else {})
-    classes = len(export.labels)
-    defines = {"PLUSH_HARNESS_CHANNELS": stream[0].frames.shape[1] - 1, "PLUSH_HARNESS_CLASSES": classes}
-    defines["PLUSH_HARNESS_MEMORY_BYTES"] = max(v.memory_bytes for v in stream)
-    defines |= {"PLUSH_HARNESS_IMAGE": 1} if setting.image else {}
-    if both:
-        defines["PLUSH_HARNESS_BOTH"] = 1
-    program = build(
-        setting.target,
-        sources,
-        out,
-        include=[folder],
-        defines=defines,
-        optimise=setting.optimise,
-        blobs=blobs,
-        cc=setting.cc,
-        flags=setting.flags,
-    )
-    try:
-        got = program.run(timeout_s=60 + 0.02 * sum(len(v.frames) for v in stream))
-    except ProgramError as cause:
-        return RowComparison(len(expected), len(expected), 0, f"{where}: {cause}")
-    result = compare(expected, got, export.labels)
-    return replace(result, first=f"{where}: {result.first}.") if result.first else result
-
-
-def _run_mutant(
-    export: Export,
-    code: Path,
-    mutant: Mutant,
-    setting: Setting,
-    streams: Sequence[tuple[int, Stream]],
-    work: Path,
-    out: Path,
-) -> MutantResult:
-    """Build a copy with one mutant and compare its answers to the golden vectors and the test scenarios.
-
-    Scenarios have models of their own and cannot show a mutant of the export's model.
-    """
-    copy = out / "export"
-    copy.mkdir(parents=True)
-    for name in (*LIBRARY, *MODEL, IMAGE):
-        shutil.copyfile(code / name, copy / name)
-    if mutant.image is not None:
-        (copy / IMAGE).write_bytes(mutant.image)
-    if mutant.source is not None:
-        (copy / LIBRARY[1]).write_text(mutant.source, _ENCODING)
-    # On the host compiling takes longer than running.
-    optimise = "-O1" if setting.target == "host" else "-O2"
-    plain = replace(setting, optimise=optimise, flags=("-std=c99",), image=mutant.image is not None)
-    cases = streams[: 1 if mutant.image is not None else None]
-    # Mutants of the rules show in the scenarios first.
-    for n, stream in reversed(cases) if mutant.kind in RULES else cases:
-        result = _attempt(export, copy, plain, stream, work / f"cases-{n}.bin", out)
-        if result.mismatches:
-            break
-    shutil.rmtree(out, ignore_errors=True)
-    return MutantResult(setting.target, mutant.kind, mutant.name, result.mismatches > 0, result.first)
+            got = program.run(timeout_s=60 + 0.02 * sum(len(v.frames) for v in stream))
+        except ProgramError as cause:
+            return RowComparison(len(expected), len(expected), 0, f"{where}: {cause}")
+        result = compare(expected, got, labels)
+        return replace(result, first=f"{where}: {result.first}.") if result.first else result
