@@ -7,13 +7,14 @@ One block is Conv1d → ReLU → normalisation; after the blocks the mean over t
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, Literal, NoReturn, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import ArchError, nearest
+from plushsense.core.toml import refuse_unknown
 
 MAX_LAYERS = 4
 MAX_NUMBER = 4096  # of a kernel, a dilation, a filter count: far above use, far below what would exhaust memory
@@ -354,28 +355,14 @@ class Arch:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON; the layers as their symbol."""
-        return {
-            "symbol": self.symbol,
-            "filters": list(self.filters),
-            "channels": self.channels,
-            "classes": self.classes,
-            "padding": self.padding,
-            "norm": self.norm,
-            "window": self.window,
-            "step": self.step,
-            "pool": self.pool,
-        }
+        others = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "layers"}
+        return {"symbol": self.symbol, "filters": list(self.filters), **others}
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> Arch:
         """Return the network that ``to_dict`` described; raise ArchError for a missing, unknown or unfit key."""
         known = ("symbol", "filters", "channels", "classes", "padding", "norm", "window", "step", "pool")
-        for key in table:
-            if key not in known:
-                accepted = ", ".join(known)
-                raise ArchError(
-                    f"Unknown key '{key}' in an architecture: accepted are {accepted}.{nearest(key, known)}"
-                )
+        refuse_unknown(table, known, "an architecture", ArchError)
         missing = [key for key in known[:2] if key not in table]
         if missing:
             raise ArchError(f"An architecture lacks the key '{missing[0]}': add it.")
