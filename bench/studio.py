@@ -34,7 +34,7 @@ import numpy as np
 
 CHROMIUM = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"]
 CHROMIUM += ["--disable-component-update", "--disable-sync", "--enable-precise-memory-info"]
-_LOOK = "() => { const s = window.plushsenseLive; return {...s, delays: [...s.delays], shown: [...s.shown]}; }"
+_LOOK = "() => { const s = window.plushsenseLive; return {...s, delays: [...s.delays], painted: [...s.painted]}; }"
 
 
 def processor_s(pid: int) -> float:
@@ -106,14 +106,14 @@ def begin(page: Any) -> None:
 
 def at_real_time(page: Any, pid: int, seconds: float) -> dict[str, Any]:
     """Measure updates, processor time and delays for a number of seconds."""
-    page.evaluate("() => { window.plushsenseLive.delays.length = 0; window.plushsenseLive.shown.length = 0; }")
+    page.evaluate("() => { window.plushsenseLive.delays.length = 0; window.plushsenseLive.painted.length = 0; }")
     before, used, began = page.evaluate(_LOOK), processor_s(pid), time.perf_counter()
     delays: list[float] = []
     drawn: list[float] = []
     while time.perf_counter() - began < seconds:
         time.sleep(min(5.0, seconds))
         seen = page.evaluate(
-            "() => { const s = window.plushsenseLive; return [s.delays.splice(0), s.shown.splice(0)]; }"
+            "() => { const s = window.plushsenseLive; return [s.delays.splice(0), s.painted.splice(0)]; }"
         )
         delays += seen[0]
         drawn += seen[1]

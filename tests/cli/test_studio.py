@@ -121,7 +121,7 @@ def test_it_answers_says_where_and_ends_on_ctrl_c(tmp_path: Path) -> None:
     second = Running(tmp_path / "home")
     _, err = second.process.communicate(timeout=60)
     assert second.process.returncode == 2
-    assert "A studio is open on" in err and len(err.strip().splitlines()) == 1
+    assert "A studio is already running in" in err and len(err.strip().splitlines()) == 1
     status, out, err = one.end()
     assert (status, out) == (130, "")
     assert "Traceback" not in err

@@ -18,7 +18,6 @@ from plushsense.core.errors import BadInput, ConfigError
 from plushsense.studio import tasks
 from plushsense.studio.app.guard import path_in, zip_chunks
 from plushsense.studio.app.jobs import DONE, Jobs, StudioJob
-from plushsense.studio.app.worker import TaskReporter
 from plushsense.studio.app.workspace import EXPORTS, Workspace
 from plushsense.studio.pages.export.exports import (
     BundleFacts,
@@ -29,6 +28,7 @@ from plushsense.studio.pages.export.exports import (
     newest_job,
     targets,
 )
+from plushsense.studio.tasks import TaskReporter
 from support.exported import bundle_of, flip, sums
 
 
@@ -91,7 +91,7 @@ def test_facts_of_bundles(tmp_path: Path) -> None:
     bundle_of(padding="mirror").save(tmp_path / "mirror.plush")
     (tmp_path / "broken.plush").write_bytes((tmp_path / "fine.plush").read_bytes()[:-9])
     fine, mirror, broken = (BundleFacts.of(tmp_path / f"{n}.plush") for n in ("fine", "mirror", "broken"))
-    assert (fine.problem, fine.cannot, fine.layout, len(fine.gestures)) == ("", "", "accel-3", 18)
+    assert (fine.problem, fine.cannot, fine.bundle.layout.name, len(fine.bundle.gestures)) == ("", "", "accel-3", 18)
     assert "train 5d1_4d3 with --padding stream" in mirror.cannot and mirror.problem == ""
     assert "bytes are missing at its end" in broken.problem
     assert BundleFacts.of(tmp_path / "none.plush").problem.startswith("There is no bundle")

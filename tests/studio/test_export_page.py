@@ -132,11 +132,11 @@ def test_each_refusal_is_a_sentence(studio: Fixture, look: Fixture, shots: Fixtu
     assert marked(page, "do").is_disabled()
     page.goto(f"{url}/export?model={home / 'bundles' / 'fine.plush'}")
     connected(page)
-    for name, said in (("taken", "is there already"), ("../out", "cannot be a name"), ("", "cannot be a name")):
+    for name, said in (("taken", "exists already"), ("../out", "cannot be a name"), ("", "cannot be a name")):
         marked(page, "name").fill(name)
         marked(page, "do").click()
-        marked(page, "said").get_by_text(said).wait_for()
-        marked(page, "said").get_by_role("button").click()
+        marked(page, "message").get_by_text(said).wait_for()
+        marked(page, "message").get_by_role("button").click()
     # A home that cannot be written to, for root too.
     (home / "exports" / "taken").rmdir()
     (home / "exports").rmdir()

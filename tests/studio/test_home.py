@@ -80,15 +80,15 @@ def test_sessions_become_a_data_set_and_what_is_new_is_added(studio: Fixture, lo
     assert "Sessions that are in no data set yet: 1" in marked(page, "next-sentence").inner_text()
     marked(page, "next-button").click()
     marked(page, "make").click()
-    marked(page, "said").get_by_text("cannot be a name").wait_for()
+    marked(page, "message").get_by_text("cannot be a name").wait_for()
     marked(page, "new-name").fill("autumn & co")
     marked(page, "make").click()
-    marked(page, "said").get_by_text("cannot be a name").wait_for()
+    marked(page, "message").get_by_text("cannot be a name").wait_for()
     assert axe(page) == []
     marked(page, "new-name").fill("autumn")
     marked(page, "make").click()
     marked(page, "dataset").get_by_text("recordings: 4").wait_for()
-    assert marked(page, "said").count() == 0
+    assert marked(page, "message").count() == 0
     marked(page, "sessions").get_by_text("in the data set “autumn”").wait_for()
     record(workspace, "S02")
     page.reload()
@@ -98,7 +98,7 @@ def test_sessions_become_a_data_set_and_what_is_new_is_added(studio: Fixture, lo
     page.locator("[data-test=batch] .q-checkbox").first.wait_for()
     # Nothing is ticked any more, for all is kept.
     marked(page, "add").click()
-    marked(page, "said").get_by_text("No session is chosen").wait_for()
+    marked(page, "message").get_by_text("No session is chosen").wait_for()
     assert axe(page) == []
     assert browser.complaints == []
 
@@ -114,14 +114,14 @@ def test_the_toy_is_chosen_and_tested(studio: Fixture, look: Fixture) -> None:
     marked(page, "virtual").click()
     marked(page, "chosen").get_by_text("virtual://?person=12").wait_for()
     marked(page, "test").click()
-    marked(page, "said").get_by_text("The toy works").wait_for()
+    marked(page, "message").get_by_text("The toy works").wait_for()
     # Another tab shows the same toy, and hears of a change.
     second = browser.open(one.url)
     marked(second, "chosen").get_by_text("person=12").wait_for()
     for wrong in ("http://x", "replay:///etc/passwd"):
         marked(page, "address").fill(wrong)
         marked(page, "use").click()
-        marked(page, "said").get_by_text(wrong.partition("//")[2]).wait_for()
+        marked(page, "message").get_by_text(wrong.partition("//")[2]).wait_for()
     marked(page, "address").fill("virtual://?person=3")
     marked(page, "use").click()
     marked(second, "chosen").get_by_text("person=3").wait_for()
@@ -158,7 +158,7 @@ def test_recordings_come_in_as_a_zip(studio: Fixture, look: Fixture, tmp_path: P
     assert "recordings: 51" in marked(page, "dataset").inner_text()
     marked(page, "incoming-name").fill("brought")
     send(page, "mine.zip", data)
-    page.get_by_role("alert").get_by_text("is there already").wait_for()
+    page.get_by_role("alert").get_by_text("exists already").wait_for()
     home = tmp_path / "home"
     assert sorted(p.name for p in (home / DATASETS).iterdir()) == ["brought"]
     assert list((home / "work" / "incoming").iterdir()) == []
@@ -172,7 +172,7 @@ def test_the_button_opens_the_file_chooser(studio: Fixture, look: Fixture, furni
     with page.expect_file_chooser() as choosing:
         page.get_by_role("button", name="Choose a .zip or .plush file").click()
     choosing.value.set_files(furniture / "bundles" / "little.plush")
-    marked(page, "said").get_by_text("is here").wait_for()
+    marked(page, "message").get_by_text("is here").wait_for()
     assert [p.name for p in (tmp_path / "home" / "bundles").iterdir()] == ["little.plush"]
     assert browser.complaints == []
 
@@ -192,7 +192,7 @@ def test_a_bundle_comes_in(studio: Fixture, look: Fixture, furniture: Path, tmp_
     send(page, "bad.plush", b"nothing")
     page.get_by_role("alert").get_by_text("bad.plush").wait_for()
     send(page, "../../good one!.plush", (furniture / "bundles" / "little.plush").read_bytes())
-    marked(page, "said").get_by_text("is here").wait_for()
+    marked(page, "message").get_by_text("is here").wait_for()
     assert "gestures: 18" in marked(page, "bundle").inner_text()
     assert [p.name for p in (tmp_path / "home" / "bundles").iterdir()] == ["good one.plush"]
     marked(page, "next-sentence").get_by_text("is trained").wait_for()

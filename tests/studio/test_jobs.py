@@ -229,14 +229,12 @@ def test_the_work_of_a_killed_studio_ends_and_reads_as_stopped(workspace: Worksp
 WORKER_WITH_CHILD = """
 import subprocess, sys
 from plushsense.studio import tasks
-from plushsense.studio.app import worker
 def run(spec, reporter):
     child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
     reporter.progress(pid=child.pid)
     child.wait()
-tasks.run_child = run
-worker.TASKS["child"] = "run_child"
-sys.exit(worker.main())
+tasks.TASKS["child"] = run
+sys.exit(tasks.main())
 """
 
 
@@ -263,7 +261,7 @@ def test_a_worker_ends_with_its_studio_and_takes_its_own_processes_along() -> No
 @pytest.mark.parametrize("line", ["\n", "nonsense\n", "[]\n", '{"task": 5, "spec": {}}\n'])
 def test_a_worker_that_is_asked_nonsense_refuses(line: str) -> None:
     worker = subprocess.Popen(
-        [sys.executable, "-m", "plushsense.studio.app.worker"],
+        [sys.executable, "-m", "plushsense.studio.tasks"],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,

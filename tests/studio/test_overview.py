@@ -10,7 +10,6 @@ import pytest
 
 from plushsense.dataset.marks import Mark, append_marks
 from plushsense.studio import tasks
-from plushsense.studio.app.worker import TaskReporter
 from plushsense.studio.app.workspace import BUNDLES, DATASETS, WORK, Workspace
 from plushsense.studio.pages.home.overview import (
     BundleEntry,
@@ -20,6 +19,7 @@ from plushsense.studio.pages.home.overview import (
     WorkspaceSummary,
     next_step,
 )
+from plushsense.studio.tasks import TaskReporter
 from plushsense.workflow.api import simulate
 from support.recorded import record
 
@@ -58,11 +58,11 @@ def test_sessions_wait_until_a_data_set_holds_all_of_them(tmp_path: Path) -> Non
         ("S01", "1", 4, True, True),
         ("S02", "1", 4, True, True),
     ]
-    assert next_step(seen).about == {"n": 2, "recordings": 8}
+    assert next_step(seen).values == {"n": 2, "recordings": 8}
     done = take_in(workspace, [first], "mine")
     assert (done["recordings"], done["rejected"]) == (4, [])
     seen = overview.look()
-    assert [s.kept for s in seen.sessions] == [("mine",), ()]
+    assert [s.datasets for s in seen.sessions] == [("mine",), ()]
     assert (seen.datasets[0].people, seen.datasets[0].recordings, seen.datasets[0].simulated) == (1, 4, True)
     done = take_in(workspace, [first, second], "mine", add=True)
     assert done["added"]["recordings"] == 4
@@ -134,7 +134,7 @@ TOY_NET = BundleEntry(Path("v.plush"), "v", simulated=True)
 BROKEN_NET = BundleEntry(Path("b.plush"), "b", refused="It is broken.")
 OPEN = SessionEntry(Path("s"), "S01", "1")
 MADE = SessionEntry(Path("s"), "S01", "1", recordings=4)
-KEPT = SessionEntry(Path("s"), "S01", "1", recordings=4, finished=True, kept=("real",))
+KEPT = SessionEntry(Path("s"), "S01", "1", recordings=4, finished=True, datasets=("real",))
 
 
 @pytest.mark.parametrize(

@@ -57,7 +57,7 @@ def _home(page: Any, studio: Studio) -> None:
         marked(page, "dataset").get_by_role("button").click()
     marked(page, "job-done").first.wait_for(timeout=90_000)
     marked(page, "test").click()
-    page.locator(".ps-said-good").wait_for()
+    page.locator(".ps-message-good").wait_for()
 
 
 def _record(page: Any, studio: Studio) -> None:
@@ -81,7 +81,7 @@ def _review(page: Any, studio: Studio) -> None:
     page.goto(f"{studio.url}/review?dataset=datasets/virtual&view=one&gesture=Back%20stroke%201")
     connected(page)
     page.wait_for_function("() => document.querySelector('[data-test=making]')?.textContent === ''")
-    page.wait_for_selector("[data-test=plot][data-shown] .uplot")
+    page.wait_for_selector("[data-test=plot][data-recording] .uplot")
 
 
 def _train(page: Any, studio: Studio) -> None:

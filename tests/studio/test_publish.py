@@ -19,7 +19,6 @@ from plushsense.dataset.publishing.checking import VALIDATORS
 from plushsense.studio import tasks
 from plushsense.studio.app.jobs import DONE, Jobs, StudioJob
 from plushsense.studio.app.words import LANGUAGES, Words
-from plushsense.studio.app.worker import TaskReporter
 from plushsense.studio.app.workspace import PACKAGES, Workspace
 from plushsense.studio.pages.publish.packages import (
     DatasetFacts,
@@ -29,6 +28,7 @@ from plushsense.studio.pages.publish.packages import (
     packages_of,
     reidentification_text,
 )
+from plushsense.studio.tasks import TaskReporter
 
 SAID = {"licence": "CC-BY-4.0", "contact": "Ada <ada@example.org>", "consent": "all agreed"}
 

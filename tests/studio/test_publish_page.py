@@ -26,12 +26,12 @@ def test_publish_check_and_break(studio: Fixture, look: Fixture, shots: Fixture,
     assert "Nothing is uploaded" in marked(page, "danger").inner_text()
     assert "does not say yet: contact" in marked(page, "lacks").inner_text()
     marked(page, "do").click()
-    assert "cannot be published without licence, contact and consent" in marked(page, "said").inner_text()
+    assert "cannot be published without licence, contact and consent" in marked(page, "message").inner_text()
     assert axe(page) == []
     marked(page, "contact-name").fill("Ada")
     marked(page, "contact-mail").fill("nonsense")
     marked(page, "do").click()
-    marked(page, "said").get_by_text("cannot be used").wait_for()
+    marked(page, "message").get_by_text("cannot be used").wait_for()
     marked(page, "contact-mail").fill("ada@example.org")
     marked(page, "with-key").click()
     marked(page, "name").fill("one")
@@ -58,12 +58,12 @@ def test_publish_check_and_break(studio: Fixture, look: Fixture, shots: Fixture,
     assert Path(loaded.value.path()).read_bytes() == made.read_bytes()
 
     # Taken names, also that of a zip alone; then a package that somebody changed.
-    for name, taken in (("one", "is there already"), ("two", "is there already")):
+    for name, taken in (("one", "exists already"), ("two", "is there already")):
         shutil.copy(made, few / "packages" / "two.zip")
         marked(page, "name").fill(name)
         marked(page, "do").click()
-        marked(page, "said").get_by_text(taken).wait_for()
-        marked(page, "said").get_by_role("button").click()
+        marked(page, "message").get_by_text(taken).wait_for()
+        marked(page, "message").get_by_role("button").click()
     made.unlink()
     (few / "packages" / "one" / "gestures.csv").write_text("Shake\n", "utf-8")
     other = look(TABLET, dark=True, language="lv", touch=True)
@@ -87,12 +87,12 @@ def test_pseudonyms_refusals_and_stop(studio: Fixture, look: Fixture, shots: Fix
     page = browser.open(f"{url}/publish")
     assert "licence, contact, consent statement" in marked(page, "lacks").inner_text()
     marked(page, "do").click()
-    assert "consent = " in marked(page, "said").inner_text()
+    assert "consent = " in marked(page, "message").inner_text()
     marked(page, "rename").get_by_text("Make a copy under pseudonyms").click()
     marked(page, "rename-name").fill("shared")
     marked(page, "rename-key").fill("../people.csv")
     marked(page, "rename-do").click()
-    marked(page, "said").get_by_text("cannot be a name").wait_for()
+    marked(page, "message").get_by_text("cannot be a name").wait_for()
     marked(page, "rename-key").fill("people.csv")
     assert axe(page) == []
     shots(page, "publish-pseudonyms")
@@ -123,7 +123,7 @@ def test_pseudonyms_refusals_and_stop(studio: Fixture, look: Fixture, shots: Fix
     marked(page, "ended").get_by_text("cannot be created").wait_for(timeout=60_000)
     page.goto(f"{url}/publish?name=nothing")
     connected(page)
-    assert "There is no package 'nothing'" in marked(page, "said").inner_text()
+    assert "There is no package 'nothing'" in marked(page, "message").inner_text()
     assert browser.complaints == []
 
 

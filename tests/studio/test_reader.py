@@ -185,7 +185,7 @@ def test_lines_that_are_no_frames_are_told(workspace: Workspace) -> None:
     until(lambda: urls)
     reader = workspace.part(LiveReader)
     reader.start(LiveChoice(urls[0], bundle(workspace, "accel")))
-    until(lambda: "none is a frame of 'accel-3'" in reader.now.problem)
+    until(lambda: "none is a frame of the layout 'accel-3'" in reader.now.problem)
     stop.set()
 
 

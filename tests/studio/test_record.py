@@ -97,7 +97,7 @@ def test_redo_skip_back_pause_and_going_to_a_step(studio: Fixture, look: Fixture
     # Skipped while it is to be made again: the earlier one counts after all.
     page.keyboard.press("s")
     showing(page, "idle.1.1.0.0")
-    assert "kept" in marked(page, "message").inner_text()
+    assert "kept" in marked(page, "recorder-message").inner_text()
     marked(page, "skip").click()
     showing(page, "idle.2.1.1.0")
     marked(page, "back").click()
@@ -115,7 +115,7 @@ def test_redo_skip_back_pause_and_going_to_a_step(studio: Fixture, look: Fixture
     page.keyboard.press("p")
     showing(page, "paused.1.")
     page.keyboard.press("Space")
-    page.wait_for_function("() => document.querySelector('[data-test=message]').innerText.includes('Paused')")
+    page.wait_for_function("() => document.querySelector('[data-test=recorder-message]').innerText.includes('Paused')")
     marked(page, "main").click()
     take(page, 1)
     showing(page, "idle.2.2.0.0")
@@ -138,7 +138,7 @@ def test_redo_skip_back_pause_and_going_to_a_step(studio: Fixture, look: Fixture
     assert marked(page, "pause").inner_text() == "Break off and pause"
     marked(page, "pause").click()
     showing(page, "paused.2.2.0.0")
-    assert "made again" in marked(page, "message").inner_text()
+    assert "made again" in marked(page, "recorder-message").inner_text()
     marked(page, "main").click()
     showing(page, "idle.2.2.0.0")
     assert len(files(tmp_path / "home")) == 2
@@ -181,7 +181,7 @@ def test_two_tabs_show_and_press_the_same_once(studio: Fixture, look: Fixture, t
             held.pop(0)()
 
     both_press()
-    marked(other, "said").get_by_text("came too late").wait_for()
+    marked(other, "message").get_by_text("came too late").wait_for()
     for page in (one, other):
         showing(page, "recording.0.")
     both_press()
@@ -197,7 +197,7 @@ def test_two_tabs_show_and_press_the_same_once(studio: Fixture, look: Fixture, t
     for page in (one, other):
         page.wait_for_url("**/record?ended=S01/1")
         connected(page)
-        assert "1 of 4 recorded" in marked(page, "said").inner_text()
+        assert "1 of 4 recorded" in marked(page, "message").inner_text()
     one.get_by_role("button", name="Go on: S01/1").click()
     sat(one, "S01/1")
     assert showing(one, "idle.") == "idle.1.1.0.0"
@@ -237,7 +237,7 @@ def test_a_lost_connection_loses_nothing(studio: Fixture, look: Fixture, tmp_pat
     page = look().open(server.url + "/record")
     heard(page)
     assert showing(page, "idle.") == "idle.2.2.0.0"
-    assert "Nobody stopped it" in marked(page, "message").inner_text()
+    assert "Nobody stopped it" in marked(page, "recorder-message").inner_text()
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="Windows cannot stop a process for a while")
@@ -280,7 +280,7 @@ def test_it_speaks_latvian_and_fits_a_tablet(studio: Fixture, look: Fixture, sho
         page.locator('[data-test="code"]').fill("Anna B")
         marked(page, "begin").click()
         page.get_by_role("alert").wait_for()
-        assert "no code for a person" in marked(page, "said").inner_text()
+        assert "no code for a person" in marked(page, "message").inner_text()
         assert axe(page) == []
         marked(page, "code").fill(code)
         choose(page, "protocol", "Izmēģināšanai" if language == "lv" else "To try it")

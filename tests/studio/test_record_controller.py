@@ -54,7 +54,7 @@ def test_a_session_from_its_beginning_to_its_end(controller: RecordController, t
     hearing.start()
     end = controller.changed.subscribe(lambda: changes.append(1), loop)
     session = controller.begin(QUICK)
-    assert (session.name, session.head.simulated, session.notices, session.mended) == ("S01/1", True, (), ())
+    assert (session.name, session.head.simulated, session.notices, session.repairs) == ("S01/1", True, (), ())
     assert controller.begin(QUICK) is session, "a second tab gets the same session"
     assert controller.resume("S01/1") is session
     assert controller.get("S01/1") is session
@@ -152,9 +152,9 @@ def test_what_is_refused_leaves_nothing(controller: RecordController, tmp_path: 
         (SessionRequest(CALM, "S01", str(outside)), "not a protocol of this studio"),
         (SessionRequest(CALM, "S01", "quick", layout=str(outside)), "not a layout of this studio"),
         (SessionRequest(CALM, "S01", "quick", words="xx"), "no wording"),
-        (SessionRequest(f"{CALM}&layout={outside}", "S01"), "names a file"),
-        (SessionRequest("replay:///etc/passwd", "S01"), "names a file"),
-        (SessionRequest("/etc/passwd", "S01"), "names a file"),
+        (SessionRequest(f"{CALM}&layout={outside}", "S01"), "refers to a file"),
+        (SessionRequest("replay:///etc/passwd", "S01"), "refers to a file"),
+        (SessionRequest("/etc/passwd", "S01"), "refers to a file"),
         (SessionRequest("serial:///dev/nowhere", "S01"), "there is no port"),
         (SessionRequest("telepathy://x", "S01"), "no scheme"),
         (SessionRequest(CALM, "S01", speed=-1.0), "0 .* to 1000"),

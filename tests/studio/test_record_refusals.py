@@ -69,7 +69,7 @@ def test_a_session_that_cannot_begin(
     assert axe(page) == []
     shots(page, "record-refused")
     fill(page, "S01", "replay:///etc/passwd")
-    said(page, "names a file")
+    said(page, "refers to a file")
     fill(page, "S01", "serial:///dev/nowhere7")
     said(page, "there is no port")
     with pty_toy(tmp_path / "none.jsonl", 1.0) as toy, open_device(toy.url):
@@ -102,7 +102,7 @@ def test_a_session_that_cannot_begin(
     sat(page, "S01/1")
     page.goto(server.url + "/record?session=S09/1")
     connected(page)
-    assert "no unfinished session S09/1" in marked(page, "said").inner_text()
+    assert "no unfinished session S09/1" in marked(page, "message").inner_text()
     assert browser.complaints == []
 
 

@@ -68,7 +68,7 @@ def test_51_recordings_by_the_space_bar(studio: Fixture, look: Fixture, shots: F
         assert marked(page, "progress").inner_text() == "51 of 51 recorded"
         marked(page, "main").click()
         page.wait_for_url("**/record?ended=S01/1")
-        assert "S01/1 is finished: 51 of 51" in marked(page, "said").inner_text()
+        assert "S01/1 is finished: 51 of 51" in marked(page, "message").inner_text()
     assert check_whole(folder, toy) == 51
     made = Counter(n.label for p in recordings(folder) if (n := parse_name(p.name)) is not None)
     assert made == dict.fromkeys(GESTURES, 3)

@@ -14,7 +14,7 @@ from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks, read_marks
 from plushsense.dataset.trimming import row_times_s, suggest_trims
 from plushsense.studio.app.workspace import Workspace
-from plushsense.studio.pages.review.selection import Reviews
+from plushsense.studio.pages.review.review import Reviews
 from support.browsing import DESK, TABLET, axe, connected, marked
 from support.reviewed import ROW_S, made, marks, raw_hash
 
@@ -35,20 +35,20 @@ def waves(tmp_path: Path) -> Path:
 def opened(page: Page) -> str:
     """The id of the recording that is drawn."""
     page.wait_for_function(
-        f"() => document.querySelector('{PLOT}')?.psPlot?.u && document.querySelector('{PLOT}').dataset.shown"
+        f"() => document.querySelector('{PLOT}')?.psPlot?.u && document.querySelector('{PLOT}').dataset.recording"
     )
     return shown(page)
 
 
 def shown(page: Page) -> str:
-    return str(page.locator(PLOT).get_attribute("data-shown"))
+    return str(page.locator(PLOT).get_attribute("data-recording"))
 
 
 def pressed(page: Page, key: str) -> str:
     """Press a key and wait for another recording."""
     was = shown(page)
     page.keyboard.press(key)
-    page.wait_for_function("([plot, was]) => document.querySelector(plot).dataset.shown !== was", arg=[PLOT, was])
+    page.wait_for_function("([plot, was]) => document.querySelector(plot).dataset.recording !== was", arg=[PLOT, was])
     return shown(page)
 
 
@@ -116,7 +116,7 @@ def test_a_click_moves_the_mark_to_within_a_sample(
     wanted[third] = (start, click(0.77))
     wait_for_kept(page, wanted[third][1])
     marked(page, "accept").click()
-    page.wait_for_function("([plot, was]) => document.querySelector(plot).dataset.shown !== was", arg=[PLOT, third])
+    page.wait_for_function("([plot, was]) => document.querySelector(plot).dataset.recording !== was", arg=[PLOT, third])
 
     dataset, standing = open_dataset(waves), read_marks(waves)
     assert set(standing) == set(wanted)
@@ -220,7 +220,9 @@ def test_keys_are_no_commands_while_something_else_has_them(waves: Path, studio:
     assert [(m["recording"], m["who"]) for m in marks(waves)] == [(first, "Ruta")]
     # After a click of the mouse, keys are commands again.
     marked(page, "accept").click()
-    page.wait_for_function("([plot, was]) => document.querySelector(plot).dataset.shown !== was", arg=[PLOT, second])
+    page.wait_for_function(
+        "([plot, was]) => document.querySelector(plot).dataset.recording !== was", arg=[PLOT, second]
+    )
     third = shown(page)
     assert pressed(page, "Enter") != third
     page.wait_for_timeout(300)
@@ -231,7 +233,9 @@ def test_keys_are_no_commands_while_something_else_has_them(waves: Path, studio:
         """() => { for (const repeat of [false, true, true]) document.body.dispatchEvent(
                    new KeyboardEvent('keydown', {key: 'Enter', repeat, bubbles: true})) }"""
     )
-    page.wait_for_function("([plot, was]) => document.querySelector(plot).dataset.shown !== was", arg=[PLOT, fourth])
+    page.wait_for_function(
+        "([plot, was]) => document.querySelector(plot).dataset.recording !== was", arg=[PLOT, fourth]
+    )
     page.wait_for_timeout(300)
     assert [m["recording"] for m in marks(waves)] == [first, second, third, fourth]
     # The name is kept by the browser; the place by the address.
@@ -241,7 +245,9 @@ def test_keys_are_no_commands_while_something_else_has_them(waves: Path, studio:
     assert opened(page) == at
     assert marked(page, "who").input_value() == "Ruta"
     page.keyboard.press("u")
-    page.wait_for_function("([plot, was]) => document.querySelector(plot).dataset.shown === was", arg=[PLOT, fourth])
+    page.wait_for_function(
+        "([plot, was]) => document.querySelector(plot).dataset.recording === was", arg=[PLOT, fourth]
+    )
     assert marks(waves)[-1]["action"] == "untrim", "a visit goes on after a reload"
     assert browser.complaints == []
 
@@ -260,7 +266,7 @@ def test_excluding_needs_a_reason_and_is_taken_back(
     shots(page, "review-dialog-en-light")
     marked(page, "own-reason").fill("a dog barked")
     marked(page, "own-reason").press("Enter")
-    page.wait_for_function("([plot, was]) => document.querySelector(plot).dataset.shown !== was", arg=[PLOT, first])
+    page.wait_for_function("([plot, was]) => document.querySelector(plot).dataset.recording !== was", arg=[PLOT, first])
     assert [(m["recording"], m["action"], m["why"]) for m in marks(waves)] == [(first, "exclude", "a dog barked")]
     assert pressed(page, "Backspace") == first
     state(page, "excluded")
@@ -347,15 +353,15 @@ def test_overlays_name_what_stands_out(waves: Path, studio: Fixture, look: Fixtu
     for language, dark, size in (("en", False, DESK), ("lv", True, TABLET)):
         browser = look(size, dark, language)
         page = browser.open(url + "/review?view=overlay&gesture=Wave")
-        page.wait_for_selector(f"[data-test=odd] :text('{longest}')")
+        page.wait_for_selector(f"[data-test=outliers] :text('{longest}')")
         assert axe(page) == []
         shots(page, f"review-overlay-{language}-{'dark' if dark else 'light'}")
         assert page.evaluate("() => document.documentElement.scrollWidth <= window.innerWidth")
         assert browser.complaints == []
-    marked(page, "odd").get_by_role("button").first.click()
+    marked(page, "outliers").get_by_role("button").first.click()
     assert opened(page) == longest
     page = look().open(url + "/review?view=overlay&gesture=Wave")
-    page.wait_for_selector(f"[data-test=odd] :text('{longest}')")
+    page.wait_for_selector(f"[data-test=outliers] :text('{longest}')")
     over = page.locator("[data-test=overlay-plot] .u-over")
     box = over.bounding_box()
     assert box is not None
@@ -407,11 +413,11 @@ def test_links_from_other_pages(waves: Path, studio: Fixture, look: Fixture) -> 
     assert [m["recording"] for m in marks(waves)] == ids[3:6]
     page = browser.open(started.url + reviews.address(waves, [*ids, *(f"P9/gone_{i}" for i in range(99))], "many"))
     page.wait_for_function(f"() => document.querySelectorAll('[data-test=table] tbody tr').length === {len(ids)}")
-    assert "99 of the linked recordings are not in this data set" in marked(page, "said").inner_text()
+    assert "99 of the linked recordings are not in this data set" in marked(page, "message").inner_text()
     page = browser.open(started.url + "/review?recording=P1/none")
     page.get_by_text("There is no recording 'P1/none'").wait_for()
     page = browser.open(started.url + "/review?selection=0000")
-    page.get_by_text("There is no selection '0000' any more").wait_for()
+    page.get_by_text("The selection '0000' does not exist").wait_for()
     page = browser.open(started.url + "/review?dataset=/etc")
     page.get_by_text("lies outside the studio's folders").wait_for()
     assert browser.complaints == []
@@ -431,7 +437,7 @@ def test_a_folder_that_cannot_be_written(waves: Path, studio: Fixture, look: Fix
     state(page, "draft")
     page.keyboard.press("Enter")
     page.locator("[role=alert]:has-text('marks.jsonl')").wait_for()
-    assert "cannot be written" in marked(page, "said").inner_text()
+    assert "cannot be written" in marked(page, "message").inner_text()
     assert axe(page) == []
     assert shown(page) == first
     state(page, "draft")
@@ -439,7 +445,7 @@ def test_a_folder_that_cannot_be_written(waves: Path, studio: Fixture, look: Fix
     lock.rmdir()
     pressed(page, "Enter")
     assert [m["recording"] for m in marks(waves)] == [first]
-    assert marked(page, "said").count() == 0
+    assert marked(page, "message").count() == 0
     assert browser.complaints == []
 
 
@@ -461,7 +467,7 @@ def test_two_tabs_show_the_same_and_do_not_fight(waves: Path, studio: Fixture, l
     right.keyboard.press("u")
     right.get_by_text("Nothing of this visit is left").wait_for()
     left.keyboard.press("u")
-    left.wait_for_function("([plot, was]) => document.querySelector(plot).dataset.shown === was", arg=[PLOT, first])
+    left.wait_for_function("([plot, was]) => document.querySelector(plot).dataset.recording === was", arg=[PLOT, first])
     # Another program's mark is seen by itself.
     append_marks(waves, [Mark(first, "exclude", "cli", "noise")])
     state(left, "excluded")
@@ -479,7 +485,7 @@ def test_a_broken_data_set_is_a_sentence(waves: Path, studio: Fixture, look: Fix
     started = studio(home=waves.parents[1])
     for name, said in (("broken", "dataset.toml"), ("torn", "line 1 is no mark")):
         page = browser.open(f"{started.url}/review?dataset=datasets/{name}")
-        assert said in marked(page, "said").inner_text()
+        assert said in marked(page, "message").inner_text()
         assert axe(page) == []
     marked(page, "dataset").click()
     page.get_by_role("option", name="(waves)").click()
@@ -512,7 +518,9 @@ def test_labelled_recordings_need_no_trimming(real_data: Path, tmp_path: Path, s
     assert marks(place) == []
     page.keyboard.press("x")
     page.get_by_role("button", name="sensor fault").click()
-    page.wait_for_function("([plot, was]) => document.querySelector(plot).dataset.shown !== was", arg=[PLOT, second])
+    page.wait_for_function(
+        "([plot, was]) => document.querySelector(plot).dataset.recording !== was", arg=[PLOT, second]
+    )
     assert [(m["recording"], m["action"], m["why"]) for m in marks(place)] == [(second, "exclude", "sensor fault")]
     assert first != second
     assert axe(page) == []

@@ -13,10 +13,10 @@ from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, MarkState, append_marks, read_marks
 from plushsense.dataset.trimming import suggest_trims
 from plushsense.studio.app.workspace import Workspace
-from plushsense.studio.pages.review import preparation as review_prepared
-from plushsense.studio.pages.review.plots import ACTIVITY, ALL
-from plushsense.studio.pages.review.review import Review
-from plushsense.studio.pages.review.selection import DONE, NO_FINDING, TO_DO, RecordingFilter, Reviews, filter_and_sort
+from plushsense.studio.pages.review import signals as review_signals
+from plushsense.studio.pages.review.controller import DONE, NO_FINDING, TO_DO, RecordingFilter, filter_and_sort
+from plushsense.studio.pages.review.review import Review, Reviews
+from plushsense.studio.pages.review.signals import ACTIVITY, ALL
 from support.reviewed import ROW_S, made, marks, raw_hash
 
 ME, VISIT = "me", "visit"
@@ -57,7 +57,7 @@ def test_suggestions_are_kept_and_not_made_again(
     def refuse(*args: object) -> None:
         raise AssertionError("made again although nothing changed")
 
-    monkeypatch.setattr(review_prepared, "suggest_trims", refuse)
+    monkeypatch.setattr(review_signals, "suggest_trims", refuse)
     again = Review(review.path)
     again.prepared.wait(60.0)
     assert again.prepared.suggestions == review.prepared.suggestions
@@ -121,7 +121,7 @@ def test_two_windows_do_not_fight(review: Review) -> None:
     review.set(second, start=3)
     review.accept("left", second, ME)
     append_marks(review.path, [Mark(second, "trim", "somebody", start=44, how="hand")])
-    with pytest.raises(DatasetError, match="decided anew since"):
+    with pytest.raises(DatasetError, match="has been changed in another window"):
         review.undo("left", ME)
     assert review.standing(second).start == 44
     assert review.undo("left", ME) is not None, "excluding does not touch the trim"
@@ -158,7 +158,7 @@ def test_drafts_stay_inside_and_keep_something(review: Review) -> None:
 def test_findings_are_accepted_with_a_reason_and_taken_back(review: Review) -> None:
     odd = next(r for r in review.rows.values() if r.open)
     finding = odd.open[0]
-    with pytest.raises(ConfigError, match="needs a reason"):
+    with pytest.raises(ConfigError, match="reason is missing"):
         review.accept_finding(VISIT, finding, ME, "  ")
     assert review.accept_finding(VISIT, finding, ME, "looked at")
     assert finding.check not in [f.check for f in review.rows[odd.id].open]
@@ -219,7 +219,7 @@ def test_what_is_drawn_is_what_was_recorded(review: Review) -> None:
 
 
 def test_long_recordings_are_thinned_to_their_extremes(workspace: Workspace) -> None:
-    from plushsense.studio.pages.review.plots import RecordingSignals
+    from plushsense.studio.pages.review.signals import RecordingSignals
     from support.reviewed import recording
 
     frames = recording(1, 6000, rows=20_000)
@@ -262,7 +262,7 @@ def test_links_to_few_and_to_many(workspace: Workspace, review: Review) -> None:
     assert len(many) < 1500
     assert reviews.selection(key) == ("Wave taken for Rest", [f"P1/x_{i}" for i in range(500)])
     for bad in ("../x", "0000"):
-        with pytest.raises(ConfigError, match="no selection"):
+        with pytest.raises(ConfigError, match="does not exist"):
             reviews.selection(bad)
 
 

@@ -21,8 +21,7 @@ from plushsense.studio.app.workspace import Workspace
 from plushsense.studio.pages.live.clips import PROTOCOL
 from plushsense.studio.pages.train.result_details import confusion_table
 from plushsense.studio.pages.train.results import Confusion
-from plushsense.studio.widgets.pictures import picture
-from plushsense.studio.widgets.work import link, verdict
+from plushsense.studio.widgets.elements import link, picture, verdict
 from plushsense.workflow.api import simulate
 from support.browsing import DESK, TABLET, Studio, axe, connected, marked
 from support.recorded import record

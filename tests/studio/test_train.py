@@ -129,10 +129,10 @@ def test_a_proof_its_table_and_the_recordings_of_a_cell(
     page = browser.open(f"{here.url}/train")
     kind(page, "Prove it on people left out")
     choose(page, "split", "windows in 5 groups")
-    marked(page, "split-told").get_by_text("so the score flatters").wait_for()
+    marked(page, "split-about").get_by_text("so the score flatters").wait_for()
     choose(page, "split", "people in 5 groups")
     fill(page, "epochs", "2")
-    marked(page, "split-told").get_by_text("flatters").wait_for(state="detached")
+    marked(page, "split-about").get_by_text("flatters").wait_for(state="detached")
     marked(page, "start").click()
     done = state(page, "done")
     assert "mean ± standard deviation over 6 people; split by-subject:5, context stream" in done.inner_text()
@@ -167,7 +167,9 @@ def test_a_proof_its_table_and_the_recordings_of_a_cell(
     assert button.inner_text().split()[0] == str(windows)
     button.click()
     marked(page, "cell-list").wait_for()
-    listed = page.locator("tr[data-recording]").evaluate_all("rows => rows.map((r) => r.dataset.recording)")
+    listed = page.locator("[data-test=cell-list] [data-recording]").evaluate_all(
+        "rows => rows.map((r) => r.dataset.recording)"
+    )
     assert sorted(listed) == sorted(wanted)
     asked = urlsplit(marked(page, "cell-all").get_attribute("href"))
     query = parse_qs(asked.query)
@@ -197,7 +199,9 @@ def test_a_proof_its_table_and_the_recordings_of_a_cell(
     page.get_by_text("positive read as neutral (recordings").wait_for()
     pair = ("positive", "neutral")
     mixed = {r for t, p, r in zip(was, told, of, strict=True) if (affect[t], affect[p]) == pair}
-    listed = page.locator("tr[data-recording]").evaluate_all("rows => rows.map((r) => r.dataset.recording)")
+    listed = page.locator("[data-test=cell-list] [data-recording]").evaluate_all(
+        "rows => rows.map((r) => r.dataset.recording)"
+    )
     assert sorted(listed) == sorted(mixed)
     assert browser.complaints == []
 
@@ -245,7 +249,7 @@ def test_a_sweep_shows_its_cost_first_and_its_front_in_the_end(
     browser = look()
     page = browser.open(f"{studio(home=home).url}/train")
     kind(page, "Compare many networks")
-    marked(page, "split-told").get_by_text("leaky", exact=True).first.wait_for()
+    marked(page, "split-about").get_by_text("leaky", exact=True).first.wait_for()
     choose(page, "grid", "wrong.toml")
     marked(page, "estimate").click()
     marked(page, "plan").get_by_role("alert").wait_for(timeout=_LONG_MS)
@@ -255,7 +259,7 @@ def test_a_sweep_shows_its_cost_first_and_its_front_in_the_end(
     assert axe(page) == []
     choose(page, "grid", "tiny.toml")
     marked(page, "start").click()
-    marked(page, "said").get_by_text("Look at the cost first").wait_for()
+    marked(page, "message").get_by_text("Look at the cost first").wait_for()
     marked(page, "estimate").click()
     marked(page, "plan-text").wait_for(timeout=_LONG_MS)
     assert "4 trials in 4 trainings (folds: 1, seeds: 1), 0 done before" in marked(page, "plan-text").inner_text()
@@ -306,11 +310,11 @@ def test_what_is_wrong_is_a_sentence_and_nothing_is_lost(
     page = browser.open(f"{studio(home=home).url}/train")
     fill(page, "name", "little")
     marked(page, "start").click()
-    marked(page, "said").get_by_text("'little.plush' is there already").wait_for()
+    marked(page, "message").get_by_text("'little.plush' exists already").wait_for()
     fill(page, "name", "other")
     fill(page, "epochs", "lots")
     marked(page, "start").click()
-    marked(page, "said").get_by_text("epochs is 'lots': accepted is a whole number").wait_for()
+    marked(page, "message").get_by_text("epochs is 'lots': accepted is a whole number").wait_for()
     marked(page, "advanced").get_by_text("Advanced settings").click()
     page.locator('[data-test="quantize_aware"]').wait_for()
     page.wait_for_timeout(400)  # until it has unfolded
@@ -324,7 +328,7 @@ def test_what_is_wrong_is_a_sentence_and_nothing_is_lost(
     kind(page, "Train one network")
     fill(page, "epochs", "2")
     marked(page, "start").click()
-    marked(page, "said").get_by_text("is no longer there: put it back").wait_for()
+    marked(page, "message").get_by_text("does not exist any more: put it back").wait_for()
     assert (home / "bundles" / "little.plush").read_bytes() == little
     assert [path.name for path in (home / "bundles").iterdir()] == ["little.plush"]
     assert browser.complaints == []

@@ -20,9 +20,7 @@ from plushsense.models.bundle import Bundle
 from plushsense.studio.app.jobs import Jobs, StudioJob
 from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import Workspace
-from plushsense.studio.pages.train.jobs_section import progress_charts
-from plushsense.studio.pages.train.pareto_plot import pareto_options, pareto_rows, pareto_table
-from plushsense.studio.pages.train.requests import JobRequest, free_name, grids, job_request
+from plushsense.studio.pages.train.jobs import JobRequest, free_name, grids, job_request, progress_charts
 from plushsense.studio.pages.train.results import (
     TRAINING,
     Confusion,
@@ -32,7 +30,7 @@ from plushsense.studio.pages.train.results import (
     recordings_of_cell,
     sum_by_affect,
 )
-from plushsense.studio.pages.train.results_section import comparable_groups
+from plushsense.studio.pages.train.results_section import comparable_groups, pareto_options, pareto_rows, pareto_table
 from plushsense.studio.tasks import Clock
 from plushsense.workflow.config import from_settings
 
@@ -66,7 +64,7 @@ def test_the_command_resolves_to_the_same_settings(home: Path, monkeypatch: pyte
 @pytest.mark.parametrize(
     ("form", "said"),
     [
-        ({"kind": "train", "name": "little"}, "'little.plush' is there already"),
+        ({"kind": "train", "name": "little"}, "'little.plush' exists already"),
         ({"kind": "train", "name": "../x"}, "cannot be a name"),
         ({"kind": "train", "name": "n", "epochs": "many"}, "epochs is 'many': accepted is a whole number"),
         ({"kind": "train", "name": "n", "epochs": 0}, "epochs is 0"),
@@ -75,14 +73,14 @@ def test_the_command_resolves_to_the_same_settings(home: Path, monkeypatch: pyte
         ({"kind": "train", "name": "n", "quantize_aware": -1}, "quantize_aware is -1"),
         ({"kind": "train", "name": "n", "quantize_aware": "many"}, "quantize_aware is 'many'"),
         ({"kind": "evaluate", "split": "by-people:5"}, "split"),
-        ({"kind": "sweep", "seeds": "many"}, "seeds is 'many': accepted are whole numbers from 1"),
+        ({"kind": "sweep", "seeds": "many"}, "seeds is 'many': give a whole number of at least 1"),
         ({"kind": "sweep", "seeds": 0}, "seeds is 0"),
         ({"kind": "search", "max_parameters": "few"}, "max_parameters is 'few'"),
         ({"kind": "search", "share": "half"}, "share is 'half'"),
         ({"kind": "search", "share": "nan"}, "share is 'nan'"),
         ({"kind": "sweep", "grid": "/etc/passwd"}, "outside the studio's folders"),
         ({"kind": "train", "name": "n", "dataset": "/tmp"}, "outside the studio's folders"),
-        ({"kind": "train", "name": "n", "dataset": "datasets/gone"}, "no longer there"),
+        ({"kind": "train", "name": "n", "dataset": "datasets/gone"}, "does not exist any more"),
         ({"kind": "train", "name": "n", "dataset": ""}, "No data set is chosen"),
     ],
 )
@@ -99,7 +97,7 @@ def test_the_same_work_is_not_begun_twice(home: Path, monkeypatch: pytest.Monkey
     form = {"dataset": str(workspace.datasets()[0]), "kind": "train", "name": "one"}
     first = job_request(workspace, jobs, form)
     jobs.start(first.task, first.spec, first.title)
-    with pytest.raises(ConfigError, match="'one' is being trained right now"):
+    with pytest.raises(ConfigError, match="'one' is being trained now"):
         job_request(workspace, jobs, form)
     again = {"dataset": form["dataset"], "kind": "evaluate", "split": "by-subject:5"}
     proof = job_request(workspace, jobs, again)
@@ -131,7 +129,7 @@ def test_without_torch_the_task_says_what_to_install(home: Path, tmp_path: Path)
     blocked.joinpath("__init__.py").write_text("raise ModuleNotFoundError('no torch', name='torch')", encoding="utf-8")
     spec = made(Workspace(home), kind="train", name="x").spec
     env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(blocked.parent), os.environ.get("PYTHONPATH", "")])}
-    command = [sys.executable, "-m", "plushsense.studio.app.worker"]
+    command = [sys.executable, "-m", "plushsense.studio.tasks"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=env) as worker:
         assert worker.stdin is not None and worker.stdout is not None
         worker.stdin.write(json.dumps({"task": "train", "spec": spec}) + "\n")
@@ -294,5 +292,5 @@ def test_rows_of_a_house_and_what_is_broken(home: Path) -> None:
     (home / "bundles" / "same.plush").unlink()
     only.path.unlink()
     assert results.rows() == []
-    with pytest.raises(BadInput, match="no longer there"):
+    with pytest.raises(BadInput, match="does not exist any more"):
         results.row(only.id)

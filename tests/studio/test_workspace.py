@@ -96,7 +96,7 @@ def test_a_new_name_makes_nothing_and_replaces_nothing(workspace: Workspace) -> 
     assert place == workspace.folder / DATASETS / "Ķepas 2026.1-a"
     assert not place.exists()
     place.mkdir()
-    with pytest.raises(ConfigError, match="is there already"):
+    with pytest.raises(ConfigError, match="exists already"):
         workspace.new(DATASETS, "Ķepas 2026.1-a")
     assert workspace.new(EXPORTS, "Ķepas 2026.1-a").parent.name == EXPORTS
 

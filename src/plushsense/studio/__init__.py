@@ -1,1 +1,1 @@
-"""The studio: the whole work in a browser, on one's own machine. `plushsense.studio.app.serve` runs it."""
+"""The studio: a web application for the whole workflow; `plushsense.studio.app.serve` runs it."""

@@ -1,18 +1,28 @@
-"""The studio's long tasks; `plushsense.studio.app.worker` runs each in a process of its own."""
+"""The long tasks of the studio, and the worker process in which `plushsense.studio.app.jobs` runs each of them.
+
+The worker reads one line of JSON, ``{"task": ..., "spec": {...}}``, from standard input. It writes lines of JSON to
+standard output: ``{"progress": {...}}``, ``{"warning": "..."}``, and at the end ``{"result": {...}}`` or
+``{"refused": "..."}``. A process that ends without either was stopped.
+"""
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
+import signal
+import sys
 import tempfile
+import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from plushsense.core.errors import ConfigError, DatasetError, ToolError
+from plushsense.core.errors import ConfigError, DatasetError, PlushSenseError, ToolError
 from plushsense.dataset.importing.archives import UnpackLimits
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
@@ -22,7 +32,6 @@ from plushsense.deploy.profile import profile
 from plushsense.deploy.proof.vectors import Export
 from plushsense.deploy.proof.verify import verify
 from plushsense.studio.app.jobs import UNFINISHED
-from plushsense.studio.app.worker import TaskReporter
 from plushsense.studio.pages.export.exports import folder_digest
 from plushsense.workflow.api import simulate
 from plushsense.workflow.config import from_settings
@@ -31,66 +40,89 @@ from plushsense.workflow.export import export
 from plushsense.workflow.reporting import check_folder
 
 
-class Clock:
-    """Told the share of the work that is done, says ``share`` and ``left_s`` (None while there is nothing to go by).
+class TaskReporter:
+    """Writes the progress and the warnings of a task as lines of JSON; any thread may call it."""
 
-    What was done before, by an earlier run, comes at once and is no measure: time counts from the first share that took
-    any.
+    def __init__(self, out: Any) -> None:
+        self._out, self._lock = out, threading.Lock()
+
+    def write(self, **message: Any) -> None:
+        """Write one line of JSON."""
+        with self._lock:
+            self._out.write(json.dumps(message, ensure_ascii=True, default=str) + "\n")
+            self._out.flush()
+
+    def progress(self, **values: Any) -> None:
+        """Report the progress of the task as plain values."""
+        self.write(progress=values)
+
+    def count(self, done: int, total: int) -> None:
+        """Report how many of ``total`` items are done."""
+        self.progress(done=done, total=total)
+
+    def stage(self, stage: str, done: int, total: int) -> None:
+        """Report how many items of a stage are done."""
+        self.progress(stage=stage, done=done, total=total)
+
+    def warn(self, sentence: str) -> None:
+        """Report a warning to the user."""
+        self.write(warning=sentence)
+
+
+class Clock:
+    """Estimates the remaining time of a task from the share of the work that is done.
+
+    Work that an earlier run finished is reported at once and says nothing about the speed: time is measured from the
+    first report that took longer than ``instant_s``.
     """
 
     def __init__(self, instant_s: float = 0.02) -> None:
         self._instant_s = instant_s
-        self._last_s = self._began_s = time.monotonic()
-        self._from = 0.0
+        self._last_s = self._start_s = time.monotonic()
+        self._start_share = 0.0
 
     def at(self, share: float) -> dict[str, Any]:
-        """Return the share of the work that is done and the time left."""
+        """Return ``share``, and ``left_s``: the remaining seconds, or None while they are unknown."""
         now = time.monotonic()
-        if self._from == 0.0 or (now - self._last_s < self._instant_s and now - self._began_s < 1.0):
-            self._from, self._began_s = share, now
+        if self._start_share == 0.0 or (now - self._last_s < self._instant_s and now - self._start_s < 1.0):
+            self._start_share, self._start_s = share, now
         self._last_s = now
-        gone = share - self._from
-        left = (now - self._began_s) / gone * (1.0 - share) if gone > 0 else None
+        gained = share - self._start_share
+        left = (now - self._start_s) / gained * (1.0 - share) if gained > 0 else None
         return {"share": round(share, 4), "left_s": None if left is None else round(left, 1)}
 
 
 def run_check(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Look at every recording of ``spec["dataset"]``."""
-    found = check_dataset(spec["dataset"], progress=lambda done, total: reporter.progress(done=done, total=total))
-    counts = found.counts()
+    """Check every recording of ``spec["dataset"]``."""
+    report = check_dataset(spec["dataset"], progress=reporter.count)
+    counts = report.counts()
     return {
         "dataset": str(spec["dataset"]),
-        "recordings": found.recordings,
-        "undecided": len(found.undecided),
+        "recordings": report.recordings,
+        "undecided": len(report.undecided),
         "by_severity": counts["by_severity"],
         "by_check": counts["by_check"],
-        "hash": found.dataset.hash,
-        "seconds": round(found.seconds, 2),
+        "hash": report.dataset.hash,
+        "seconds": round(report.seconds, 2),
     }
 
 
 UNPACKED = UnpackLimits(total_bytes=4_000_000_000, files=50_000)
-"""What a zip that came through the browser may unpack to."""
+"""Limits of an uploaded zip."""
 
 
 def run_import(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Import ``sessions`` (folders below ``recordings``, gathered in ``work``) or the zip ``archive`` to ``dest``.
+    """Import ``sessions`` (folders in ``recordings``, collected in ``work``) or the zip ``archive`` into ``dest``.
 
-    ``add``: to the data set that is there. The archive is the studio's own copy, and is removed in the end.
+    With ``add``, ``dest`` is an existing data set. The archive is the studio's own copy and is removed at the end.
     """
     settings: dict[str, Any] = {"add_to": True} if spec.get("add") else {"name": spec.get("name") or None}
     if spec.get("layout"):
         settings["layout"] = spec["layout"]
     archive = Path(spec["archive"]) if spec.get("archive") else None
     try:
-        with _itself(archive) if archive is not None else _gathered(spec) as source:
-            done = import_recordings(
-                source,
-                spec["dest"],
-                progress=lambda at, total: reporter.progress(done=at, total=total),
-                limits=UNPACKED,
-                **settings,
-            )
+        with nullcontext(archive) if archive is not None else _collected(spec) as source:
+            done = import_recordings(source, spec["dest"], progress=reporter.count, limits=UNPACKED, **settings)
     finally:
         if archive is not None:
             archive.unlink(missing_ok=True)
@@ -108,13 +140,8 @@ def run_import(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
 
 
 @contextmanager
-def _itself(archive: Path) -> Iterator[Path]:
-    yield archive
-
-
-@contextmanager
-def _gathered(spec: dict[str, Any]) -> Iterator[Path]:
-    """Yield a temporary folder with these sessions alone, as hard links where the disk supports them."""
+def _collected(spec: dict[str, Any]) -> Iterator[Path]:
+    """Yield a temporary folder with only these sessions, as hard links if the disk supports them."""
     recordings = Path(spec["recordings"])
     work = Path(spec["work"])
     work.mkdir(parents=True, exist_ok=True)
@@ -122,11 +149,11 @@ def _gathered(spec: dict[str, Any]) -> Iterator[Path]:
         folder = Path(place) / "recordings"
         for session in spec["sessions"]:
             inside = Path(session).relative_to(recordings)
-            shutil.copytree(recordings / inside, folder / inside, copy_function=_linked)
+            shutil.copytree(recordings / inside, folder / inside, copy_function=_link_or_copy)
         yield folder
 
 
-def _linked(source: str, target: str) -> str:
+def _link_or_copy(source: str, target: str) -> str:
     try:
         os.link(source, target)
     except OSError:
@@ -135,12 +162,10 @@ def _linked(source: str, target: str) -> str:
 
 
 def run_simulate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Simulate ``people`` with ``repetitions`` each as the new data set ``dest``, which says that it
-    is a simulation. ``work`` is a folder for what is made on the way.
-    """
+    """Simulate ``people`` with ``repetitions`` each as the new data set ``dest``; ``work`` holds temporary files."""
     work = Path(spec["work"])
     work.mkdir(parents=True, exist_ok=True)
-    # The recordings are of no more use once the data set holds them.
+    # The data set holds copies of the recordings.
     with tempfile.TemporaryDirectory(prefix=UNFINISHED, dir=work) as place:
         done = simulate(
             Path(place) / "sessions",
@@ -154,10 +179,10 @@ def run_simulate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]
 
 
 def run_pseudonymise(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Make ``spec["place"]`` of ``dataset`` with the ``key`` file; ``words`` and ``drop_notes`` as the library's.
+    """Write a pseudonymised copy of ``dataset`` to ``place``; the keys are arguments of `pseudonymise`.
 
     Raises:
-        ConfigError: without ``words``: a studio that was started again has not kept them, and none is not the same.
+        ConfigError: without ``words``. They are not stored, so a job resumed after a restart lacks them.
     """
     if "words" not in spec:
         raise ConfigError("Words that may not be left anywhere are not kept: give them again on the publish page.")
@@ -167,52 +192,31 @@ def run_pseudonymise(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, 
         key=spec["key"],
         words=spec["words"],
         drop_notes=spec.get("drop_notes", False),
-        progress=lambda done, total: reporter.progress(stage="rewriting", done=done, total=total),
+        progress=partial(reporter.stage, "rewriting"),
     )
     return done.to_dict()
 
 
 def run_publish(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Publish ``spec["dataset"]`` as the package ``spec["place"]``; the other keys are arguments of
-    `publish_dataset`.
-    """
+    """Publish ``dataset`` as the package ``place``; the other keys are arguments of `publish_dataset`."""
     key = spec.get("key") or None
     if key is not None:
         try:
             Path(key).parent.mkdir(parents=True, exist_ok=True)
         except OSError as cause:
-            raise DatasetError(f"The key '{key}' cannot be kept: {cause.strerror or cause}.") from None
-    done = publish_dataset(
-        spec["dataset"],
-        spec["place"],
-        licence=spec.get("licence", ""),
-        contact=spec.get("contact", ""),
-        consent=spec.get("consent", ""),
-        save=spec.get("save", False),
-        streams=spec.get("streams", True),
-        excluded=spec.get("excluded", False),
-        columns=tuple(spec.get("columns", ())),
-        key=key,
-        bids=spec.get("bids", False),
-        reidentification=spec.get("reidentification", True),
-        thorough=spec.get("thorough", False),
-        progress=lambda stage, done, total: reporter.progress(stage=stage, done=done, total=total),
-    )
-    return done.to_dict()
+            raise DatasetError(f"The key file '{key}' cannot be written: {cause.strerror or cause}.") from None
+    options = {name: value for name, value in spec.items() if name not in ("dataset", "place")}
+    options |= {"columns": tuple(spec.get("columns", ())), "key": key}
+    return publish_dataset(spec["dataset"], spec["place"], **options, progress=reporter.stage).to_dict()
 
 
 def run_validate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Prove the package ``spec["place"]``, a folder or a zip; ``thorough``: every row of the streams by everybody."""
-    checked = validate_package(
-        spec["place"],
-        thorough=spec.get("thorough", False),
-        progress=lambda stage, done, total: reporter.progress(stage=stage, done=done, total=total),
-    )
-    return checked.to_dict()
+    """Validate the package ``place``, a folder or a zip; with ``thorough``, all validators read every row."""
+    return validate_package(spec["place"], thorough=spec.get("thorough", False), progress=reporter.stage).to_dict()
 
 
 def run_train(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Train and save a bundle; of a dry run return the estimate of `preview_training`."""
+    """Train and save a bundle; in a dry run, return the estimate of `preview_training`."""
     config = from_settings(**spec.get("settings", {}))
     if spec.get("dry"):
         from plushsense.trials.estimate import preview_training
@@ -228,12 +232,12 @@ def run_train(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     whole = config.training.epochs + tuning
 
     def epoch(at: int, of: int, row: dict[str, Any]) -> None:
-        fine = "what" in row
-        done = config.training.epochs + at if fine else at
-        stage = "fine-tuning" if fine else "training"
-        shown = {k: row.get(k) for k in ("train_loss", "train_accuracy", "validation_loss", "validation_accuracy")}
-        reporter.progress(stage=stage, epoch=at, epochs=of, **shown, **clock.at(done / whole))
-        if at == of and not fine and not tuning:
+        fine_tuning = "what" in row
+        done = config.training.epochs + at if fine_tuning else at
+        stage = "fine-tuning" if fine_tuning else "training"
+        scores = {k: row.get(k) for k in ("train_loss", "train_accuracy", "validation_loss", "validation_accuracy")}
+        reporter.progress(stage=stage, epoch=at, epochs=of, **scores, **clock.at(done / whole))
+        if at == of and not fine_tuning and not tuning:
             reporter.progress(stage="deciding", epoch=at, epochs=of, share=1.0)
 
     done = train(
@@ -245,7 +249,7 @@ def run_train(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
         progress=epoch,
         warn=reporter.warn,
     )
-    bundle = done.save(_free(out, done.bundle.to_bytes()))
+    bundle = done.save(_free_path(out, done.bundle.to_bytes()))
     return {
         "bundle": str(bundle),
         "scores": done.scores,
@@ -257,8 +261,8 @@ def run_train(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     }
 
 
-def _free(path: Path, content: bytes) -> Path:
-    """Return the path, or a numbered one beside it if another file has taken it meanwhile."""
+def _free_path(path: Path, content: bytes) -> Path:
+    """Return the path, or a numbered one beside it if another file has been written there meanwhile."""
     number, free = 2, path
     while free.exists() and not (free.is_file() and free.read_bytes() == content):
         free = path.with_stem(f"{path.stem} {number}")
@@ -267,7 +271,7 @@ def _free(path: Path, content: bytes) -> Path:
 
 
 def run_evaluate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Evaluate; return the output folder, the report and the main scores, of a dry run the estimate."""
+    """Evaluate; return the output folder, the report and the main scores, in a dry run the estimate."""
     config = from_settings(**spec.get("settings", {}))
     if spec.get("split"):
         config = replace(config, evaluation=replace(config.evaluation, split=spec["split"]))
@@ -277,7 +281,6 @@ def run_evaluate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]
         return preview_evaluation(spec["dataset"], config, warn=reporter.warn)
     reporter.progress(stage="reading", share=0.0)
 
-    from plushsense.dataset.index import open_dataset
     from plushsense.workflow.api import evaluate
     from plushsense.workflow.reporting import PAGE, name_of, write_report
 
@@ -292,9 +295,9 @@ def run_evaluate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]
             running.pop(at.fold, None)
         share = (at.done + sum(running.values())) / at.folds
         row = at.row or {}
-        shown = {k: row.get(k) for k in ("train_loss", "validation_loss", "validation_accuracy")}
-        where = {"done": at.done, "folds": at.folds, "resumed": at.resumed, "fold": at.fold}
-        reporter.progress(stage="training", epoch=at.epoch, epochs=at.epochs, **where, **shown, **clock.at(share))
+        scores = {k: row.get(k) for k in ("train_loss", "validation_loss", "validation_accuracy")}
+        counts = {"done": at.done, "folds": at.folds, "resumed": at.resumed, "fold": at.fold}
+        reporter.progress(stage="training", epoch=at.epoch, epochs=at.epochs, **counts, **scores, **clock.at(share))
 
     result = evaluate(dataset, config, out=out, int8=bool(spec.get("int8")), progress=fold, warn=reporter.warn)
     report = write_report(out / PAGE, dataset, [out])
@@ -315,7 +318,7 @@ def run_evaluate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]
 
 
 def run_sweep(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Run a sweep; return ``out`` and the summary's main figures, of a dry run the preview."""
+    """Run a sweep; return ``out`` and the main figures of the summary, in a dry run the preview."""
     from plushsense.experiments.sweep.run import preview, sweep
 
     changes = dict(spec.get("changes", {}))
@@ -326,61 +329,60 @@ def run_sweep(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
 
     def training(at: Any) -> None:
         best = at.best and {key: at.best[key] for key in ("arch", "filters", "accuracy", "macro_f1")}
-        where = {"done": at.done, "trainings": at.trainings, "resumed": at.resumed, "what": at.what}
-        reporter.progress(stage="training", epoch=at.epoch, epochs=at.epochs, best=best, **where, **clock.at(at.share))
+        counts = {"done": at.done, "trainings": at.trainings, "resumed": at.resumed, "what": at.what}
+        reporter.progress(stage="training", epoch=at.epoch, epochs=at.epochs, best=best, **counts, **clock.at(at.share))
 
-    found = sweep(spec["dataset"], spec["grid"], progress=training, warn=reporter.warn, **changes)
-    s = found.summary
+    done = sweep(spec["dataset"], spec["grid"], progress=training, warn=reporter.warn, **changes)
+    s = done.summary
     for lost in s["failed"]:
         reporter.warn(f"{lost['arch']} with {lost['filters']} was given up: {lost['why']}")
     keys = ("name", "split", "leaky", "context", "simulated", "trials", "done", "trainings_lost", "best", "seconds")
-    return {"out": str(found.out), **{key: s[key] for key in keys}}
+    return {"out": str(done.out), **{key: s[key] for key in keys}}
 
 
 def run_search(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Run a search; return ``out`` and the summary's main figures, of a dry run the preview."""
+    """Run a search; return ``out`` and the main figures of the summary, in a dry run the preview."""
     from plushsense.experiments.search.run import preview_search, search
 
-    asked, changes = dict(spec.get("asked", {})), dict(spec.get("changes", {}))
+    limits, changes = dict(spec.get("asked", {})), dict(spec.get("changes", {}))
     if spec.get("dry"):
         return preview_search(
-            spec["dataset"], spec["grid"], asked=asked, changes=changes, measure=True, warn=reporter.warn
+            spec["dataset"], spec["grid"], asked=limits, changes=changes, measure=True, warn=reporter.warn
         )
     reporter.progress(stage="reading", share=0.0)
     clock = Clock()
 
     def training(at: Any) -> None:
         best = at.best and {"title": at.best[0], "macro_f1": at.best[1]}
-        where = {"rung": at.rung, "rungs": at.rungs, "networks": at.networks, "what": at.what}
-        where |= {"done": at.done, "trainings": at.trainings, "resumed": at.resumed}
+        counts = {"rung": at.rung, "rungs": at.rungs, "networks": at.networks, "what": at.what}
+        counts |= {"done": at.done, "trainings": at.trainings, "resumed": at.resumed}
         share = min(1.0, at.share)
-        reporter.progress(stage="training", epoch=at.epoch, epochs=at.epochs, best=best, **where, **clock.at(share))
+        reporter.progress(stage="training", epoch=at.epoch, epochs=at.epochs, best=best, **counts, **clock.at(share))
 
-    found = search(spec["dataset"], spec["grid"], **asked, progress=training, warn=reporter.warn, **changes)
-    s = found.summary
+    done = search(spec["dataset"], spec["grid"], **limits, progress=training, warn=reporter.warn, **changes)
+    s = done.summary
     keys = ("name", "split", "leaky", "context", "simulated", "candidates", "winner", "smallest_equal", "seconds")
-    return {"out": str(found.out), **{key: s[key] for key in keys}, "command": s["command"]}
+    return {"out": str(done.out), **{key: s[key] for key in keys}, "command": s["command"]}
 
 
 def run_profile(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Count on the export ``spec["place"]``."""
-    return {"profile": measured(Path(spec["place"]), reporter)}
+    """Profile the export ``spec["place"]``."""
+    return {"profile": _profile(Path(spec["place"]), reporter)}
 
 
-def measured(folder: Path, reporter: TaskReporter) -> dict[str, Any]:
-    """Return the profile in plain values with the ``digest`` of what was measured; ``refused``: why there is none."""
-    before = folder_digest(folder)
+def _profile(folder: Path, reporter: TaskReporter) -> dict[str, Any]:
+    """Return the profile with the ``digest`` of the profiled files, or ``refused``: why there is no profile."""
+    digest = folder_digest(folder)
     reporter.progress(stage="profile")
     try:
-        found = profile(folder, progress=lambda done, total: reporter.progress(stage="profile", done=done, total=total))
+        return {"digest": digest, **profile(folder, progress=partial(reporter.stage, "profile")).to_dict()}
     except ToolError as refusal:
-        # The export stands without it.
-        return {"digest": before, "refused": str(refusal)}
-    return {"digest": before, **found.to_dict()}
+        # An export without a profile is valid.
+        return {"digest": digest, "refused": str(refusal)}
 
 
 def run_export(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Export ``spec["bundle"]`` to ``spec["place"]``; ``also`` are formats, ``dataset`` ("": none) calibrates anew."""
+    """Export ``bundle`` to ``place``, ``also`` in further formats; a ``dataset`` other than "" calibrates it again."""
     reporter.progress(stage="export")
     done = export(
         spec["bundle"],
@@ -389,18 +391,20 @@ def run_export(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
         also=spec.get("also", ()),
         warn=reporter.warn,
     )
-    return {**done.to_dict(), "profile": measured(Path(spec["place"]), reporter)}
+    return {**done.to_dict(), "profile": _profile(Path(spec["place"]), reporter)}
 
 
 _SAMPLES = 100_000
 
 
 def run_verify(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Prove the export ``spec["place"]`` on ``targets`` (none: all that are here), also with recordings of
-    ``dataset`` ("": none), with mutants if ``faults``, and with ``trust`` also where the C was changed.
+    """Verify the export ``place`` on ``targets``, by default on all that are available.
+
+    With ``dataset``, recordings are streamed, too; with ``faults``, mutants are tried; with ``trust``, changed C files
+    are compiled and run.
     """
     folder = Path(spec["place"])
-    before = folder_digest(folder)
+    digest = folder_digest(folder)
     reporter.progress(stage="vectors")
     export = Export(folder)
     dataset = spec.get("dataset")
@@ -411,6 +415,63 @@ def run_verify(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
         vectors,
         mutants=(lambda mutant: True) if spec.get("faults") else None,
         trust=bool(spec.get("trust")),
-        progress=lambda done, total: reporter.progress(stage="verify", done=done, total=total),
+        progress=partial(reporter.stage, "verify"),
     )
-    return {**done.to_dict(), "digest": before, "changed_copies": changed_copies(folder)}
+    return {**done.to_dict(), "digest": digest, "changed_copies": changed_copies(folder)}
+
+
+TASKS: dict[str, Callable[[dict[str, Any], TaskReporter], dict[str, Any]]] = {
+    "check": run_check,
+    "train": run_train,
+    "sweep": run_sweep,
+    "search": run_search,
+    "evaluate": run_evaluate,
+    "import": run_import,
+    "publish": run_publish,
+    "export": run_export,
+    "verify": run_verify,
+    "simulate": run_simulate,
+    "profile": run_profile,
+    "validate": run_validate,
+    "pseudonymise": run_pseudonymise,
+}
+"""The functions of the tasks. Each takes a spec and returns a result; both hold plain values."""
+
+
+def main() -> int:
+    """Run one task; return 0 if it is done, 1 if interrupted, 2 if refused."""
+    # Libraries may print, but standard output is reserved for messages.
+    out, sys.stdout = sys.stdout, sys.stderr
+    reporter = TaskReporter(out)
+    line = sys.stdin.readline()
+    threading.Thread(target=_end_with_studio, daemon=True).start()
+    try:
+        request = json.loads(line)
+        reporter.write(result=TASKS[request["task"]](request["spec"], reporter))
+    except KeyboardInterrupt:
+        return 1
+    except PlushSenseError as refusal:
+        reporter.write(refused=str(refusal))
+        return 2
+    except OSError as cause:
+        where = f" ({cause.filename})" if cause.filename else ""
+        reporter.write(refused=f"The computer refused: {cause.strerror or cause}{where}.")
+        return 2
+    except Exception as cause:  # noqa: BLE001, RUF100
+        reporter.write(refused=f"The work broke off ({type(cause).__name__}: {cause}): what was finished is kept.")
+        return 2
+    return 0
+
+
+def _end_with_studio() -> None:
+    """End this process with the studio, whose end closes standard input."""
+    while sys.stdin.read(1):
+        pass
+    if sys.platform != "win32" and os.getpgrp() == os.getpid():
+        # This also ends all processes that the task has started.
+        os.killpg(os.getpid(), signal.SIGKILL)
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

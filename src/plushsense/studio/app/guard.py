@@ -38,16 +38,16 @@ COOKIE = "plushsense_visitor"
 TOKEN = "token"
 WELCOME = "welcome"
 UPLOAD_BYTES = 501_000_000
-"""The largest body of a request that brings a file."""
+"""The largest body of an upload."""
 BODY_BYTES = 4_000_000
 """The largest body of any other request."""
 HEAD_BYTES = 65_536
 """The longest head of a request."""
 _UNANSWERED = "No response returned"
-"""Starlette's error message if the visitor disconnected before the response was ready."""
+"""Part of Starlette's error message if a visitor disconnected before the response was ready."""
 _LOOPBACK = ("127.0.0.1", "localhost", "[::1]", "::1")
 
-# NiceGUI's Vue templates are compiled in the browser, which needs eval; nothing may come from elsewhere.
+# NiceGUI's Vue templates are compiled in the browser, which needs eval; nothing is loaded from elsewhere.
 CONTENT_POLICY = (
     "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; style-src 'self' 'unsafe-inline'; "
     "img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self'; object-src 'none'; base-uri 'self'; "
@@ -70,13 +70,13 @@ def is_loopback(host: str) -> bool:
 
 
 class Visitors:
-    """The browsers that are admitted: all of this machine if the studio listens there alone, else those with a token.
+    """The admitted browsers: all of this computer if the studio listens only there, else those with a token.
+
+    A token is valid once: the browser that presents it gets a cookie.
 
     Args:
         host: the address that the studio listens on.
-        names: more names under which it may be called, such as the machine's.
-
-    A token is valid once: the browser that presents it gets a cookie.
+        names: further names of this computer.
     """
 
     def __init__(self, host: str, names: Iterable[str] = ()) -> None:
@@ -94,6 +94,7 @@ class Visitors:
     def refusal_of(self, headers: dict[str, str]) -> str:
         """Return why a request must be refused for its host or origin, or ""."""
         origin = headers.get("origin")
+        foreign = "This request came from another web page: open the studio by its own address."
         try:
             host = urlsplit(f"//{headers.get('host', '')}").hostname or ""
             origin_host = urlsplit(origin or "").netloc
@@ -103,10 +104,8 @@ class Visitors:
             return f"This studio does not answer under the name '{host}': use the address that it printed."
         # Browsers name the requesting page; following a link to the studio is harmless.
         if headers.get("sec-fetch-site") == "cross-site" and headers.get("sec-fetch-mode") != "navigate":
-            return "This request came from another web page: open the studio by its own address."
-        if origin and origin_host.lower() != headers.get("host", "").lower():
-            return "This request came from another web page: open the studio by its own address."
-        return ""
+            return foreign
+        return foreign if origin and origin_host.lower() != headers.get("host", "").lower() else ""
 
     def admits(self, headers: dict[str, str]) -> bool:
         """Return whether a request comes from an admitted browser."""
@@ -164,11 +163,11 @@ _TOKEN_NEEDED = "This studio can only be opened with the address that it printed
 
 
 async def _bounded(app: App, scope: Scope, receive: Receive, send: Send, headers: dict[str, str]) -> None:
-    """Call ``app`` with a bounded request body, also one of unknown length, and add the security headers."""
-    most = UPLOAD_BYTES if _is_upload(scope) else BODY_BYTES
-    refusal = f"This is larger than the {most / 1e6:g} MB that are accepted here."
+    """Call ``app`` with a bounded request body, also of unknown length, and add the security headers."""
+    limit = UPLOAD_BYTES if _is_upload(scope) else BODY_BYTES
+    refusal = f"This is larger than the {limit / 1e6:g} MB that are accepted here."
     length = headers.get("content-length", "0")
-    if not length.isdecimal() or int(length) > most:
+    if not length.isdecimal() or int(length) > limit:
         await _refuse(scope, send, 413, refusal)
         return
     received, too_large, started, disconnected = 0, False, False, False
@@ -180,7 +179,7 @@ async def _bounded(app: App, scope: Scope, receive: Receive, send: Send, headers
         message = await receive()
         disconnected = disconnected or message["type"] == "http.disconnect"
         received += len(message.get("body", b""))
-        if received > most:
+        if received > limit:
             too_large = True
             return {"type": "http.disconnect"}
         return message
@@ -197,7 +196,7 @@ async def _bounded(app: App, scope: Scope, receive: Receive, send: Send, headers
     try:
         await app(scope, receiving, sending)
     except Exception as cause:
-        # NiceGUI takes the end of the body for a disconnect; a visitor who left needs no answer.
+        # NiceGUI treats the end of the body as a disconnect; a visitor who has left needs no answer.
         if not too_large and not (disconnected and _UNANSWERED in str(cause)):
             raise
     if too_large and not started:
@@ -238,8 +237,7 @@ async def _answer(send: Send, status: int, body: bytes, kind: str) -> None:
 # Connections ------------------------------------------------------------------------------------------------------
 
 _MOST, _MOST_PER_PEER = 256, 32
-"""Connections at once, and of one peer, where file descriptors do not set a lower bound. A browser has up to six, and a
-websocket for each open page."""
+"""Default limits of all connections, and of one peer. A browser opens up to six, and a websocket for each page."""
 
 
 @dataclass(frozen=True)
@@ -247,12 +245,12 @@ class ConnectionLimits:
     """Limits on the number of open connections and on how long each may wait.
 
     Attributes:
-        total: connections of all peers; ``per_peer`` of them are kept free for this machine's own browser.
+        total: connections of all peers; ``per_peer`` of them are reserved for the browser of this computer.
         per_peer: connections of one peer, see `peer_of`.
-        head_s: time until the head of a request is complete, from the connection or the answer before.
+        head_s: time until the head of a request is complete, from the connection or the previous answer.
         body_s: time without any data while the body of a request is incomplete.
-        keep_alive_s: time until a connection on which nothing comes after an answer is closed.
-        backlog: connections that wait to be accepted; as many are open for a moment before they can be refused.
+        keep_alive_s: time after an answer until a connection without a new request is closed.
+        backlog: connections that wait to be accepted, each of which is open for a moment before it can be refused.
     """
 
     total: int = _MOST
@@ -267,7 +265,7 @@ class ConnectionLimits:
         """Return limits that leave three quarters of this process's file descriptors for everything else."""
         try:
             import resource
-        except ImportError:  # Windows: sockets do not count as open files
+        except ImportError:  # Windows, where sockets do not count as open files
             return cls()
         files = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
         total = _MOST if files == resource.RLIM_INFINITY else max(4, min(_MOST, files // 4))
@@ -276,8 +274,10 @@ class ConnectionLimits:
 
 @lru_cache(maxsize=1024)
 def peer_of(client: str, server: str) -> str:
-    """Return by what name the connections of a client are counted: "" for this machine, whichever of its addresses it
-    uses; else the IPv4 address, or the /64 network of an IPv6 address, whose hosts choose the rest themselves.
+    """Return the name under which the connections of a client are counted.
+
+    It is "" for this computer, by any of its addresses; else the IPv4 address, or the /64 network of an IPv6 address,
+    because a host can choose the rest of that itself.
     """
     try:
         address = ipaddress.ip_address(client.partition("%")[0])
@@ -291,11 +291,11 @@ def peer_of(client: str, server: str) -> str:
 
 
 def limited_protocol(limits: ConnectionLimits) -> type[Any]:  # noqa: C901
-    """Return a protocol class for uvicorn (its setting ``http``) that keeps these limits.
+    """Return a protocol class for uvicorn's setting ``http`` that enforces these limits.
 
-    uvicorn bounds how long a connection is kept *after* an answer and how long a head is, but not how long a request
-    takes to arrive; and its ``limit_concurrency`` answers 503 to whoever has sent a whole request, while those that
-    have sent half of one stay. Here a new connection takes the place of the one that has waited longest for a request.
+    uvicorn limits the time *after* an answer and the length of a head, but not the time that a request takes to arrive.
+    Its ``limit_concurrency`` answers 503 to complete requests, while incomplete ones stay. Here a new connection
+    replaces the one that has waited longest for a request.
     """
     import h11
     from uvicorn.protocols.http.h11_impl import H11Protocol
@@ -339,22 +339,22 @@ def limited_protocol(limits: ConnectionLimits) -> type[Any]:  # noqa: C901
             return self.cycle is None or self.cycle.response_complete
 
         def _find_room(self) -> bool:
-            """Return whether this connection may stay; an idle one makes room for it where there is none."""
-            mine = peer(self)
+            """Return whether this connection may stay, after dropping an idle one if necessary."""
+            own_peer = peer(self)
             others = [(peer(c), c) for c in self.connections if c is not self]
-            crowd = [c for name, c in others if name == mine]
-            if len(crowd) < limits.per_peer:
-                # This machine's own share is never given away.
-                crowd = [c for name, c in others if name] if mine else []
-                if len(crowd) < limits.total - limits.per_peer:
+            rivals = [c for name, c in others if name == own_peer]
+            if len(rivals) < limits.per_peer:
+                # The share of this computer is never given away.
+                rivals = [c for name, c in others if name] if own_peer else []
+                if len(rivals) < limits.total - limits.per_peer:
                     return True
-            idle = [c for c in crowd if isinstance(c, LimitedProtocol) and c._idle]
+            idle = [c for c in rivals if isinstance(c, LimitedProtocol) and c._idle]
             if idle:
                 min(idle, key=lambda c: c._idle_since)._drop()
             return bool(idle)
 
         def _drop(self) -> None:
-            # Uncount it now: the transport reports its end only in the loop's next round.
+            # Remove it now: the transport reports its end only in the next iteration of the loop.
             self.connections.discard(self)
             self.transport.abort()
 
@@ -378,18 +378,20 @@ def limited_protocol(limits: ConnectionLimits) -> type[Any]:  # noqa: C901
     return LimitedProtocol
 
 
-_PIECE = 1 << 16
-_LONGEST_NAME = 255
-"""Bytes of a file's name; file systems refuse longer ones in ways of their own."""
+# Downloads --------------------------------------------------------------------------------------------------------
+
+_CHUNK = 1 << 16
+_MAX_NAME = 255
+"""Longest name of a file, in bytes; file systems refuse longer ones in different ways."""
 
 
-def address(kind: str, name: str) -> str:
+def download_address(kind: str, name: str) -> str:
     """Return the download address of an export or package; ``kind`` is `EXPORTS` or `PACKAGES`."""
     return f"/download/{kind}/{quote(name, safe='')}.zip"
 
 
 def router(workspace: Workspace) -> APIRouter:
-    """Return the routes for the addresses of `address`."""
+    """Return the routes for the addresses of `download_address`."""
     routes = APIRouter()
 
     @routes.get(f"/download/{EXPORTS}/{{name}}.zip", include_in_schema=False)
@@ -425,13 +427,13 @@ def path_in(workspace: Workspace, kind: str, name: str) -> Path:
         ConfigError: for a name that leads elsewhere, also by way of a link.
     """
     place = workspace.inside(workspace.folder / kind / name)
-    if place.parent != workspace.folder / kind or len(place.name.encode()) > _LONGEST_NAME:
-        raise ConfigError(f"'{name}' is no name in '{workspace.folder / kind}'.")
+    if place.parent != workspace.folder / kind or len(place.name.encode()) > _MAX_NAME:
+        raise ConfigError(f"'{name}' cannot be a name in '{workspace.folder / kind}'.")
     return place
 
 
 def zip_chunks(folder: Path) -> Iterator[bytes]:
-    """Yield a zip of a folder, under the folder's name, while it is packed; equal files give equal bytes.
+    """Yield a zip of a folder while it is packed; equal files give equal bytes.
 
     Links that lead out of the folder are left out.
     """
@@ -442,8 +444,8 @@ def zip_chunks(folder: Path) -> Iterator[bytes]:
                 continue
             entry = zip_entry(f"{folder.name}/{path.relative_to(folder).as_posix()}")
             with path.open("rb") as source, archive.open(entry, "w") as target:
-                while piece := source.read(_PIECE):
-                    target.write(piece)
+                while chunk := source.read(_CHUNK):
+                    target.write(chunk)
                     yield pipe.take()
     yield pipe.take()
 
@@ -452,16 +454,16 @@ class _Pipe(io.RawIOBase):
     """Buffer between `zipfile` and the response; it cannot seek, so that sizes are written after the data."""
 
     def __init__(self) -> None:
-        self._held = bytearray()
+        self._buffer = bytearray()
 
     def writable(self) -> bool:
         return True
 
-    def write(self, piece: object) -> int:
-        taken = bytes(piece)  # type: ignore[call-overload]
-        self._held += taken
-        return len(taken)
+    def write(self, data: object) -> int:
+        content = bytes(data)  # type: ignore[call-overload]
+        self._buffer += content
+        return len(content)
 
     def take(self) -> bytes:
-        held, self._held = bytes(self._held), bytearray()
-        return held
+        content, self._buffer = bytes(self._buffer), bytearray()
+        return content

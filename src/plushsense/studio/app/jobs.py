@@ -1,4 +1,4 @@
-"""Long tasks in processes of their own: started, followed, stopped and resumed, independent of open pages."""
+"""Jobs: long tasks in separate processes that can be started, followed, stopped and resumed from any page."""
 
 from __future__ import annotations
 
@@ -21,24 +21,25 @@ from plushsense.studio.app.workspace import WORK, ChangeSignal, Workspace
 UNFINISHED = ".unfinished-"
 """Prefix of temporary folders in the work folder; they are removed at the next start."""
 INCOMING = "incoming"
-"""In the work folder: uploaded files until they are imported; orphans are removed at the next start."""
+"""Folder in the work folder for uploaded files that are not imported yet; unused ones are removed at the next start."""
 RUNNING, DONE, REFUSED, STOPPED = "running", "done", "refused", "stopped"
 _MAX_REPORTS = 2000
-# Keys of a spec that are never stored: they may hold people's names.
+# Keys of a spec that are never stored, because they may contain names of people.
 _SECRET_KEYS = ("words",)
 _STOP_S = 10.0
 
 
 @dataclass
 class StudioJob:
-    """A task that runs in a process of its own, with its progress and its outcome.
+    """A task that runs in a separate process, with its progress and outcome.
 
     Attributes:
-        id: unique, in the order of beginning. ``task``: a key of `plushsense.studio.app.worker.TASKS`.
-        spec: what the task is given, plain values. ``title``: for people.
+        id: unique, in the order of start.
+        task: a key of `plushsense.studio.tasks.TASKS`.
+        spec: the argument of the task, in plain values.
         state: `RUNNING`, `DONE`, `REFUSED` (``message`` says why), or `STOPPED` (by a person, or with the studio).
-        progress: the newest report of the task; ``reports``: all of them, up to some thousands. Plain values.
-        warnings: sentences. ``result``: what the task returned.
+        progress: the newest report of the task, in plain values; ``reports`` are all of them, up to some thousands.
+        result: the value that the task returned.
         begun_s, ended_s: seconds since 1970.
     """
 
@@ -57,11 +58,9 @@ class StudioJob:
 
 
 class Jobs:
-    """All jobs of a studio, stored in ``<workspace>/work/<id>.json``.
+    """All jobs of a studio, stored in ``<workspace>/work/<id>.json``; `changed` is notified at every report.
 
-    `changed` is notified at every report.
-
-    A job whose spec says ``dry`` is a preview: it is not stored once it has ended.
+    A job with ``dry`` in its spec is an estimate: it is not stored after its end.
     """
 
     def __init__(self, workspace: Workspace) -> None:
@@ -81,10 +80,10 @@ class Jobs:
                 if job.spec.get("dry"):
                     path.unlink()
                     continue
-                # A running job ended with the studio that ran it.
+                # A job that was running has ended with its studio.
                 job.state = STOPPED if job.state == RUNNING else job.state
                 self._jobs[job.id] = job
-        # Keep only uploads that a stopped job would resume with.
+        # Keep only uploads that a stopped job needs to resume.
         resumable = {str(job.spec.get("archive")) for job in self._jobs.values() if job.state == STOPPED}
         for file in self._folder.glob(f"{INCOMING}/*"):
             if str(file) not in resumable:
@@ -100,7 +99,7 @@ class Jobs:
         """Return the job with this id.
 
         Raises:
-            ConfigError: for an id that is none.
+            ConfigError: for an unknown id.
         """
         try:
             return self._jobs[identity]
@@ -108,9 +107,9 @@ class Jobs:
             raise ConfigError(f"There is no job '{identity}': it may have been removed.") from None
 
     def start(self, task: str, spec: dict[str, Any], title: str) -> StudioJob:
-        """Start a task in a process of its own."""
+        """Start a task in a separate process."""
         with self._lock:
-            # Ids stay in the order of start even if the clock is set back.
+            # Ids are in the order of start even if the clock was set back.
             last = max((int(i) for i in self._jobs if i.isdecimal()), default=0)
             identity = str(max(time.time_ns() // 1_000_000, last + 1))
             job = StudioJob(identity, task, spec, title)
@@ -132,7 +131,7 @@ class Jobs:
         """Remove a job that has ended from the list; its results stay.
 
         Raises:
-            ConfigError: for work that is running, or an id that is none.
+            ConfigError: for a running job, or an unknown id.
         """
         job = self.get(identity)
         with self._lock:
@@ -160,22 +159,18 @@ class Jobs:
 
     def _run(self, job: StudioJob) -> None:
         job.begun_s, job.ended_s, job.progress = time.time(), 0.0, {}
-        new_group: dict[str, Any] = (
-            {"creationflags": getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)}
-            if sys.platform == "win32"
-            else {"start_new_session": True}
-        )
         try:
-            # Store it first: a job that is not stored could not be found again.
+            # Store it first, so that it is found again after a crash.
             self._store(job)
             process = subprocess.Popen(
-                [sys.executable, "-m", "plushsense.studio.app.worker"],
+                [sys.executable, "-m", "plushsense.studio.tasks"],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
                 text=True,
                 encoding="utf-8",
-                **new_group,
+                start_new_session=True,
+                creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
             )
         except OSError as cause:
             where = cause.filename or self._folder
@@ -186,7 +181,7 @@ class Jobs:
         self._processes[job.id] = process
         assert process.stdin is not None
         with contextlib.suppress(OSError):
-            # Standard input stays open: the worker ends when the studio closes it.
+            # Standard input stays open: the worker ends when it is closed.
             process.stdin.write(json.dumps({"task": job.task, "spec": job.spec}, default=str) + "\n")
             process.stdin.flush()
         self.changed.notify()
@@ -218,7 +213,7 @@ class Jobs:
                 if end is not None:
                     end.close()
         job.ended_s = time.time()
-        # Under the lock: a job dropped as soon as its state says that it ended must not be stored after that.
+        # Under the lock: a job that is dropped right after its end must not be stored afterwards.
         with self._lock:
             if "result" in outcome:
                 job.state, job.result = DONE, outcome["result"]
@@ -227,7 +222,7 @@ class Jobs:
             else:
                 job.state = STOPPED
             with contextlib.suppress(OSError):
-                # The outcome stands even if it cannot be stored.
+                # The outcome is valid even if it cannot be stored.
                 if job.spec.get("dry"):
                     self.drop(job.id)
                 else:

@@ -1,17 +1,17 @@
-// The keys of a page: each press goes out once, as `press`, with what the page showed at that moment.
+// Keyboard commands of a page: each press is emitted once, as `press`, with what the page showed at that moment.
 export default {
   template: '<span hidden :data-seen="seen"></span>',
   props: { seen: String, keys: String, fields: Object },
   mounted() {
-    this.listener = (event) => this.hear(event);
-    // Before any button hears of it: a space must not also press the button that has the focus.
+    this.listener = (event) => this.onKey(event);
+    // In the capture phase: a space must not also press the button that has the focus.
     for (const type of ["keydown", "keypress", "keyup"]) window.addEventListener(type, this.listener, true);
   },
   beforeUnmount() {
     for (const type of ["keydown", "keypress", "keyup"]) window.removeEventListener(type, this.listener, true);
   },
   methods: {
-    hear(event) {
+    onKey(event) {
       if (event.ctrlKey || event.altKey || event.metaKey || event.isComposing) return;
       const at = event.target;
       if (at && at.matches && (at.isContentEditable || at.matches("input, textarea, select"))) return;
@@ -25,7 +25,7 @@ export default {
       if (this.fields[key]) {
         event.preventDefault();
         event.stopImmediatePropagation();
-        // At once, here: the next letter is typed already.
+        // Immediately and in the browser: the next letter may already be on its way.
         if (event.type === "keydown") document.querySelector(this.fields[key])?.focus();
         return;
       }
@@ -33,8 +33,8 @@ export default {
       event.preventDefault();
       event.stopImmediatePropagation();
       if (event.type !== "keydown" || event.repeat) return;
-      // Nobody hears it now, and later it would mean something else.
-      if (!window.socket || !window.socket.connected || document.body.classList.contains("ps-unknown")) return;
+      // Without a connection a press is dropped: sent later, it could mean something else.
+      if (!window.socket || !window.socket.connected || document.body.classList.contains("ps-disconnected")) return;
       this.$emit("press", { key, seen: this.seen });
     },
   },

@@ -49,18 +49,18 @@ def run(
     """Serve a workspace until interrupted.
 
     Args:
-        host: where to listen; any other than 127.0.0.1 asks visitors for a token.
-        port: `PORT`, or the next free one, by default; 0: any.
-        names: further names under which browsers may call the machine.
+        host: address to listen on; any other than 127.0.0.1 requires a token of visitors.
+        port: by default `PORT` or the next free one; 0 for any.
+        names: further names under which browsers may reach this computer.
         show: whether to open a browser.
-        on_ready: called with the address when it answers.
+        on_ready: called with the address as soon as it answers.
 
     Raises:
         MissingExtraError: without the extra ``studio``.
-        ConfigError: for an address that cannot be listened on, and a folder that another studio serves.
+        ConfigError: if the address cannot be listened on, or another studio serves the folder.
     """
     need("nicegui", "studio")
-    # Else NiceGUI stores files in the working directory or in Redis.
+    # By default, NiceGUI stores files in the working directory or in Redis.
     os.environ["NICEGUI_STORAGE_PATH"] = str(workspace.folder / WORK / "nicegui")
     os.environ.pop("NICEGUI_REDIS_URL", None)
     from nicegui import app, ui
@@ -86,12 +86,12 @@ def run(
         workspace.invite = lambda: f"{address}?{TOKEN}={visitors.invite()}"
 
     def announce() -> None:
-        # The callback may open a browser at once, but start-up ends before the port is open.
+        # The callback may open a browser immediately, but start-up ends before the port is open.
         _wait_open(host_name, port)
         on_ready(workspace.invite() if workspace.invite else address)
 
     limits = ConnectionLimits.of_process()
-    # NiceGUI's own tasks may miss the shutdown; that message is of no use.
+    # Tasks of NiceGUI may outlive the shutdown; the message about that helps nobody.
     logging.getLogger("nicegui").addFilter(lambda record: "Could not cancel" not in str(record.msg))
     # Quasar's loading bar has no accessible name.
     app.config.quasar_config["loadingBar"] = {"skipHijack": True}
@@ -117,10 +117,10 @@ def run(
 
 
 def _lock_folder(workspace: Workspace) -> FileLock | None:
-    """Lock the folder until this process ends: two studios would each remove the other's unfinished work.
+    """Lock the folder until this process ends, because each studio removes unfinished work that it does not know.
 
     Raises:
-        ConfigError: when another studio has it.
+        ConfigError: if another studio serves the folder.
     """
     lock = FileLock(workspace.folder / WORK / "studio.lock", timeout=0)
     try:
@@ -128,16 +128,16 @@ def _lock_folder(workspace: Workspace) -> FileLock | None:
         lock.acquire()
     except Timeout:
         raise ConfigError(
-            f"A studio is open on '{workspace.folder}' already: use that one, or give another folder with --home."
+            f"A studio is already running in '{workspace.folder}': use that one, or give another folder with --home."
         ) from None
     except (OSError, NotImplementedError):
-        # Without a writable folder nothing can collide.
+        # A folder that cannot be written needs no lock.
         return None
     return lock
 
 
 def _page(workspace: Workspace, name: str) -> Callable[[], Any]:
-    """Return the function that builds a page; it imports the page's module at the first visit."""
+    """Return the function that builds a page; it imports the module of the page at the first visit."""
 
     async def build() -> None:
         from plushsense.studio.app.shell import frame
@@ -155,7 +155,7 @@ def _free_port(host: str, port: int | None) -> int:
     """Return ``port`` if it is free, by default the next free one.
 
     Raises:
-        ConfigError: for an address that is taken, or not this machine's.
+        ConfigError: if the address is in use, or is not one of this computer.
     """
     for candidate in (port,) if port is not None else range(PORT, PORT + 20):
         with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM) as probe:
@@ -177,12 +177,12 @@ def _wait_open(host: str, port: int) -> None:
 
 
 def _addresses() -> list[str]:
-    """Return this machine's network addresses, without sending a packet."""
-    found = []
-    with contextlib.suppress(OSError):
-        found = [str(info[4][0]) for info in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)]
+    """Return the network addresses of this computer, without sending a packet."""
+    addresses = []
     with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        # A connected datagram socket knows its own address; no packet leaves.
+        # Connecting a datagram socket sends no packet, but determines its own address.
         probe.connect(("192.0.2.1", 9))
-        found.insert(0, str(probe.getsockname()[0]))
-    return list(dict.fromkeys(a for a in found if not is_loopback(a)))
+        addresses.append(str(probe.getsockname()[0]))
+    with contextlib.suppress(OSError):
+        addresses += [str(info[4][0]) for info in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)]
+    return list(dict.fromkeys(a for a in addresses if not is_loopback(a)))

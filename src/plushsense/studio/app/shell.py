@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import inspect
+import json
+import time
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from copy import copy
@@ -25,12 +27,12 @@ _CLICKED = "(e) => emit({seen: document.querySelector('[data-seen]').dataset.see
 
 
 class Keys(Element, component="keys.js"):
-    """Keyboard commands of a page: calls ``on_press(key, seen)`` once for each press; a key that is held counts once.
+    """Keyboard commands of a page; a key that is held down counts once.
 
     Args:
         keys: the characters that are commands.
-        on_press: gets the key and what `show` had last set in this browser when it was pressed.
-        fields: keys that go to a field to be typed into, and its CSS selector.
+        on_press: called with the key and the state that the browser displayed when it was pressed (see `show`).
+        fields: maps keys that move the focus to a field to the CSS selector of that field.
     """
 
     def __init__(self, keys: str, on_press: Callable[[str, str], Any], fields: Mapping[str, str] | None = None) -> None:
@@ -45,14 +47,14 @@ class Keys(Element, component="keys.js"):
         self.on("press", pressed)
 
     def show(self, seen: str) -> None:
-        """Set what the page shows now; it is sent with every press from here on."""
+        """Set the state that the page displays now; it is sent with every later press."""
         if self._props["seen"] != seen:
             self._props["seen"] = seen
             self.update()
 
 
 def on_click(button: ui.button, call: Callable[[str], Any], once: bool = False) -> None:
-    """Call ``call(seen)`` at a click, with what the `Keys` of the page showed; ``once``: a double click is one."""
+    """Call ``call(seen)`` at a click, with the state set by `Keys.show`; with ``once``, a double click counts once."""
 
     def clicked(event: GenericEventArguments) -> Any:
         if not (once and int(event.args["times"] or 0) > 1):
@@ -72,27 +74,27 @@ PAGES = {
     "export": "/export",
     "publish": "/publish",
 }
-"""The registry of pages: name to path, in the order of the work. A page is a folder ``pages/<name>`` whose module
-``page`` has a function ``show(page)``, one line here, and its texts: ``pages.<name>`` and ``<name>.title``."""
+"""The registry of pages: name to path, in the order of the navigation bar. A page is a folder ``pages/<name>`` whose
+module ``page`` has a function ``show(page)``, one line here, and the texts ``pages.<name>`` and ``<name>.title``."""
 
 AFFECT_SIGNS = {"positive": "+", "neutral": "○", "negative": "−", "none": "·"}
-"""Affect is never shown by colour alone: a sign and a word stand with it."""
+"""Affect is never marked by colour alone, but also by a sign and a word."""
 AFFECT_COLOURS = {"positive": "#00805c", "neutral": "#3a6ea5", "negative": "#b84a00", "none": "#767676"}
-"""After Okabe and Ito's palette for colour-blind eyes, darkened to read as text on white."""
+"""Okabe and Ito's palette for colour-blind people, darkened so that white text is readable on it."""
 LINES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8a8a00", "#7f3c8d", "#a06000", "#444444")
 """Colours of lines in plots (Okabe and Ito, and four more)."""
 
 _QUASAR = {"en": "en-US", "lv": "lv"}
 _LIGHTS = {"system": "brightness_auto", "light": "light_mode", "dark": "dark_mode"}
-# The colour of Quasar's dark page.
-_NIGHT = "#121212"
-_BEAR = Markup(
+# Background of Quasar's dark pages.
+_DARK_BACKGROUND = "#121212"
+_LOGO = Markup(
     '<svg viewBox="0 0 32 32" width="28" height="28"><g fill="#e0a872"><circle cx="8" cy="8" r="5"/>'
     '<circle cx="24" cy="8" r="5"/><circle cx="16" cy="18" r="12"/></g><g fill="#3a2410"><circle cx="11.5" cy="16" '
     'r="1.8"/><circle cx="20.5" cy="16" r="1.8"/><ellipse cx="16" cy="21" rx="3" ry="2"/></g></svg>'
 )
 
-# All fields look alike.
+# The same design for all fields.
 for _field in (ui.input, ui.number, ui.select, ui.textarea):
     _field.default_props("outlined dense")
 
@@ -113,14 +115,14 @@ class Page:
     _messages: Any = None
 
     def say(self, sentence: str, kind: Kind = "info") -> None:
-        """Show a message at the top, for eyes and screen readers; "" removes it."""
+        """Show a message at the top of the page, also to screen readers; "" removes it."""
         self._messages.clear()
         if not sentence:
             return
         with self._messages:
             role = "alert" if kind == "error" else "status"
-            box = ui.row().classes(f"ps-said ps-said-{kind} w-full items-center no-wrap").props(f'role="{role}"')
-            with tag(box, "said"):
+            box = ui.row().classes(f"ps-message ps-message-{kind} w-full items-center no-wrap").props(f'role="{role}"')
+            with tag(box, "message"):
                 ui.label(sentence).classes("flex-grow")
                 close = ui.button(icon="close", on_click=lambda: self.say("")).props("flat round dense color=inherit")
                 close.props(f'aria-label="{self.words("shell.close")}"')
@@ -138,19 +140,13 @@ class Page:
 
 
 def visitor() -> tuple[Words, bool | None]:
-    """Return the words and the colour scheme (dark, light, None: the system's) that this visitor chose."""
+    """Return the texts and the colour scheme of this visitor: dark (True), light (False), or the system's (None)."""
     request = context.client.request
     cookies = request.cookies if request is not None else {}
-    chosen = cookies.get(LANGUAGE_COOKIE) or _preferred(request.headers.get("accept-language", "") if request else "")
-    return Words(chosen), {"dark": True, "light": False}.get(cookies.get(LIGHT_COOKIE, ""))
-
-
-def _preferred(accepted: str) -> str:
-    for part in accepted.split(","):
-        code = part.split(";")[0].strip()[:2].lower()
-        if code in LANGUAGES:
-            return code
-    return next(iter(LANGUAGES))
+    accepted = request.headers.get("accept-language", "") if request is not None else ""
+    codes = [part.strip()[:2].lower() for part in accepted.split(",")]
+    language = cookies.get(LANGUAGE_COOKIE) or next((code for code in codes if code in LANGUAGES), "")
+    return Words(language), {"dark": True, "light": False}.get(cookies.get(LIGHT_COOKIE, ""))
 
 
 @contextmanager
@@ -162,9 +158,9 @@ def frame(workspace: Workspace, name: str) -> Iterator[Page]:
     ui.page_title(f"{words(f'pages.{name}')} · PlushSense")
     ui.add_head_html(f"<style>{_CSS.read_text(encoding='utf-8')}</style>")
     with ui.header().classes("ps-header items-center no-wrap"):
-        # A link of NiceGUI's would load the page once more.
+        # A link made by NiceGUI would reload the page.
         html(Markup('<a class="ps-skip" href="#content">{}</a>').format(words("shell.skip")))
-        html(_BEAR, "span").classes("ps-bear").props("aria-hidden=true")
+        html(_LOGO, "span").classes("ps-logo").props("aria-hidden=true")
         ui.label("PlushSense").classes("ps-brand")
         with ui.element("nav").classes("ps-bar row items-center").props(f'aria-label="{words("shell.pages")}"'):
             for key, path in PAGES.items():
@@ -175,26 +171,22 @@ def frame(workspace: Workspace, name: str) -> Iterator[Page]:
         _choices(words, dark)
     with ui.element("div").classes("ps-main column no-wrap items-start").props('id="content" tabindex="-1"'):
         tag(html(words(f"{name}.title"), "h1"), "title")
-        page._messages = ui.column().classes("w-full ps-sayings")
+        page._messages = ui.column().classes("w-full ps-messages")
         yield page
 
 
 def _set_appearance(words: Words, dark: bool | None) -> None:
-    """Set language and colour scheme in the response itself, so that they are right before scripts run."""
+    """Set language and colour scheme in the response itself, so that they apply before scripts run."""
     client = context.client
-    # The page object is the route's, shared by all visitors: each gets a copy.
+    # The page object belongs to the route and is shared by all visitors: each gets a copy.
     own = copy(client.page)
     own.dark, own.language = dark, _QUASAR[words.language]  # type: ignore[assignment]
     client.page = own
-    translations[own.language] = {  # type: ignore[index]
-        "connection_lost": words("shell.connection_lost"),
-        "trying_to_reconnect": words("shell.trying_to_reconnect"),
-        "message_too_long": words("shell.message_too_long"),
-        "message_too_long_body": words("shell.message_too_long_body"),
-    }
-    night = f":root {{ color-scheme: dark; background: {_NIGHT}; }}"
-    early = night if dark else "" if dark is False else f"@media (prefers-color-scheme: dark) {{ {night} }}"
-    ui.add_head_html(f"<style>{early}</style>")
+    keys = ("connection_lost", "trying_to_reconnect", "message_too_long", "message_too_long_body")
+    translations[own.language] = {key: words(f"shell.{key}") for key in keys}  # type: ignore[index]
+    style = f":root {{ color-scheme: dark; background: {_DARK_BACKGROUND}; }}"
+    if dark is not False:
+        ui.add_head_html(f"<style>{style if dark else f'@media (prefers-color-scheme: dark) {{ {style} }}'}</style>")
     # Announce a lost connection to screen readers, too.
     ui.add_body_html(
         "<script>addEventListener('DOMContentLoaded', () => document.querySelectorAll('.nicegui-error-popup')"
@@ -203,7 +195,7 @@ def _set_appearance(words: Words, dark: bool | None) -> None:
 
 
 def _choices(words: Words, dark: bool | None) -> None:
-    """Add the choices of language and colour scheme, which are kept as cookies."""
+    """Add the choices of language and colour scheme, which are stored in cookies."""
     language = ui.toggle({code: code.upper() for code in LANGUAGES}, value=words.language)
     language.props(
         f"dense unelevated color=blue-grey-9 toggle-color=blue-grey-1 toggle-text-color=black "
@@ -229,10 +221,10 @@ def _set_cookie(cookie: str, value: str) -> None:
 
 
 def on_change(signal: ChangeSignal, callback: Callable[[], Any]) -> None:
-    """Call ``callback``, which may be async, in this page after each notification of ``signal`` until it is closed."""
+    """Call ``callback``, which may be async, after each notification of ``signal`` until this page is closed."""
     client = context.client
 
-    async def going_on(result: Awaitable[Any]) -> None:
+    async def finish(result: Awaitable[Any]) -> None:
         with client:
             await result
 
@@ -240,55 +232,84 @@ def on_change(signal: ChangeSignal, callback: Callable[[], Any]) -> None:
         with client:
             result = callback()
         if inspect.isawaitable(result):
-            background_tasks.create(going_on(result))
+            background_tasks.create(finish(result))
 
     client.on_delete(signal.subscribe(called))
 
 
 def address(page: str, **query: str | Path) -> str:
-    """Return the address of a page that opens with a selection, such as ``address("review", dataset=path)``."""
-    chosen = {key: str(value) for key, value in query.items() if str(value)}
-    return PAGES[page] + (f"?{urlencode(chosen)}" if chosen else "")
+    """Return the address of a page with a query, such as ``address("review", dataset=path)``; skip empty values."""
+    values = {key: str(value) for key, value in query.items() if str(value)}
+    return PAGES[page] + (f"?{urlencode(values)}" if values else "")
 
 
-def query_value(key: str) -> str:
-    """Return the value of ``key`` in this page's address, or "". Check paths with `Workspace.inside`."""
+def query() -> dict[str, str]:
+    """Return the query of this page's address. Check paths with `Workspace.inside`."""
     request = context.client.request
-    return str(request.query_params.get(key, "")) if request is not None else ""
+    return dict(request.query_params) if request is not None else {}
 
 
-def query_path(workspace: Workspace, key: str, among: Iterable[str]) -> str:
-    """Return the path in this page's address if it is one of ``among``; else the first of them, or ""."""
-    there = list(among)
+def query_path(workspace: Workspace, key: str, allowed: Iterable[str]) -> str:
+    """Return the path ``key`` of this page's address if it is allowed; else the first allowed path, or ""."""
+    paths = list(allowed)
     with suppress(PlushSenseError):
-        if (path := str(workspace.inside(query_value(key)))) in there:
+        if (path := str(workspace.inside(query().get(key, "")))) in paths:
             return path
-    return next(iter(there), "")
+    return next(iter(paths), "")
+
+
+def set_address(path: str) -> None:
+    """Change the address in the browser without loading a page."""
+    ui.run_javascript(f"history.replaceState(history.state, '', {json.dumps(path)})")
+
+
+def moment(seconds: float) -> str:
+    """Format seconds since 1970 as date and time in the time zone of this computer."""
+    return time.strftime("%Y-%m-%d %H:%M", time.localtime(seconds))
 
 
 def html(content: str = "", kind: str = "div") -> ui.html:
     """Return an HTML element ``kind`` that shows ``content``, now and whenever it is set later.
 
-    A plain string is text: it is escaped. Only `markupsafe.Markup` is HTML; build it with ``Markup("…{}…").format(…)``,
-    which escapes what it fills in. The studio creates no HTML in any other way.
+    A plain string is escaped. Only `markupsafe.Markup` is HTML; build it with ``Markup("…{}…").format(…)``, which
+    escapes the values. The studio creates no HTML in any other way.
     """
     return ui.html(content, sanitize=lambda given: str(escape(given)), tag=kind)
 
 
 def tag(element: E, name: str) -> E:
-    """Give an element a name that browsers see, ``data-test``: for tests and the manual, never for looks."""
+    """Set the attribute ``data-test`` of an element, by which tests find it; never use it for styles."""
     element.props["data-test"] = name
     return element
 
 
 def named(element: E, label: str) -> E:
-    """Give an element a name for screen readers, whatever characters that holds."""
+    """Set the name of an element for screen readers; the label may hold any characters."""
     element.props["aria-label"] = label
     return element
 
 
+def section(label: str, classes: str = "ps-card", level: int = 2) -> ui.element:
+    """Add a section with a heading; screen readers find it as a region of that name."""
+    box = named(ui.element("section").classes(f"{classes} w-full column no-wrap ps-small-gap"), label)
+    with box:
+        heading(label, level)
+    return box
+
+
+def heading(text: str, level: int) -> ui.label:
+    """Add a heading; use `section` where it begins a region."""
+    look = "text-lg" if level < 4 else "text-weight-bold"
+    return ui.label(text).classes(look).props(f'role="heading" aria-level="{level}"')
+
+
+def scroll_region(label: str) -> ui.element:
+    """Add a box in which wide content scrolls sideways; it can be reached by keyboard."""
+    return named(ui.element("div").classes("ps-scroll-x").props('role="region" tabindex="0"'), label)
+
+
 def focus(element: ui.element) -> None:
-    """Give an element the keyboard, as soon as it is shown."""
+    """Move the keyboard focus to an element as soon as it is displayed."""
     ui.run_javascript(f"setTimeout(() => getHtmlElement({element.id})?.focus())")
 
 

@@ -1,4 +1,4 @@
-"""Texts of the pages: one TOML file a language in ``words/``, with the same keys in each."""
+"""Texts of the pages: one TOML file for each language in ``words/``, all with the same keys."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 LANGUAGES = {"en": "English", "lv": "Latviešu"}
-"""Code to name; ``words/<code>.toml`` has the words."""
+"""Code to name; the texts are in ``words/<code>.toml``."""
 
 
 class Words:
-    """Texts in one language: ``words("record.start", n=3)`` is ``start`` of ``[record]``, with ``{n}`` filled in."""
+    """Texts in one language: ``words("record.start", n=3)`` is ``start`` of ``[record]`` with ``{n}`` filled in."""
 
     def __init__(self, language: str) -> None:
         self.language = language if language in LANGUAGES else next(iter(LANGUAGES))
@@ -28,6 +28,10 @@ class Words:
         """Format a number with this language's decimal point."""
         text = f"{value:.{digits}f}"
         return text.replace(".", self._texts["shell.decimal_point"])
+
+    def table(self, name: str) -> dict[str, str]:
+        """Return all texts of a table, without its name in the keys."""
+        return {key.removeprefix(f"{name}."): text for key, text in self._texts.items() if key.startswith(f"{name}.")}
 
     def has(self, key: str) -> bool:
         """Return whether there is a text with this key."""

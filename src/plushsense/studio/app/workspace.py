@@ -5,8 +5,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import re
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -21,6 +22,7 @@ WORK = "work"
 VIRTUAL = "virtual://?person=7"
 _HEAD = "dataset.toml"
 _BUNDLE = "*.plush"
+_NOT_PLAIN = re.compile(r"[^\w .-]")
 
 T = TypeVar("T")
 
@@ -29,16 +31,16 @@ T = TypeVar("T")
 class Workspace:
     """Folders, toys and shared services of one studio.
 
-    Pages may read and write inside ``folder`` and the data sets given at start, nowhere else.
+    Pages may read and write only inside ``folder`` and the data sets given at start.
 
     Attributes:
-        folder: holds `RECORDINGS`, `DATASETS`, `BUNDLES`, `EXPORTS`, `PACKAGES`, `WORK`, each made when it is needed.
-        given: data sets named at start, wherever they lie.
-        devices: toys named at start; the first is chosen.
-        models: bundles named at start.
+        folder: holds `RECORDINGS`, `DATASETS`, `BUNDLES`, `EXPORTS`, `PACKAGES` and `WORK`, created when needed.
+        given: data sets given at start, in any folder.
+        devices: toys given at start; the first is chosen.
+        models: bundles given at start.
         toy: the URL of the toy that is chosen on the home page.
-        speed: times real time at which a virtual toy runs.
-        invite: gives an address with a new token for one more visitor; None where everybody may come.
+        speed: speed of a virtual toy, as a multiple of real time.
+        invite: returns an address with a new token for one more visitor; None if no token is needed.
     """
 
     folder: Path
@@ -66,11 +68,11 @@ class Workspace:
         with self._lock:
             if kind not in self._parts:
                 self._parts[kind] = kind(self)  # type: ignore[index]
-            found: T = self._parts[kind]  # type: ignore[index]
-            return found
+            part: T = self._parts[kind]  # type: ignore[index]
+            return part
 
     def close(self) -> None:
-        """Close all parts, the last made first."""
+        """Close all parts, the last created first."""
         with self._lock:
             parts, self._parts = list(self._parts.values()), {}
         for part in reversed(parts):
@@ -86,17 +88,17 @@ class Workspace:
 
     def datasets(self) -> list[Path]:
         """Return all data sets: those given at start, then those in the folder by name."""
-        found = [p for p in self.given if (p / _HEAD).is_file()]
-        below = sorted(p.parent for p in (self.folder / DATASETS).glob(f"*/{_HEAD}"))
-        return [*found, *(p for p in below if p.resolve() not in self.given)]
+        given = [p for p in self.given if (p / _HEAD).is_file()]
+        own = sorted(p.parent for p in (self.folder / DATASETS).glob(f"*/{_HEAD}"))
+        return [*given, *(p for p in own if p.resolve() not in self.given)]
 
     def bundles(self) -> list[Path]:
         """Return all bundles, the newest first: those given at start, in the folder, and beside a data set."""
-        places = [self.folder / BUNDLES, *self.datasets()]
-        found = {p.resolve(): p for p in self.models if p.is_file()}
-        found |= {p.resolve(): p for place in places for p in place.glob(_BUNDLE)}
+        folders = [self.folder / BUNDLES, *self.datasets()]
+        bundles = {p.resolve(): p for p in self.models if p.is_file()}
+        bundles |= {p.resolve(): p for folder in folders for p in folder.glob(_BUNDLE)}
         dated = []
-        for path in found.values():
+        for path in bundles.values():
             # A file may have been removed since it was listed, or be a broken link.
             with contextlib.suppress(OSError):
                 dated.append((-path.stat().st_mtime, str(path), path))
@@ -128,36 +130,46 @@ class Workspace:
         )
 
     def new(self, kind: str, name: str) -> Path:
-        """Return the path for something new with this name in ``folder / kind``; nothing is created yet.
+        """Return the path for a new file or folder of this name in ``folder / kind``; create nothing.
 
         Raises:
-            ConfigError: for a name that is no plain file name, and one that is taken.
+            ConfigError: for a name that is no plain file name, or one that is taken.
         """
         plain = name.strip()
-        odd = plain.startswith(".") or plain.endswith(".") or not all(c.isalnum() or c in " ._-" for c in plain)
-        if not plain or len(plain) > 64 or odd or DEVICE_NAME.match(plain):
+        dotted = plain.startswith(".") or plain.endswith(".")
+        if not 0 < len(plain) <= 64 or dotted or _NOT_PLAIN.search(plain) or DEVICE_NAME.match(plain):
             raise ConfigError(
                 f"'{name}' cannot be a name: give at most 64 letters, digits, spaces, points and hyphens."
             )
         place = self.inside(Path(kind) / plain)
         if place.exists():
-            raise ConfigError(
-                f"'{plain}' is there already in '{place.parent}': give another name, nothing is replaced."
-            )
+            raise ConfigError(f"'{plain}' exists already in '{place.parent}': give another name, nothing is replaced.")
         return place
+
+    def free_name(self, kind: str, name: str, *suffixes: str, separator: str = "-", taken: Collection[str] = ()) -> str:
+        """Return ``name``, numbered if it is ``taken`` or exists in ``folder / kind`` with one of the suffixes."""
+        free, number = name, 2
+        while free in taken or any((self.folder / kind / f"{free}{s}").exists() for s in suffixes or ("",)):
+            free, number = f"{name}{separator}{number}", number + 1
+        return free
 
     def title(self, dataset: Path) -> str:
         """Return the name of a data set; its folder's name if it cannot be read."""
         try:
-            now = (dataset / _HEAD).stat()
-            seen = now.st_mtime_ns, now.st_size
+            stat = (dataset / _HEAD).stat()
+            stamp = stat.st_mtime_ns, stat.st_size
             # Cached: pages call this in the event loop for every data set.
-            known = self._titles.get(dataset)
-            if known is None or known[0] != seen:
-                known = self._titles[dataset] = (seen, DatasetHead.read(dataset).name)
-            return known[1]
+            cached = self._titles.get(dataset)
+            if cached is None or cached[0] != stamp:
+                cached = self._titles[dataset] = (stamp, DatasetHead.read(dataset).name)
+            return cached[1]
         except Exception:  # noqa: BLE001, RUF100
             return dataset.name
+
+
+def plain_name(text: str, default: str) -> str:
+    """Return a text as a valid name for `Workspace.new`, with hyphens for other characters; ``default`` if empty."""
+    return _NOT_PLAIN.sub("-", text).strip(" .")[:56] or default
 
 
 class ChangeSignal:
@@ -177,15 +189,10 @@ class ChangeSignal:
     def subscribe(
         self, callback: Callable[[], Any], loop: asyncio.AbstractEventLoop | None = None
     ) -> Callable[[], None]:
-        """Call ``callback`` in ``loop`` after notifications; those before it runs are merged into one call.
+        """Call ``callback`` in ``loop`` (by default the running one) after notifications; return how to unsubscribe.
 
-        Pages use `plushsense.studio.app.shell.on_change`, which unsubscribes when the page is closed.
-
-        Args:
-            loop: the running event loop by default.
-
-        Returns:
-            A function that unsubscribes.
+        Notifications that come before it runs are merged into one call. Pages use
+        `plushsense.studio.app.shell.on_change`, which unsubscribes when the page is closed.
         """
         loop = loop or asyncio.get_running_loop()
         key, waiting = object(), threading.Event()

@@ -1,1 +1,1 @@
-"""One module a page: ``show(workspace)`` builds it. `plushsense.studio.app.serve.PAGES` is their table."""
+"""The pages: each is a folder with a module ``page``. `plushsense.studio.app.shell.PAGES` is the registry."""

@@ -7,7 +7,7 @@ export default {
   template: '<div role="img" :aria-label="label"><div ref="place"></div></div>',
   props: {
     label: String, series: Array, xTitle: String, yTitle: String, height: Number, windowS: Number,
-    rangeY: Array, valuesY: { type: Boolean, default: true }, legend: Boolean, pickable: Boolean, start: Object, resourcePath: String,
+    rangeY: Array, valuesY: { type: Boolean, default: true }, pickable: Boolean, start: Object, resourcePath: String,
   },
   async mounted() {
     await this.$nextTick();
@@ -50,7 +50,7 @@ export default {
       const options = {
         width: this.$el.clientWidth || 600,
         height: this.height,
-        legend: { show: this.legend, live: false },
+        legend: { live: false },
         cursor: { drag: { x: false, y: false } },
         scales: { x: { time: false }, y: this.rangeY ? { range: this.rangeY } : {} },
         axes: [axis(this.xTitle, 44), this.valuesY ? axis(this.yTitle, 64) : { show: false }],

@@ -9,10 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.core.errors import PlushSenseError
-from plushsense.core.gestures import NOBODY
 from plushsense.dataset.files import sha256_of
 from plushsense.dataset.publishing.tables import list_package_files
-from plushsense.dataset.store import UNKNOWN_SUBJECT
 from plushsense.deploy.convert import CONVERTERS
 from plushsense.deploy.emit import FACTS, TOY_BYTES, read_facts
 from plushsense.deploy.quantize import integer_model
@@ -26,25 +24,17 @@ _NEEDS = {
     "tflite": ("tflite", ("ai_edge_litert", "flatbuffers")),
     "espdl": ("espdl", ("onnx", "esp_ppq", "torch")),
 }
-"""Extra and modules needed by the formats, by the first word of their names."""
+"""The extra and the modules that a format needs, by the first word of its name."""
 
 
 @dataclass(frozen=True)
 class BundleFacts:
-    """Facts of a bundle; ``problem``: why it cannot be read, ``cannot``: why it cannot be exported."""
+    """A bundle, or None and the ``problem`` why it cannot be read; ``cannot``: why it cannot be exported."""
 
     path: Path
+    bundle: Bundle | None = None
     problem: str = ""
     cannot: str = ""
-    title: str = ""
-    padding: str = ""
-    layout: str = ""
-    gestures: tuple[str, ...] = ()
-    dataset: str = ""
-    people: int = 0
-    simulated: bool = False
-    adapted_to: str = ""
-    scores: dict[str, Any] = field(default_factory=dict)
     bytes: int = 0
 
     @classmethod
@@ -59,28 +49,23 @@ class BundleFacts:
             cannot = ""
         except PlushSenseError as refusal:
             cannot = str(refusal)
-        origin = bundle.provenance
-        people = origin.get("subjects")
-        scores = origin.get("scores")
-        return cls(
-            path,
-            cannot=cannot,
-            title=bundle.arch.title,
-            padding=bundle.arch.padding,
-            layout=bundle.layout.name,
-            gestures=tuple(bundle.gestures.labels),
-            dataset=str(origin.get("dataset", "")),
-            people=len(set(people) - {NOBODY, UNKNOWN_SUBJECT}) if isinstance(people, list) else int(people or 0),
-            simulated=bool(origin.get("simulated", False)),
-            adapted_to=bundle.adapted_to or "",
-            scores=dict(scores) if isinstance(scores, dict) and "accuracy" in scores else {},
-            bytes=path.stat().st_size,
-        )
+        return cls(path, bundle, cannot=cannot, bytes=path.stat().st_size)
+
+    @property
+    def simulated(self) -> bool:
+        """True if the bundle was trained on a virtual toy."""
+        return self.bundle is not None and bool(self.bundle.provenance.get("simulated", False))
 
 
 @dataclass(frozen=True)
 class ExportFacts:
-    """Facts of an export folder; ``problem``: why it cannot be read, ``digest``: hash of its files."""
+    """Facts of an export folder.
+
+    Attributes:
+        problem: why it cannot be read, or "".
+        files: bytes of each file.
+        digest: hash of all files.
+    """
 
     folder: Path
     problem: str = ""
@@ -116,8 +101,8 @@ class ExportFacts:
 
 def exports_of(workspace: Workspace) -> list[Path]:
     """List the export folders of a workspace, the newest first."""
-    found = [p.parent for p in (workspace.folder / EXPORTS).glob(f"*/{FACTS}") if not p.parent.name.startswith(".")]
-    return sorted(found, key=lambda p: -(p / FACTS).stat().st_mtime)
+    folders = [p.parent for p in (workspace.folder / EXPORTS).glob(f"*/{FACTS}") if not p.parent.name.startswith(".")]
+    return sorted(folders, key=lambda p: -(p / FACTS).stat().st_mtime)
 
 
 def folder_digest(folder: Path) -> str:
@@ -135,12 +120,11 @@ def newest_job(jobs: Jobs, task: str, place: Path) -> StudioJob | None:
 
 def formats() -> dict[str, str]:
     """Map each export format to the extra that it needs, or "" if that is installed."""
-    return {name: _lacks(name) for name in CONVERTERS}
-
-
-def _lacks(name: str) -> str:
-    extra, modules = _NEEDS[name.partition("-")[0]]
-    return "" if all(importlib.util.find_spec(m) for m in modules) else extra
+    missing = {}
+    for name in CONVERTERS:
+        extra, modules = _NEEDS[name.partition("-")[0]]
+        missing[name] = "" if all(importlib.util.find_spec(m) for m in modules) else extra
+    return missing
 
 
 def targets() -> dict[str, list[str]]:

@@ -2,28 +2,30 @@
 
 from __future__ import annotations
 
-import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 from markupsafe import Markup
-from nicegui import context, run, ui
+from nicegui import run, ui
 
+from plushsense.core.gestures import NOBODY
+from plushsense.dataset.store import UNKNOWN_SUBJECT
 from plushsense.deploy.convert import CONVERTERS
 from plushsense.deploy.package import ARDUINO, IDF, IDF_EXAMPLE, SKETCH
 from plushsense.deploy.targets import TARGETS
-from plushsense.studio.app.guard import address, path_in
+from plushsense.models.bundle import Bundle
+from plushsense.studio.app.guard import download_address, path_in
 from plushsense.studio.app.jobs import Jobs, StudioJob
-from plushsense.studio.app.shell import Page, html, tag
+from plushsense.studio.app.shell import Page, address, html, moment, query, set_address, tag
 from plushsense.studio.app.words import Words
-from plushsense.studio.app.workspace import EXPORTS
+from plushsense.studio.app.workspace import EXPORTS, plain_name
 from plushsense.studio.pages.export.exports import BundleFacts, ExportFacts, exports_of, formats, newest_job, targets
-from plushsense.studio.widgets.work import (
+from plushsense.studio.widgets.elements import (
     WorkPanel,
     facts,
     link,
-    moment,
+    notice,
     scroll_to,
     size,
     style,
@@ -39,30 +41,29 @@ _FITS = {"yes": True, "no": False, "unsure": None}
 def show_cost(page: Page, work: WorkPanel, export: ExportFacts, counted: StudioJob | None) -> None:
     """Build the card with the cost of an export; ``counted`` is the job that measured it."""
     words = page.words
-    found: dict[str, Any] = counted.result.get("profile", {}) if counted else {}
-    fresh = found.get("digest") == export.digest
+    profile: dict[str, Any] = counted.result.get("profile", {}) if counted else {}
+    current = profile.get("digest") == export.digest
 
-    async def again() -> None:
+    async def start() -> None:
         await work.start("profile", {"place": str(export.folder)})
 
     with tag(ui.column().classes("ps-card w-full"), "cost"):
         text(words("export.cost"), "h3")
-        if not found:
+        if not profile:
             text(words("export.not_counted"))
-        elif not fresh:
-            text(words("export.counted_before"), classes="ps-said ps-said-warning w-full")
-        elif "refused" in found:
-            tag(text(found["refused"], classes="ps-said ps-said-warning w-full"), "cost-refused")
+        elif not current:
+            notice(words("export.counted_before"))
+        elif "refused" in profile:
+            tag(notice(profile["refused"]), "cost-refused")
         else:
             assert counted is not None
-            _display_cost(page, found, moment(counted.ended_s))
-        if not fresh or "refused" in found:
-            tag(ui.button(words("export.count"), on_click=again).props("outline no-caps"), "count")
+            _display_cost(words, profile, moment(counted.ended_s))
+        if not current or "refused" in profile:
+            tag(ui.button(words("export.count"), on_click=start).props("outline no-caps"), "count")
 
 
-def _display_cost(page: Page, found: dict[str, Any], when: str) -> None:
-    words = page.words
-    text(words("export.cost_about", step=f"{found['step_ms']:g}"), classes="ps-dim")
+def _display_cost(words: Words, profile: dict[str, Any], when: str) -> None:
+    text(words("export.cost_about", step=f"{profile['step_ms']:g}"), classes="ps-dim")
     rows = [
         (
             each["chip"],
@@ -70,7 +71,7 @@ def _display_cost(page: Page, found: dict[str, Any], when: str) -> None:
             words("export.between", low=f"{each['low']:.2g}", high=f"{each['high']:.2g}"),
             verdict(_FITS[each["fits"]], words(f"export.fits_{each['fits']}")),
         )
-        for each in found["estimated_ms"].values()
+        for each in profile["estimated_ms"].values()
     ]
     if rows:
         head = [words(f"export.{k}") for k in ("chip", "mhz", "estimate", "fits")]
@@ -81,50 +82,53 @@ def _display_cost(page: Page, found: dict[str, Any], when: str) -> None:
             *(f"{each[key]:,}" for key in ("instructions_per_step", "flash_bytes", "ram_bytes")),
             f"{each['stack_push_bytes']:,}" if each["stack_push_bytes"] is not None else "–",
         )
-        for name, each in found["targets"].items()
+        for name, each in profile["targets"].items()
         if each["instructions_per_step"] is not None
     ]
     if counted:
         head = [words(f"export.{k}") for k in ("counted_on", "instructions", "flash_all", "ram_all", "stack")]
-        table(words("export.counted_caption", optimise=found["optimise"]), head, counted, (1, 2, 3, 4))
-    for name, packages in found["missing"].items():
-        message = words("export.target_missing", target=TARGETS[name].title, packages=" ".join(packages))
-        text(message, classes="ps-dim")
+        table(words("export.counted_caption", optimise=profile["optimise"]), head, counted, (1, 2, 3, 4))
+    for name, packages in profile["missing"].items():
+        text(_missing_target(words, TARGETS[name].title, packages), classes="ps-dim")
 
 
-def show_facts(page: Page, found: ExportFacts, made: StudioJob | None) -> None:
+def _missing_target(words: Words, title: str, packages: Sequence[str]) -> str:
+    return words("export.target_missing", target=title, packages=" ".join(packages))
+
+
+def show_facts(page: Page, export: ExportFacts, made: StudioJob | None) -> None:
     """Build the card with facts, files and download of an export; ``made`` is the job that wrote it."""
-    words, card = page.words, found.facts
+    words, card = page.words, export.facts
     with tag(ui.column().classes("ps-card w-full"), "export-facts"):
         if card.get("simulated"):
-            text(words("shell.simulation"), classes="ps-said ps-said-warning w-full")
+            notice(words("shell.simulation"))
         for warning in made.warnings if made else ():
-            text(warning, classes="ps-said ps-said-warning w-full")
+            notice(warning)
         facts(
             [
                 (words("export.network"), str(card["title"])),
                 (words("export.gestures"), str(card["classes"])),
                 (words("export.layout"), str(card.get("layout", ""))),
-                (words("export.flash"), words("export.flash_value", n=f"{found.flash_bytes:,}")),
-                (words("export.ram"), words("export.ram_value", n=f"{found.ram_bytes:,}")),
+                (words("export.flash"), words("export.flash_value", n=f"{export.flash_bytes:,}")),
+                (words("export.ram"), words("export.ram_value", n=f"{export.ram_bytes:,}")),
                 (
                     words("export.step"),
                     words("export.step_value", ms=f"{card['step_ms']:g}", macs=f"{card['macs_per_step']:,}"),
                 ),
-                (words("export.made"), moment(found.made_s)),
-                (words("export.place"), str(found.folder)),
+                (words("export.made"), moment(export.made_s)),
+                (words("export.place"), str(export.folder)),
             ]
         )
         for name, each in card.get("conversions", {}).items():
             apart = each.get("largest_difference")
             message = words("export.converted", file=each["file"], n=f"{each['bytes']:,}", name=name)
             text(message if apart is None else f"{message} {words('export.apart', d=f'{apart:.1g}')}")
-        with ui.expansion(words("export.files", n=len(found.files), size=size(sum(found.files.values())))) as files:
-            rows = [(name, f"{bytes_:,}") for name, bytes_ in found.files.items()]
+        with ui.expansion(words("export.files", n=len(export.files), size=size(sum(export.files.values())))) as files:
+            rows = [(name, f"{bytes_:,}") for name, bytes_ in export.files.items()]
             table(words("export.files_caption"), (words("export.file"), words("export.bytes")), rows, (1,))
         tag(files.classes("w-full"), "files")
-        down = ui.link(words("export.download"), address(EXPORTS, found.name)).classes("ps-link")
-        tag(down.props("download"), "download")
+        download = ui.link(words("export.download"), download_address(EXPORTS, export.name)).classes("ps-link")
+        tag(download.props("download"), "download")
 
 
 def show_next(page: Page) -> None:
@@ -144,12 +148,12 @@ def verification_verdict(words: Words, export: ExportFacts, proof: StudioJob | N
         return verdict(None, words("export.never_proved"))
     if proof.result.get("digest") != export.digest:
         return verdict(None, words("export.proved_before"))
-    good, found = _found(words, proof.result)
-    return verdict(good, f"{found}, {moment(proof.ended_s)}")
+    good, outcome = _outcome(words, proof.result)
+    return verdict(good, f"{outcome}, {moment(proof.ended_s)}")
 
 
-def _found(words: Words, result: dict[str, Any]) -> tuple[bool | None, str]:
-    """Return the verdict of a proof and its words; None: equal, but of code that is not ours."""
+def _outcome(words: Words, result: dict[str, Any]) -> tuple[bool | None, str]:
+    """Return whether a verification passed, and its text; None means equal, but with C that is not our own."""
     if not result["passed"]:
         return False, words("export.unequal")
     return (True, words("export.equal")) if result["own"] else (None, words("export.equal_not_own"))
@@ -164,17 +168,17 @@ class VerificationCard:
 
     async def build(self) -> None:
         words = self.words
-        lacking = await run.io_bound(targets) or {}
+        missing = await run.io_bound(targets) or {}
         with tag(ui.column().classes("ps-card w-full"), "proof"):
             text(words("export.prove"), "h3")
             text(words("export.prove_about"), classes="ps-dim")
             with ui.row().classes("w-full"):
-                for name in (n for n, lacks in lacking.items() if not lacks):
+                for name in (n for n, packages in missing.items() if not packages):
                     self._chosen[name] = ui.checkbox(self._title(name), value=True)
                     tag(self._chosen[name], f"target-{name}")
-            for name, lacks in lacking.items():
-                if lacks:
-                    message = words("export.target_missing", target=self._title(name), packages=" ".join(lacks))
+            for name, packages in missing.items():
+                if packages:
+                    message = _missing_target(words, self._title(name), packages)
                     tag(text(message, classes="ps-dim"), f"missing-{name}")
             with ui.expansion(words("export.more")).classes("w-full"):
                 options = {"": words("export.recorded_none")} | await titles(self.page.workspace)
@@ -211,18 +215,19 @@ class VerificationCard:
             await self.work.start("verify", spec)
 
     def _display(self, proof: StudioJob) -> None:
-        words, found = self.words, proof.result
+        words, result = self.words, proof.result
         with tag(ui.column().classes("w-full"), "verdict"):
-            if found["digest"] != self.export.digest:
+            if result["digest"] != self.export.digest:
                 text(
-                    words("export.changed_since", when=moment(proof.ended_s)), classes="ps-said ps-said-warning w-full"
+                    words("export.changed_since", when=moment(proof.ended_s)),
+                    classes="ps-message ps-message-warning w-full",
                 )
-            good, message = _found(words, found)
+            good, outcome = _outcome(words, result)
             with ui.row().classes("items-center"):
-                html(verdict(good, message))
-                text(self._sum(found), "span")
-            for sentence in self._sentences(found):
-                text(sentence, classes=f"ps-said ps-said-{'error' if good is False else 'warning'} w-full")
+                html(verdict(good, outcome))
+                text(self._sum(result), "span")
+            for sentence in self._sentences(result):
+                notice(sentence, "error" if good is False else "warning")
             rows = [
                 (
                     words("export.host_short") if r["target"] == "host" else self._title(r["target"]),
@@ -233,52 +238,52 @@ class VerificationCard:
                     f"{r['max_abs_diff']:,}",
                     verdict(not r["mismatches"], words("export.unequal" if r["mismatches"] else "export.equal")),
                 )
-                for r in found["runs"]
+                for r in result["runs"]
             ]
             keys = ("target", "compiler", "flags", "answers", "mismatches", "difference", "verdict")
             caption = words("export.runs_caption", when=moment(proof.ended_s))
             tag(table(caption, [words(f"export.{k}") for k in keys], rows, (3, 4, 5)), "runs")
-            fed = [(s["name"], f"{s['samples']:,}", f"{s['frames']:,}", f"{s['answers']:,}") for s in found["streams"]]
-            head = [words(f"export.{k}") for k in ("stream", "samples", "frames", "answers")]
-            tag(table(words("export.streams_caption"), head, fed, (1, 2, 3)), "streams")
-            for each in found["not_run"]:
+            counts = ("samples", "frames", "answers")
+            streams = [(s["name"], *(f"{s[key]:,}" for key in counts)) for s in result["streams"]]
+            head = [words(f"export.{k}") for k in ("stream", *counts)]
+            tag(table(words("export.streams_caption"), head, streams, (1, 2, 3)), "streams")
+            for each in result["not_run"]:
                 text(words("export.not_run", what=each["what"], why=each["why"]), classes="ps-dim")
-            self._planted(found)
+            if result["faults"]:
+                self._mutants(result["faults"])
 
-    def _sum(self, found: dict[str, Any]) -> str:
-        settings = len(found["runs"])
-        if not found["mismatches"]:
-            return self.words("export.all_equal", n=f"{found['vectors']:,}", settings=settings)
-        return self.words("export.some_unequal", bad=f"{found['mismatches']:,}", n=f"{found['vectors']:,}")
+    def _sum(self, result: dict[str, Any]) -> str:
+        total, unequal = f"{result['vectors']:,}", f"{result['mismatches']:,}"
+        if not result["mismatches"]:
+            return self.words("export.all_equal", n=total, settings=len(result["runs"]))
+        return self.words("export.some_unequal", bad=unequal, n=total)
 
-    def _sentences(self, found: dict[str, Any]) -> list[str]:
-        words, message = self.words, []
-        if found["first"]:
-            message.append(found["first"])
-        elif not found["decisions"]:
-            message.append(words("export.nothing_proved"))
-        elif not found["passed"]:
-            message.append(words("export.fault_missed"))
-        if not found["own"]:
-            message.append(words("export.not_own"))
-        if found["changed_copies"]:
-            message.append(words("export.changed_copies", files=", ".join(found["changed_copies"])))
-        return message
+    def _sentences(self, result: dict[str, Any]) -> list[str]:
+        words, sentences = self.words, []
+        if result["first"]:
+            sentences.append(result["first"])
+        elif not result["decisions"]:
+            sentences.append(words("export.nothing_proved"))
+        elif not result["passed"]:
+            sentences.append(words("export.fault_missed"))
+        if not result["own"]:
+            sentences.append(words("export.not_own"))
+        if result["changed_copies"]:
+            sentences.append(words("export.changed_copies", files=", ".join(result["changed_copies"])))
+        return sentences
 
-    def _planted(self, found: dict[str, Any]) -> None:
+    def _mutants(self, faults: Sequence[dict[str, Any]]) -> None:
         words = self.words
-        if not found["faults"]:
-            return
         kinds = {True: "caught", None: "not_shown", False: "not_caught"}
         rows = []
-        for each in found["faults"]:
+        for each in faults:
             state = True if each["caught"] else None if each["silent"] else False
             cell = verdict(state, words(f"export.{kinds[state]}"))
             rows.append((each["kind"], each["fault"], self._title(each["target"]), cell))
         with ui.expansion(words("export.faults_found", n=len(rows))).classes("w-full"):
             head = [words(f"export.{k}") for k in ("fault_kind", "fault", "target", "verdict")]
             table(words("export.faults_caption"), head, rows)
-            if any(f["silent"] for f in found["faults"]):
+            if any(f["silent"] for f in faults):
                 text(words("export.not_shown_about"), classes="ps-dim")
 
 
@@ -293,8 +298,7 @@ async def show(page: Page) -> None:
 class _Exporting:
     def __init__(self, page: Page) -> None:
         self.page, self.words, self.workspace = page, page.words, page.workspace
-        request = context.client.request
-        self.asked = dict(request.query_params) if request is not None else {}
+        self.query = query()
         self.bundle: BundleFacts | None = None
         self.open = ""
 
@@ -306,8 +310,7 @@ class _Exporting:
         self._allow()
         self._detail = tag(ui.column().classes("w-full"), "detail")
         self._list = tag(ui.column().classes("w-full"), "exports")
-        name = self.asked.get("name", "")
-        if name:
+        if name := self.query.get("name", ""):
             await self._show(name)
         await self._refresh_list()
 
@@ -320,15 +323,15 @@ class _Exporting:
             text(words("export.new"), "h2")
             if not bundles:
                 tag(text(words("export.no_bundle")), "no-bundle")
-                ui.link(words("pages.train"), "/train").classes("ps-link")
+                ui.link(words("pages.train"), address("train")).classes("ps-link")
                 return
-            named = {str(p): self._named(p) for p in bundles}
-            wanted = self.asked.get("model", "")
-            first = wanted if wanted in named else str(bundles[0])
-            choice = ui.select(
-                named, value=first, label=words("export.bundle"), on_change=lambda e: self._choose(e.value)
+            options = {str(p): self._label(p) for p in bundles}
+            model = self.query.get("model", "")
+            first = model if model in options else str(bundles[0])
+            select = ui.select(
+                options, value=first, label=words("export.bundle"), on_change=lambda e: self._choose(e.value)
             )
-            tag(choice.classes("w-full"), "bundle")
+            tag(select.classes("w-full"), "bundle")
             self._about = tag(ui.column().classes("w-full"), "bundle-facts")
             self._name = tag(ui.input(words("export.name")).props("maxlength=64").classes("w-full"), "name")
             with ui.expansion(words("export.more")).classes("w-full"):
@@ -337,63 +340,61 @@ class _Exporting:
             tag(self._button, "do")
             await self._choose(first)
 
-    def _named(self, path: Path) -> str:
+    def _label(self, path: Path) -> str:
         inside = self.workspace.folder in path.parents
         return str(path.relative_to(self.workspace.folder)) if inside else f"{path.name} ({path.parent})"
 
     async def _more(self) -> None:
         words = self.words
-        lacking = await run.io_bound(formats) or {}
+        extras = await run.io_bound(formats) or {}
         self._formats: dict[str, ui.checkbox] = {}
         text(words("export.formats"), "h3")
         text(words("export.formats_about"), classes="ps-dim")
-        for name in (n for n, lacks in lacking.items() if not lacks):
+        for name in (n for n, extra in extras.items() if not extra):
             self._formats[name] = tag(ui.checkbox(f"{name}: {CONVERTERS[name].holds}"), f"format-{name}")
-        for extra in dict.fromkeys(e for e in lacking.values() if e):
-            missing = ", ".join(n for n, lacks in lacking.items() if lacks == extra)
+        for extra in dict.fromkeys(e for e in extras.values() if e):
+            missing = ", ".join(n for n, needed in extras.items() if needed == extra)
             text(words("export.format_missing", names=missing, extra=extra), classes="ps-dim")
         text(words("export.calibrate"), "h3")
         options = {"": words("export.calibrate_kept")} | await titles(self.workspace)
         self._dataset = ui.select(options, value="", label=words("export.calibrate_on")).classes("w-full")
 
     async def _choose(self, path: str) -> None:
-        words = self.words
         found = await run.io_bound(lambda: BundleFacts.of(Path(path)))
         assert found is not None
         self.bundle = found
         self._about.clear()
         with self._about:
-            if found.problem:
-                tag(text(found.problem, classes="ps-said ps-said-error w-full"), "bundle-problem")
+            if found.bundle is None:
+                tag(notice(found.problem, "error"), "bundle-problem")
             else:
                 if found.simulated:
-                    text(words("shell.simulation"), classes="ps-said ps-said-warning w-full")
-                facts(self._facts_of(found))
+                    notice(self.words("shell.simulation"))
+                facts(self._facts_of(found.bundle, found.bytes))
                 if found.cannot:
-                    tag(text(found.cannot, classes="ps-said ps-said-error w-full"), "bundle-cannot")
-        self._name.set_value(self._free(Path(path).stem))
+                    tag(notice(found.cannot, "error"), "bundle-cannot")
+        self._name.set_value(self._free_name(Path(path).stem))
         self._allow()
 
-    def _free(self, stem: str) -> str:
-        """Return a name that no export uses."""
-        plain = "".join(c if c.isalnum() or c in " ._-" else "-" for c in stem).strip(" .")[:56] or "export"
-        number, name = 2, plain
-        while (self.workspace.folder / EXPORTS / name).exists():
-            number, name = number + 1, f"{plain}-{number}"
-        return name
+    def _free_name(self, stem: str) -> str:
+        return self.workspace.free_name(EXPORTS, plain_name(stem, "export"))
 
-    def _facts_of(self, found: BundleFacts) -> list[tuple[str, str]]:
-        words, scores = self.words, found.scores
-        trained = words("export.trained_value", dataset=found.dataset, people=found.people)
+    def _facts_of(self, bundle: Bundle, bytes_: int) -> list[tuple[str, str]]:
+        words, origin = self.words, bundle.provenance
+        subjects, dataset = origin.get("subjects"), str(origin.get("dataset", ""))
+        people = len(set(subjects) - {NOBODY, UNKNOWN_SUBJECT}) if isinstance(subjects, list) else int(subjects or 0)
+        trained = words("export.trained_value", dataset=dataset, people=people)
+        network = words("export.network_value", title=bundle.arch.title, padding=bundle.arch.padding)
         rows = [
-            (words("export.network"), words("export.network_value", title=found.title, padding=found.padding)),
-            (words("export.gestures"), str(len(found.gestures))),
-            (words("export.layout"), found.layout),
-            (words("export.trained_on"), trained if found.dataset else words("export.not_told")),
-            (words("export.adapted_to"), found.adapted_to),
-            (words("export.size"), size(found.bytes)),
+            (words("export.network"), network),
+            (words("export.gestures"), str(len(bundle.gestures.labels))),
+            (words("export.layout"), bundle.layout.name),
+            (words("export.trained_on"), trained if dataset else words("export.unknown_dataset")),
+            (words("export.adapted_to"), bundle.adapted_to or ""),
+            (words("export.size"), size(bytes_)),
         ]
-        if not scores:
+        scores = origin.get("scores")
+        if not isinstance(scores, dict) or "accuracy" not in scores:
             return [*rows, (words("export.scores"), words("export.no_scores"))]
         value = words(
             "export.scores_value",
@@ -403,14 +404,14 @@ class _Exporting:
             split=scores.get("split", "?"),
         )
         leaky = f" {words('export.leaky')}" if scores.get("leaky") else ""
-        simulated = f" {words('export.simulated_scores')}" if found.simulated else ""
+        simulated = f" {words('export.simulated_scores')}" if origin.get("simulated") else ""
         return [*rows, (words("export.scores"), f"{value}{leaky}{simulated}")]
 
     def _allow(self) -> None:
         """Enable the button while no export runs and the bundle can be read."""
         if hasattr(self, "_button") and hasattr(self, "work"):
-            whole = self.bundle is not None and not self.bundle.problem
-            self._button.set_enabled(whole and not self.work.running("export"))
+            readable = self.bundle is not None and not self.bundle.problem
+            self._button.set_enabled(readable and not self.work.running("export"))
 
     async def _start(self) -> None:
         self.page.say("")
@@ -423,18 +424,18 @@ class _Exporting:
             spec = {"bundle": str(bundle), "place": str(place), "also": also, "dataset": dataset}
             await self.work.start("export", spec)
 
-    # What runs ------------------------------------------------------------------------------------------------
+    # Jobs -----------------------------------------------------------------------------------------------------
 
     def _progress_text(self, job: StudioJob) -> str:
         stage, total = str(job.progress.get("stage", "begin")), job.progress.get("total") or 0
-        of = f" {self.words('export.of', done=job.progress.get('done', 0), total=total)}" if total else ""
-        return f"{self.words(f'export.stage_{stage}')}{of}"
+        count = f" {self.words('export.of', done=job.progress.get('done', 0), total=total)}" if total else ""
+        return f"{self.words(f'export.stage_{stage}')}{count}"
 
     async def _ended(self, job: StudioJob) -> None:
         name = Path(job.spec["place"]).name
         if job.task == "export":
             self.page.say(self.words("export.done", name=name), "good")
-            self._name.set_value(self._free(name))
+            self._name.set_value(self._free_name(name))
         if job.task == "export" or name == self.open:
             await self._show(name)
             scroll_to("verdict" if job.task == "verify" else "detail")
@@ -456,12 +457,12 @@ class _Exporting:
                 default=None,
             )
             self.open = name
-            ui.run_javascript(f"history.replaceState(null, '', {json.dumps(f'/export?name={quote(name)}')})")
+            set_address(address("export", name=name))
             self._detail.clear()
             with self._detail:
                 text(words("export.one", name=name), "h2")
                 if found.problem:
-                    text(found.problem, classes="ps-said ps-said-error w-full")
+                    notice(found.problem, "error")
                     return
                 show_facts(
                     self.page,
@@ -472,19 +473,18 @@ class _Exporting:
                 await VerificationCard(self.page, self.work, found).build()
                 show_next(self.page)
 
-    # All of them ----------------------------------------------------------------------------------------------
+    # All exports ----------------------------------------------------------------------------------------------
 
     async def _refresh_list(self) -> None:
         words = self.words
-        folders = await run.io_bound(lambda: exports_of(self.workspace)) or []
-        found = await run.io_bound(lambda: [ExportFacts.of(f) for f in folders]) or []
+        exports = await run.io_bound(lambda: [ExportFacts.of(f) for f in exports_of(self.workspace)]) or []
         jobs = self.workspace.part(Jobs)
         rows = []
-        for each in found:
+        for each in exports:
             proof = newest_job(jobs, "verify", each.folder)
             rows.append(
                 (
-                    link(each.name, f"/export?name={quote(each.name)}"),
+                    link(each.name, address("export", name=each.name)),
                     each.problem or str(each.facts["title"]),
                     words("export.simulation_short") if each.facts.get("simulated") else "",
                     moment(each.made_s) if each.made_s else "",

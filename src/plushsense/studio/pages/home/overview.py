@@ -7,7 +7,7 @@ import csv
 import json
 import os
 import threading
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -24,15 +24,16 @@ from plushsense.recording.session_files import SessionHead
 from plushsense.studio.app.workspace import EXPORTS, Workspace
 
 INDEX = "recordings.csv"
-# Marks set by programs are not a review.
-_NOT_PEOPLE = (RECORDER,)
 # The recordings of one session in the paper; fewer of one person are too few to train on.
 _ENOUGH = 51
 
 
 @dataclass(frozen=True)
 class DatasetEntry:
-    """A data set. ``refused``: the sentence where it cannot be read, and then nothing else is known."""
+    """A data set. ``refused`` is the error message if it cannot be read; the other fields are then empty.
+
+    ``files`` are the names of the recordings' files; they contain the time of the recording.
+    """
 
     path: Path
     name: str
@@ -45,33 +46,32 @@ class DatasetEntry:
     bytes: int = 0
     reviewed: bool = False
     files: frozenset[str] = frozenset()
-    """The names of the recordings' files, which hold the moment of recording."""
 
 
 @dataclass(frozen=True)
 class SessionEntry:
-    """A session in the recordings folder; ``kept`` names the data sets that hold all of it."""
+    """A session in the recordings folder; ``datasets`` are the names of the data sets that contain all of it."""
 
     path: Path
     subject: str
     session: str
-    began_s: float = 0.0
+    start_s: float = 0.0
     recordings: int = 0
     finished: bool = False
     simulated: bool = False
     layout: str = ""
     refused: str = ""
-    kept: tuple[str, ...] = ()
+    datasets: tuple[str, ...] = ()
 
     @property
     def waiting(self) -> bool:
-        """True if the session has recordings that no data set holds."""
-        return bool(self.recordings) and not self.kept and not self.refused
+        """True if the session has recordings and no data set contains all of them."""
+        return bool(self.recordings) and not self.datasets and not self.refused
 
 
 @dataclass(frozen=True)
 class BundleEntry:
-    """A bundle; ``refused`` is the sentence where it cannot be read."""
+    """A bundle; ``refused`` is the error message if it cannot be read."""
 
     path: Path
     name: str
@@ -91,10 +91,7 @@ class WorkspaceSummary:
     exports: int = 0
 
     def batches(self) -> list[tuple[SessionEntry, ...]]:
-        """Group the sessions that fit into one data set: of one layout, all real or all simulated.
-
-        Real ones first; in each the order of the sessions.
-        """
+        """Group the sessions that fit into one data set (one layout, all real or all simulated), real ones first."""
         groups: dict[tuple[bool, str], list[SessionEntry]] = {}
         for s in self.sessions:
             if s.recordings and not s.refused:
@@ -107,31 +104,33 @@ class NextStep:
     """The suggested next step.
 
     Attributes:
-        key: names its text and button. ``page``: where the button leads, "" for nowhere.
-        about: values to fill into the text.
+        key: key of its text and of the text of its button.
+        page: page that the button opens, "" for none.
+        values: values to fill into the text.
     """
 
     key: str
     page: str = ""
-    about: dict[str, Any] = field(default_factory=dict)
+    values: dict[str, Any] = field(default_factory=dict)
 
 
-def next_step(seen: WorkspaceSummary, *, toy: str = "", virtual: bool = False, making: bool = False) -> NextStep:
+def next_step(summary: WorkspaceSummary, *, toy: str = "", virtual: bool = False, making: bool = False) -> NextStep:
     """Return the suggested next step.
 
     Args:
-        toy: the toy that is chosen; ``virtual``: it is the virtual one.
-        making: a data set is being made.
+        toy: the chosen toy, "" for none.
+        virtual: whether it is the virtual one.
+        making: whether a data set is being made.
     """
     if making:
         return NextStep("making")
-    waiting = [s for s in seen.sessions if s.waiting]
-    bundles = [b for b in seen.bundles if not b.refused]
-    readable = [d for d in seen.datasets if not d.refused and d.recordings]
+    waiting = [s for s in summary.sessions if s.waiting]
+    bundles = [b for b in summary.bundles if not b.refused]
+    readable = [d for d in summary.datasets if not d.refused and d.recordings]
     if waiting:
         return NextStep("collect", "", {"n": len(waiting), "recordings": sum(s.recordings for s in waiting)})
     if not readable and not bundles:
-        unfinished = [s for s in seen.sessions if not s.finished and not s.refused]
+        unfinished = [s for s in summary.sessions if not s.finished and not s.refused]
         if unfinished:
             return NextStep("go_on", "record", {"subject": unfinished[-1].subject, "session": unfinished[-1].session})
         return NextStep("record", "record") if toy and not virtual else NextStep("try")
@@ -144,44 +143,49 @@ def next_step(seen: WorkspaceSummary, *, toy: str = "", virtual: bool = False, m
             return NextStep("more", "record", {"name": best.name})
         return NextStep("train", "train", {"name": best.name})
     if unreviewed and all(b.simulated for b in bundles):
-        # All bundles are simulations: go on with the real data.
+        # All bundles are simulations: continue with the real data.
         return NextStep("review", "review", {"name": unreviewed[0].name})
     return NextStep("live", "live", {"name": bundles[0].name})
 
 
 class Overview:
-    """Reads the contents of the workspace; files that did not change are not read again. Not for the event loop."""
+    """Reads the contents of the workspace, and changed files only; do not call it in the event loop."""
 
     def __init__(self, workspace: Workspace) -> None:
         self._workspace = workspace
-        self._known: dict[Path, tuple[Any, Any]] = {}
+        self._cache: dict[Path, tuple[Any, Any]] = {}
         self._lock = threading.Lock()
 
     def look(self) -> WorkspaceSummary:
         """Return the current contents of the workspace."""
         with self._lock:
-            datasets = tuple(self._of(p, _stamp(p, HEAD, INDEX, MARKS), _dataset) for p in self._workspace.datasets())
+            datasets = tuple(
+                self._cached(p, _stamp(p, HEAD, INDEX, MARKS), _dataset) for p in self._workspace.datasets()
+            )
             sessions = tuple(_session(p, datasets) for p in self._workspace.sessions())
-            bundles = tuple(self._of(p, _stamp(p), _bundle) for p in self._workspace.bundles())
+            bundles = tuple(self._cached(p, _stamp(p), _bundle) for p in self._workspace.bundles())
         exports = sum(1 for p in (self._workspace.folder / EXPORTS).glob("*") if p.is_dir() and p.name[0] != ".")
         return WorkspaceSummary(datasets, sessions, bundles, exports)
 
-    def _of(self, path: Path, stamp: Any, read: Any) -> Any:
-        known = self._known.get(path)
-        if known is None or known[0] != stamp:
-            known = self._known[path] = (stamp, read(path))
-        return known[1]
+    def _cached(self, path: Path, stamp: Any, read: Callable[[Path], Any]) -> Any:
+        if self._cache.get(path, (None,))[0] != stamp:
+            self._cache[path] = (stamp, read(path))
+        return self._cache[path][1]
 
 
 def _stamp(path: Path, *names: str) -> tuple[tuple[int, int], ...]:
     stamps = []
     for file in [path / n for n in names] or [path]:
         try:
-            found = file.stat()
-            stamps.append((found.st_mtime_ns, found.st_size))
+            stat = file.stat()
+            stamps.append((stat.st_mtime_ns, stat.st_size))
         except OSError:
             stamps.append((0, -1))
     return tuple(stamps)
+
+
+def _unreadable(path: Path, cause: Exception) -> str:
+    return f"'{path}' cannot be read: {getattr(cause, 'strerror', None) or cause}."
 
 
 def _dataset(path: Path) -> DatasetEntry:
@@ -195,7 +199,7 @@ def _dataset(path: Path) -> DatasetEntry:
     except PlushSenseError as refusal:
         return DatasetEntry(path, path.name, str(refusal))
     except (OSError, ValueError, csv.Error) as cause:
-        return DatasetEntry(path, path.name, f"'{path}' cannot be read: {getattr(cause, 'strerror', None) or cause}.")
+        return DatasetEntry(path, path.name, _unreadable(path, cause))
     return DatasetEntry(
         path,
         head.name,
@@ -221,23 +225,22 @@ def _size(path: Path) -> int:
 
 
 def _reviewed(path: Path) -> bool:
-    """Return whether a person has set any mark."""
+    """Return whether a person has set any mark; marks of the recorder are not a review."""
     with contextlib.suppress(OSError):
         for line in (path / MARKS).read_bytes().splitlines():
             with contextlib.suppress(ValueError, AttributeError, RecursionError):
-                if json.loads(line).get("who") not in _NOT_PEOPLE:
+                if json.loads(line).get("who") != RECORDER:
                     return True
     return False
 
 
 def _session(path: Path, datasets: Iterable[DatasetEntry]) -> SessionEntry:
-    unread = SessionEntry(path, path.parent.name, path.name)
     try:
         head = SessionHead.read(path)
         if head is None:
-            return unread
+            return SessionEntry(path, path.parent.name, path.name)
         files = {f.name for f in path.iterdir() if parse_name(f.name) is not None}
-        kept = tuple(d.name for d in datasets if files and d.simulated == head.simulated and files <= d.files)
+        names = tuple(d.name for d in datasets if files and d.simulated == head.simulated and files <= d.files)
         return SessionEntry(
             path,
             head.subject,
@@ -247,13 +250,12 @@ def _session(path: Path, datasets: Iterable[DatasetEntry]) -> SessionEntry:
             is_finished(path),
             head.simulated,
             str(head.layout.get("name", "")),
-            kept=kept,
+            datasets=names,
         )
     except PlushSenseError as refusal:
         return SessionEntry(path, path.parent.name, path.name, refused=str(refusal))
     except OSError as cause:
-        text = f"'{path}' cannot be read: {cause.strerror or cause}."
-        return SessionEntry(path, path.parent.name, path.name, refused=text)
+        return SessionEntry(path, path.parent.name, path.name, refused=_unreadable(path, cause))
 
 
 def _bundle(path: Path) -> BundleEntry:
@@ -262,8 +264,8 @@ def _bundle(path: Path) -> BundleEntry:
     except PlushSenseError as refusal:
         return BundleEntry(path, path.stem, refused=str(refusal))
     except OSError as cause:
-        return BundleEntry(path, path.stem, refused=f"'{path}' cannot be read: {cause.strerror or cause}.")
-    made = bundle.provenance
+        return BundleEntry(path, path.stem, refused=_unreadable(path, cause))
+    origin = bundle.provenance
     return BundleEntry(
-        path, path.stem, str(made.get("dataset") or ""), len(bundle.gestures), bool(made.get("simulated"))
+        path, path.stem, str(origin.get("dataset") or ""), len(bundle.gestures), bool(origin.get("simulated"))
     )

@@ -1,10 +1,11 @@
-"""Home page: the next step, data sets, networks, uploads, the toy, and running work."""
+"""Home page: the next step, data sets, networks, uploads, the toy, and jobs."""
 
 from __future__ import annotations
 
 import uuid
 from collections.abc import Awaitable, Callable
 from pathlib import Path
+from typing import Any
 
 from nicegui import context, events, run, ui
 
@@ -15,37 +16,42 @@ from plushsense.studio.app.guard import UPLOAD_BYTES
 from plushsense.studio.app.jobs import INCOMING, RUNNING, Jobs
 from plushsense.studio.app.shell import Page, address, html, named, on_change, tag
 from plushsense.studio.app.toys import PERSONS, Toys, error_text
-from plushsense.studio.app.workspace import BUNDLES, DATASETS, WORK, Workspace
-from plushsense.studio.pages.home.data import SMALL, DatasetSection, SessionSection, section, simulated
+from plushsense.studio.app.workspace import BUNDLES, DATASETS, WORK
 from plushsense.studio.pages.home.overview import NextStep, Overview, WorkspaceSummary, next_step
-from plushsense.studio.pages.home.work import WorkSection
+from plushsense.studio.pages.home.sections import (
+    SMALL,
+    DatasetSection,
+    JobList,
+    SessionSection,
+    page_links,
+    simulation_badge,
+    titled_card,
+)
 
 
 def toy_section(page: Page, toys: Toys) -> None:  # noqa: C901
-    """Build the section; looks for toys when nobody has looked yet."""
+    """Build the section of the toy, and search for toys if that was not done yet."""
     words, workspace = page.words, page.workspace
-    with section(page, "home.toy", "toy"):
-        chosen = ui.column().classes("w-full ps-tight").props('aria-live="polite"')
-        with ui.row().classes("items-end ps-tight w-full"):
+    with titled_card(page, "home.toy", "toy"):
+        chosen = ui.column().classes("w-full ps-small-gap").props('aria-live="polite"')
+        with ui.row().classes("items-end ps-small-gap w-full"):
             options = {n: words("home.person", n=n) for n in range(1, PERSONS + 1)}
-            who = ui.select(options, value=7, label=words("home.virtual_person")).props("dense outlined")
-            tag(who.classes("ps-wide"), "person")
-            virtual = ui.button(
-                words("home.choose_virtual"), on_click=lambda: take(lambda: toys.person(int(who.value)))
-            )
+            who = ui.select(options, value=7, label=words("home.virtual_person")).classes("ps-wide")
+            tag(who, "person")
+            virtual = ui.button(words("home.choose_virtual"), on_click=lambda: choose(toys.person, int(who.value)))
             tag(virtual.props("unelevated no-caps"), "virtual")
-        found = ui.column().classes("w-full ps-tight")
-        with ui.row().classes("items-end ps-tight w-full"):
-            other = ui.input(words("home.address"), placeholder="tcp://192.168.1.20:3333").props("dense outlined")
-            tag(other.classes("ps-wide"), "address")
-            use = ui.button(words("home.use"), on_click=lambda: take(lambda: toys.choose(str(other.value or ""))))
+        others = ui.column().classes("w-full ps-small-gap")
+        with ui.row().classes("items-end ps-small-gap w-full"):
+            other = ui.input(words("home.address"), placeholder="tcp://192.168.1.20:3333").classes("ps-wide")
+            tag(other, "address")
+            use = ui.button(words("home.use"), on_click=lambda: choose(toys.choose, str(other.value or "")))
             tag(use.props("outline no-caps"), "use")
 
-    testing = [False]
+    testing = False
 
-    def take(choose: object) -> None:
+    def choose(command: Callable[[Any], object], toy: Any) -> None:
         with page.show_errors():
-            choose()  # type: ignore[operator]
+            command(toy)
             page.say("")
 
     def show_chosen() -> None:
@@ -54,51 +60,52 @@ def toy_section(page: Page, toys: Toys) -> None:  # noqa: C901
             if not workspace.toy:
                 ui.label(words("home.no_toy")).classes("ps-dim")
                 return
-            with ui.row().classes("items-center ps-tight"):
+            with ui.row().classes("items-center ps-small-gap"):
                 tag(ui.label(words("home.chosen", url=workspace.toy)).classes("ps-break text-weight-bold"), "chosen")
                 if toys.simulated:
-                    simulated(page)
+                    simulation_badge(page)
             tag(ui.button(words("home.test"), on_click=test).props("outline no-caps"), "test")
 
     async def test() -> None:
-        if testing[0]:
+        nonlocal testing
+        if testing:
             return
-        testing[0] = True
+        testing = True
         page.say(words("home.testing"))
         try:
-            done = await run.io_bound(toys.test)
+            result = await run.io_bound(toys.test)
         except Exception as cause:  # noqa: BLE001, RUF100
             page.say(error_text(cause), "error")
             return
         finally:
-            testing[0] = False
-        if done is None:
+            testing = False
+        if result is None:
             # The studio is ending.
             return
-        about = {
-            "frames": done.frames,
-            "seconds": words.number(done.seconds, 1),
-            "layout": done.layout,
-            "malformed": done.malformed,
-            "rate": words.number(done.rate_hz),
+        values = {
+            "frames": result.frames,
+            "seconds": words.number(result.seconds, 1),
+            "layout": result.layout,
+            "malformed": result.malformed,
+            "rate": words.number(result.rate_hz),
         }
-        key = "good" if done.fits and done.on_time else "slow" if done.fits else "malformed"
-        page.say(words(f"home.test_{key}", **about), "good" if key == "good" else "warning")
+        key = "good" if result.fits and result.on_time else "slow" if result.fits else "malformed"
+        page.say(words(f"home.test_{key}", **values), "good" if key == "good" else "warning")
 
-    def show_found() -> None:
-        found.clear()
+    def show_others() -> None:
+        others.clear()
         given = [(url, "", words("home.given")) for url in workspace.devices]
         listed = [(d.url, d.name, d.description) for d in toys.listing.devices if d.kind != "virtual"]
-        with found:
+        with others:
             for url, name, about in [*given, *listed]:
                 with ui.row().classes("ps-row items-center justify-between w-full no-wrap"):
-                    with ui.column().classes("ps-close"):
+                    with ui.column().classes("ps-no-gap"):
                         ui.label(name or url).classes("ps-break")
                         ui.label(" · ".join(t for t in (url if name else "", about) if t)).classes("ps-dim ps-break")
-                    choose = ui.button(words("home.choose"), on_click=lambda url=url: take(lambda: toys.choose(url)))
-                    named(choose.props(SMALL), f"{words('home.choose')}: {name or url}")
+                    button = ui.button(words("home.choose"), on_click=lambda url=url: choose(toys.choose, url))
+                    named(button.props(SMALL), f"{words('home.choose')}: {name or url}")
             if toys.searching:
-                with ui.row().classes("items-center ps-tight").props('role="status"'):
+                with ui.row().classes("items-center ps-small-gap").props('role="status"'):
                     ui.spinner(size="1.2em").props("aria-hidden=true")
                     ui.label(words("home.looking"))
                 return
@@ -111,7 +118,7 @@ def toy_section(page: Page, toys: Toys) -> None:  # noqa: C901
 
     def update() -> None:
         show_chosen()
-        show_found()
+        show_others()
 
     update()
     on_change(toys.changed, update)
@@ -120,47 +127,45 @@ def toy_section(page: Page, toys: Toys) -> None:  # noqa: C901
 
 
 ARCHIVE_BYTES = UPLOAD_BYTES - 1_000_000
-"""The largest zip; a request is a little larger than its file."""
+"""The largest zip; a request is slightly larger than its file."""
 BUNDLE_BYTES = 64_000_000
 
 
 def bundles(page: Page) -> Callable[[WorkspaceSummary], None]:
     """Build the section of trained networks; return the function that fills it."""
-    box = section(page, "home.bundles", "bundles")
+    box = titled_card(page, "home.bundles", "bundles")
     with box:
-        rows = ui.column().classes("w-full ps-tight")
+        rows = ui.column().classes("w-full ps-small-gap")
 
-    def fill(seen: WorkspaceSummary) -> None:
+    def fill(summary: WorkspaceSummary) -> None:
         rows.clear()
-        box.set_visibility(bool(seen.bundles))
+        box.set_visibility(bool(summary.bundles))
         with rows:
-            for one in seen.bundles:
+            for entry in summary.bundles:
                 with tag(ui.column().classes("ps-row w-full"), "bundle"):
-                    with ui.row().classes("items-center ps-tight"):
-                        ui.label(one.name).classes("text-weight-bold ps-break")
-                        if one.simulated:
-                            simulated(page)
-                    if one.refused:
-                        ui.label(one.refused).classes("ps-bad ps-break")
+                    with ui.row().classes("items-center ps-small-gap"):
+                        ui.label(entry.name).classes("text-weight-bold ps-break")
+                        if entry.simulated:
+                            simulation_badge(page)
+                    if entry.refused:
+                        ui.label(entry.refused).classes("ps-bad ps-break")
                         continue
-                    facts = [page.words("home.gestures", n=one.gestures)]
-                    if one.dataset:
-                        facts.append(page.words("home.trained_on", name=one.dataset))
+                    facts = [page.words("home.gestures", n=entry.gestures)]
+                    if entry.dataset:
+                        facts.append(page.words("home.trained_on", name=entry.dataset))
                     ui.label(" · ".join(facts)).classes("ps-dim")
-                    with ui.row().classes("ps-tight"):
-                        for to in ("live", "export"):
-                            link = ui.link(page.words(f"pages.{to}"), address(to, model=one.path)).classes("ps-link")
-                            named(link, f"{page.words(f'pages.{to}')}: {one.name}")
+                    with ui.row().classes("ps-small-gap"):
+                        page_links(page, ("live", "export"), entry.name, model=entry.path)
 
     return fill
 
 
-def incoming(page: Page, jobs: Jobs, changed: Callable[[], Awaitable[None]]) -> None:
-    """Build the section for uploads, a zip of recordings or a bundle; ``changed`` is called after a bundle came."""
+def uploads(page: Page, jobs: Jobs, on_bundle: Callable[[], Awaitable[None]]) -> None:
+    """Build the section for uploads: a zip of recordings, or a bundle, after which ``on_bundle`` is called."""
     words = page.words
 
     async def take(file: events.UploadEventArguments) -> None:
-        """Keep what came, under a name of ours; a bundle is looked at, an archive imported."""
+        """Store the file under a random name, then check a bundle or import a zip."""
         name = Path(file.file.name.replace("\\", "/")).name
         kind = Path(name).suffix.lower()
         uploader.reset()
@@ -168,91 +173,87 @@ def incoming(page: Page, jobs: Jobs, changed: Callable[[], Awaitable[None]]) -> 
         with page.show_errors():
             if kind not in (".zip", ".plush"):
                 raise ConfigError(f"'{name}' is neither a .zip of recordings nor a .plush bundle: choose one of these.")
-            most = BUNDLE_BYTES if kind == ".plush" else ARCHIVE_BYTES
-            if file.file.size() > most:
-                raise ConfigError(f"'{name}' is larger than the {most / 1e6:g} MB that are accepted.")
-            name_or_stem = str(title.value or "").strip() or _plain(Path(name).stem)
-            place = page.workspace.new(
-                DATASETS if kind == ".zip" else BUNDLES, name_or_stem + (kind if kind != ".zip" else "")
-            )
-            kept = folder / f"{uuid.uuid4().hex}{kind}"
+            limit = BUNDLE_BYTES if kind == ".plush" else ARCHIVE_BYTES
+            if file.file.size() > limit:
+                raise ConfigError(f"'{name}' is larger than the {limit / 1e6:g} MB that are accepted.")
+            title = str(name_field.value or "").strip() or _plain(Path(name).stem)
+            place = page.workspace.new(*((BUNDLES, f"{title}.plush") if kind == ".plush" else (DATASETS, title)))
+            stored = folder / f"{uuid.uuid4().hex}{kind}"
             await run.io_bound(lambda: folder.mkdir(parents=True, exist_ok=True))
             try:
-                await file.file.save(kept)
+                await file.file.save(stored)
                 if kind == ".plush":
-                    await run.io_bound(_settle, kept, place, name)
+                    await run.io_bound(_move_bundle, stored, place, name)
                     page.say(words("home.bundle_came", name=place.stem), "good")
-                    await changed()
+                    await on_bundle()
                     return
             except BaseException:
-                kept.unlink(missing_ok=True)
+                stored.unlink(missing_ok=True)
                 raise
-            spec = {"archive": str(kept), "dest": str(place), "name": place.name}
+            spec = {"archive": str(stored), "dest": str(place), "name": place.name}
             if layout.value:
                 spec["layout"] = str(layout.value)
             jobs.start("import", spec, words("home.import_title", name=place.name))
-            title.set_value("")
+            name_field.set_value("")
             page.say("")
 
-    def rejected() -> None:
-        page.say(words("home.upload_rejected", mb=ARCHIVE_BYTES // 1_000_000), "error")
-
-    with section(page, "home.incoming", "incoming"):
-        ui.label(words("home.incoming_about", mb=ARCHIVE_BYTES // 1_000_000, bundle=BUNDLE_BYTES // 1_000_000)).classes(
-            "ps-dim"
-        )
-        with ui.row().classes("items-end ps-tight w-full"):
-            title = tag(
-                ui.input(words("home.incoming_name")).props("dense outlined").classes("ps-wide"), "incoming-name"
-            )
+    archive_mb, bundle_mb = ARCHIVE_BYTES // 1_000_000, BUNDLE_BYTES // 1_000_000
+    with titled_card(page, "home.incoming", "incoming"):
+        ui.label(words("home.incoming_about", mb=archive_mb, bundle=bundle_mb)).classes("ps-dim")
+        with ui.row().classes("items-end ps-small-gap w-full"):
+            name_field = tag(ui.input(words("home.incoming_name")).classes("ps-wide"), "incoming-name")
             options = {"": words("home.layout_of_sessions"), **{n: n for n in layout_names()}}
-            layout = ui.select(options, value="", label=words("home.layout")).props("dense outlined").classes("ps-wide")
+            layout = ui.select(options, value="", label=words("home.layout")).classes("ps-wide")
         uploader = ui.upload(
             max_file_size=ARCHIVE_BYTES,
             on_begin_upload=lambda: page.say(words("home.receiving")),
             on_upload=take,
-            on_rejected=rejected,
+            on_rejected=lambda: page.say(words("home.upload_rejected", mb=archive_mb), "error"),
             auto_upload=True,
         )
-        # Quasar's uploader is not accessible: a button of ours opens its file dialog.
+        # Quasar's uploader is not accessible: a separate button opens its file dialog.
         tag(uploader.props("accept=.zip,.plush").style("display: none"), "upload")
         choose = ui.button(words("home.choose_file"), icon="upload_file").props("outline no-caps")
         tag(choose, "choose-file").on("click", js_handler=f"() => runMethod({uploader.id}, 'pickFiles', [])")
 
 
-def _settle(kept: Path, place: Path, name: str) -> None:
-    """Move a bundle that can be read to its place; one that cannot is refused."""
+def _move_bundle(stored: Path, place: Path, name: str) -> None:
+    """Move an uploaded bundle to its place.
+
+    Raises:
+        BundleError: if it cannot be read. ConfigError: if its name is taken.
+    """
     try:
-        Bundle.load(kept)
+        Bundle.load(stored)
     except BundleError as cause:
-        # Name the file as the visitor knows it.
-        raise BundleError(str(cause).replace(str(kept), name)) from None
+        # Show the visitor the name of the uploaded file.
+        raise BundleError(str(cause).replace(str(stored), name)) from None
     place.parent.mkdir(parents=True, exist_ok=True)
     if place.exists():
-        raise ConfigError(f"'{place.stem}' is there already: give another name, nothing is replaced.")
-    kept.rename(place)
+        raise ConfigError(f"'{place.stem}' exists already: give another name, nothing is replaced.")
+    stored.rename(place)
 
 
 def _plain(stem: str) -> str:
-    """Return a file's name as a valid name of a data set."""
-    kept = "".join(c if c.isalnum() or c in " _-" else " " for c in stem).strip()
-    return " ".join(kept.split())[:60] or "recordings"
+    """Return the stem of a file as a valid name of a data set."""
+    plain = "".join(c if c.isalnum() or c in " _-" else " " for c in stem)
+    return " ".join(plain.split())[:60] or "recordings"
 
 
 def invitation(page: Page) -> None:
-    """Build the section that gives one-time addresses to further devices, if the studio accepts any."""
+    """Build the section that creates one-time addresses for further devices, if the studio accepts any."""
     invite = page.workspace.invite
     if invite is None:
         return
     words = page.words
-    with section(page, "home.invite", "invite"):
+    with titled_card(page, "home.invite", "invite"):
         ui.label(words("home.invite_about")).classes("ps-dim")
         place = ui.column().classes("w-full").props('aria-live="polite"')
 
         def show() -> None:
             place.clear()
             with place:
-                text = ui.input(words("home.invite_address"), value=invite()).props("readonly outlined dense")
+                text = ui.input(words("home.invite_address"), value=invite()).props("readonly")
                 tag(text.classes("w-full ps-mono"), "invitation")
 
         tag(ui.button(words("home.invite_new"), on_click=show).props("outline no-caps"), "invite-new")
@@ -260,7 +261,7 @@ def invitation(page: Page) -> None:
 
 MAKING = ("simulate", "import")
 CHANGING = (*MAKING, "check", "train", "sweep", "search", "export", "publish")
-# Enough to train a network on, and simulated in seconds.
+# Enough to train a network, and simulated within seconds.
 _PEOPLE, _REPETITIONS = 6, 2
 _TRY_NAME = "virtual toy"
 
@@ -269,17 +270,17 @@ async def show(page: Page) -> None:
     """Build the page."""
     workspace = page.workspace
     overview, jobs, toys = workspace.part(Overview), workspace.part(Jobs), workspace.part(Toys)
-    seen = await run.io_bound(overview.look)
+    summary = await run.io_bound(overview.look)
     step = NextStepCard(page, jobs, toys)
     with ui.element("div").classes("ps-two w-full"):
         with ui.column().classes("w-full"):
             datasets = DatasetSection(page, jobs)
             sessions = SessionSection(page, jobs)
             networks = bundles(page)
-            incoming(page, jobs, lambda: refresh())
+            uploads(page, jobs, lambda: refresh())
         with ui.column().classes("w-full"):
             toy_section(page, toys)
-            work = WorkSection(page, jobs)
+            job_list = JobList(page, jobs)
             invitation(page)
 
     def fill(now: WorkspaceSummary) -> None:
@@ -290,22 +291,23 @@ async def show(page: Page) -> None:
 
     async def refresh() -> None:
         now = await run.io_bound(overview.look)
-        # None: the studio is ending. The page may have been closed meanwhile.
+        # None means that the studio is ending. The page may have been closed meanwhile.
         if now is not None and not context.client.is_deleted:
             fill(now)
 
     def job_states() -> tuple[object, ...]:
         return tuple((j.id, j.state) for j in jobs.all(*CHANGING))
 
-    last = [job_states()]
+    last = job_states()
 
     async def update() -> None:
-        work.update()
-        if last[0] != (now := job_states()):
-            last[0] = now
+        nonlocal last
+        job_list.update()
+        if last != (now := job_states()):
+            last = now
             await refresh()
 
-    fill(seen or WorkspaceSummary())
+    fill(summary or WorkspaceSummary())
     on_change(jobs.changed, update)
     on_change(toys.changed, step.update)
 
@@ -315,19 +317,19 @@ class NextStepCard:
 
     def __init__(self, page: Page, jobs: Jobs, toys: Toys) -> None:
         self._page, self._jobs, self._toys = page, jobs, toys
-        self._seen = WorkspaceSummary()
+        self._summary = WorkspaceSummary()
         self._step: NextStep | None = None
         self._box = tag(ui.card().classes("ps-card ps-next w-full").props("flat"), "next")
 
-    def fill(self, seen: WorkspaceSummary) -> None:
-        """Update the step for these contents."""
-        self._seen = seen
+    def fill(self, summary: WorkspaceSummary) -> None:
+        """Update the step for new contents of the workspace."""
+        self._summary = summary
         self.update()
 
     def update(self) -> None:
-        """Update the step for the current toy and work; the card changes only when the step does."""
+        """Update the step for the current toy and jobs; the card changes only with the step."""
         making = any(j.state == RUNNING for j in self._jobs.all(*MAKING))
-        step = next_step(self._seen, toy=self._page.workspace.toy, virtual=self._toys.simulated, making=making)
+        step = next_step(self._summary, toy=self._page.workspace.toy, virtual=self._toys.simulated, making=making)
         if step == self._step:
             return
         self._step = step
@@ -336,18 +338,17 @@ class NextStepCard:
         with self._box:
             html(words("home.next"), "h2")
             with ui.row().classes("items-center w-full"):
-                tag(ui.label(words(f"home.next_{step.key}", **step.about)), "next-sentence").classes("text-lg")
+                tag(ui.label(words(f"home.next_{step.key}", **step.values)), "next-sentence").classes("text-lg")
                 if words.has(f"home.next_{step.key}_button"):
                     button = ui.button(words(f"home.next_{step.key}_button"), on_click=lambda: self._do(step))
                     tag(button.props("unelevated size=lg color=primary no-caps"), "next-button")
-                if step.key == "try":
-                    _second(self._page, "home.next_record_button", "record")
-                if step.key == "live":
-                    _second(self._page, "home.next_export_button", "export")
+                if second := {"try": "record", "live": "export"}.get(step.key):
+                    button = ui.button(words(f"home.next_{second}_button"))
+                    button.props("outline no-caps").on_click(lambda: ui.navigate.to(address(second)))
 
     def _do(self, step: NextStep) -> None:
         if step.key == "try":
-            _try(self._page, self._jobs, self._toys)
+            self._try()
         elif step.key == "collect":
             ui.run_javascript(
                 "const box = document.querySelector('[data-test=sessions]');"
@@ -356,28 +357,16 @@ class NextStepCard:
         else:
             ui.navigate.to(address(step.page))
 
-
-def _second(page: Page, key: str, to: str) -> None:
-    ui.button(page.words(key), on_click=lambda: ui.navigate.to(address(to))).props("outline no-caps")
-
-
-def _try(page: Page, jobs: Jobs, toys: Toys) -> None:
-    """Make the small simulated data set, and choose the virtual toy."""
-    with page.show_errors():
-        if not page.workspace.toy:
-            toys.person(7)
-        spec = {
-            "people": _PEOPLE,
-            "repetitions": _REPETITIONS,
-            "dest": str(page.workspace.folder / DATASETS / free_name(page.workspace, _TRY_NAME)),
-            "work": str(page.workspace.folder / WORK),
-        }
-        jobs.start("simulate", spec, page.words("home.try_title"))
-
-
-def free_name(workspace: Workspace, name: str) -> str:
-    """Return the name, with a number appended if it is taken."""
-    number = 1
-    while (workspace.folder / DATASETS / (name if number == 1 else f"{name} {number}")).exists():
-        number += 1
-    return name if number == 1 else f"{name} {number}"
+    def _try(self) -> None:
+        """Simulate a small data set, and choose the virtual toy if there is no other."""
+        workspace = self._page.workspace
+        with self._page.show_errors():
+            if not workspace.toy:
+                self._toys.person(7)
+            spec = {
+                "people": _PEOPLE,
+                "repetitions": _REPETITIONS,
+                "dest": str(workspace.folder / DATASETS / workspace.free_name(DATASETS, _TRY_NAME, separator=" ")),
+                "work": str(workspace.folder / WORK),
+            }
+            self._jobs.start("simulate", spec, self._page.words("home.try_title"))

@@ -12,7 +12,7 @@ const fill = (text, values) => text.replace(/\{(\w+)\}/g, (_, key) => values[key
 const SPOKEN_MS = 2500, KEPT_DELAYS = 600;
 
 const EYES = {
-  // Round and lifted; narrowed under slanted brows; closed: told apart by shape as much as by colour.
+  // Round and lifted; narrowed under slanted brows; closed: distinguished by shape as much as by colour.
   green: `<g class="lv-eye-light"><circle cx="60" cy="58" r="26" fill="#0f7a4d"/><circle cx="140" cy="58" r="26" fill="#0f7a4d"/>
     <circle cx="60" cy="58" r="16" fill="#5df2ae"/><circle cx="140" cy="58" r="16" fill="#5df2ae"/>
     <circle cx="66" cy="51" r="5" fill="#fff"/><circle cx="146" cy="51" r="5" fill="#fff"/></g>
@@ -70,7 +70,7 @@ export default {
       css.id = "lv-css";
       document.head.append(css);
     }
-    this.stats = window.plushsenseLive = { updates: 0, drawn: 0, drawMs: 0, samples: 0, scenes: 0, delays: [], shown: [] };
+    this.stats = window.plushsenseLive = { updates: 0, drawn: 0, drawMs: 0, samples: 0, scenes: 0, delays: [], painted: [] };
     // Made once: a formatter is dear.
     this.digits = new Intl.NumberFormat(this.locale, { maximumFractionDigits: 2 });
     this.build();
@@ -115,7 +115,7 @@ export default {
       n.latency.dataset.test = "latency";
       signals.append(n.signals, n.latency);
 
-      const now = section(w.now, "", "now"), top = el("div", "lv-top"), told = el("div");
+      const now = section(w.now, "", "now"), top = el("div", "lv-top"), texts = el("div");
       n.face = el("div", "lv-face");
       n.face.dataset.test = "eyes";
       n.face.setAttribute("role", "img");
@@ -126,8 +126,8 @@ export default {
       n.badge = el("span", "lv-badge");
       n.badge.dataset.test = "affect";
       n.eyes = el("div", "lv-dim");
-      told.append(n.state, n.event, n.badge, n.eyes);
-      top.append(n.face, told);
+      texts.append(n.state, n.event, n.badge, n.eyes);
+      top.append(n.face, texts);
       const voices = el("div", "lv-voices");
       for (const [key, title] of [["network", w.network], ["gate", w.gate]]) {
         const box = el("div");
@@ -185,7 +185,7 @@ export default {
       this.spans = new Map();
       this.t = 0;
       this.chances = null;
-      this.said = { running: false, said: "", state: "", gate: null, event: null, eyes: "off", sound: "" };
+      this.now = { running: false, message: "", state: "", gate: null, event: null, eyes: "off", sound: "" };
       this.net = null;
       this.names = Object.fromEntries(this.classes.map((c) => [c.label, c.name]));
       this.n.signals.setAttribute("aria-label", fill(this.words.signals_label, { n: this.channels.length, s: s.window }));
@@ -264,9 +264,9 @@ export default {
         this.listed = false;
       }
       if (m.now) {
-        if (!first && (m.now.state !== this.said.state || m.now.running !== this.said.running)) this.speak(this.stateWords(m.now));
-        this.said = m.now;
-        this.told = false;
+        if (!first && (m.now.state !== this.now.state || m.now.running !== this.now.running)) this.speak(this.stateWords(m.now));
+        this.now = m.now;
+        this.nowDrawn = false;
       }
       this.draw();
     },
@@ -280,8 +280,8 @@ export default {
         this.stats.drawMs += performance.now() - began;
         this.stats.drawn++;
         if (this.waits && this.sameClock) {
-          this.stats.shown.push(performance.timeOrigin + performance.now() - this.waits);
-          if (this.stats.shown.length > KEPT_DELAYS) this.stats.shown.splice(0, 100);
+          this.stats.painted.push(performance.timeOrigin + performance.now() - this.waits);
+          if (this.stats.painted.length > KEPT_DELAYS) this.stats.painted.splice(0, 100);
         }
         this.waits = 0;
       });
@@ -298,7 +298,7 @@ export default {
       const sorted = [...this.stats.delays].slice(-200).sort((a, b) => a - b);
       const p95 = sorted.length ? sorted[Math.min(sorted.length - 1, Math.floor(0.95 * sorted.length))] : null;
       const w = this.words, parts = [];
-      if (this.said.running) {
+      if (this.now.running) {
         if (this.decided !== undefined) parts.push(fill(w.latency_decision, { ms: this.number(this.decided) }));
         if (p95 !== null && p95 >= 0) parts.push(fill(this.sameClock ? w.latency_page : w.latency_page_most, { ms: this.number(p95) }));
       }
@@ -382,7 +382,7 @@ export default {
         if (x(s) > 14 && x(s) < width - 14) c.fillText(`${s} s`, x(s), 90);
       }
       c.textAlign = "left";
-      const told = [-1, -1];
+      const ends = [-1, -1];
       for (const s of this.spans.values()) {
         const to = s.to === null ? this.t : s.to;
         if (to < begin) continue;
@@ -401,33 +401,33 @@ export default {
         const label = `${this.signs[s.affect || "none"]} ${this.nameOf(s)}`;
         const wide = c.measureText(label).width, at = Math.min(a, width - wide);
         // Names never stand on each other; the list has them all.
-        if (at > told[row]) {
+        if (at > ends[row]) {
           c.fillText(label, at, top + 27);
-          told[row] = at + wide + 6;
+          ends[row] = at + wide + 6;
         }
       }
     },
     showNow() {
-      if (!this.net && !this.said) return;
-      const w = this.words, said = this.said, net = this.net, e = said.event;
+      if (!this.net && !this.now) return;
+      const w = this.words, now = this.now, net = this.net, e = now.event;
       // The network's voice is new at every step, the rest only when it changed.
-      if (net && said.running && (said.state === "tracking" || said.state === "warming")) {
+      if (net && now.running && (now.state === "tracking" || now.state === "warming")) {
         const answer = w[`answer_${net.answer || "none"}`];
         say(this.n.network, net.answer === null ? w.answer_none : fill(answer, { gesture: this.names[net.gesture] || net.gesture || "", sure: net.sure, affect: this.affectText(net.affect) }));
-      } else say(this.n.network, said.running ? w.answer_none : "–");
-      const g = said.gate;
+      } else say(this.n.network, now.running ? w.answer_none : "–");
+      const g = now.gate;
       if (!this.gateRules) say(this.n.gate, w.gate_none);
       else if (!g) say(this.n.gate, w.gate_quiet);
       else say(this.n.gate, fill(w.gate_ago, { what: [this.affectText(g.affect), this.names[g.gesture] || g.gesture].filter(Boolean).join(", "), s: Math.max(0, Math.round(this.t - g.t)) }));
-      if (this.told) return;
-      this.told = true;
-      say(this.n.state, this.stateWords(said));
-      this.n.state.dataset.state = said.running ? said.state : "stopped";
+      if (this.nowDrawn) return;
+      this.nowDrawn = true;
+      say(this.n.state, this.stateWords(now));
+      this.n.state.dataset.state = now.running ? now.state : "stopped";
       say(this.n.event, e ? this.nameOf(e) : w.nothing);
       this.n.event.dataset.label = e && e.gesture ? e.gesture : "";
       this.n.badge.style.visibility = e ? "visible" : "hidden";
       if (e) this.badge(this.n.badge, e.affect);
-      const eyes = EYES[said.eyes] ? said.eyes : "off", text = w[`eyes_${eyes}`] + (said.sound ? ` · ♪ ${said.sound}` : "");
+      const eyes = EYES[now.eyes] ? now.eyes : "off", text = w[`eyes_${eyes}`] + (now.sound ? ` · ♪ ${now.sound}` : "");
       if (this.n.face.dataset.eyes !== eyes) {
         this.n.face.dataset.eyes = eyes;
         this.n.face.innerHTML = face(eyes);
@@ -465,11 +465,11 @@ export default {
       }));
     },
 
-    // What is said -----------------------------------------------------------------------------------------------
+    // Texts -----------------------------------------------------------------------------------------------
     nameOf(s) { return s.gesture ? this.names[s.gesture] || s.gesture : this.words.some_gesture; },
     affectText(affect) { const key = affect || "none"; return `${this.signs[key]} ${this.affects[key]}`; },
-    stateWords(said) {
-      return said.running ? this.words[`state_${said.state.replace(" ", "_")}`] || "" : this.words.state_stopped;
+    stateWords(now) {
+      return now.running ? this.words[`state_${now.state.replace(" ", "_")}`] || "" : this.words.state_stopped;
     },
     speakEvent(s, before, first) {
       if (first || s.to !== null || (before && before.gesture === s.gesture)) return;

@@ -18,16 +18,7 @@ from plushsense.live.reactions import reaction_names
 from plushsense.recording.setup import is_virtual
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.studio.app.guard import is_loopback
-from plushsense.studio.app.shell import (
-    AFFECT_COLOURS,
-    AFFECT_SIGNS,
-    LINES,
-    Page,
-    on_change,
-    query_path,
-    query_value,
-    tag,
-)
+from plushsense.studio.app.shell import AFFECT_COLOURS, AFFECT_SIGNS, LINES, Page, on_change, query, query_path, tag
 from plushsense.studio.app.toys import Toys
 from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import VIRTUAL, Workspace
@@ -36,25 +27,23 @@ from plushsense.studio.pages.live.clips import Clips
 from plushsense.studio.pages.live.reader import EventSpan, LatestAnswer, LiveChoice, LiveReader, LiveState
 
 WINDOW_S = 8.0
-"""Seconds of signals on a page."""
+"""Displayed seconds of signals."""
 STRIP_S = 60.0
-"""Seconds of events on its time line."""
+"""Displayed seconds of events on the time line."""
 PACE_S = 0.04
-"""Between two messages at least; a bundle that decides every 50 ms at real time is never held back."""
-_AHEAD = 60
-"""Messages that a page may be behind before it is sent nothing more; it says once a second how far it is."""
-LISTED = 20
-"""Events in the list for reading."""
+"""Shortest time between two messages; shorter than the 50 ms between two decisions at real time."""
+_MAX_BEHIND = 60
+"""Messages that a page may be behind before it is sent nothing more; it reports its position once a second."""
 
 Message = dict[str, Any]
 
 
 class Feed:
-    """Messages for one page: what it was sent already, and whether it keeps up. For use in one thread only.
+    """Messages for one page: holds what the page was sent and whether it keeps up. For use in one thread only.
 
     Attributes:
-        hidden: the page is in the background: it gets nothing, and all anew when it is seen again.
-        away: the connection is lost; likewise.
+        hidden: whether the page is in the background. It then gets nothing, and the whole state afterwards.
+        away: whether the connection is lost; with the same effect.
     """
 
     def __init__(self, reader: LiveReader) -> None:
@@ -76,7 +65,7 @@ class Feed:
     @property
     def holds(self) -> bool:
         """True if the page should be sent nothing now."""
-        return self.hidden or self.away or self._sent - self._seen > _AHEAD
+        return self.hidden or self.away or self._sent - self._seen > _MAX_BEHIND
 
     def seen(self, number: int) -> None:
         """Note that the page has drawn message ``number``."""
@@ -86,24 +75,19 @@ class Feed:
         self._seen = max(self._seen, number)
 
     def again(self) -> None:
-        """Send everything anew after the page was hidden or disconnected."""
+        """Send the whole state next, after the page was hidden or disconnected."""
         self._generation = -1
         self._seen = self._sent
 
     def scene(self) -> Message:
-        """Return the whole state, for a page that opens, comes back, or sees another toy or bundle."""
+        """Return the whole state, for a page that opens or returns, or after a change of toy or bundle."""
         reader = self._reader
         now, device, bundle = reader.now, reader.device, reader.bundle
         self._generation = now.generation
         self._change = 0
-        scene: Message = {
-            "window": WINDOW_S,
-            "strip": STRIP_S,
-            "channels": [],
-            "classes": [],
-            "gate_rules": 0,
-            "simulated": reader.choice.simulated,
-        }
+        scene: Message = {"window": WINDOW_S, "strip": STRIP_S, "simulated": reader.choice.simulated}
+        scene |= {"channels": [], "classes": [], "gate_rules": 0}
+        self._place = 0
         if device is not None and bundle is not None:
             channels = device.layout.channels
             scene["channels"] = [
@@ -111,10 +95,7 @@ class Feed:
             ]
             scene["classes"] = [{"label": g.label, "affect": g.affect} for g in bundle.gestures.gestures]
             scene["gate_rules"] = len(DecideSpec.from_dict(bundle.decision).gate.rules)
-            rate = device.layout.rate_hz
-            self._place = max(0, device.buffer.count - int(WINDOW_S * rate))
-        else:
-            self._place = 0
+            self._place = max(0, device.buffer.count - int(WINDOW_S * device.layout.rate_hz))
         self._rare = ()
         return scene | {"first": self._message(now)}
 
@@ -145,7 +126,7 @@ class Feed:
             message["x"] = [round(s, 3) for s in piece.seconds.tolist()]
             message["y"] = piece.values.astype(int).T.tolist()
         if now.probabilities is not None:
-            # Whole thousandths: what a bar can show.
+            # Integer thousandths are enough for a bar.
             message["p"] = [round(1000.0 * p) for p in now.probabilities]
         if now.network is not None:
             message["net"] = _answer(now.network)
@@ -156,13 +137,13 @@ class Feed:
         if now.changes > self._change:
             message["spans"] = [_span(s) for s in self._reader.spans(self._change)]
             self._change = now.changes
-        # Sent only when it changed, which is rare.
+        # Sent only after a change, which is rare.
         rare = (now.running, now.message, now.state, now.gate, now.event, now.reaction)
         if rare != self._rare:
             self._rare = rare
             message["now"] = {
                 "running": now.running,
-                "said": now.message,
+                "message": now.message,
                 "state": now.state,
                 "gate": _answer(now.gate),
                 "event": None if now.event is None else _span(now.event),
@@ -195,96 +176,41 @@ def _span(span: EventSpan) -> Message:
     }
 
 
-WORDS = (
-    "signals",
-    "signals_label",
-    "network",
-    "gate",
-    "gate_none",
-    "gate_quiet",
-    "gate_ago",
-    "gate_mark",
-    "now",
-    "nothing",
-    "chances",
-    "timeline",
-    "timeline_label",
-    "events",
-    "events_none",
-    "by_gate",
-    "by_network",
-    "lasting",
-    "eyes_label",
-    "eyes_green",
-    "eyes_red",
-    "eyes_off",
-    "state_warming",
-    "state_tracking",
-    "state_no_signal",
-    "state_sensor_fault",
-    "state_stopped",
-    "answer_sure",
-    "answer_affect",
-    "answer_unsure",
-    "answer_unknown",
-    "answer_idle",
-    "answer_none",
-    "latency",
-    "latency_decision",
-    "latency_page",
-    "latency_page_most",
-    "some_gesture",
-    "unit_count",
-)
-"""Keys of the table ``live`` that the component says."""
-
-
 class LiveView(Element, component="live_view.js"):
-    """Draws what a `Feed` sends.
+    """Browser component that draws the messages of a `Feed`, with the texts ``words``."""
 
-    Args:
-        words: of the page.
-        feed: what it is to draw.
-        on_seen: called once a second with the page's own figures (for tests and the curious).
-    """
-
-    def __init__(self, words: Words, feed: Feed, on_seen: Callable[[dict[str, Any]], None] | None = None) -> None:
+    def __init__(self, words: Words, feed: Feed) -> None:
         super().__init__()
-        self._feed = feed
-        self._on_seen = on_seen
-        self._props["words"] = {key: words(f"live.{key}") for key in WORDS}
-        self._props["affects"] = {key: words.affect(key) for key in AFFECT_COLOURS}
-        self._props["signs"] = dict(AFFECT_SIGNS)
-        self._props["colours"] = dict(AFFECT_COLOURS)
-        self._props["lines"] = list(LINES)
-        self._props["locale"] = words.language
-        # Latencies can only be measured on the same clock.
-        self._props["sameClock"] = is_loopback(context.client.ip)
-        self._words = words
-        self._props["start"] = self._named(feed.scene())
+        self._feed, self._words = feed, words
+        self._props.update(
+            words=words.table("live"),
+            affects={key: words.affect(key) for key in AFFECT_COLOURS},
+            signs=dict(AFFECT_SIGNS),
+            colours=dict(AFFECT_COLOURS),
+            lines=list(LINES),
+            locale=words.language,
+            # Latencies can only be measured on one clock.
+            sameClock=is_loopback(context.client.ip),
+            start=self._named(feed.scene()),
+        )
         self.classes("w-full")
         self.on("seen", self._seen)
         self.on("visible", self._visible)
 
     def push(self) -> None:
-        """Send what is new."""
-        due = self._feed.message()
-        if due is None:
-            return
-        what, message = due
-        self.run_method(what, self._named(message) if what == "scene" else message)
+        """Send the next message, if any."""
+        if (due := self._feed.message()) is not None:
+            method, message = due
+            self.run_method(method, self._named(message) if method == "scene" else message)
 
     def _named(self, scene: Message) -> Message:
-        """Add the gestures' names in the page's language to the scene."""
-        for one in scene["classes"]:
-            one["name"] = self._words.gesture(one["label"])
+        """Add the names of the gestures in the language of the page to the scene."""
+        for gesture in scene["classes"]:
+            gesture["name"] = self._words.gesture(gesture["label"])
         return scene
 
     def _seen(self, event: GenericEventArguments) -> None:
-        figures = dict(event.args)
-        self._feed.seen(int(figures["n"]))
-        if self._on_seen is not None:
-            self._on_seen(figures)
+        self._feed.seen(int(event.args["n"]))
 
     def _visible(self, event: GenericEventArguments) -> None:
         visible = bool(event.args["on"])
@@ -302,32 +228,31 @@ def show(page: Page) -> None:
     """Build the page."""
     reader = page.workspace.part(LiveReader)
     words = page.words
-    with ui.element("section").classes("ps-card w-full column no-wrap ps-tight"):
+    with ui.element("section").classes("ps-card w-full column no-wrap ps-small-gap"):
         _controls(page, reader)
-    simulated = tag(ui.label(words("shell.simulation")).classes("ps-said ps-said-warning w-full"), "simulation")
+    simulated = tag(ui.label(words("shell.simulation")).classes("ps-message ps-message-warning w-full"), "simulation")
 
-    def mark() -> None:
-        device = reader.device
-        simulated.set_visibility(device is not None and reader.choice.simulated)
+    def update_mark() -> None:
+        simulated.set_visibility(reader.device is not None and reader.choice.simulated)
 
-    on_change(reader.changed, mark)
-    mark()
+    on_change(reader.changed, update_mark)
+    update_mark()
     feed = Feed(reader)
-    view = LiveView(words, feed)
-    _follow(view, feed, reader)
+    _follow(LiveView(words, feed), feed, reader)
     clips_page.show(page, reader)
     clips = page.workspace.part(Clips)
     context.client.on_delete(reader.add_viewer(lambda: bool(clips.recording)))
 
 
 def _follow(view: LiveView, feed: Feed, reader: LiveReader) -> None:
-    """Push to the view after every change, no faster than its pace; nothing while it cannot take it."""
+    """Push to the view after every change, at most at its pace, and not while it is disconnected."""
     client = context.client
     loop = asyncio.get_running_loop()
-    waits: list[asyncio.TimerHandle] = []
+    timer: asyncio.TimerHandle | None = None
 
     def push() -> None:
-        waits.clear()
+        nonlocal timer
+        timer = None
         if not client.has_socket_connection:
             feed.away = True
             return
@@ -335,28 +260,27 @@ def _follow(view: LiveView, feed: Feed, reader: LiveReader) -> None:
             view.push()
 
     def update() -> None:
-        if waits:
+        nonlocal timer
+        if timer is not None:
             return
-        wait_s = feed.wait_s()
-        if wait_s > 0.0:
-            waits.append(loop.call_later(wait_s, push))
+        if (wait_s := feed.wait_s()) > 0.0:
+            timer = loop.call_later(wait_s, push)
         else:
             push()
 
-    def back() -> None:
+    def connected() -> None:
         if feed.away:
             feed.away = False
             feed.again()
         push()
 
+    def deleted() -> None:
+        if timer is not None:
+            timer.cancel()
+
     on_change(reader.changed, update)
-    client.on_connect(back)
-
-    def gone() -> None:
-        for handle in waits:
-            handle.cancel()
-
-    client.on_delete(gone)
+    client.on_connect(connected)
+    client.on_delete(deleted)
 
 
 def _controls(page: Page, reader: LiveReader) -> None:  # noqa: C901
@@ -365,31 +289,27 @@ def _controls(page: Page, reader: LiveReader) -> None:  # noqa: C901
     choice = reader.choice
     bundles = {str(path): path.stem for path in workspace.bundles()}
     chosen = str(choice.bundle) if choice.bundle else None
-    if chosen is None or (query_value("model") and not reader.now.running):
+    if chosen is None or (query().get("model") and not reader.now.running):
         chosen = query_path(workspace, "model", bundles) or None
     first = choice.toy if reader.now.running else workspace.toy or VIRTUAL
     with ui.element("div").classes("w-full").style(_GRID):
         toy = ui.select(
-            _named(toys, workspace, first),
+            _toy_options(toys, workspace, first),
             value=first,
             label=words("live.toy"),
             with_input=True,
             new_value_mode="add-unique",
         )
-        hint = words("live.toy_hint")
-        tag(toy.props(f'outlined dense hint="{hint}"'), "toy")
-        bundle = ui.select(bundles, value=chosen, label=words("live.bundle"))
-        tag(bundle.props("outlined dense"), "bundle")
+        tag(toy.props(f'hint="{words("live.toy_hint")}"'), "toy")
+        bundle = tag(ui.select(bundles, value=chosen, label=words("live.bundle")), "bundle")
         engines = {"float": words("live.engine_float"), "int8": words("live.engine_int8")}
-        engine = ui.select(engines, value=choice.engine, label=words("live.engine"))
-        tag(engine.props("outlined dense"), "engine")
-        answers = {"": words("live.reactions_none")} | {
+        engine = tag(ui.select(engines, value=choice.engine, label=words("live.engine")), "engine")
+        names = {"": words("live.reactions_none")} | {
             name: words(f"live.reactions_{name}") if words.has(f"live.reactions_{name}") else name
             for name in reaction_names()
         }
-        reactions = ui.select(answers, value=choice.reactions, label=words("live.reactions"))
-        tag(reactions.props("outlined dense"), "reactions")
-    with ui.row().classes("w-full items-center ps-tight"):
+        reactions = tag(ui.select(names, value=choice.reactions, label=words("live.reactions")), "reactions")
+    with ui.row().classes("w-full items-center ps-small-gap"):
         start = tag(ui.button(words("live.start"), icon="play_arrow").props("unelevated no-caps"), "start")
         stop = tag(ui.button(words("live.stop"), icon="stop").props("outline no-caps"), "stop")
         look = tag(ui.button(words("live.look"), icon="search", on_click=toys.search).props("flat no-caps"), "look")
@@ -397,32 +317,32 @@ def _controls(page: Page, reader: LiveReader) -> None:  # noqa: C901
         busy = tag(ui.spinner(size="1.6em").props("aria-hidden=true"), "busy")
     busy.set_visibility(False)
 
-    async def working(what: Any, *args: Any) -> bool:
-        """Run a command beside the loop; whether it was taken."""
+    async def run(command: Callable[..., None], *args: Any) -> bool:
+        """Run a command in a thread; return whether it succeeded."""
         busy.set_visibility(True)
         page.say("")
-        taken = False
+        done = False
         with page.show_errors():
-            await asyncio.to_thread(what, *args)
-            taken = True
+            await asyncio.to_thread(command, *args)
+            done = True
         busy.set_visibility(False)
-        return taken
+        return done
 
     async def begin() -> None:
         with page.show_errors():
             url = toys.choose(str(toy.value or ""))
             path = Path(bundle.value) if bundle.value else None
-            await working(reader.start, LiveChoice(url, path, engine.value, reactions.value, bool(virtual.value)))
+            await run(reader.start, LiveChoice(url, path, engine.value, reactions.value, bool(virtual.value)))
 
-    async def other() -> None:
-        # Also called when the page follows another tab's choice, with nothing to do.
+    async def change() -> None:
+        # Also called when the page follows the choice of another tab; then there is nothing to do.
         now = reader.choice
         selection = (Path(bundle.value) if bundle.value else None, engine.value, reactions.value)
-        if selection != (now.bundle, now.engine, now.reactions) and not await working(reader.choose, *selection):
+        if selection != (now.bundle, now.engine, now.reactions) and not await run(reader.choose, *selection):
             follow()
 
     def follow() -> None:
-        """Show what is chosen, whoever chose it."""
+        """Display the current choice, which another tab may have made."""
         now = reader.choice
         if now.bundle is not None:
             if str(now.bundle) not in bundles:
@@ -432,52 +352,48 @@ def _controls(page: Page, reader: LiveReader) -> None:  # noqa: C901
         engine.set_value(now.engine)
         reactions.set_value(now.reactions)
         if reader.now.running:
-            toy.set_options(_named(toys, workspace, now.toy), value=now.toy)
+            toy.set_options(_toy_options(toys, workspace, now.toy), value=now.toy)
             virtual.set_value(now.simulated)
 
-    def changed(before: list[Any]) -> None:
-        running = reader.now.running
+    state: tuple[Any, ...] = ("",)
+
+    def update() -> None:
+        # Called at every decision, mostly without a change.
+        nonlocal state
+        message, running = reader.now.problem or reader.now.message, reader.now.running
+        if (message, running, reader.choice) == state:
+            return
         start.set_visibility(not running)
         stop.set_visibility(running)
         for control in (toy, look, virtual):
             control.set_enabled(not running)
-        if message := reader.now.problem or reader.now.message:
+        if message or state[0]:
             page.say(message, "warning")
-        elif before and before[0]:
-            page.say("")
+        state = (message, running, reader.choice)
+        follow()
 
-    state: list[Any] = []
-
-    def update() -> None:
-        # Called at every decision, mostly without a change.
-        seen = [reader.now.problem or reader.now.message, reader.now.running, reader.choice]
-        if seen != state:
-            changed(state)
-            state[:] = seen
-            follow()
-
-    def listed() -> None:
+    def update_toys() -> None:
         busy.set_visibility(toys.searching)
         if not reader.now.running:
-            toy.set_options(_named(toys, workspace, str(toy.value or "")), value=toy.value)
+            toy.set_options(_toy_options(toys, workspace, str(toy.value or "")), value=toy.value)
 
-    def simulated() -> None:
+    def update_simulated() -> None:
         if not reader.now.running:
             with contextlib.suppress(PlushSenseError):
                 virtual.set_value(is_virtual(str(toy.value or "")))
 
     start.on_click(begin)
-    stop.on_click(lambda: working(reader.stop))
-    toy.on_value_change(simulated)
+    stop.on_click(lambda: run(reader.stop))
+    toy.on_value_change(update_simulated)
     for control in (bundle, engine, reactions):
-        control.on_value_change(other)
+        control.on_value_change(change)
     on_change(reader.changed, update)
-    on_change(toys.changed, listed)
-    simulated()
+    on_change(toys.changed, update_toys)
+    update_simulated()
     update()
 
 
-def _named(toys: Toys, workspace: Workspace, url: str) -> dict[str, str]:
-    """Return the toys to choose from: those named at start, ``url``, the virtual one, and those that were found."""
-    named = {one: one for one in (url, workspace.toy, *workspace.devices, VIRTUAL) if one}
-    return named | {d.url: f"{d.name or d.url}: {d.description}" for d in toys.listing.devices}
+def _toy_options(toys: Toys, workspace: Workspace, url: str) -> dict[str, str]:
+    """Return the toys to choose from: ``url``, those given at start, the virtual one, and those that were found."""
+    known = {one: one for one in (url, workspace.toy, *workspace.devices, VIRTUAL) if one}
+    return known | {d.url: f"{d.name or d.url}: {d.description}" for d in toys.listing.devices}

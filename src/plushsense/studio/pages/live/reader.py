@@ -31,9 +31,9 @@ from plushsense.workflow.export import classifier_of
 class LiveChoice:
     """The toy, bundle, engine and reactions in use.
 
-    ``reactions``: a name, or "" for none.
-
-    ``simulated``: the toy is a virtual one, also behind a port.
+    Attributes:
+        reactions: a name, or "" for none.
+        simulated: whether the toy is a virtual one, also behind a port.
     """
 
     toy: str = ""
@@ -45,7 +45,7 @@ class LiveChoice:
 
 @dataclass(frozen=True)
 class LatestAnswer:
-    """Latest answer of the network (at every step) or of the gate (when one of its rules fired)."""
+    """Latest answer of the network, at every step, or of the gate, when one of its rules fires."""
 
     t_s: float
     affect: str | None
@@ -58,9 +58,10 @@ class LatestAnswer:
 class EventSpan:
     """An event on the time line.
 
-    ``number`` counts from 1 over all bundles; ``change`` is the number of its latest change.
-
-    ``end_s`` is None while it lasts.
+    Attributes:
+        number: counts from 1, over all bundles.
+        change: number of its latest change.
+        end_s: None while it lasts.
     """
 
     number: int
@@ -74,20 +75,20 @@ class EventSpan:
 
 @dataclass(frozen=True)
 class LiveState:
-    """Current state that pages show beside the signals.
-
-    Times are seconds of the toy since it was opened.
+    """Current state that pages display beside the signals. Times are seconds of the toy since it was opened.
 
     Attributes:
-        generation: increases with every new toy or bundle; pages then start anew.
-        running: whether a toy is being read; ``message``: why reading ended, or "".
+        generation: increases with every new toy or bundle, after which pages are drawn again.
+        running: whether a toy is being read.
+        message: why reading ended, or "".
         problem: why no data arrive now, or "".
-        state: as of a decision; "" before the first.
-        probabilities: of the classes, in the bundle's order; None while there is no answer.
+        state: state of the last decision; "" before the first.
+        probabilities: of the classes, in the order of the bundle; None while there is no answer.
         event: the current event.
-        reaction: the toy's current reaction, which ends at ``reaction_ends_s``.
-        latency_s: from the bytes to the newest decision; ``arrived``: when those bytes came, seconds since 1970.
-        changes: number of the newest change of a span.
+        reaction: the current reaction of the toy, which ends at ``reaction_ends_s``.
+        latency_s: from the arrival of the bytes to the newest decision.
+        arrived: arrival of those bytes, seconds since 1970.
+        changes: number of the newest change of an event.
     """
 
     generation: int = 0
@@ -155,7 +156,7 @@ class LiveReader:
     # Commands: they block, call them outside the event loop -------------------------------------------
 
     def start(self, choice: LiveChoice) -> None:
-        """Open a toy and read it with a bundle, once both are valid; what was read before ends.
+        """Open a toy and read it with a bundle; a toy that is being read is closed once both are valid.
 
         Raises:
             ConfigError, DeviceError, BundleError: as for `open_device`, `Bundle.load` and `check_layout`.
@@ -368,14 +369,13 @@ class LiveReader:
         assert span is not None
         self._changes += 1
         fresh = replace(span, change=self._changes, **changed)
-        for at in range(len(self._spans) - 1, -1, -1):
-            if self._spans[at].number == span.number:
-                self._spans[at] = fresh
-                break
+        at = next((i for i, s in enumerate(self._spans) if s.number == span.number), None)
+        if at is not None:
+            self._spans[at] = fresh
         self.now = replace(self.now, event=None if fresh.end_s is not None else fresh)
 
     def _swap(self, fresh: _BundleRun) -> None:
-        """Go on with another bundle; the current event ends."""
+        """Continue with another bundle; the current event ends."""
         with self._lock:
             self._end_event(self.now.t_s)
             self.bundle = fresh.bundle
@@ -398,20 +398,20 @@ class LiveReader:
 
 
 def _problem(device: TappedDevice, before: str) -> str:
-    """Return why no frame arrives; ``before``, the reason given last, stands until one does."""
+    """Return why no frame arrives; ``before``, the last reason, applies until one does."""
     if getattr(device.device, "state", "connected") == "waiting":
         gaps = getattr(device.device, "gaps", ())
         return str(gaps[-1].reason) if gaps else before
     if device.buffer.count == 0 and device.counters.malformed >= _UNREADABLE:
         return (
-            f"The toy sends lines, but none is a frame of '{device.layout.name}' ({len(device.layout.wire)} numbers), "
-            "which the bundle reads: choose a bundle that was made for this toy, and look whether the cable is sound."
+            f"The toy sends lines, but none is a frame of the layout '{device.layout.name}' of the bundle "
+            f"({len(device.layout.wire)} numbers): choose a bundle for this toy, and check the cable."
         )
     return before
 
 
 def _simulated(url: str) -> bool:
-    """Return whether this is the virtual toy, or a recording of one."""
+    """Return whether a URL is that of a virtual toy, or of a recording of one."""
     address = parse_url(url)
     if address.scheme != "replay":
         return is_virtual(url)
@@ -431,15 +431,10 @@ def _reactor(reactions: str, bundle: Bundle) -> Reactor | None:
 
 
 def _refuse_strange(fresh: Bundle, running: Bundle) -> None:
-    """Refuse a bundle whose gesture set has nothing in common with the one in use.
-
-    Raises:
-        ConfigError: where both sets have no gesture in common.
-    """
+    """Raise ConfigError if two bundles have no gesture in common."""
     if not any(running.gestures.find(label) for label in fresh.gestures.labels):
-        mine, theirs = ", ".join(fresh.gestures.labels[:4]), ", ".join(running.gestures.labels[:4])
+        new, current = ", ".join(fresh.gestures.labels[:4]), ", ".join(running.gestures.labels[:4])
         raise ConfigError(
-            f"This bundle is of the gesture set '{fresh.gestures.name}' ({mine}, …) and knows no gesture of "
-            f"'{running.gestures.name}' ({theirs}, …), which is in use: stop the toy first to "
-            "change to it."
+            f"The gesture set of this bundle, '{fresh.gestures.name}' ({new}, …), has no gesture in common with the "
+            f"one in use, '{running.gestures.name}' ({current}, …): stop the toy before you choose this bundle."
         )

@@ -8,7 +8,6 @@ import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 from markupsafe import Markup
 from nicegui import run, ui
@@ -24,16 +23,16 @@ from plushsense.dataset.publishing.croissant import CROISSANT_FILE
 from plushsense.dataset.publishing.description import CHECKSUMS
 from plushsense.dataset.publishing.readme import REIDENTIFICATION_JSON
 from plushsense.dataset.publishing.tables import list_package_files
-from plushsense.studio.app.guard import address
+from plushsense.studio.app.guard import download_address
 from plushsense.studio.app.jobs import DONE, Jobs, StudioJob
-from plushsense.studio.app.shell import Page, html, tag
+from plushsense.studio.app.shell import Page, address, html, moment, set_address, tag
 from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import PACKAGES, Workspace
-from plushsense.studio.widgets.work import WorkPanel, link, moment, size, table, text, verdict
+from plushsense.studio.widgets.elements import WorkPanel, link, notice, size, table, text, verdict
 
 KEYS = "keys"
 """Folder of the workspace for secrets: neither in a data set nor in a package."""
-# Dates under pseudonyms are later (`dataset.keyfile`).
+# Shifted dates are later than this (see `dataset.keyfile`).
 _MOVED_MS = 4_102_444_800_000
 _TOOLS = {
     "publish": ("mlcroissant", "frictionless", "rocrate", "datacite"),
@@ -43,9 +42,12 @@ _TOOLS = {
 
 @dataclass(frozen=True)
 class DatasetFacts:
-    """Facts of a data set before publication; ``problem``: why it cannot be read.
+    """Facts of a data set before publication.
 
-    ``own_codes``: people whose codes ``pseudonymise`` did not draw; ``own_dates``: the dates may be the true ones.
+    Attributes:
+        problem: why it cannot be read, or "".
+        own_codes: people whose codes were not drawn by ``pseudonymise``.
+        own_dates: whether the dates may be the true ones.
     """
 
     path: Path
@@ -98,8 +100,9 @@ class DatasetFacts:
 class PackageFacts:
     """Facts of a published package, which is a folder, a zip, or both.
 
-    ``contents``: (files, bytes) of each folder (its name ends in "/") and top-level file. ``reidentification``:
-    figures of the report, {} if no test was run.
+    Attributes:
+        reidentification: figures of the report, {} if no test was run.
+        contents: (files, bytes) of each folder (its name ends in "/") and top-level file.
     """
 
     name: str
@@ -115,9 +118,9 @@ class PackageFacts:
     @property
     def place(self) -> Path:
         """Path to validate: the zip if there is one, because that is what is shared."""
-        found = self.zip or self.folder
-        assert found is not None
-        return found
+        place = self.zip or self.folder
+        assert place is not None
+        return place
 
     @classmethod
     def of(cls, workspace: Workspace, name: str) -> PackageFacts:
@@ -143,9 +146,9 @@ class PackageFacts:
 def packages_of(workspace: Workspace) -> list[str]:
     """List the names of the packages of a workspace, the newest first."""
     root = workspace.folder / PACKAGES
-    found = {p.parent.name: p.stat().st_mtime for p in root.glob(f"*/{CHECKSUMS}") if not p.parent.name.startswith(".")}
-    found |= {p.stem: p.stat().st_mtime for p in root.glob("*.zip") if p.is_file()}
-    return sorted(found, key=lambda name: -found[name])
+    dated = {p.parent.name: p.stat().st_mtime for p in root.glob(f"*/{CHECKSUMS}") if not p.parent.name.startswith(".")}
+    dated |= {p.stem: p.stat().st_mtime for p in root.glob("*.zip") if p.is_file()}
+    return sorted(dated, key=lambda name: -dated[name])
 
 
 def missing_extras() -> list[str]:
@@ -185,19 +188,19 @@ def _has(folder: Path | None, packed: Path | None, file: str) -> bool:
 def _load(folder: Path | None, packed: Path | None, file: str) -> dict[str, Any]:
     try:
         if folder is not None:
-            found = json.loads((folder / file).read_text(encoding="utf-8"))
+            content = json.loads((folder / file).read_text(encoding="utf-8"))
         elif packed is not None:
             with zipfile.ZipFile(packed) as archive:
                 name = next(n for n in archive.namelist() if n.partition("/")[2] == file)
-                found = json.loads(archive.read(name))
+                content = json.loads(archive.read(name))
         else:
             return {}
     except (OSError, ValueError, StopIteration, zipfile.BadZipFile):
         return {}
-    return found if isinstance(found, dict) else {}
+    return content if isinstance(content, dict) else {}
 
 
-_SHOWN = 20
+_MAX_PROBLEMS = 20
 
 
 class PackagesSection:
@@ -216,18 +219,17 @@ class PackagesSection:
 
     async def refresh(self) -> None:
         """Update the list of packages."""
-        words = self.words
-        names = await run.io_bound(lambda: packages_of(self.workspace)) or []
-        found = await run.io_bound(lambda: [PackageFacts.of(self.workspace, n) for n in names]) or []
+        words, workspace = self.words, self.workspace
+        packages = await run.io_bound(lambda: [PackageFacts.of(workspace, n) for n in packages_of(workspace)]) or []
         rows = [
             (
-                link(each.name, f"/publish?name={quote(each.name)}"),
+                link(each.name, address("publish", name=each.name)),
                 each.title,
                 words("export.simulation_short") if each.simulated else "",
                 moment(each.made_s),
-                self._state(newest_validation(self.workspace.part(Jobs), each)),
+                self._state(newest_validation(workspace.part(Jobs), each)),
             )
-            for each in found
+            for each in packages
         ]
         self._list.clear()
         with self._list:
@@ -249,16 +251,16 @@ class PackagesSection:
         words = self.words
         with self.page.show_errors():
             if name not in (await run.io_bound(lambda: packages_of(self.workspace)) or []):
-                raise ConfigError(f"There is no package '{name}' in this studio: choose one of the list.")
+                raise ConfigError(f"There is no package '{name}' in this studio: choose one from the list.")
             found = await run.io_bound(lambda: PackageFacts.of(self.workspace, name))
             assert found is not None
             job = newest_validation(self.workspace.part(Jobs), found)
-            ui.run_javascript(f"history.replaceState(null, '', {json.dumps(f'/publish?name={quote(name)}')})")
+            set_address(address("publish", name=name))
             self._detail.clear()
             with self._detail:
                 text(words("publish.one", name=name), "h2")
                 if found.simulated:
-                    text(words("shell.simulation"), classes="ps-said ps-said-warning w-full")
+                    notice(words("shell.simulation"))
                 self._answers(found, job)
                 with tag(ui.column().classes("ps-card w-full"), "recognised"):
                     text(words("publish.recognised"), "h3")
@@ -278,7 +280,7 @@ class PackagesSection:
                     text(words("publish.all_agree" if job.result["valid"] else "publish.some_disagree"), "span")
                 self._validators(job.result)
                 for each in [*job.result.get("warnings", ()), *job.result.get("notes", ())]:
-                    text(f"{words('publish.note')} {each}", classes="ps-said ps-said-info w-full")
+                    notice(f"{words('publish.note')} {each}", "info")
             self._thorough = tag(ui.checkbox(words("publish.with_thorough")), "check-thorough")
             again = ui.button(words("publish.check"), icon="fact_check", on_click=lambda: self._check(found))
             tag(again.props("outline no-caps"), "check").set_enabled("publish" not in self.lacking)
@@ -295,11 +297,13 @@ class PackagesSection:
         head = [words(f"publish.{k}") for k in ("validator", "answer", "looks_at", "looked_at")]
         tag(table(words("publish.validators_caption"), head, rows), "validators")
         if problems := result["problems"]:
-            listed = [(p["validator"], p["file"] or words("publish.whole"), p["problem"]) for p in problems[:_SHOWN]]
+            listed = [
+                (p["validator"], p["file"] or words("publish.whole"), p["problem"]) for p in problems[:_MAX_PROBLEMS]
+            ]
             head = [words(f"publish.{k}") for k in ("validator", "file", "problem")]
             tag(table(words("publish.problems_caption", n=len(problems)), head, listed), "problems")
-            if len(problems) > _SHOWN:
-                text(words("publish.more_problems", n=len(problems) - _SHOWN), classes="ps-dim")
+            if len(problems) > _MAX_PROBLEMS:
+                text(words("publish.more_problems", n=len(problems) - _MAX_PROBLEMS), classes="ps-dim")
 
     async def _check(self, found: PackageFacts) -> None:
         self.page.say("")
@@ -324,10 +328,10 @@ class PackagesSection:
             text(words("publish.take"), "h3")
             if found.zip is not None:
                 message = words("publish.download", size=size(found.zip.stat().st_size))
-                down = ui.link(message, address(PACKAGES, found.name)).classes("ps-link").props("download")
-                tag(down, "download")
+                download = ui.link(message, download_address(PACKAGES, found.name)).classes("ps-link")
+                tag(download.props("download"), "download")
             else:
-                text(words("publish.no_zip"), classes="ps-said ps-said-warning w-full")
+                notice(words("publish.no_zip"))
             text(words("publish.by_hand"))
             text(str(found.place), classes="ps-path")
 
@@ -352,10 +356,9 @@ def reidentification_text(words: Words, figures: dict[str, Any]) -> list[str]:
     if head is None:
         return [words("publish.nobody_looked")]
     top, low, chance = head["top1"], (head["top1"].get("ci95") or [head["top1"]["mean"]])[0], head["chance"]
-    between = (
-        words("publish.interval", low=_of_100(top["ci95"][0]), high=_of_100(top["ci95"][1])) if top["ci95"] else ""
-    )
-    message = [
+    interval = [_of_100(limit) for limit in top["ci95"] or ()]
+    between = words("publish.interval", low=interval[0], high=interval[1]) if interval else ""
+    sentences = [
         words(
             "publish.named",
             right=_of_100(top["mean"]),
@@ -372,14 +375,11 @@ def reidentification_text(words: Words, figures: dict[str, Any]) -> list[str]:
         ("session", trials.get(("sessions", "everything"))),
     ):
         if trial is not None:
-            message.append(words(f"publish.named_{key}", right=_of_100(trial["top1"]["mean"])))
+            sentences.append(words(f"publish.named_{key}", right=_of_100(trial["top1"]["mean"])))
     if ("sessions", "everything") not in trials:
-        message.append(words("publish.no_sessions"))
-    if figures.get("simulated"):
-        message.append(words("publish.means_simulated"))
-    else:
-        message.append(words("publish.means_guessing" if low <= chance else "publish.means_personal"))
-    return [*message, words("publish.lower_bound")]
+        sentences.append(words("publish.no_sessions"))
+    meaning = "simulated" if figures.get("simulated") else "guessing" if low <= chance else "personal"
+    return [*sentences, words(f"publish.means_{meaning}"), words("publish.lower_bound")]
 
 
 def _of_100(share: float) -> str:

@@ -6,19 +6,19 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
-from nicegui import context, run, ui
+from nicegui import run, ui
 
 from plushsense.core.errors import ConfigError
 from plushsense.dataset.publishing.description import LICENCES
 from plushsense.dataset.publishing.package import complete_head
 from plushsense.dataset.store import DatasetHead
 from plushsense.studio.app.jobs import Jobs, StudioJob
-from plushsense.studio.app.shell import Page, address, tag
-from plushsense.studio.app.workspace import DATASETS, PACKAGES
+from plushsense.studio.app.shell import Page, address, query, tag
+from plushsense.studio.app.workspace import DATASETS, PACKAGES, plain_name
 from plushsense.studio.pages.publish.packages import KEYS, DatasetFacts, PackagesSection, missing_extras
-from plushsense.studio.widgets.work import WorkPanel, facts, scroll_to, style, text, titles
+from plushsense.studio.widgets.elements import WorkPanel, facts, notice, scroll_to, style, text, titles
 
-_SHOWN = 5
+_MAX_CODES = 5
 
 
 class StatementsForm:
@@ -29,24 +29,20 @@ class StatementsForm:
 
     def build(self) -> None:
         words, found = self.words, self.found
-        last = next(
-            (j.spec for j in self.page.workspace.part(Jobs).all("publish") if j.spec["dataset"] == str(found.path)), {}
-        )
+        jobs = self.page.workspace.part(Jobs).all("publish")
+        last = next((j.spec for j in jobs if j.spec["dataset"] == str(found.path)), {})
         name, _, mail = str(last.get("contact", "")).rstrip(">").partition(" <")
         text(words("publish.statements"), "h3")
-        lacking = [
-            words(f"publish.lacks_{key}")
-            for key, there in (("licence", found.licence), ("contact", found.contact_mail), ("consent", found.consent))
-            if not there
-        ]
-        message = words("publish.lacks", what=", ".join(lacking)) if lacking else words("publish.lacks_nothing")
+        given = {"licence": found.licence, "contact": found.contact_mail, "consent": found.consent}
+        missing = [words(f"publish.lacks_{key}") for key, value in given.items() if not value]
+        message = words("publish.lacks", what=", ".join(missing)) if missing else words("publish.lacks_nothing")
         tag(text(message), "lacks")
-        known = {s: s if s == each.title else f"{s}: {each.title}" for s, each in LICENCES.items()}
+        licences = {s: s if s == each.title else f"{s}: {each.title}" for s, each in LICENCES.items()}
         value = found.licence or last.get("licence") or None
-        if value is not None and value not in known:
+        if value is not None:
             # A licence that the library refuses stays visible.
-            known[value] = value
-        licence = ui.select(known, value=value, label=words("publish.licence"), with_input=False).classes("w-full")
+            licences.setdefault(value, value)
+        licence = ui.select(licences, value=value, label=words("publish.licence"), with_input=False).classes("w-full")
         self._licence = tag(licence, "licence")
         text(words("publish.licence_about"), classes="ps-dim")
         with ui.row().classes("w-full"):
@@ -88,14 +84,12 @@ class PseudonymsForm:
         if not found.own_codes and not found.own_dates:
             tag(text(words("publish.renamed_already"), classes="ps-dim"), "renamed-already")
             return
-        visible = ", ".join(found.own_codes[:_SHOWN]) + (" …" if len(found.own_codes) > _SHOWN else "")
+        codes = ", ".join(found.own_codes[:_MAX_CODES]) + (" …" if len(found.own_codes) > _MAX_CODES else "")
         with tag(ui.column().classes("w-full"), "advice"):
-            kind = "info" if found.simulated else "warning"
-            message = words("publish.advice", codes=visible or "–")
-            text(message, classes=f"ps-said ps-said-{kind} w-full")
+            notice(words("publish.advice", codes=codes or "–"), "info" if found.simulated else "warning")
         with tag(ui.expansion(words("publish.rename")).classes("w-full"), "rename"):
             text(words("publish.rename_about"))
-            name = self._free(f"{found.path.name}-shared")
+            name = self.page.workspace.free_name(DATASETS, f"{found.path.name}-shared")
             self._name = tag(ui.input(words("publish.rename_name"), value=name).props("maxlength=64"), "rename-name")
             key = ui.input(words("publish.rename_key"), value=f"{found.path.name}-people.csv").props("maxlength=64")
             self._key = tag(key, "rename-key")
@@ -104,15 +98,9 @@ class PseudonymsForm:
             text(words("publish.key_place", folder=str(self.page.workspace.folder / KEYS)), classes="ps-dim")
             self._listed = tag(ui.textarea(words("publish.rename_words")).props("autogrow").classes("w-full"), "words")
             self._drop = tag(ui.checkbox(words("publish.rename_drop")), "drop-notes")
-            text(words("publish.rename_safe"), classes="ps-said ps-said-warning w-full")
+            notice(words("publish.rename_safe"))
             do = ui.button(words("publish.rename_do"), icon="masks", on_click=self._go).props("outline no-caps")
             tag(do, "rename-do")
-
-    def _free(self, name: str) -> str:
-        number, free = 2, name
-        while (self.page.workspace.folder / DATASETS / free).exists():
-            number, free = number + 1, f"{name}-{number}"
-        return free
 
     async def _go(self) -> None:
         listed = [line.strip() for line in (self._listed.value or "").splitlines() if line.strip()]
@@ -133,8 +121,7 @@ async def show(page: Page) -> None:
 class _Publishing:
     def __init__(self, page: Page) -> None:
         self.page, self.words, self.workspace = page, page.words, page.workspace
-        request = context.client.request
-        self.asked = dict(request.query_params) if request is not None else {}
+        self.query = query()
         self.dataset: DatasetFacts | None = None
         self.lacking: list[str] = missing_extras()
 
@@ -142,33 +129,33 @@ class _Publishing:
         words = self.words
         style()
         text(words("publish.about"), classes="ps-dim")
-        with ui.row().classes("ps-said ps-said-warning w-full items-center no-wrap"):
+        with ui.row().classes("ps-message ps-message-warning w-full items-center no-wrap"):
             ui.icon("lock").props('aria-hidden="true"')
             tag(text(words("publish.danger")), "danger")
         if "publish" in self.lacking:
-            tag(text(words("publish.missing_publish"), classes="ps-said ps-said-error w-full"), "missing-publish")
+            tag(notice(words("publish.missing_publish"), "error"), "missing-publish")
         await self._form()
         self.work = WorkPanel(self.page, _TASKS, self._progress_text, self._ended, self._allow)
         self._allow()
         self.packages = PackagesSection(self.page, self.work, self.lacking)
-        await self.packages.build(self.asked.get("name", ""))
+        await self.packages.build(self.query.get("name", ""))
 
     # A new package --------------------------------------------------------------------------------------------
 
     async def _form(self) -> None:
         words = self.words
-        found = await titles(self.workspace)
+        options = await titles(self.workspace)
         with tag(ui.column().classes("ps-card w-full"), "new"):
             text(words("publish.new"), "h2")
-            if not found:
+            if not options:
                 tag(text(words("publish.no_dataset")), "no-dataset")
                 return
-            wanted = self.asked.get("dataset", "")
-            first = wanted if wanted in found else next(iter(found))
-            chosen = ui.select(
-                found, value=first, label=words("publish.dataset"), on_change=lambda e: self._choose(e.value)
+            dataset = self.query.get("dataset", "")
+            first = dataset if dataset in options else next(iter(options))
+            select = ui.select(
+                options, value=first, label=words("publish.dataset"), on_change=lambda e: self._choose(e.value)
             )
-            tag(chosen.classes("w-full"), "dataset")
+            tag(select.classes("w-full"), "dataset")
             self._rest = ui.column().classes("w-full")
             await self._choose(first)
 
@@ -180,16 +167,16 @@ class _Publishing:
         self._rest.clear()
         with self._rest:
             if found.problem:
-                tag(text(found.problem, classes="ps-said ps-said-error w-full"), "dataset-problem")
+                tag(notice(found.problem, "error"), "dataset-problem")
                 return
             if found.simulated:
-                text(words("shell.simulation"), classes="ps-said ps-said-warning w-full")
+                notice(words("shell.simulation"))
             tag(facts(self._facts_of(found)), "dataset-facts")
             PseudonymsForm(self.page, found, self._pseudonymise).build()
             self.statements = StatementsForm(self.page, found)
             self.statements.build()
             self._choices(found)
-            name = ui.input(words("publish.name"), value=self._free(found.path.name)).props("maxlength=64")
+            name = ui.input(words("publish.name"), value=self._free_name(found.path.name)).props("maxlength=64")
             self._name = tag(name.classes("w-full"), "name")
             button = ui.button(words("publish.do"), icon="inventory_2", on_click=self._start).props("no-caps")
             self._button = tag(button, "do")
@@ -217,7 +204,10 @@ class _Publishing:
         if "baselines" in self.lacking:
             self._switches["reidentification"].set_value(False)
             self._switches["reidentification"].set_enabled(False)
-            tag(text(words("publish.missing_baselines"), classes="ps-said ps-said-warning w-full"), "missing-baselines")
+            tag(
+                notice(words("publish.missing_baselines")),
+                "missing-baselines",
+            )
         self._columns: dict[str, ui.checkbox] = {}
         if found.columns:
             text(words("publish.columns"), classes="ps-dim")
@@ -229,13 +219,8 @@ class _Publishing:
         where = text(words("publish.key_place", folder=str(self.workspace.folder / KEYS)), classes="ps-dim")
         where.bind_visibility_from(self._keep, "value")
 
-    def _free(self, stem: str) -> str:
-        """Return a name that neither a folder nor a zip uses."""
-        plain = "".join(c if c.isalnum() or c in " ._-" else "-" for c in stem).strip(" .")[:56] or "package"
-        number, name, root = 2, plain, self.workspace.folder / PACKAGES
-        while (root / name).exists() or (root / f"{name}.zip").exists():
-            number, name = number + 1, f"{plain}-{number}"
-        return name
+    def _free_name(self, stem: str) -> str:
+        return self.workspace.free_name(PACKAGES, plain_name(stem, "package"), "", ".zip")
 
     def _allow(self) -> None:
         if hasattr(self, "_button") and hasattr(self, "work"):
@@ -249,28 +234,27 @@ class _Publishing:
             dataset = self.workspace.inside(found.path)
             place = self.workspace.new(PACKAGES, self._name.value or "")
             if place.with_name(f"{place.name}.zip").exists():
-                raise ConfigError(f"'{place.name}.zip' is there already: give another name, nothing is replaced.")
-            message = self.statements.values()
+                raise ConfigError(f"'{place.name}.zip' exists already: give another name, nothing is replaced.")
+            statements = self.statements.values()
             # Check now, while the form is visible, and not only in the job.
             head = await run.io_bound(lambda: DatasetHead.read(dataset))
             assert head is not None
-            complete_head(head, dataset, message["licence"], message["contact"], message["consent"])
+            complete_head(head, dataset, statements["licence"], statements["contact"], statements["consent"])
             spec = {
                 "dataset": str(dataset),
                 "place": str(place),
-                **message,
+                **statements,
                 **{key: bool(box.value) for key, box in self._switches.items()},
                 "columns": [name for name, box in self._columns.items() if box.value],
-                "key": str(self._key_place()) if self._keep.value else "",
+                "key": str(self._key_path((self._key.value or "").strip())) if self._keep.value else "",
             }
             await self.work.start("publish", spec)
 
-    def _key_place(self) -> Path:
-        """Return the path of the key file, new or existing."""
-        name = (self._key.value or "").strip()
-        there = self.workspace.folder / KEYS / name
-        if name and there.parent == self.workspace.folder / KEYS and there.is_file():
-            return self.workspace.inside(there)
+    def _key_path(self, name: str) -> Path:
+        """Return the path of a key file, new or existing."""
+        path = self.workspace.folder / KEYS / name
+        if name and path.parent == self.workspace.folder / KEYS and path.is_file():
+            return self.workspace.inside(path)
         return self.workspace.new(KEYS, name)
 
     async def _pseudonymise(self, name: str, key: str, words: list[str], drop_notes: bool) -> None:
@@ -278,14 +262,16 @@ class _Publishing:
         assert found is not None
         self.page.say("")
         with self.page.show_errors():
-            place, there = self.workspace.new(DATASETS, name), self.workspace.folder / KEYS / key
-            one_of_before = key and there.parent == self.workspace.folder / KEYS and there.is_file()
-            kept = self.workspace.inside(there) if one_of_before else self.workspace.new(KEYS, key)
-            spec = {"dataset": str(self.workspace.inside(found.path)), "place": str(place), "key": str(kept)}
-            spec |= {"words": words, "drop_notes": drop_notes}  # type: ignore[dict-item]
+            spec: dict[str, Any] = {
+                "dataset": str(self.workspace.inside(found.path)),
+                "place": str(self.workspace.new(DATASETS, name)),
+                "key": str(self._key_path(key)),
+                "words": words,
+                "drop_notes": drop_notes,
+            }
             await self.work.start("pseudonymise", spec)
 
-    # What runs ------------------------------------------------------------------------------------------------
+    # Jobs -----------------------------------------------------------------------------------------------------
 
     def _progress_text(self, job: StudioJob) -> str:
         words, stage = self.words, str(job.progress.get("stage", ""))
@@ -306,7 +292,7 @@ class _Publishing:
             message = self.words("publish.done" if good else "publish.done_invalid", name=name)
             self.page.say(message, "good" if good else "error")
             if hasattr(self, "_name"):
-                self._name.set_value(self._free(name))
+                self._name.set_value(self._free_name(name))
         await self.packages.show(name.removesuffix(".zip") if job.task == "validate" else name)
         await self.packages.refresh()
         scroll_to("package")
@@ -315,10 +301,8 @@ class _Publishing:
         result = job.result
         self.page.say(self.words("publish.renamed", name=Path(job.spec["place"]).name, file=result["key"]), "good")
         with self.page._messages, tag(ui.column().classes("w-full"), "findings"):
-            link = ui.link(self.words("publish.renamed_go"), address("publish", dataset=job.spec["place"])).classes(
-                "ps-link"
-            )
-            tag(link, "go-renamed")
-            for found in result["findings"]:
-                where = [str(found[k]) for k in ("file", "line") if found[k]]
-                text(": ".join([*where, found["message"]]), classes="ps-said ps-said-warning w-full")
+            link = ui.link(self.words("publish.renamed_go"), address("publish", dataset=job.spec["place"]))
+            tag(link.classes("ps-link"), "go-renamed")
+            for finding in result["findings"]:
+                where = [str(finding[k]) for k in ("file", "line") if finding[k]]
+                notice(": ".join([*where, finding["message"]]))

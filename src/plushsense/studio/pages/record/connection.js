@@ -2,7 +2,7 @@
 const ASK_MS = 1000, SILENT_MS = 5000;
 
 export default {
-  template: '<div role="alert" class="ps-lost"><span v-if="lost">{{ text }}</span></div>',
+  template: '<div role="alert" class="ps-connection-lost"><span v-if="lost">{{ text }}</span></div>',
   props: { text: String },
   data() {
     return { lost: false };
@@ -13,7 +13,7 @@ export default {
   },
   beforeUnmount() {
     clearInterval(this.timer);
-    document.body.classList.remove("ps-unknown");
+    document.body.classList.remove("ps-disconnected");
   },
   methods: {
     look() {
@@ -34,7 +34,7 @@ export default {
     },
     set(lost) {
       this.lost = lost;
-      document.body.classList.toggle("ps-unknown", lost);
+      document.body.classList.toggle("ps-disconnected", lost);
     },
   },
 };

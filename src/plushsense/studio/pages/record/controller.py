@@ -1,4 +1,4 @@
-"""Recording sessions of the studio: started and resumed here, driven by any page, independent of open pages."""
+"""Recording sessions of the studio, which any page can start, resume and control."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ from plushsense.studio.app.toys import TappedDevice
 from plushsense.studio.app.workspace import VIRTUAL, ChangeSignal, Workspace
 
 PROTOCOLS, LAYOUTS = "protocols", "layouts"
-"""Folders in the workspace for a user's own files."""
+"""Folders of the workspace for a user's own files."""
 NO_CONSENT, PSEUDO = "no_consent", "pseudo"
-"""Notices before recording: keys of the page's texts."""
+"""Notices before recording: keys of texts in the table ``record``."""
 SOFTWARE = f"plushsense {__version__} studio"
 
 
@@ -45,8 +45,9 @@ class ActiveSession:
     """A session that is being recorded.
 
     Attributes:
-        name: ``<subject>/<session>``, as it stands in the page's address.
-        notices: `NO_CONSENT`, `PSEUDO`. ``mended``: sentences about what a crash had left.
+        name: ``<subject>/<session>``, as in the address of the page.
+        notices: some of `NO_CONSENT` and `PSEUDO`.
+        repairs: descriptions of what was repaired after a crash.
     """
 
     name: str
@@ -54,12 +55,12 @@ class ActiveSession:
     device: TappedDevice
     request: SessionRequest
     notices: tuple[str, ...] = ()
-    mended: tuple[str, ...] = ()
+    repairs: tuple[str, ...] = ()
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     @property
     def head(self) -> SessionHead:
-        """The head of the session's files."""
+        """The head of the session."""
         return self.recorder.session.head
 
     def status(self) -> RecorderStatus:
@@ -67,20 +68,20 @@ class ActiveSession:
         return self.recorder.status()
 
     def steps(self) -> tuple[StepResult, ...]:
-        """Return all steps of the plan and the recording of each."""
+        """Return all steps of the plan, each with its recording."""
         return self.recorder.steps()
 
     def press(self, key: str, seen: str) -> bool:
         """Run a command if the status is still the one that was displayed; return whether it was run.
 
-        So two pages that press at the same moment, or a delayed press, give one command.
+        Therefore simultaneous presses on two pages, or a delayed press, give one command.
 
         Args:
             key: " ", "r", "s", "b", "p" as in the terminal, or ``go:<number of the step>``.
-            seen: `plushsense.recording.status.RecorderStatus.seen` of what was on the screen.
+            seen: `plushsense.recording.status.RecorderStatus.seen` of the displayed status.
 
         Raises:
-            ConfigError: for a key that is none.
+            ConfigError: for an unknown command.
         """
         recorder = self.recorder
         with self._lock:
@@ -104,11 +105,9 @@ class ActiveSession:
 
 
 class RecordController:
-    """Starts, resumes and ends the sessions of a studio.
+    """Starts, resumes and ends the sessions of a studio; `changed` is notified whenever one changes.
 
-    `changed` is notified whenever a session changes, starts or ends.
-
-    `begin`, `resume`, `close_session` and `sessions` block: call them outside the event loop.
+    `begin`, `resume`, `close_session` and `sessions` block: do not call them in the event loop.
     """
 
     def __init__(self, workspace: Workspace) -> None:
@@ -136,10 +135,10 @@ class RecordController:
         """Start a session, or return this person's active one.
 
         Args:
-            anew: begin another one although the person's last is unfinished.
+            anew: whether to begin another one although the last one of the person is unfinished.
 
         Raises:
-            PlushSenseError: what the recorder or the toy refuses; also when the last one is unfinished.
+            PlushSenseError: if the recorder or the toy refuses, or the last session is unfinished.
         """
         self._check(request)
         with self._opening:
@@ -155,10 +154,10 @@ class RecordController:
             return self._open(request, folder, None)
 
     def _active_of(self, request: SessionRequest, subject: str) -> ActiveSession | None:
-        """Return the person's active session, if there is one; end a finished session of this person or toy."""
+        """Return the active session of a person, if any; end finished sessions of this person or toy."""
         for session in self.active_sessions():
-            over = session.status().state in ("finished", "stopped")
-            if over and (session.head.subject == subject or session.request.device == request.device):
+            ended = session.status().state in ("finished", "stopped")
+            if ended and (session.head.subject == subject or session.request.device == request.device):
                 self._end(session)
             elif session.head.subject == subject:
                 return session
@@ -168,10 +167,10 @@ class RecordController:
         """Resume an unfinished session, or return it if it is active.
 
         Args:
-            device: the toy's URL; "": the one that it was begun with.
+            device: the URL of the toy, by default the one that the session was begun with.
 
         Raises:
-            PlushSenseError: what the recorder or the toy refuses.
+            PlushSenseError: if the recorder or the toy refuses.
         """
         folder = self._folder(name)
         with self._opening:
@@ -180,7 +179,7 @@ class RecordController:
                 return session
             known = SessionHead.read(folder)
             if known is None:
-                raise ConfigError(f"There is no session '{name}' in '{self._workspace.recordings}'.")
+                raise self._unknown(name)
             if is_finished(folder):
                 raise ConfigError(f"The session '{name}' is finished: begin a new one.")
             url = device or known.device
@@ -189,7 +188,7 @@ class RecordController:
             return self._open(request, folder, known)
 
     def close_session(self, name: str) -> None:
-        """Close a session; a running recording is discarded, all else is kept. May be called twice."""
+        """Close a session; only a running recording is discarded. May be called twice."""
         with self._opening:
             with self._lock:
                 session = self._active.get(name)
@@ -204,11 +203,11 @@ class RecordController:
         self.changed.notify()
 
     def close(self) -> None:
-        """End all."""
+        """End all sessions."""
         for session in self.active_sessions():
             self.close_session(session.name)
 
-    # What may be chosen ---------------------------------------------------------------------------------------
+    # Choices --------------------------------------------------------------------------------------------------
 
     def speed_for(self, url: str, simulated: bool) -> float:
         """Return the speed at which a toy runs, as a multiple of real time; 1 for a real toy."""
@@ -217,23 +216,23 @@ class RecordController:
         return speed_of(url) if "speed" in parse_url(url).query else self._workspace.speed
 
     def toys(self) -> list[str]:
-        """Return the toys to choose from: the chosen one, those named at start, the virtual one."""
+        """Return the toys to choose from: the chosen one, those given at start, the virtual one."""
         return list(dict.fromkeys(u for u in (self._workspace.toy, *self._workspace.devices, VIRTUAL) if u))
 
     def protocols(self) -> dict[str, str]:
         """Return the protocols to choose from: name or path to title."""
-        own = self._workspace.folder / PROTOCOLS
-        return {n: n for n in sorted(builtin_names("protocols"), key=lambda n: (n != "plush-17", n))} | {
-            str(p): p.name for p in sorted(own.glob("*.toml"))
-        }
+        names = sorted(builtin_names("protocols"), key=lambda n: (n != "plush-17", n))
+        return {n: n for n in names} | self._own_files(PROTOCOLS)
 
     def layouts(self) -> dict[str, str]:
         """Return the layouts to choose from: name or path to title."""
-        own = self._workspace.folder / LAYOUTS
-        return {n: n for n in layout_names()} | {str(p): p.name for p in sorted(own.glob("*.toml"))}
+        return {n: n for n in layout_names()} | self._own_files(LAYOUTS)
+
+    def _own_files(self, folder: str) -> dict[str, str]:
+        return {str(p): p.name for p in sorted((self._workspace.folder / folder).glob("*.toml"))}
 
     def _check(self, request: SessionRequest, known_device: str = "") -> None:
-        """Refuse toys, protocols and layouts that name files outside this studio."""
+        """Refuse toys, protocols and layouts that refer to files outside this studio."""
         check_speed(request.speed)
         if request.protocol and request.protocol not in self.protocols():
             raise ConfigError(f"'{request.protocol}' is not a protocol of this studio: choose one from the list.")
@@ -241,17 +240,20 @@ class RecordController:
             raise ConfigError(f"'{request.layout}' is not a layout of this studio: choose one from the list.")
         address = parse_url(request.device)
         given = request.device in (*self.toys(), known_device)
-        strange = address.scheme == "replay" or address.query.get("layout", "plush-15") not in self.layouts()
-        if strange and not given:
+        is_file = address.scheme == "replay" or address.query.get("layout", "plush-15") not in self.layouts()
+        if is_file and not given:
             raise ConfigError(
-                f"'{request.device}' names a file: start the studio with --device {request.device} to record from it."
+                f"'{request.device}' refers to a file: start the studio with --device {request.device} to use it."
             )
 
     def _folder(self, name: str) -> Path:
         folder = self._workspace.inside(self._workspace.recordings / name)
         if folder.parent.parent != self._workspace.recordings or not (folder / SESSION_HEAD).is_file():
-            raise ConfigError(f"There is no session '{name}' in '{self._workspace.recordings}'.")
+            raise self._unknown(name)
         return folder
+
+    def _unknown(self, name: str) -> ConfigError:
+        return ConfigError(f"There is no session '{name}' in '{self._workspace.recordings}'.")
 
     def _open(self, request: SessionRequest, folder: Path, known: SessionHead | None) -> ActiveSession:
         layout = session_layout(request, folder, known)

@@ -1,25 +1,240 @@
-"""Record page: starts, resumes and conducts a session."""
+"""Record page: the sessions to resume and the form for a new one, or the session that is being recorded."""
 
 from __future__ import annotations
 
-from nicegui import context
+from collections.abc import Callable
+from typing import Any
 
-from plushsense.studio.app.shell import Page
-from plushsense.studio.pages.record.controller import RecordController
-from plushsense.studio.pages.record.session import show_session
-from plushsense.studio.pages.record.start import show_start
+from nicegui import run, ui
+
+from plushsense.core.errors import ConfigError, PlushSenseError
+from plushsense.devices.opening import list_devices
+from plushsense.recording.plan import DEFAULT, wordings
+from plushsense.recording.session import SessionSummary
+from plushsense.recording.setup import PROTOCOL, SessionRequest, is_virtual
+from plushsense.studio.app.shell import Page, html, named, query, tag
+from plushsense.studio.app.words import Words
+from plushsense.studio.pages.record.controller import ActiveSession, RecordController
+from plushsense.studio.pages.record.session import address, protocol_title, show_session, summary
+
+_LISTED = 8
+_SCAN_S = 3.0
+
+
+def toy_name(words: Words, url: str) -> str:
+    """Return the name of a toy in a list: its address, and a word if it is virtual."""
+    return f"{words('record.virtual_toy')} · {url}" if is_virtual(url) else url
 
 
 async def show(page: Page) -> None:
     """Show the session that the address names, or the only active one; else the page to start one."""
     controller = page.workspace.part(RecordController)
-    request = context.client.request
-    query = dict(request.query_params) if request is not None else {}
+    chosen = query()
     active = controller.active_sessions()
-    session = controller.get(query.get("session", ""))
-    if session is None and not query and len(active) == 1:
+    session = controller.get(chosen.get("session", ""))
+    if session is None and not chosen and len(active) == 1:
         session = active[0]
     if session is not None:
         show_session(page, controller, session)
     else:
-        await show_start(page, controller, query.get("session", ""), query.get("ended", ""))
+        await show_start(page, controller, chosen.get("session", ""), chosen.get("ended", ""))
+
+
+async def show_start(page: Page, controller: RecordController, requested: str, ended: str) -> None:
+    """Build the page before a session: sessions to resume, and the form for a new one.
+
+    Args:
+        requested: a session that the address names and that is not open; ``ended``: one that was just closed.
+    """
+    sessions = await run.io_bound(controller.sessions) or []
+    mine = {_name(s): s for s in sessions}
+    if ended in mine:
+        _report_ended(page, mine[ended])
+    elif requested in mine and not mine[requested].finished:
+        page.say(page.words("record.not_open", name=requested), "warning")
+    elif requested:
+        page.say(page.words("record.no_session", name=requested), "warning")
+    _open_ones(page, controller)
+    _unfinished(page, controller, sessions)
+    _Form(page, controller)
+    done = sum(s.finished for s in sessions)
+    if done:
+        with ui.row().classes("items-baseline"):
+            ui.label(page.words("record.finished_ones", n=done)).classes("ps-dim")
+            ui.link(page.words("record.import_them"), "/").classes("ps-link")
+
+
+def _report_ended(page: Page, session: SessionSummary) -> None:
+    counts = {"name": _name(session), "done": session.done, "steps": session.steps}
+    page.say(page.words("record.ended_whole" if session.finished else "record.ended_part", **counts), "good")
+
+
+def _name(session: SessionSummary) -> str:
+    return f"{session.folder.parent.name}/{session.folder.name}"
+
+
+def _open_ones(page: Page, controller: RecordController) -> None:
+    for session in controller.active_sessions():
+        with tag(ui.row().classes("ps-card w-full items-center"), "open-session"):
+            ui.label(page.words("record.open_now", name=session.name)).classes("flex-grow text-bold")
+            there = page.words("record.show")
+            button = ui.button(there, on_click=lambda s=session: ui.navigate.to(address(s.name)))
+            named(button.props("no-caps unelevated"), f"{there}: {session.name}")
+
+
+def _unfinished(page: Page, controller: RecordController, sessions: list[SessionSummary]) -> None:
+    words = page.words
+    left = [s for s in sessions if not s.finished and controller.get(_name(s)) is None]
+    if not left:
+        return
+    with ui.column().classes("ps-card w-full"):
+        html(words("record.unfinished"), "h2")
+        for session in left[:_LISTED]:
+            _one_unfinished(page, controller, session)
+        if len(left) > _LISTED:
+            with ui.element("details").classes("w-full"):
+                summary(words("record.older", n=len(left) - _LISTED))
+                for session in left[_LISTED:]:
+                    _one_unfinished(page, controller, session)
+
+
+def _one_unfinished(page: Page, controller: RecordController, session: SessionSummary) -> None:
+    words, name = page.words, _name(session)
+    with tag(ui.row().classes("w-full items-center"), f"unfinished-{name}"):
+        if session.head is None or session.protocol is None:
+            ui.label(f"{name}: {session.error}").classes("flex-grow")
+            return
+        text = words("record.so_far", name=name, done=session.done, steps=session.steps)
+        with ui.column().classes("flex-grow").style("gap: 0"):
+            ui.label(text).classes("text-bold")
+            title = protocol_title(words, session.protocol.name, session.protocol.title)
+            title += f" · {words('record.simulated')}" if session.head.simulated else ""
+            ui.label(title).classes("ps-dim")
+        toys = list(dict.fromkeys([session.head.device, *controller.toys()]))
+        titles = {u: toy_name(words, u) for u in toys}
+        toy = ui.select(titles, value=toys[0], label=words("record.toy")).style("width: 24rem; max-width: 100%")
+        named(toy.props("outlined dense"), f"{words('record.toy')}: {name}")
+        button = ui.button(words("record.go_on")).props("no-caps unelevated")
+        named(button, f"{words('record.go_on')}: {name}")
+        button.on_click(lambda: _open_session(page, button, lambda: controller.resume(name, str(toy.value))))
+
+
+async def _open_session(page: Page, button: ui.button, work: Callable[[], ActiveSession]) -> None:
+    """Open the toy, which may take a while, and go to the session; show why if that is refused."""
+    button.disable()
+    page.say(page.words("record.opening"))
+    try:
+        with page.show_errors():
+            session = await run.io_bound(work)
+            if session is not None:
+                ui.navigate.to(address(session.name))
+    finally:
+        button.enable()
+
+
+class _Form:
+    """A new session."""
+
+    def __init__(self, page: Page, controller: RecordController) -> None:
+        self._page, self._controller, words = page, controller, page.words
+        protocols = controller.protocols()
+        with tag(ui.column().classes("ps-card w-full"), "new-session"):
+            html(words("record.new"), "h2")
+            with ui.row().classes("w-full items-start"):
+                self._subject = self._input("code", "code_hint")
+                self._consent = self._input("consent", "consent_hint")
+                self._age = self._input("age_group", "age_hint")
+                self._gender = self._input("gender", "gender_hint")
+            with ui.row().classes("w-full items-start"):
+                named = {key: self._named("protocol", key, name) for key, name in protocols.items()}
+                self._protocol = self._select(named, "protocol", PROTOCOL)
+                self._protocol.on_value_change(self._choose_words)
+                self._words = self._select({DEFAULT: DEFAULT}, "wording", DEFAULT)
+            with ui.row().classes("w-full items-start"):
+                toys = controller.toys()
+                self._toy = self._select({u: toy_name(words, u) for u in toys}, "toy", toys[0])
+                self._look = ui.button(words("record.look"), on_click=self._look_for_toys).props("no-caps outline")
+                self._other = self._input("other_toy", "other_toy_hint")
+            with ui.element("details").classes("w-full"):
+                summary(words("record.more"))
+                with ui.column():
+                    layouts = {"": words("record.layout_usual")} | controller.layouts()
+                    self._layout = self._select(layouts, "layout", "")
+                    self._simulated = ui.checkbox(words("record.is_virtual"))
+                    self._anew = ui.checkbox(words("record.anew"))
+            self._begin = ui.button(words("record.begin"), on_click=self._begin_session)
+            tag(self._begin, "begin").props("no-caps unelevated size=lg")
+        self._choose_words()
+
+    def _named(self, what: str, key: str, name: str) -> str:
+        text = f"record.{what}_{key}"
+        return self._page.words(text) if self._page.words.has(text) else name
+
+    def _input(self, key: str, hint: str) -> ui.input:
+        words = self._page.words
+        field = ui.input(label=words(f"record.{key}")).props(f'outlined hint="{words(f"record.{hint}")}"')
+        return tag(field, key).classes("w-64")
+
+    def _select(self, options: dict[str, str], key: str, value: str) -> ui.select:
+        label = self._page.words(f"record.{key}")
+        value = value if value in options else next(iter(options))
+        field = ui.select(options, value=value, label=label).props("outlined")
+        named(field, label)
+        return tag(field, key).style("width: 27rem; max-width: 100%")
+
+    def _choose_words(self) -> None:
+        """Offer the wordings of the chosen protocol, the page's language first."""
+        try:
+            known = wordings(str(self._protocol.value))
+        except PlushSenseError as refusal:
+            self._page.say(str(refusal), "error")
+            known = (DEFAULT,)
+        language = self._page.words.language
+        value = language if language in known else DEFAULT
+        self._words.set_options({w: self._named("wording", w, w) for w in known}, value=value)
+
+    async def _look_for_toys(self) -> None:
+        words = self._page.words
+        self._look.disable()
+        self._page.say(words("record.looking", s=f"{_SCAN_S:g}"))
+        try:
+            found = await run.io_bound(list_devices, _SCAN_S)
+        finally:
+            self._look.enable()
+        if found is None:
+            return
+        known = dict.fromkeys(self._controller.toys())
+        options = {u: toy_name(words, u) for u in known} | {
+            d.url: f"{d.name} · {d.url}" for d in found.devices if d.url not in known
+        }
+        self._toy.set_options(options, value=self._toy.value)
+        self._page.say(" ".join([words("record.found", n=len(options)), *found.notes]))
+
+    def _request(self) -> SessionRequest:
+        toy = str(self._other.value or "").strip() or str(self._toy.value)
+        simulated = bool(self._simulated.value)
+        return SessionRequest(
+            device=toy,
+            subject=str(self._subject.value or "").strip(),
+            protocol=str(self._protocol.value),
+            words=str(self._words.value),
+            layout=str(self._layout.value or ""),
+            age_group=_short(self._age.value),
+            gender=_short(self._gender.value),
+            consent=_short(self._consent.value),
+            speed=self._controller.speed_for(toy, simulated),
+            simulated=simulated,
+        )
+
+    async def _begin_session(self) -> Any:
+        with self._page.show_errors():
+            request = self._request()
+            anew = bool(self._anew.value)
+            await _open_session(self._page, self._begin, lambda: self._controller.begin(request, anew))
+
+
+def _short(value: Any) -> str:
+    text = " ".join(str(value or "").split())
+    if len(text) > 100:
+        raise ConfigError(f"'{text[:20]}…' is too long: at most 100 characters.")
+    return text

@@ -6,35 +6,52 @@ import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any
+from urllib.parse import quote
 
 from markupsafe import Markup
 from nicegui import run, ui
 from nicegui.element import Element
 
-from plushsense.recording.status import RecorderStatus, StepResult
+from plushsense.recording.status import RecorderStatus
 from plushsense.studio.app.shell import LINES, Keys, Page, focus, html, named, on_change, on_click, tag
+from plushsense.studio.app.words import Words
 from plushsense.studio.pages.record.controller import ActiveSession, RecordController
-from plushsense.studio.pages.record.start import address, protocol_title, summary
-from plushsense.studio.widgets.pictures import has_picture, own_picture, picture
-from plushsense.studio.widgets.plot import Plot
+from plushsense.studio.widgets.elements import Plot, own_picture, picture
 
 _WINDOW_S = 10.0
-_POINTS_A_PUSH = 12
-_LIGHTS = {
+# Largest number of points that are sent to a plot at once.
+_MAX_POINTS = 12
+_SIGNAL_STYLES = {
     "good": ("✔", "#00664a"),
     "fair": ("◑", "#7a4e00"),
     "poor": ("▲", "#9d2b00"),
     "none": ("✖", "#6b1d1d"),
     "unreadable": ("?", "#6b1d1d"),
 }
-"""A sign and a colour for each word of `plushsense.recording.takes.SIGNAL`."""
+"""Sign and colour of each value of `plushsense.recording.takes.SIGNAL`."""
 
 
-def percent(share: float, language: str) -> str:
-    """Format a share in per cent, with one decimal place under ten."""
-    text = f"{100 * share:.1f}" if share < 0.1 else f"{100 * share:.0f}"
-    text = text.removesuffix(".0")
-    return text.replace(".", ",") if language == "lv" else text
+def percent(share: float, words: Words) -> str:
+    """Format a share in per cent, with one decimal place below ten."""
+    text = words.number(100 * share, 1 if share < 0.1 else 0)
+    return text.removesuffix(f"{words('shell.decimal_point')}0")
+
+
+def address(name: str, key: str = "session") -> str:
+    """Return the address of a session's page."""
+    return f"/record?{key}={quote(name)}"
+
+
+def protocol_title(words: Words, name: str, title: str) -> str:
+    """Return the title of a protocol, in the page's language if it is a built-in one."""
+    key = f"record.protocol_{name}"
+    return words(key) if words.has(key) else title
+
+
+def summary(text: str) -> None:
+    """Add the visible heading of a folded part of the page."""
+    style = "display: list-item; list-style-position: inside; cursor: pointer; font-weight: 600"
+    html(text, "summary").style(style)
 
 
 class SignalPanel:
@@ -43,19 +60,19 @@ class SignalPanel:
     def __init__(self, page: Page, session: ActiveSession) -> None:
         self._page, self._device = page, session.device
         words = page.words
-        with ui.column().classes("ps-of-now ps-card w-full").style("gap: 6px"):
+        with ui.column().classes("ps-current ps-card w-full").style("gap: 6px"):
             with ui.row().classes("items-center w-full").style("gap: 4px 16px"):
                 ui.label(words("record.signal")).classes("text-bold")
-                self._light = tag(ui.label(), "signal").classes("q-px-md q-py-xs rounded-borders text-bold")
+                self._quality = tag(ui.label(), "signal").classes("q-px-md q-py-xs rounded-borders text-bold")
                 self._lost = tag(ui.label(), "lost")
                 self._rate = tag(ui.label(), "rate")
-            self._more = tag(ui.label(), "counters").classes("ps-dim")
+            self._counters = tag(ui.label(), "counters").classes("ps-dim")
             with tag(ui.element("details").props("open").classes("w-full"), "live"):
                 summary(words("record.live"))
                 self._plots = self._build(max(1.0, session.request.speed))
         rate = self._device.layout.rate_hz * max(1.0, session.request.speed)
         self._place = max(0, self._device.buffer.count - int(_WINDOW_S * rate))
-        self._word = ""
+        self._drawn_signal = ""
 
     def _build(self, speed: float) -> list[tuple[Plot, list[int]]]:
         words, kinds = self._page.words, dict[str, list[int]]()
@@ -64,61 +81,60 @@ class SignalPanel:
             kinds.setdefault(channel.kind, []).append(n)
         plots = []
         with ui.row().classes("w-full items-start").style("gap: 8px"):
-            for kind, which in kinds.items():
+            for kind, indices in kinds.items():
                 key = f"record.kind_{kind}"
                 title = words(key) if words.has(key) else kind
-                names = ", ".join(channels[n].name for n in which)
-                label = words("record.live_label", s=f"{_WINDOW_S * speed:g}", channels=names)
-                series = [{"label": channels[n].name, "stroke": LINES[i % len(LINES)]} for i, n in enumerate(which)]
-                wide = "2 1 420px" if len(which) > 5 else "1 1 260px"
-                with ui.column().classes("gap-0").style(f"flex: {wide}; min-width: 0"):
+                names = [channels[n].name for n in indices]
+                label = words("record.live_label", s=f"{_WINDOW_S * speed:g}", channels=", ".join(names))
+                series = [{"label": name, "stroke": LINES[i % len(LINES)]} for i, name in enumerate(names)]
+                flex = "2 1 420px" if len(indices) > 5 else "1 1 260px"
+                with ui.column().classes("gap-0").style(f"flex: {flex}; min-width: 0"):
                     ui.label(title).classes("text-bold")
                     plot = Plot(
                         label,
                         series,
                         x=words("record.live_x"),
-                        y=words.unit(channels[which[0]].unit),
+                        y=words.unit(channels[indices[0]].unit),
                         height=190,
                         window_s=_WINDOW_S * speed,
                     )
-                    plots.append((tag(plot, f"plot-{kind}"), which))
+                    plots.append((tag(plot, f"plot-{kind}"), indices))
         return plots
 
     def draw(self, s: RecorderStatus) -> None:
-        """Show the current signal quality; called as often as the page is drawn."""
+        """Display the current signal quality; called whenever the page is drawn."""
         words = self._page.words
-        if self._word != s.signal:
-            self._word = s.signal
-            sign, colour = _LIGHTS[s.signal]
-            self._light.text = f"{sign} {words(f'record.signal_{s.signal}')}"
-            self._light.style(f"background: {colour}; color: #fff").props(f'data-signal="{s.signal}"')
-        shares = {"recent": percent(s.bad_share, words.language), "ever": percent(s.bad_share_total, words.language)}
-        # Without a signal, the figures of the last seconds mean nothing.
+        if self._drawn_signal != s.signal:
+            self._drawn_signal = s.signal
+            sign, colour = _SIGNAL_STYLES[s.signal]
+            self._quality.text = f"{sign} {words(f'record.signal_{s.signal}')}"
+            self._quality.style(f"background: {colour}; color: #fff").props(f'data-signal="{s.signal}"')
+        shares = {"recent": percent(s.bad_share, words), "ever": percent(s.bad_share_total, words)}
+        # Without a signal, the figures of the last seconds have no meaning.
         has_signal = s.signal not in ("none", "unreadable")
         self._lost.text = words("record.signal_lost", **shares) if has_signal else ""
         self._rate.text = words("record.signal_rate", rate=f"{s.rate_hz:.0f}") if has_signal else ""
         counts = {k: getattr(s, k) for k in ("lost", "malformed", "garbage", "gaps", "reconnects")}
-        self._more.text = words("record.signal_more", **counts)
+        self._counters.text = words("record.signal_more", **counts)
 
     def push(self) -> None:
         """Append new samples to the plots."""
-        piece = self._device.buffer.since(self._place)
-        self._place = piece.end
-        if not len(piece.seconds):
+        samples = self._device.buffer.since(self._place)
+        self._place = samples.end
+        if not len(samples.seconds):
             return
-        # At high speed a toy sends more than can be seen.
-        step = max(1, len(piece.seconds) // _POINTS_A_PUSH)
-        seconds = piece.seconds[::step].tolist()
-        values = piece.values[::step]
+        # At high speed a toy sends more samples than can be seen.
+        step = max(1, len(samples.seconds) // _MAX_POINTS)
+        seconds, values = samples.seconds[::step].tolist(), samples.values[::step]
         channels = self._device.layout.channels
-        for plot, which in self._plots:
+        for plot, indices in self._plots:
             curves = [
-                ((values[:, n] * channels[n].step - channels[n].offset) * channels[n].scale).tolist() for n in which
+                ((values[:, n] * channels[n].step - channels[n].offset) * channels[n].scale).tolist() for n in indices
             ]
             plot.push(seconds, curves)
 
 
-_MOST = 400
+_MAX_STEPS = 400
 _SIGNS = {"now": "▶", "made": "✓", "skipped": "–", "open": "○"}
 
 
@@ -134,19 +150,18 @@ class StepList:
         steps = session.steps()
         with tag(ui.element("details").classes("ps-card w-full"), "steps"):
             summary(words("record.steps"))
-            if len(steps) > _MOST:
+            if len(steps) > _MAX_STEPS:
                 ui.label(words("record.steps_many"))
                 return
-            rows: dict[str, list[StepResult]] = {}
-            for step in steps:
-                rows.setdefault(step.step.gesture, []).append(step)
-            made: dict[int, ui.button] = {}
-            for gesture, mine in rows.items():
+            rows: dict[str, list[int]] = {}
+            for result in steps:
+                rows.setdefault(result.step.gesture, []).append(result.step.number)
+            buttons: dict[int, ui.button] = {}
+            for gesture, numbers in rows.items():
                 with ui.row().classes("items-center w-full q-mt-xs").style("gap: 6px"):
                     ui.label(words.gesture(gesture)).style("min-width: 12rem")
-                    for standing in mine:
-                        made[standing.step.number] = self._button(standing.step.number, go)
-            self._buttons = [made[n] for n in sorted(made)]
+                    buttons |= {number: self._button(number, go) for number in numbers}
+            self._buttons = [buttons[n] for n in sorted(buttons)]
             self._states = [""] * len(steps)
 
     def _button(self, number: int, go: Callable[[int, str], Any]) -> ui.button:
@@ -160,18 +175,19 @@ class StepList:
             return
         self._seen = status.seen
         words = self._page.words
-        for n, standing in enumerate(self._session.steps()):
-            state = "made" if standing.file else "skipped" if standing.skipped else "open"
+        for n, result in enumerate(self._session.steps()):
+            state = "made" if result.file else "skipped" if result.skipped else "open"
             now = n == status.step.number and status.state not in ("finished", "stopped")
             key = f"{state}{now}"
             if self._states[n] == key:
                 continue
             self._states[n] = key
             text = words(f"record.step_{state}") + (f", {words('record.step_now')}" if now else "")
-            where = words("record.repetition", n=standing.step.repetition, m=status.repetitions)
+            step = result.step
+            repetition = words("record.repetition", n=step.repetition, m=status.repetitions)
             signs = _SIGNS[state] + (f" {_SIGNS['now']}" if now else "")
-            self._buttons[n].text = f"{standing.step.repetition} {signs}"
-            label = f"{words.gesture(standing.step.gesture)}, {where}: {text}"
+            self._buttons[n].text = f"{step.repetition} {signs}"
+            label = f"{words.gesture(step.gesture)}, {repetition}: {text}"
             named(self._buttons[n].props(f'data-step="{state}"'), label)
 
 
@@ -182,10 +198,10 @@ _GREEN, _BLUE, _RED, _AMBER, _GREY = "#00664a", "#0b4f9e", "#9d2b00", "#7a4e00",
 
 
 class ConnectionAlert(Element, component="connection.js"):
-    """An alert that shows ``text`` and hides all elements of class ``ps-of-now`` while the studio does not answer.
+    """An alert that displays ``text`` and hides elements of class ``ps-current`` while the studio does not answer.
 
-    The connection counts as lost when the socket is closed or nothing was answered for five seconds; only an answer
-    ends that, so that what the page shows then is up to date.
+    The connection counts as lost when the socket is closed or there was no answer for five seconds. Only an answer
+    restores it, so that the page is up to date then.
     """
 
     def __init__(self, text: str) -> None:
@@ -196,32 +212,32 @@ class ConnectionAlert(Element, component="connection.js"):
 
 
 def show_session(page: Page, controller: RecordController, session: ActiveSession) -> None:
-    """Build the page of a session; it follows the session until it is left."""
+    """Build the page of a session."""
     view = _View(page, controller, session)
     on_change(controller.changed, view.draw)
     ui.timer(_DRAW_S, view.tick, immediate=False)
     view.draw()
 
 
-def _state_text(page: Page, s: RecorderStatus) -> tuple[str, str, str]:
-    """Return the state, the line that says what happens and what to press, and its colour."""
+def _state_text(page: Page, s: RecorderStatus) -> tuple[str, str]:
+    """Return the text of the state, which says what to press, and its colour."""
     words = page.words
     if s.state == "idle":
         if s.signal in ("none", "unreadable"):
-            return "idle", words("record.waiting" if s.signal == "none" else "record.unreadable"), _RED
-        return "idle", words("record.ready"), _BLUE
+            return words("record.waiting" if s.signal == "none" else "record.unreadable"), _RED
+        return words("record.ready"), _BLUE
     if s.state == "recording":
         if s.away:
-            return "recording", words("record.recording_away"), _RED
+            return words("record.recording_away"), _RED
         if s.left_s < _REMIND_S and s.elapsed_s > _REMIND_S:
-            return "recording", words("record.recording_long", s=f"{s.left_s:.0f}"), _RED
-        return "recording", words("record.recording"), _GREEN
+            return words("record.recording_long", s=f"{s.left_s:.0f}"), _RED
+        return words("record.recording"), _GREEN
     colours = {"countdown": _AMBER, "saving": _BLUE, "paused": _GREY, "finished": _GREEN, "stopped": _RED}
-    return s.state, words(f"record.{s.state}"), colours[s.state]
+    return words(f"record.{s.state}"), colours[s.state]
 
 
 class _View:
-    """The elements of the page; `draw` updates them to the session's state."""
+    """The elements of the page; `draw` updates them to the state of the session."""
 
     def __init__(self, page: Page, controller: RecordController, session: ActiveSession) -> None:
         self._page, self._controller, self._session = page, controller, session
@@ -235,7 +251,7 @@ class _View:
             ui.label(protocol_title(words, head.protocol["name"], head.protocol["title"])).classes("ps-dim")
             if head.simulated:
                 tag(ui.label(words("shell.simulation")).classes("ps-simulated"), "simulation")
-        self._notices(words, session)
+        self._notices()
         with ui.column().classes("w-full").style("gap: 4px"):
             self._progress = tag(ui.label(), "progress").classes("text-bold")
             self._bar = ui.element("progress").classes("w-full").style("height: 14px; accent-color: #00805c")
@@ -253,11 +269,12 @@ class _View:
         self._last = tag(ui.label(), "last").classes("ps-dim").style("overflow-wrap: anywhere")
         ui.label(words("record.keys")).classes("ps-dim")
 
-    def _notices(self, words: Any, session: ActiveSession) -> None:
-        notices = [words(f"record.{key}") for key in session.notices]
-        notices += [words("record.mended", what=what) for what in session.mended]
+    def _notices(self) -> None:
+        words = self._page.words
+        notices = [words(f"record.{key}") for key in self._session.notices]
+        notices += [words("record.mended", what=repair) for repair in self._session.repairs]
         for text in notices:
-            box = ui.row().classes("ps-said ps-said-warning w-full").props('role="status"')
+            box = ui.row().classes("ps-message ps-message-warning w-full").props('role="status"')
             with tag(box, "notice"):
                 ui.label(f"⚠ {text}")
 
@@ -269,52 +286,40 @@ class _View:
         self._prompt = tag(ui.label(), "prompt").style("font-size: 2rem; line-height: 1.3; font-weight: 600")
         self._again = tag(ui.label(), "again").classes("ps-dim").style("font-size: 1.1rem")
         tag(ConnectionAlert(self._page.words("record.lost")), "connection-lost")
-        self._box = ui.row().classes("ps-of-now w-full items-center no-wrap rounded-borders q-pa-md")
+        self._box = ui.row().classes("ps-current w-full items-center no-wrap rounded-borders q-pa-md")
         with tag(self._box, "state-box"):
             self._number = tag(ui.label(), "number").style(
                 "font-size: 3.4rem; line-height: 1; font-weight: 700; white-space: nowrap"
             )
             self._state = tag(ui.label(), "state").style("font-size: 1.5rem; line-height: 1.25; font-weight: 700")
-        self._message = (
-            tag(ui.label(), "message")
-            .classes("ps-of-now")
-            .props('role="status"')
-            .style("font-size: 1.15rem; min-height: 1.6rem")
-        )
-        # For screen readers: what to do, announced once, without the running numbers.
-        self._aloud = tag(ui.label(), "aloud").props('aria-live="polite"').classes("ps-aloud ps-of-now")
-        self._aloud.style("position: absolute; width: 1px; height: 1px; overflow: hidden; clip-path: inset(50%)")
+        self._message = tag(ui.label(), "recorder-message").classes("ps-current").props('role="status"')
+        self._message.style("font-size: 1.15rem; min-height: 1.6rem")
+        # For screen readers: what to do, announced once, without the changing numbers.
+        self._announcement = tag(ui.label(), "announcement").props('aria-live="polite"').classes("ps-current")
+        self._announcement.style("position: absolute; width: 1px; height: 1px; overflow: hidden; clip-path: inset(50%)")
 
     def _controls(self) -> None:
         words = self._page.words
-        with ui.row().classes("ps-of-now w-full items-center").style("gap: 10px"):
+        with ui.row().classes("ps-current w-full items-center").style("gap: 10px"):
             self._main = tag(ui.button(color=None).props("no-caps unelevated"), "main")
             self._main.style("font-size: 1.6rem; min-width: 260px; min-height: 72px")
             on_click(self._main, self._main_clicked, once=True)
             self._small: dict[str, ui.button] = {}
-            for key, name, text in (
-                ("r", "redo", "redo"),
-                ("s", "skip", "skip"),
-                ("b", "back", "back"),
-                ("p", "pause", "pause"),
-            ):
-                button = tag(ui.button(words(f"record.{text}")).props("no-caps outline"), name)
+            for key, name in {"r": "redo", "s": "skip", "b": "back", "p": "pause"}.items():
+                button = tag(ui.button(words(f"record.{name}")).props("no-caps outline"), name)
                 button.style("min-height: 48px")
                 on_click(button, partial(self._press, key))
                 self._small[key] = button
             ui.space()
             self._end_button = ui.button(words("record.end"), on_click=self._ask_end)
             tag(self._end_button, "end").props("no-caps flat").style("min-height: 48px")
-        self._ending = tag(ui.row().classes("ps-said ps-said-warning w-full items-center"), "ending")
+        self._ending = tag(ui.row().classes("ps-message ps-message-warning w-full items-center"), "ending")
         with self._ending:
             self._end_text = ui.label().classes("flex-grow")
-            yes = ui.button(words("record.end_yes"), on_click=self._end).props(
-                "no-caps unelevated color=deep-orange-10"
-            )
-            tag(yes, "end-yes")
-            no = ui.button(words("record.end_no"), color=None).props("no-caps outline")
-            no.on_click(self._stay)
-            self._no = tag(no, "end-no")
+            yes = ui.button(words("record.end_yes"), on_click=self._end, color="deep-orange-10")
+            tag(yes.props("no-caps unelevated"), "end-yes")
+            self._no = ui.button(words("record.end_no"), on_click=self._stay, color=None).props("no-caps outline")
+            tag(self._no, "end-no")
         self._ending.set_visibility(False)
 
     def _finished(self) -> None:
@@ -331,11 +336,9 @@ class _View:
     def _note_row(self) -> None:
         words = self._page.words
         with ui.row().classes("w-full items-center no-wrap"):
-            self._note = tag(
-                ui.input(label=words("record.note")).props("outlined dense maxlength=500 name=note"), "note"
-            )
-            self._note.classes("flex-grow").on("keydown.enter", self._keep_note)
-            keep = ui.button(words("record.keep_note"), on_click=self._keep_note).props("no-caps outline")
+            self._note = tag(ui.input(label=words("record.note")).props("maxlength=500 name=note"), "note")
+            self._note.classes("flex-grow").on("keydown.enter", self._store_note)
+            keep = ui.button(words("record.keep_note"), on_click=self._store_note).props("no-caps outline")
             tag(keep, "keep-note")
 
     # Commands -------------------------------------------------------------------------------------------------
@@ -356,7 +359,7 @@ class _View:
         else:
             self._press("p" if state == "paused" else " ", seen)
 
-    def _keep_note(self) -> None:
+    def _store_note(self) -> None:
         text = str(self._note.value or "").strip()
         if text:
             self._session.recorder.note(text)
@@ -366,8 +369,8 @@ class _View:
 
     def _ask_end(self) -> None:
         words = self._page.words
-        running = self._session.status().state == "recording"
-        self._end_text.text = words("record.end_running" if running else "record.end_really")
+        recording = self._session.status().state == "recording"
+        self._end_text.text = words("record.end_running" if recording else "record.end_really")
         self._ending.set_visibility(True)
         focus(self._no)
 
@@ -384,7 +387,7 @@ class _View:
         self._left = False
 
     async def _reopen(self) -> None:
-        """Resume the session; if that is refused, offer the start page, where another toy can be chosen."""
+        """Resume the session; if that fails, offer the start page, where another toy can be chosen."""
         if self._left:
             ui.navigate.to(address(self._session.name))
             return
@@ -396,7 +399,7 @@ class _View:
             return
         self._main.text = self._page.words("record.all_sessions")
 
-    # Following ------------------------------------------------------------------------------------------------
+    # Drawing --------------------------------------------------------------------------------------------------
 
     def tick(self) -> None:
         """Update the page and append new samples."""
@@ -405,13 +408,13 @@ class _View:
             self._signals.push()
 
     def draw(self) -> None:
-        """Update the page to the session's state."""
+        """Update the page to the state of the session."""
         if self._left:
             return
         if self._controller.get(self._session.name) is not self._session:
             self._left = True
-            again = self._controller.get(self._session.name) is not None
-            ui.navigate.to(address(self._session.name, "session" if again else "ended"))
+            reopened = self._controller.get(self._session.name) is not None
+            ui.navigate.to(address(self._session.name, "session" if reopened else "ended"))
             return
         s = self._session.status()
         self._keys.show(s.seen)
@@ -427,12 +430,10 @@ class _View:
         if self._progress.text != (text := ", ".join(counts)):
             self._progress.text = text
             self._bar.props(f'max="{s.steps}" value="{s.done + s.skipped}"')
-        f = s.next_step
-        self._next.text = (
-            words("record.next", gesture=words.gesture(f.gesture), n=f.repetition, m=s.repetitions)
-            if f is not None and s.state not in ("finished", "stopped")
-            else ""
-        )
+        self._next.text = ""
+        if (following := s.next_step) is not None and s.state not in ("finished", "stopped"):
+            gesture = words.gesture(following.gesture)
+            self._next.text = words("record.next", gesture=gesture, n=following.repetition, m=s.repetitions)
         if self._gesture != s.step.gesture:
             self._gesture = s.step.gesture
             self._name.content = words.gesture(s.step.gesture)
@@ -450,16 +451,16 @@ class _View:
         own = own_picture(self._page.workspace.folder, gesture)
         if own:
             return Markup('<img src="{}" alt="{}" style="width: 100%; border-radius: 16px">').format(own, name)
-        return picture(gesture if has_picture(gesture) else "", name)
+        return picture(gesture, name)
 
     def _draw_state(self, s: RecorderStatus) -> None:
-        words = self._page.words
-        state, text, colour = _state_text(self._page, s)
+        words, state = self._page.words, s.state
+        text, colour = _state_text(self._page, s)
         number = ""
         if state == "countdown":
             number = f"{math.ceil(s.countdown_s)}"
         elif state == "recording":
-            number = words("record.seconds", s=_one_place(s.elapsed_s, words.language))
+            number = words("record.seconds", s=words.number(s.elapsed_s, 1))
         self._number.text, self._state.text = number, text
         self._number.set_visibility(bool(number))
         if self._message.text != s.message:
@@ -476,21 +477,17 @@ class _View:
         self._small["s"].set_visibility(state not in ("finished", "stopped"))
         for key in "rb":
             self._small[key].set_visibility(state != "stopped")
-        # The main button ends the session then.
+        # When all is recorded, the main button ends the session.
         self._end_button.set_visibility(state != "finished")
         if state == "finished":
             folder = str(self._session.recorder.session.folder.relative_to(self._page.workspace.folder))
             counts = {"done": s.done, "skipped": s.skipped, "redone": s.redone}
             self._done_text.text = words("record.all_done", folder=folder, **counts)
         self._done.set_visibility(state == "finished")
-        where = f"{words.gesture(s.step.gesture)}, {self._repetition.text}. {s.step.prompt}. "
-        aloud = (where if state == "idle" else "") + text
-        # Not at every second of a countdown to the end.
-        if self._announced != (state, aloud) and not (state == self._announced[0] == "recording" and not s.away):
-            self._announced = (state, aloud)
-            self._aloud.text = aloud
-
-
-def _one_place(value: float, language: str) -> str:
-    text = f"{value:.1f}"
-    return text.replace(".", ",") if language == "lv" else text
+        step = f"{words.gesture(s.step.gesture)}, {self._repetition.text}. {s.step.prompt}. "
+        announcement = (step if state == "idle" else "") + text
+        # While recording, announce only a lost toy and not the remaining seconds.
+        still_recording = state == self._announced[0] == "recording" and not s.away
+        if self._announced != (state, announcement) and not still_recording:
+            self._announced = (state, announcement)
+            self._announcement.text = announcement

@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import itertools
 import json
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass, fields, replace
 from typing import Any, Protocol
 from urllib.parse import quote, unquote, urlencode
 
 from nicegui import background_tasks, context, run, ui
 
+from plushsense.core.errors import PlushSenseError
+from plushsense.dataset.quality.checking import author_name
 from plushsense.dataset.quality.findings import SEVERITIES
 from plushsense.dataset.quality.registry import CHECKS
-from plushsense.studio.app.shell import Page, on_change, tag
-from plushsense.studio.pages.review.review import STATES, Review
-from plushsense.studio.pages.review.selection import (
-    DONE,
-    NO_FINDING,
-    TO_DO,
-    RecordingFilter,
-    filter_and_sort,
-    resolve_author,
-)
+from plushsense.studio.app.shell import Page, address, on_change, set_address, tag
+from plushsense.studio.pages.review.review import EXCLUDED, LABELLED, LOOKING, STATES, Review, ReviewedRecording
 
 TABLE, ONE, OVERLAY = "table", "one", "overlay"
 VIEWS = (TABLE, ONE, OVERLAY)
@@ -31,35 +27,103 @@ _AHEAD = 4
 _LOOK_S = 1.5
 
 
-class ListLike(Protocol):
-    """The table of recordings, as the controller drives it."""
+TO_DO, DONE = "todo", "done"
+NO_FINDING = "no-finding"
 
-    first: int
+
+@dataclass(frozen=True)
+class RecordingFilter:
+    """Conditions that a recording must meet to be listed; "" accepts all.
+
+    ``state``: one of `STATES`, or `TO_DO` or `DONE`. ``severity``: least severity of the most urgent open finding, or
+    `NO_FINDING`. ``check``: a check with a finding, accepted or not. ``text``: part of the id or of a finding.
+    """
+
+    person: str = ""
+    gesture: str = ""
+    state: str = ""
+    severity: str = ""
+    check: str = ""
+    text: str = ""
+
+    def fits(self, row: ReviewedRecording) -> bool:
+        """Return whether a recording passes the filter."""
+        return (
+            self.person in ("", row.info.subject)
+            and self.gesture in ("", row.info.gesture)
+            and self._state_fits(row)
+            and self._severity_fits(row)
+            and (not self.check or any(f.check == self.check for f in row.findings))
+            and self._text_fits(row)
+        )
+
+    def _state_fits(self, row: ReviewedRecording) -> bool:
+        if self.state in (TO_DO, DONE):
+            return row.done == (self.state == DONE)
+        return self.state in ("", row.state)
+
+    def _severity_fits(self, row: ReviewedRecording) -> bool:
+        if self.severity in ("", NO_FINDING):
+            return not self.severity or not row.worst
+        return bool(row.worst) and SEVERITIES.index(row.worst) <= SEVERITIES.index(self.severity)
+
+    def _text_fits(self, row: ReviewedRecording) -> bool:
+        text = self.text.strip().casefold()
+        return any(text in s.casefold() for s in (row.id, *(f.message for f in row.findings)))
+
+    @classmethod
+    def of(cls, query: Mapping[str, str]) -> RecordingFilter:
+        """Read a filter from the query of an address; ignore unknown values."""
+        values = {f.name: query[f.name] for f in fields(cls) if query.get(f.name)}
+        for key, allowed in (("state", (TO_DO, DONE, *STATES)), ("severity", (NO_FINDING, *SEVERITIES))):
+            if values.get(key) not in allowed:
+                values.pop(key, None)
+        return cls(**values)
+
+    def query(self) -> dict[str, str]:
+        """Return the conditions as query parameters of an address."""
+        return {f.name: value for f in fields(self) if (value := getattr(self, f.name))}
+
+
+_URGENCY = {s: i for i, s in enumerate((*SEVERITIES, ""))}
+SORTS: dict[str, Callable[[ReviewedRecording], Any]] = {
+    "recording": lambda r: (),
+    "person": lambda r: r.info.subject,
+    "gesture": lambda r: r.info.gesture,
+    "seconds": lambda r: r.seconds,
+    "findings": lambda r: (_URGENCY[r.worst], -len(r.open)),
+    "state": lambda r: (STATES.index(r.state), r.confidence),
+}
+"""Sort keys of the columns; equal recordings are sorted by id."""
+
+
+def filter_and_sort(
+    rows: Iterable[ReviewedRecording],
+    filter: RecordingFilter,
+    only: Collection[str] | None = None,
+    by: str = "recording",
+    down: bool = False,
+) -> list[str]:
+    """Return the ids of the recordings that pass a filter, sorted."""
+    fitting = [r for r in rows if (only is None or r.id in only) and filter.fits(r)]
+    fitting.sort(key=lambda r: r.id, reverse=down and by == "recording")
+    if by != "recording":
+        fitting.sort(key=SORTS[by], reverse=down)
+    return [r.id for r in fitting]
+
+
+class ReviewView(Protocol):
+    """A view of the page: the table, one recording, or the overlay of a gesture."""
 
     @property
-    def place(self) -> ui.element: ...
+    def place(self) -> ui.element:
+        """Element that contains the view."""
 
-    def fill(self) -> None: ...
+    def draw(self) -> None:
+        """Display the current selection of the controller."""
 
-
-class RecordingLike(Protocol):
-    """The view of one recording, as the controller drives it."""
-
-    @property
-    def place(self) -> ui.element: ...
-
-    def draw(self, *, keep: bool = False, low: float | None = None, high: float | None = None) -> None: ...
-
-    def refresh(self, *, moved: bool = True) -> None: ...
-
-
-class OverlayLike(Protocol):
-    """The view of all recordings of a gesture, as the controller drives it."""
-
-    @property
-    def place(self) -> ui.element: ...
-
-    def fill(self, anew: bool = True) -> None: ...
+    def refresh(self) -> None:
+        """Update what has changed since it was drawn."""
 
 
 class ReviewController:
@@ -69,90 +133,82 @@ class ReviewController:
         visit: id of the browser tab; its decisions can be undone one by one, also after a reload.
         current: id of the displayed recording, "" for none.
         order: ids that passed the filter when it was set; `next` skips those that no longer pass.
+        first_row: place in ``order`` of the first row of the table's page.
         ends: whether a suggested stop is accepted, too.
     """
 
-    def __init__(self, page: Page, review: Review, asked: dict[str, str]) -> None:
+    def __init__(self, page: Page, review: Review, query: Mapping[str, str]) -> None:
         self.page, self.review, self.words = page, review, page.words
         self.visit = str(getattr(context.client, "tab_id", None) or context.client.id)
         self.client = context.client
-        self.filter = RecordingFilter.of(asked)
+        self.filter = RecordingFilter.of(query)
         self.by, self.down = "recording", False
-        self.view = asked["view"] if asked.get("view") in VIEWS else ONE if asked.get("recording") else TABLE
+        self.view = query["view"] if query.get("view") in VIEWS else ONE if query.get("recording") else TABLE
         self.current = ""
         self.order: list[str] = []
         self.trail: list[str] = []
+        self.first_row = 0
         self.ends = False
         self.only: dict[str, None] | None = None
         self.title = ""
-        self._asked = {k: v for k, v in asked.items() if k in ("dataset", "selection")}
+        self._query = {k: v for k, v in query.items() if k in ("dataset", "selection")}
         self._turn = asyncio.Lock()
         self._rows: object = None
-        self._said = ""
+        self._address = ""
 
     def limit(self, title: str, only: list[str]) -> None:
         """Limit the page to a selection of recordings, and report those that do not exist."""
         if not only:
             return
-        there = {i: None for i in only if i in self.review.infos}
-        self.only, self.title = there, title
-        if not self._asked.get("selection"):
-            self._asked |= {"title": title}
-        if lacking := [i for i in only if i not in there]:
-            self.page.say(self.words("review.not_there", n=len(lacking), first=lacking[0]), "warning")
+        self.only, self.title = {i: None for i in only if i in self.review.infos}, title
+        if not self._query.get("selection"):
+            self._query |= {"title": title}
+        if missing := [i for i in only if i not in self.only]:
+            self.page.say(self.words("review.not_there", n=len(missing), first=missing[0]), "warning")
 
     # Building -----------------------------------------------------------------------------------------------------
 
-    def build(
-        self,
-        list_view: Callable[[ReviewController], ListLike],
-        recording_view: Callable[[ReviewController], RecordingLike],
-        overlay_view: Callable[[ReviewController], OverlayLike],
-    ) -> None:
-        """Build the header, the filters and the three views."""
+    def build(self, views: Mapping[str, Callable[[ReviewController], ReviewView]]) -> None:
+        """Build the header, the filters, and the views `TABLE`, `ONE` and `OVERLAY`."""
         words, review = self.words, self.review
         with ui.row().classes("w-full items-center gap-2"):
             tag(ui.label(review.dataset.head.name).classes("text-lg font-bold"), "name")
             if review.dataset.head.simulated:
-                tag(ui.label(words("shell.simulation")).classes("ps-said ps-said-warning"), "simulation")
+                tag(ui.label(words("shell.simulation")).classes("ps-message ps-message-warning"), "simulation")
             self.counts = tag(ui.label().props("role=status"), "counts")
             self.making = tag(ui.label().classes("ps-dim").props("role=status"), "making")
             ui.space()
             self.who = ui.input(words("review.who"), value=self._who(), on_change=lambda e: self._keep_who(e.value))
             tag(self.who.props("outlined dense").style("width: 170px"), "who")
-            tag(
-                ui.link(words("review.to_train"), f"/train?dataset={quote(str(review.path))}").classes("ps-link"),
-                "to-train",
-            )
+            to_train = ui.link(words("review.to_train"), address("train", dataset=review.path)).classes("ps-link")
+            tag(to_train, "to-train")
         if review.is_labelled:
-            tag(ui.label(words("review.labelled")).classes("ps-said ps-said-info w-full"), "labelled")
+            tag(ui.label(words("review.labelled")).classes("ps-message ps-message-info w-full"), "labelled")
         with ui.row().classes("w-full items-center gap-2"):
             toggle = ui.toggle({v: words(f"review.view_{v}") for v in VIEWS}, value=self.view)
             toggle.props(f'no-caps unelevated aria-label="{words("review.view")}"').classes("ps-toggle")
-            self.views = tag(toggle, "view")
-            self.views.on_value_change(lambda e: self.turn_to(str(e.value)))
+            self.toggle = tag(toggle, "view")
+            self.toggle.on_value_change(lambda e: self.turn_to(str(e.value)))
             self._filters()
         if self.only is not None:
-            with tag(ui.row().classes("w-full items-center ps-said ps-said-info"), "selection"):
+            with tag(ui.row().classes("w-full items-center ps-message ps-message-info"), "selection"):
                 ui.label(words("review.selection", n=len(self.only), title=self.title or "")).classes("flex-grow")
-                ui.link(words("review.show_all"), f"/review?dataset={quote(str(review.path))}").style("color: inherit")
+                ui.link(words("review.show_all"), address("review", dataset=review.path)).style("color: inherit")
         self.page_slot = ui.element("div")
-        self.list, self.one, self.overlay = list_view(self), recording_view(self), overlay_view(self)
+        self.views = {name: view(self) for name, view in views.items()}
         on_change(review.changed, self.changed)
         ui.timer(_LOOK_S, self._look)
 
     def _filters(self) -> None:
         words, rows = self.words, self.review.rows.values()
-        people = sorted({r.info.subject for r in rows})
-        present = {r.info.gesture for r in rows}
-        gestures = [g.label for g in self.review.dataset.gestures.gestures if g.label in present]
-        gestures += sorted(present - set(gestures))
-        states = [TO_DO, DONE, *(s for s in STATES if s != "looking" and (s == "labelled") == self.review.is_labelled)]
-        states += ["excluded"] if self.review.is_labelled else []
+        if self.review.is_labelled:
+            states = [TO_DO, DONE, LABELLED, EXCLUDED]
+        else:
+            states = [TO_DO, DONE, *(s for s in STATES if s not in (LOOKING, LABELLED))]
         options: dict[str, dict[str, str]] = {
-            "person": {p: self.person(p) for p in people},
-            "gesture": {g: words.gesture(g) for g in gestures},
-            "state": {s: words(f"review.state_{s}") for s in dict.fromkeys(states)},
+            "person": {p: self.person(p) for p in sorted({r.info.subject for r in rows})},
+            "gesture": {g: words.gesture(g) for g in self.review.gestures()},
+            "state": {s: words(f"review.state_{s}") for s in states},
             "severity": {
                 **{s: words(f"review.from_{s}") for s in SEVERITIES},
                 NO_FINDING: words("review.no_finding"),
@@ -174,15 +230,14 @@ class ReviewController:
             self.filter, **{k: "" for k in options if getattr(self.filter, k) and self._fields[k].value is None}
         )
 
-    async def begin(self, asked: dict[str, str]) -> None:
-        """Open the view and the recording that the address names."""
+    async def begin(self, recording: str) -> None:
+        """Open the view that the address names, with ``recording`` or the first one."""
         self.arrange()
-        wanted = asked.get("recording", "")
-        if wanted and wanted not in self.review.infos:
+        if recording and recording not in self.review.infos:
             with self.page.show_errors():
-                self.review.info(wanted)
-            wanted = ""
-        self.current = wanted or (self.order[0] if self.order else "")
+                self.review.info(recording)
+            recording = ""
+        self.current = recording or (self.order[0] if self.order else "")
         await self.turn_to(self.view)
         self.changed()
 
@@ -192,15 +247,14 @@ class ReviewController:
 
     def _who(self) -> str:
         request = context.client.request
-        message = unquote(request.cookies.get(WHO_COOKIE, "")) if request is not None else ""
-        try:
-            return message or resolve_author("")
-        except Exception:  # noqa: BLE001, RUF100
-            return ""
+        name = unquote(request.cookies.get(WHO_COOKIE, "")) if request is not None else ""
+        with contextlib.suppress(PlushSenseError):
+            return name or author_name(None)
+        return ""
 
     def _keep_who(self, name: str | None) -> None:
-        kept = json.dumps(quote(name or ""))
-        ui.run_javascript(f"document.cookie = '{WHO_COOKIE}=' + {kept} + '; path=/; max-age=31536000; SameSite=Strict'")
+        cookie = json.dumps(f"{WHO_COOKIE}={quote(name or '')}; path=/; max-age=31536000; SameSite=Strict")
+        ui.run_javascript(f"document.cookie = {cookie}")
 
     @property
     def name(self) -> str:
@@ -209,9 +263,9 @@ class ReviewController:
         Raises:
             ConfigError: if neither the field nor the login gives a name.
         """
-        return resolve_author(self.who.value or "")
+        return author_name((self.who.value or "").strip() or None)
 
-    # What is shown ------------------------------------------------------------------------------------------------
+    # Views and navigation -----------------------------------------------------------------------------------------
 
     def arrange(self) -> None:
         """Filter and sort the recordings again."""
@@ -220,7 +274,7 @@ class ReviewController:
     async def _filtered(self, key: str, value: Any) -> None:
         self.filter = replace(self.filter, **{key: str(value or "")})
         self.arrange()
-        self.list.first = 0
+        self.first_row = 0
         if self.current not in self.order:
             self.current = self.order[0] if self.order else ""
             self.trail.clear()
@@ -229,19 +283,18 @@ class ReviewController:
     async def turn_to(self, view: str) -> None:
         """Switch to the table, the single recording or the overlay."""
         self.view = view
-        if self.views.value != view:
-            self.views.value = view
+        if self.toggle.value != view:
+            self.toggle.value = view
             return
-        for name, each in ((TABLE, self.list), (ONE, self.one), (OVERLAY, self.overlay)):
+        for name, each in self.views.items():
             each.place.set_visibility(name == view)
+        if view == ONE:
+            await self.go(self.current)
+            return
         if view == TABLE:
             self.arrange()
-            self.list.fill()
-        elif view == ONE:
-            await self.go(self.current)
-        else:
-            self.overlay.fill()
-        self._say_address()
+        self.views[view].draw()
+        self._update_address()
 
     async def open(self, identity: str) -> None:
         """Open the view of one recording."""
@@ -256,10 +309,9 @@ class ReviewController:
             if remember and self.current and self.current != identity:
                 self.trail.append(self.current)
             self.current = identity
-            self.one.draw()
-        self._say_counts()
-        self._say_address()
-
+            self.views[ONE].draw()
+        self._update_counts()
+        self._update_address()
         ahead = [i for i in self.following(_AHEAD) if not self.review.is_read(i)]
         if ahead:
             background_tasks.create(run.io_bound(self._read_ahead, ahead), name="review: neighbours")
@@ -271,16 +323,12 @@ class ReviewController:
             except Exception:  # noqa: BLE001, RUF100
                 return
 
-    def following(self, many: int = 1) -> list[str]:
-        """Return the next recordings of the order that still pass the filter."""
-        rows, found = self.review.rows, []
-        at = self.order.index(self.current) + 1 if self.current in self.order else 0
-        for identity in self.order[at:]:
-            if identity in rows and self.filter.fits(rows[identity]):
-                found.append(identity)
-                if len(found) == many:
-                    break
-        return found
+    def following(self, count: int = 1) -> list[str]:
+        """Return up to ``count`` next recordings of the order that still pass the filter."""
+        rows = self.review.rows
+        start = self.order.index(self.current) + 1 if self.current in self.order else 0
+        fitting = (i for i in self.order[start:] if i in rows and self.filter.fits(rows[i]))
+        return list(itertools.islice(fitting, count))
 
     async def next(self) -> None:
         """Go to the next recording of the order."""
@@ -292,11 +340,11 @@ class ReviewController:
         if ahead:
             await self.go(ahead[0], remember=True)
         else:
-            self.one.draw()
+            self.views[ONE].draw()
             self.page.say(self.words("review.last"), "good")
 
     async def back(self) -> None:
-        """Go back to the recording displayed before, else to the previous one of the order."""
+        """Return to the recording displayed before, else to the previous one of the order."""
         async with self._turn:
             while self.trail and self.trail[-1] not in self.review.infos:
                 self.trail.pop()
@@ -316,24 +364,21 @@ class ReviewController:
 
     # Deciding -----------------------------------------------------------------------------------------------------
 
-    async def decide(self, visible: str, decision: Callable[[], Any], *, move: bool = False) -> None:
-        """Run a decision about the displayed recording, and go on to the next after success if asked to.
+    async def decide(self, recording: str, decision: Callable[[], Any], *, move: bool = False) -> None:
+        """Run a decision about the displayed recording; with ``move``, go to the next one after success.
 
         Do nothing if another recording is displayed by now.
         """
         async with self._turn:
-            if visible != self.current:
+            if recording != self.current:
                 return
-            done = False
             with self.page.show_errors():
                 await run.io_bound(decision)
-                done = True
-            if done:
                 self.page.say("")
-            if done and move:
-                await self._next()
-            else:
-                self.one.refresh()
+                if move:
+                    await self._next()
+                    return
+            self.views[ONE].refresh()
 
     async def undo(self) -> None:
         """Discard the draft of the displayed recording, else undo the last decision of this browser tab."""
@@ -341,66 +386,58 @@ class ReviewController:
             with self.page.show_errors():
                 if self.view == ONE and self.review.drop(self.current):
                     self.page.say("")
-                    self.one.refresh()
+                    self.views[ONE].refresh()
                     return
                 why = self.words("review.taken_back")
                 last = await run.io_bound(self.review.undo, self.visit, self.name, why)
                 if last is None:
                     self.page.say(self.words("review.nothing_to_undo"))
                     return
-                self.page.say(
-                    self.words("review.undone", what=self.words(f"review.did_{last.action}"), id=last.recording)
-                )
+                what = self.words(f"review.did_{last.action}")
+                self.page.say(self.words("review.undone", what=what, id=last.recording))
                 if self.view == ONE and last.recording in self.review.infos:
                     await self.go(last.recording)
 
     def changed(self) -> None:
         """Update the page after a change, made here or elsewhere."""
-        self._say_making()
+        self._update_progress()
         rows = self.review.rows
         if rows is self._rows:
             return
         self._rows = rows
-        self._say_counts()
-        if self.view == TABLE:
-            if not self.order:
-                self.arrange()
-            self.list.fill()
-        elif self.view == ONE:
-            self.one.refresh()
-        else:
-            self.overlay.fill(anew=False)
+        self._update_counts()
+        if self.view == TABLE and not self.order:
+            self.arrange()
+        self.views[self.view].refresh()
 
     async def _look(self) -> None:
-        """Read marks that other programs wrote."""
+        """Read marks written by other programs."""
         with self.page.show_errors():
             await run.io_bound(self.review.look)
 
-    def _say_counts(self) -> None:
+    def _update_counts(self) -> None:
         rows = self.review.rows.values()
         done = sum(r.done for r in rows)
         self.counts.set_text(self.words("review.counts", done=done, of=len(rows), left=len(rows) - done))
 
-    def _say_making(self) -> None:
+    def _update_progress(self) -> None:
         prepared = self.review.prepared
-        if prepared.message:
-            self.making.set_text(prepared.message)
-        elif prepared.progress is not None:
-            what, done, of = prepared.progress
-            self.making.set_text(self.words(f"review.making_{what}", done=done, of=of))
-        else:
-            self.making.set_text("")
-        self.making.set_visibility(bool(self.making.text))
+        text = prepared.message
+        if not text and prepared.progress is not None:
+            what, done, total = prepared.progress
+            text = self.words(f"review.making_{what}", done=done, of=total)
+        self.making.set_text(text)
+        self.making.set_visibility(bool(text))
 
-    def _say_address(self) -> None:
-        message = {**self._asked, "dataset": str(self.review.path), **self.filter.query(), "view": self.view}
+    def _update_address(self) -> None:
+        query = {**self._query, "dataset": str(self.review.path), **self.filter.query(), "view": self.view}
         if self.view == ONE:
-            message["recording"] = self.current
-        pairs = list(message.items())
-        if self.only is not None and not message.get("selection"):
+            query["recording"] = self.current
+        pairs = list(query.items())
+        if self.only is not None and not query.get("selection"):
             pairs += [("recordings", i) for i in self.only]
-        address = f"/review?{urlencode(pairs)}"
-        if address != self._said:
-            self._said = address
+        path = f"/review?{urlencode(pairs)}"
+        if path != self._address:
+            self._address = path
             with self.client:
-                ui.run_javascript(f"history.replaceState(history.state, '', {json.dumps(address)})")
+                set_address(path)

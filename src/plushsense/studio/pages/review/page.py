@@ -7,25 +7,24 @@ The address holds the state of the page, so that it can be linked to and survive
 ``recordings=ID`` (several times), ``title=TEXT``
     only these recordings, and what they have in common. Unknown ids are left out with a message.
 ``selection=KEY``
-    the same, stored under a key. `plushsense.studio.pages.review.selection.Reviews.address` chooses between both.
+    the same, stored under a key. `plushsense.studio.pages.review.review.Reviews.address` chooses between both.
 ``person, gesture, state, severity, check, text``
-    the filters (`plushsense.studio.pages.review.selection.RecordingFilter`).
+    the filters (`plushsense.studio.pages.review.controller.RecordingFilter`).
 ``view=table | one | overlay``, ``recording=ID``
     the open view; ``recording`` alone opens that recording.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
-from urllib.parse import quote
 
 from nicegui import context, run, ui
 
-from plushsense.studio.app.shell import Page, tag
-from plushsense.studio.pages.review.controller import ReviewController
+from plushsense.studio.app.shell import Page, address, query, tag
+from plushsense.studio.pages.review.controller import ONE, OVERLAY, TABLE, ReviewController
 from plushsense.studio.pages.review.recording_view import GestureOverlayView, RecordingView
-from plushsense.studio.pages.review.review import Review
-from plushsense.studio.pages.review.selection import Reviews
+from plushsense.studio.pages.review.review import Review, Reviews
 from plushsense.studio.pages.review.table_view import RecordingTableView
 
 _CSS = Path(__file__).with_name("review.css")
@@ -34,12 +33,10 @@ _CSS = Path(__file__).with_name("review.css")
 async def show(page: Page) -> None:
     """Build the page."""
     ui.add_css(_CSS.read_text(encoding="utf-8"))
-    words, request = page.words, context.client.request
-    query = request.query_params if request is not None else {}
-    asked = {key: str(value) for key, value in query.items()}
-    named = request.query_params.getlist("recordings") if request is not None else []
+    words, request, values = page.words, context.client.request, query()
+    recordings = request.query_params.getlist("recordings") if request is not None else []
     datasets = page.workspace.datasets()
-    place = asked.get("dataset") or (str(datasets[0]) if datasets else "")
+    place = values.get("dataset") or (str(datasets[0]) if datasets else "")
     with page.show_errors():
         place = str(page.workspace.inside(place)) if place else ""
     _choice_of_dataset(page, datasets, place)
@@ -47,36 +44,36 @@ async def show(page: Page) -> None:
         ui.label(words("review.no_dataset")).classes("ps-dim")
         ui.link(words("pages.home"), "/").classes("ps-link")
         return
-    waiting = tag(ui.label(words("review.opening")).props("role=status"), "opening")
+    opening = tag(ui.label(words("review.opening")).props("role=status"), "opening")
     await context.client.connected()
     with page.show_errors():
         reviews = page.workspace.part(Reviews)
         review: Review | None = await run.io_bound(reviews.open, place)
         if review is None:
             return  # the studio is ending
-        title, only = asked.get("title", ""), named
-        if asked.get("selection"):
-            selection = await run.io_bound(reviews.selection, asked["selection"])
+        title = values.get("title", "")
+        if values.get("selection"):
+            selection = await run.io_bound(reviews.selection, values["selection"])
             if selection is None:
                 return
-            title, only = selection
-        controller = ReviewController(page, review, asked)
-        controller.limit(title, only)
-        controller.build(RecordingTableView, RecordingView, GestureOverlayView)
-        await controller.begin(asked)
-    waiting.delete()
+            title, recordings = selection
+        controller = ReviewController(page, review, values)
+        controller.limit(title, recordings)
+        controller.build({TABLE: RecordingTableView, ONE: RecordingView, OVERLAY: GestureOverlayView})
+        await controller.begin(values.get("recording", ""))
+    opening.delete()
 
 
 def _choice_of_dataset(page: Page, datasets: list[Path], place: str) -> None:
     words = page.words
     titles = {str(p.resolve()): page.workspace.title(p) for p in datasets}
-    twice = {t for t in titles.values() if list(titles.values()).count(t) > 1}
-    options = {p: f"{t} ({Path(p).name})" if t in twice else t for p, t in titles.items()}
+    count = Counter(titles.values())
+    options = {p: f"{t} ({Path(p).name})" if count[t] > 1 else t for p, t in titles.items()}
     if len(options) > 1 or place not in options:
         choice = ui.select(
             options,
             value=place if place in options else None,
             label=words("review.dataset"),
-            on_change=lambda e: ui.navigate.to(f"/review?dataset={quote(str(e.value))}"),
+            on_change=lambda e: ui.navigate.to(address("review", dataset=str(e.value))),
         )
-        tag(choice.props("outlined dense").style("min-width: 280px"), "dataset")
+        tag(choice.style("min-width: 280px"), "dataset")

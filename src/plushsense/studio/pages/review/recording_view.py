@@ -2,21 +2,95 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from nicegui import ui
+from nicegui.element import Element
 
-from plushsense.studio.app.shell import AFFECT_COLOURS, LINES, tag
-from plushsense.studio.pages.review.plots import ACTIVITY, ALL, GestureOverlay, ReviewPlot
-from plushsense.studio.pages.review.table_view import AFFECTS, SIGNS, ask_reason, finding_text
+from plushsense.studio.app.shell import AFFECT_COLOURS, AFFECT_SIGNS, LINES, tag
+from plushsense.studio.pages.review.controller import ReviewController
+from plushsense.studio.pages.review.signals import ACTIVITY, ALL, GestureOverlay
+from plushsense.studio.pages.review.table_view import SIGNS, ask_reason, finding_button, finding_text
 
-if TYPE_CHECKING:
-    from plushsense.studio.pages.review.controller import ReviewController
+_VENDOR = Path(__file__).parents[2] / "widgets" / "vendor" / "uplot"
 
 
-_NAMED = 30
-_USUAL = "#8a9099"
+class ReviewPlot(Element, component="review_plot.js"):
+    """Browser component that plots curves over seconds with marks, and reports clicks and keys.
+
+    Args:
+        label: text alternative while nothing is plotted.
+        on_pick: called with {x, y, button ("left" or "right"), shift, recording (id of the plotted one)}.
+        on_key: called with {key, shift, recording}, except for keys typed into a field or a dialog.
+        on_zoom: called with {low, high, recording} after zooming into thinned curves.
+    """
+
+    def __init__(
+        self,
+        label: str,
+        *,
+        height: int = 330,
+        legend: bool = True,
+        on_pick: Callable[[dict[str, Any]], Any],
+        on_key: Callable[[dict[str, Any]], Any] | None = None,
+        on_zoom: Callable[[dict[str, Any]], Any] | None = None,
+    ) -> None:
+        super().__init__()
+        self.add_resource(_VENDOR)
+        self._props.update({"label": label, "height": height, "legend": legend, "keyed": on_key is not None})
+        self.classes("w-full")
+        for event, handler in (("pick", on_pick), ("key", on_key), ("zoomed", on_zoom)):
+            if handler is not None:
+                self.on(event, lambda e, handler=handler: handler(dict(e.args)))
+
+    def show(
+        self,
+        identity: str,
+        label: str,
+        x: Sequence[float],
+        curves: Sequence[Sequence[float | None]],
+        series: Sequence[dict[str, Any]],
+        *,
+        x_title: str,
+        y_title: str = "",
+        lanes: Sequence[tuple[float, str]] = (),
+        limits: tuple[float, float] | None = None,
+        marks: Sequence[dict[str, Any]] = (),
+        cut: Sequence[tuple[float, float]] = (),
+        thinned: bool = False,
+        keep: bool = False,
+    ) -> None:
+        """Plot another set of curves.
+
+        Args:
+            identity: id sent back with every click and key.
+            label: text alternative.
+            lanes: (position, name) that replace the numbers of the y-axis.
+            limits: range of the y-axis.
+            marks: vertical lines with ``x``, ``label``, ``stroke`` and ``dash``.
+            cut: shaded ranges (from, to).
+            keep: whether to keep the zoom if the recording is the same.
+        """
+        plot = {"id": identity, "label": label, "data": [x, *curves], "series": series, "from": x[0] if x else 0.0}
+        plot |= {"xTitle": x_title, "y": y_title, "lanes": lanes, "range": limits, "marks": marks, "cut": cut}
+        self.run_method("show", plot | {"thinned": thinned, "keep": keep})
+
+    def remark(
+        self, identity: str, marks: Sequence[dict[str, Any]], cut: Sequence[tuple[float, float]], label: str
+    ) -> None:
+        """Move the marks of the plotted recording."""
+        self.run_method("remark", identity, marks, cut, label)
+
+    def zoom(self, factor: float) -> None:
+        """Scale the visible range by ``factor`` around the first mark; 0 displays the whole recording."""
+        self.run_method("zoom", factor)
+
+
+_MAX_OUTLIERS = 30
+_GREY = "#8a9099"
 
 
 class GestureOverlayView:
@@ -26,10 +100,7 @@ class GestureOverlayView:
         self.desk = desk
         self._overlay: GestureOverlay | None = None
         self._drawn: Any = None
-        words = desk.words
-        present = {r.info.gesture for r in desk.review.rows.values()}
-        labels = [g.label for g in desk.review.dataset.gestures.gestures if g.label in present]
-        labels += sorted(present - set(labels))
+        words, labels = desk.words, desk.review.gestures()
         self._gesture = desk.filter.gesture or (labels[0] if labels else "")
         with tag(ui.element("div").classes("ps-two w-full"), "overlay") as self.place:
             with ui.column().classes("w-full gap-2 no-wrap"):
@@ -39,73 +110,79 @@ class GestureOverlayView:
                     label=words("review.gesture"),
                     on_change=lambda e: self._choose(str(e.value)),
                 )
-                tag(self.choice.props("outlined dense options-dense").style("min-width: 260px"), "overlay-gesture")
-                self.message = tag(ui.label().props("role=status"), "overlay-said")
+                tag(self.choice.props("options-dense").style("min-width: 260px"), "overlay-gesture")
+                self.summary = tag(ui.label().props("role=status"), "overlay-summary")
                 self.plot = ReviewPlot(words("review.overlay_plot"), height=420, legend=False, on_pick=self.picked)
                 tag(self.plot, "overlay-plot")
                 ui.label(words("review.overlay_help")).classes("ps-dim")
             with ui.column().classes("w-full gap-2"):
-                ui.label(words("review.odd")).classes("font-bold")
-                self.names = tag(ui.column().classes("w-full gap-0"), "odd")
+                ui.label(words("review.outliers")).classes("font-bold")
+                self.names = tag(ui.column().classes("w-full gap-0"), "outliers")
 
     async def _choose(self, gesture: str) -> None:
         self._gesture = gesture
-        self.fill()
+        self.draw()
 
-    def fill(self, anew: bool = True) -> None:
-        """Plot the gesture; skip this if nothing changed and ``anew`` is false."""
-        desk, words = self.desk, self.desk.words
-        if anew and desk.filter.gesture and desk.filter.gesture != self._gesture:
+    def draw(self) -> None:
+        """Plot the gesture; a gesture chosen in the filter replaces the one displayed."""
+        desk = self.desk
+        if desk.filter.gesture and desk.filter.gesture != self._gesture:
             self._gesture = desk.filter.gesture
             self.choice.value = self._gesture
-        made = desk.review.overlay(self._gesture)
+        self._drawn = None
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Plot the gesture again if its recordings or the filter have changed."""
+        desk, words = self.desk, self.desk.words
+        overlay = desk.review.overlay(self._gesture)
         fitting = set(desk.order) if desk.filter.query() or desk.only is not None else None
-        now = (self._gesture, [(c.recording, c.seconds, c.why) for c in made.drawn], fitting)
-        if now == self._drawn and not anew:
+        now = (self._gesture, [(c.recording, c.seconds, c.why) for c in overlay.drawn], fitting)
+        if now == self._drawn:
             return
-        self._drawn, self._overlay = now, made
-        odd = [c for c in made.drawn if c.why]
-        colours = {c.recording: LINES[i % len(LINES)] for i, c in enumerate(odd)}
+        self._drawn, self._overlay = now, overlay
+        outliers = [c for c in overlay.drawn if c.why]
+        colours = {c.recording: LINES[i % len(LINES)] for i, c in enumerate(outliers)}
         series, curves = [], []
-        for c, heights in zip(made.drawn, made.curves, strict=True):
+        for c, heights in zip(overlay.drawn, overlay.curves, strict=True):
             if c.why:
                 look = {"label": c.recording, "stroke": colours[c.recording], "width": 2}
             else:
-                faint = len(made.drawn) > 40 or (fitting is not None and c.recording not in fitting)
-                look = {"label": c.recording, "stroke": f"{_USUAL}{'66' if faint else 'cc'}", "width": 1}
+                faint = len(overlay.drawn) > 40 or (fitting is not None and c.recording not in fitting)
+                look = {"label": c.recording, "stroke": f"{_GREY}{'66' if faint else 'cc'}", "width": 1}
             series.append(look)
             curves.append([None if np.isnan(v) else round(float(v), 3) for v in heights])
-        message = words("review.overlay_said", n=len(made.drawn), odd=len(odd), gesture=words.gesture(self._gesture))
-        self.message.set_text(message if made.drawn else words("review.overlay_empty"))
+        gesture = words.gesture(self._gesture)
+        summary = words("review.overlay_summary", n=len(overlay.drawn), odd=len(outliers), gesture=gesture)
+        self.summary.set_text(summary if overlay.drawn else words("review.overlay_empty"))
         self.plot.show(
             f"overlay {self._gesture}",
-            message,
-            np.round(made.x, 4).tolist(),
+            summary,
+            np.round(overlay.x, 4).tolist(),
             curves,
             series,
             x_title=words("review.x_axis"),
             y_title=words("review.activity_axis"),
-            limits=(0.0, made.top),
+            limits=(0.0, overlay.top),
         )
         self.names.clear()
         with self.names:
-            if not odd:
-                ui.label(words("review.no_odd")).classes("ps-dim")
-            for c in odd[:_NAMED]:
+            if not outliers:
+                ui.label(words("review.no_outliers")).classes("ps-dim")
+            for c in outliers[:_MAX_OUTLIERS]:
                 with ui.row().classes("items-center no-wrap w-full"):
                     dash = ui.element("span").style("width: 22px; height: 4px; flex: none")
                     dash.style(f"background: {colours[c.recording]}")
                     button = ui.button(f"{c.recording}: {c.why}", on_click=lambda c=c: desk.open(c.recording))
                     button.props("no-caps flat dense align=left").style("overflow-wrap: anywhere; text-align: left")
                     button.classes("flex-grow")
-            if len(odd) > _NAMED:
-                ui.label(words("review.more_odd", n=len(odd) - _NAMED)).classes("ps-dim")
+            if len(outliers) > _MAX_OUTLIERS:
+                ui.label(words("review.more_outliers", n=len(outliers) - _MAX_OUTLIERS)).classes("ps-dim")
 
-    async def picked(self, message: dict[str, Any]) -> None:
+    async def picked(self, event: dict[str, Any]) -> None:
         """Open the recording whose curve is nearest to a click."""
-        found = self._overlay.nearest(float(message["x"]), float(message["y"])) if self._overlay is not None else ""
-        if found:
-            await self.desk.open(found)
+        if self._overlay is not None and (nearest := self._overlay.nearest(float(event["x"]), float(event["y"]))):
+            await self.desk.open(nearest)
 
 
 START, STOP = "start", "stop"
@@ -122,7 +199,8 @@ KEYS = (
     ("u", "undo"),
     ("+ − 0", "zoom"),
 )
-"""The keys as they are written, and the word that says what each does; only what works without trimming otherwise."""
+"""Keyboard commands: the keys, and the key of the text that describes them."""
+# The commands for recordings that cannot be trimmed.
 _PLAIN = ("accept", "back", "pass", "exclude", "undo", "zoom")
 _SET, _DRAFT = "--ps-set", "--ps-draft"
 _STEPS = {"ArrowLeft": -1, "ArrowRight": 1, ",": -10, "<": -10, ";": -10, ".": 10, ">": 10, ":": 10}
@@ -167,14 +245,14 @@ class RecordingView:
                             with ui.element("dd"):
                                 ui.label(words(f"review.key_{'next' if does == 'accept' and not trims else does}"))
 
-    def _button(self, key: str, does: Any, name: str, look: str = "outline") -> ui.button:
-        button = ui.button(self.desk.words(f"review.{key}"), on_click=does).props(f"no-caps {look}")
+    def _button(self, key: str, action: Any, name: str, look: str = "outline") -> ui.button:
+        button = ui.button(self.desk.words(f"review.{key}"), on_click=action).props(f"no-caps {look}")
         return tag(button.classes("ps-act"), name)
 
     def _actions(self, trims: bool) -> None:
         desk = self.desk
         with ui.row().classes("w-full items-center gap-2"):
-            self._button("accept" if trims else "next", self.accept, "accept", "unelevated color=primary")
+            self._button("accept" if trims else "next", lambda: self.accept(), "accept", "unelevated color=primary")
             self._button("back", desk.back, "back")
             self.exclude = self._button("exclude", self._exclude, "exclude")
             self._button("undo", desk.undo, "undo")
@@ -200,9 +278,9 @@ class RecordingView:
         kinds = list(dict.fromkeys(c.kind for c in self.desk.review.dataset.layout.channels))
         groups = [ALL, *(kinds if len(kinds) > 1 else []), ACTIVITY]
         with ui.row().classes("w-full items-center gap-2"):
-            visible = ui.toggle({g: self._kind(g) for g in groups}, value=ALL)
-            visible.props(f'no-caps dense unelevated aria-label="{words("review.group")}"').classes("ps-toggle")
-            tag(visible, "group").on_value_change(lambda e: self._grouped(str(e.value)))
+            toggle = ui.toggle({g: self._kind(g) for g in groups}, value=ALL)
+            toggle.props(f'no-caps dense unelevated aria-label="{words("review.group")}"').classes("ps-toggle")
+            tag(toggle, "group").on_value_change(lambda e: self._grouped(str(e.value)))
             for key, (icon, factor) in _ZOOMS.items():
                 button = ui.button(icon=icon, on_click=lambda factor=factor: self.plot.zoom(factor))
                 tag(button.props(f'flat round dense aria-label="{words(f"review.{key}")}"').classes("ps-act"), key)
@@ -211,7 +289,7 @@ class RecordingView:
         key = f"review.kind_{kind}"
         return self.desk.words(key) if self.desk.words.has(key) else kind
 
-    # Showing ------------------------------------------------------------------------------------------------------
+    # Drawing ------------------------------------------------------------------------------------------------------
 
     def draw(self, *, keep: bool = False, low: float | None = None, high: float | None = None) -> None:
         """Plot the current recording."""
@@ -221,46 +299,46 @@ class RecordingView:
         if not identity or identity not in desk.review.infos:
             self.heading.set_text(words("review.none_fit"))
             return
-        read = desk.review.signals(identity)
-        visible = read.curves(self.group, low, high)
-        names = [self._kind(n) if n == ACTIVITY else n for n in visible["names"]]
+        plotted = desk.review.signals(identity).curves(self.group, low, high)
+        names = [self._kind(n) if n == ACTIVITY else n for n in plotted["names"]]
         series = [
             {"label": n, "stroke": LINES[i % len(LINES)], "dash": _DASHES[i // len(LINES) % len(_DASHES)]}
             for i, n in enumerate(names)
         ]
-        y_title = words("review.y_axis", unit=words.unit(visible["unit"])) if visible["unit"] else ""
+        y_title = words("review.y_axis", unit=words.unit(plotted["unit"])) if plotted["unit"] else ""
+        lanes = [(at, self._kind(kind)) for at, kind in plotted["lanes"]]
         self.plot.show(
             identity,
             self._label(),
-            visible["x"],
-            visible["curves"],
+            plotted["x"],
+            plotted["curves"],
             series,
             x_title=words("review.x_axis"),
             y_title=words("review.activity_axis") if self.group == ACTIVITY else y_title,
-            lanes=[(at, self._kind(kind)) for at, kind in visible["lanes"]],
-            limits=(-1.08 - 2.1 * (len(visible["lanes"]) - 1), 1.08) if visible["lanes"] else None,
+            lanes=lanes,
+            limits=(-1.08 - 2.1 * (len(lanes) - 1), 1.08) if lanes else None,
             marks=self._lines(),
             cut=self._cut(),
-            thinned=visible["thinned"] or low is not None,
+            thinned=plotted["thinned"] or low is not None,
             keep=keep,
         )
-        self.refresh(moved=False)
+        self.refresh()
 
-    def refresh(self, *, moved: bool = True) -> None:
+    def refresh(self) -> None:
         """Update marks, state and findings of the current recording; its curves stay."""
         desk, words, review = self.desk, self.desk.words, self.desk.review
         row = review.rows.get(desk.current)
         if row is None or not review.is_read(row.id):
             return
-        standing, draft = review.standing(row.id), review.draft(row.id)
-        now = (row.id, row.state, standing, draft, row.findings, desk.ends, row.confidence)
+        marks, draft = review.standing(row.id), review.draft(row.id)
+        now = (row.id, row.state, marks, draft, row.findings, desk.ends, row.confidence)
         if now == self._drawn:
             return
-        self._drawn = now
-        if moved:
+        if self._drawn is not None:
             self.plot.remark(row.id, self._lines(), self._cut(), self._label())
+        self._drawn = now
         self.heading.set_text(row.id)
-        self.affect.set_text(f"{AFFECTS[row.affect]} {words.gesture(row.info.gesture)}")
+        self.affect.set_text(f"{AFFECT_SIGNS[row.affect]} {words.gesture(row.info.gesture)}")
         self.affect.style(f"background: {AFFECT_COLOURS.get(row.affect, '#767676')}")
         self.state.set_text(f"{SIGNS[row.state]} {words(f'review.state_{row.state}')}")
         self.state.props(f'data-state="{row.state}"')
@@ -268,24 +346,23 @@ class RecordingView:
         excluded = row.state == "excluded"
         self.exclude.set_text(words("review.include" if excluded else "review.exclude"))
         if not review.is_labelled:
-            self.untrim.set_visibility(standing.trimmed)
+            self.untrim.set_visibility(marks.trimmed)
         self._fill_findings()
 
     def _about(self) -> str:
         desk, words = self.desk, self.desk.words
         row, at = desk.review.rows[desk.current], desk.review.signals(desk.current).seconds
         place = desk.order.index(row.id) + 1 if row.id in desk.order else 0
-        message = words(
-            "review.about", person=desk.person(row.info.subject), seconds=words.number(at[-1], 2), rows=row.info.rows
-        )
-        message += f" · {words('review.place', at=place, of=len(desk.order))}" if place else ""
-        if desk.review.is_labelled:
-            return message
-        start, stop = desk.review.kept_rows(row.id, desk.ends)
-        message += " · " + words("review.kept", start=words.number(at[start], 2), stop=words.number(at[stop], 2))
-        if row.state == "suggested":
-            message += " · " + words("review.confidence", percent=f"{100 * row.confidence:.0f}")
-        return message
+        person, seconds = desk.person(row.info.subject), words.number(at[-1], 2)
+        facts = [words("review.about", person=person, seconds=seconds, rows=row.info.rows)]
+        if place:
+            facts.append(words("review.place", at=place, of=len(desk.order)))
+        if not desk.review.is_labelled:
+            start, stop = desk.review.kept_rows(row.id, desk.ends)
+            facts.append(words("review.kept", start=words.number(at[start], 2), stop=words.number(at[stop], 2)))
+            if row.state == "suggested":
+                facts.append(words("review.confidence", percent=f"{100 * row.confidence:.0f}"))
+        return " · ".join(facts)
 
     def _label(self) -> str:
         desk, words = self.desk, self.desk.words
@@ -293,7 +370,7 @@ class RecordingView:
         return f"{row.id}, {words.gesture(row.info.gesture)}, {words(f'review.state_{row.state}')}. {self._about()}"
 
     def _lines(self) -> list[dict[str, Any]]:
-        """Return the vertical lines: the suggestion dotted, drafts and set marks solid."""
+        """Return the vertical lines: suggestions dotted, drafts and marks solid."""
         desk, words, review = self.desk, self.desk.words, self.desk.review
         if review.is_labelled:
             return []
@@ -305,14 +382,14 @@ class RecordingView:
             colour = _DRAFT if draft else _SET
             for key, row, edge in ((START, start, 0), (STOP, stop, rows)):
                 if row != edge or (key == START and draft):
-                    message = words(f"review.mark_{key}", at=words.number(at[row], 2))
-                    lines.append({"x": float(at[row]), "label": message, "stroke": colour, "edge": key})
+                    label = words(f"review.mark_{key}", at=words.number(at[row], 2))
+                    lines.append({"x": float(at[row]), "label": label, "stroke": colour, "edge": key})
         taken = {line["x"] for line in lines}
         for key, row, visible in ((START, s.start, s.onset_visible), (STOP, s.stop, s.offset_visible)):
             if visible and float(at[row]) not in taken:
-                sure = key == START or desk.ends
-                message = words(f"review.suggested_{key}", at=words.number(at[row], 2)) if sure else ""
-                lines.append({"x": float(at[row]), "label": message, "dash": [2, 4] if sure else [1, 7], "edge": key})
+                used = key == START or desk.ends
+                label = words(f"review.suggested_{key}", at=words.number(at[row], 2)) if used else ""
+                lines.append({"x": float(at[row]), "label": label, "dash": [2, 4] if used else [1, 7], "edge": key})
         return lines
 
     def _cut(self) -> list[tuple[float, float]]:
@@ -328,12 +405,11 @@ class RecordingView:
 
     def _fill_findings(self) -> None:
         desk, words = self.desk, self.desk.words
-        review, visit, visible = desk.review, desk.visit, desk.current
-        row = review.rows[visible]
+        row = desk.review.rows[desk.current]
         self.findings.clear()
         with self.findings:
             if not row.findings:
-                key = "no_findings" if review.prepared.checked else "not_checked"
+                key = "no_findings" if desk.review.prepared.checked else "not_checked"
                 ui.label(words(f"review.{key}")).classes("ps-dim")
             for f in row.findings:
                 with ui.column().classes("w-full gap-0").props(f'data-check="{f.check}"'):
@@ -342,23 +418,16 @@ class RecordingView:
                     if f.accepted:
                         with ui.row().classes("items-center"):
                             ui.label(f"✓ {words('review.accepted_finding')}").classes("ps-dim")
-                            ui.button(
-                                words("review.reopen"),
-                                on_click=lambda f=f: desk.decide(
-                                    visible, lambda: review.reopen_finding(visit, f, desk.name)
-                                ),
-                            ).props("no-caps flat dense").classes("ps-act")
+                            finding_button(desk, f, row.id).classes("ps-act")
                     else:
                         ui.label(f"→ {f.action}").classes("ps-dim")
-                        ui.button(words("review.accept_finding"), on_click=lambda f=f: ask_reason(desk, f)).props(
-                            "no-caps flat dense"
-                        ).classes("ps-act")
+                        finding_button(desk, f, row.id).classes("ps-act")
 
-    # Doing --------------------------------------------------------------------------------------------------------
+    # Commands -----------------------------------------------------------------------------------------------------
 
-    async def key(self, message: dict[str, Any]) -> None:
-        """Handle a key that was pressed while recording ``shown`` was displayed."""
-        desk, key, shift = self.desk, str(message["key"]), bool(message["shift"])
+    async def key(self, event: dict[str, Any]) -> None:
+        """Handle a key that was pressed while ``event["recording"]`` was displayed."""
+        desk, key, shift = self.desk, str(event["key"]), bool(event["shift"])
         trims = not desk.review.is_labelled
         if key == "Backspace":
             await desk.back()
@@ -368,11 +437,11 @@ class RecordingView:
             await desk.previous()
         elif key == "u":
             await desk.undo()
-        elif message["shown"] != desk.current:
-            # The next one has come since: nothing is decided about what nobody saw.
+        elif event["recording"] != desk.current:
+            # Another recording is displayed by now: the key was not meant for it.
             return
         elif key == "Enter":
-            await self.accept(str(message["shown"]))
+            await self.accept(str(event["recording"]))
         elif key == "x":
             await self._exclude()
         elif trims and key in ("s", "Escape"):
@@ -384,21 +453,21 @@ class RecordingView:
         elif trims and key in _STEPS:
             self.step(_STEPS[key], shift)
 
-    def picked(self, message: dict[str, Any]) -> None:
+    def picked(self, event: dict[str, Any]) -> None:
         """Set the start or the stop at a click in the plot."""
         desk = self.desk
-        if message["shown"] != desk.current or desk.review.is_labelled:
+        if event["recording"] != desk.current or desk.review.is_labelled:
             return
         with desk.page.show_errors():
-            row = desk.review.signals(desk.current).row_at(float(message["x"]))
-            stop = bool(message["shift"]) or message["button"] == "right" or self.side == STOP
-            self._set(**({"stop": row} if stop else {"start": row}))
+            row = desk.review.signals(desk.current).row_at(float(event["x"]))
+            stop = bool(event["shift"]) or event["button"] == "right" or self.side == STOP
+            self._set(**{STOP if stop else START: row})
 
     def step(self, by: int, stop: bool) -> None:
         """Move the start or the stop by some rows."""
         with self.desk.page.show_errors():
             start, end = self.desk.review.kept_rows(self.desk.current, self.desk.ends)
-            self._set(**({"stop": end + by} if stop else {"start": start + by}))
+            self._set(**{STOP: end + by} if stop else {START: start + by})
 
     def _set(self, **rows: int) -> None:
         desk = self.desk
@@ -407,10 +476,10 @@ class RecordingView:
             desk.page.say("")
         self.refresh()
 
-    async def accept(self, visible: Any = None) -> None:
+    async def accept(self, recording: str = "") -> None:
         """Mark the displayed trim as accepted and go to the next recording."""
         desk = self.desk
-        identity = visible if isinstance(visible, str) else desk.current
+        identity = recording or desk.current
         if desk.review.is_labelled:
             await desk.next()
         else:
@@ -444,7 +513,7 @@ class RecordingView:
         self.group = group
         self.draw(keep=True)
 
-    def zoomed(self, message: dict[str, Any]) -> None:
+    def zoomed(self, event: dict[str, Any]) -> None:
         """Plot a long recording again with all rows of the visible range."""
-        if message["shown"] == self.desk.current:
-            self.draw(keep=True, low=float(message["low"]), high=float(message["high"]))
+        if event["recording"] == self.desk.current:
+            self.draw(keep=True, low=float(event["low"]), high=float(event["high"]))

@@ -6,16 +6,22 @@ tab displays, too. Every decision is written as a mark at once.
 
 from __future__ import annotations
 
+import hashlib
+import json
+import os
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlencode
 
 import numpy as np
 
 from plushsense.core.errors import ConfigError, DatasetError
+from plushsense.core.files import write_file
 from plushsense.dataset import trimming as trim
 from plushsense.dataset.files import current_stamp
 from plushsense.dataset.index import apply_marks, open_dataset
@@ -24,15 +30,15 @@ from plushsense.dataset.marks import Mark, MarksFollower, MarkState, append_mark
 from plushsense.dataset.onset import Suggestion
 from plushsense.dataset.quality.findings import SEVERITIES, Finding
 from plushsense.dataset.store import Dataset, RecordingInfo
-from plushsense.studio.app.workspace import ChangeSignal
-from plushsense.studio.pages.review.plots import (
+from plushsense.studio.app.workspace import ChangeSignal, Workspace
+from plushsense.studio.pages.review.signals import (
     GestureOverlay,
     RecordingSignals,
+    ReviewPreparation,
     build_overlay,
     read_signals,
     trimmed_curve,
 )
-from plushsense.studio.pages.review.preparation import ReviewPreparation
 
 LOOKING, NONE, SUGGESTED, DRAFT = "looking", "none", "suggested", "draft"
 ACCEPTED, ADJUSTED, EXCLUDED, LABELLED = "accepted", "adjusted", "excluded", "labelled"
@@ -74,7 +80,7 @@ class ReviewedRecording:
 
 @dataclass(frozen=True)
 class ReviewDecision:
-    """A decision of a browser tab, with the standing before and after it."""
+    """A decision of a browser tab, with the marks of the recording before and after it."""
 
     recording: str
     action: str
@@ -82,27 +88,26 @@ class ReviewDecision:
     after: MarkState
     check: str = ""
 
-
-def aspect(decision: ReviewDecision, standing: MarkState) -> Any:
-    """Return the part of a standing that a decision changes."""
-    if decision.check:
-        return decision.check in standing.accepted
-    if decision.action in ("exclude", "include"):
-        return standing.excluded
-    return standing.start, standing.stop, standing.how
+    def changed_part(self, marks: MarkState) -> Any:
+        """Return the part of a mark state that the decision changes."""
+        if self.check:
+            return self.check in marks.accepted
+        if self.action in ("exclude", "include"):
+            return marks.excluded
+        return marks.start, marks.stop, marks.how
 
 
 ODD = ("never-stopped", "duration", "no-onset", "several-gestures", "stuck", "flat")
 """Checks whose findings make a recording stand out among the others of its gesture."""
-_SIGNALS_KEPT = 48
-_VISITS_KEPT = 50
+_MAX_SIGNALS = 48
+_MAX_VISITS = 50
 
 
 class Review:
     """A data set under review, shared by all pages.
 
-    Methods may be called from any thread; those that read files may take seconds. `changed` notifies of each change;
-    ``version`` counts the changes.
+    Methods may be called from any thread; those that read files may take seconds. `changed` is notified of each change,
+    and ``version`` counts the changes.
     """
 
     def __init__(self, path: Path) -> None:
@@ -118,7 +123,7 @@ class Review:
         self._marks = MarksFollower(path)
         self._open()
         self.prepared = ReviewPreparation(self.changed)
-        self._seen: Any = None
+        self._rows_source: Any = None
         self.prepared.begin(self.as_marked())
 
     def _open(self) -> None:
@@ -133,7 +138,7 @@ class Review:
         self.prepared.close()
 
     def renew(self) -> None:
-        """Read recordings added since, and check again if decisions were made since."""
+        """Read recordings added since the last call, and check again if decisions were made since the last check."""
         with self._lock:
             now = current_stamp(self.path)
             new = now | {"marks": ""} != self._stamp | {"marks": ""}
@@ -149,7 +154,7 @@ class Review:
         """True if the recordings are cut from labels, so that they cannot be trimmed."""
         return self.dataset.layout.is_labelled
 
-    # What stands --------------------------------------------------------------------------------------------------
+    # Marks and findings -------------------------------------------------------------------------------------------
 
     def look(self) -> None:
         """Read marks that other programs wrote, and notify subscribers if there are any.
@@ -169,11 +174,11 @@ class Review:
         self.changed.notify()
 
     def standing(self, identity: str) -> MarkState:
-        """Return the standing of a recording, stream or person according to the marks."""
+        """Return the state of a recording, stream or person according to the marks."""
         return self._standing.get(identity, MarkState())
 
     def as_marked(self) -> Dataset:
-        """Return the data set with the current marks and its own reader, for another thread."""
+        """Return the data set with the current marks, as an object for use in another thread."""
         bare = [replace(r, start=0, stop=r.rows, excluded=False) for r in self.dataset.recordings]
         return Dataset(self.path, self.dataset.head, apply_marks(bare, dict(self._standing)), self.dataset.streams)
 
@@ -194,13 +199,13 @@ class Review:
     def rows(self) -> dict[str, ReviewedRecording]:
         """Recordings by id in the order of the index; the same dictionary until something changes."""
         with self._lock:
-            made_of = (self.version, id(self.prepared.checked), len(self.prepared.shapes), id(self.dataset))
-            if made_of != self._seen:
-                found: dict[str, list[Finding]] = {}
+            source = (self.version, id(self.prepared.checked), len(self.prepared.shapes), id(self.dataset))
+            if source != self._rows_source:
+                findings: dict[str, list[Finding]] = {}
                 for f in self._findings():
-                    found.setdefault(f.recording, []).append(f)
-                self._rows = {i: self._row(info, tuple(found.get(i, ()))) for i, info in self.infos.items()}
-                self._seen = made_of
+                    findings.setdefault(f.recording, []).append(f)
+                self._rows = {i: self._row(info, tuple(findings.get(i, ()))) for i, info in self.infos.items()}
+                self._rows_source = source
             return self._rows
 
     def _row(self, info: RecordingInfo, findings: tuple[Finding, ...]) -> ReviewedRecording:
@@ -236,8 +241,14 @@ class Review:
             yield f if f.accepted == accepted else replace(f, accepted=accepted)
 
     def findings_elsewhere(self) -> list[Finding]:
-        """Return the findings about sessions, people and the data set as a whole."""
+        """Return the findings about sessions, people and the whole data set."""
         return [f for f in self._findings() if not f.recording]
+
+    def gestures(self) -> list[str]:
+        """Return the gestures of the recordings, in the order of the gesture set."""
+        present = {info.gesture for info in self.infos.values()}
+        known = [g.label for g in self.dataset.gestures.gestures if g.label in present]
+        return [*known, *sorted(present - set(known))]
 
     def info(self, identity: str) -> RecordingInfo:
         """Return the index entry of a recording.
@@ -256,26 +267,25 @@ class Review:
         """Read the signals of a recording; the last 48 are cached."""
         self.prepared.step_back()
         info = self.info(identity)
-        known = self._read.get(identity)
-        if known is not None and (not len(self.prepared.scale) or not np.isnan(known.activity).any()):
-            return known
+        cached = self._read.get(identity)
+        if cached is not None and (not len(self.prepared.scale) or not np.isnan(cached.activity).any()):
+            return cached
         with self._reading:
-            made = read_signals(self.dataset, info, self.prepared.scale)
-            self._read[identity] = made
+            signals = self._read[identity] = read_signals(self.dataset, info, self.prepared.scale)
             self._read.move_to_end(identity)
-            while len(self._read) > _SIGNALS_KEPT:
+            while len(self._read) > _MAX_SIGNALS:
                 self._read.popitem(last=False)
-        return made
+        return signals
 
     def is_read(self, identity: str) -> bool:
         """Return whether the signals of a recording are cached."""
         return identity in self._read
 
     def trim(self, identity: str) -> trim.Trim:
-        """Return the suggestion and the standing of a recording; without a suggestion while that is computed."""
+        """Return the suggestion (an empty one until it is computed) and the marks of a recording."""
         info = self.info(identity)
-        nothing = Suggestion(0, info.rows, False, False, 0.0, 0.0, 1.0)
-        suggestion = self.prepared.suggestions.get(identity, nothing)
+        empty = Suggestion(0, info.rows, False, False, 0.0, 0.0, 1.0)
+        suggestion = self.prepared.suggestions.get(identity, empty)
         return trim.Trim(info, suggestion, self.standing(identity), self.signals(identity).seconds)
 
     def draft(self, identity: str) -> tuple[int, int] | None:
@@ -298,9 +308,9 @@ class Review:
         with self._lock:
             if self.standing(identity).excluded:
                 raise DatasetError(f"'{identity}' is excluded: take it back in before you trim it.")
-            was = self.kept_rows(identity, ends)
-            first = was[0] if start is None else min(max(0, start), info.rows - 1)
-            last = was[1] if stop is None else min(max(1, stop), info.rows)
+            first, last = self.kept_rows(identity, ends)
+            first = first if start is None else min(max(0, start), info.rows - 1)
+            last = last if stop is None else min(max(1, stop), info.rows)
             if last <= first:
                 raise DatasetError(
                     f"Nothing of '{identity}' would be left: set the start before the end, and the end after the start."
@@ -313,15 +323,15 @@ class Review:
     def drop(self, identity: str) -> bool:
         """Discard a draft, and return whether there was one."""
         with self._lock:
-            gone = self._drafts.pop(identity, None) is not None
-        if gone:
+            dropped = self._drafts.pop(identity, None) is not None
+        if dropped:
             self._changed()
-        return gone
+        return dropped
 
     # Decisions ----------------------------------------------------------------------------------------------------
 
     def _decide(self, visit: str, about: str, action: str, make: Callable[[], object], check: str = "") -> bool:
-        """Write marks, remember how to undo them, and return whether the standing changed."""
+        """Write marks, remember how to undo them, and return whether the state changed."""
         with self._lock:
             self._standing = self._marks.states()
             before = self.standing(about)
@@ -332,7 +342,7 @@ class Review:
                 history = self._histories.setdefault(visit, [])
                 history.append(ReviewDecision(about, action, before, now, check))
                 self._histories.move_to_end(visit)
-                while len(self._histories) > _VISITS_KEPT:
+                while len(self._histories) > _MAX_VISITS:
                     self._histories.popitem(last=False)
         self._changed()
         return now != before
@@ -347,29 +357,32 @@ class Review:
             DatasetError: if the marks cannot be written, or the suggestion is still being computed.
         """
         with self._lock:
-            found, draft = self.trim(identity), self._drafts.get(identity)
-            state = self._state(found.recording, self.prepared.suggestions.get(identity))
+            current, draft = self.trim(identity), self._drafts.get(identity)
+            state = self._state(current.recording, self.prepared.suggestions.get(identity))
             if state in (EXCLUDED, LABELLED, ACCEPTED, ADJUSTED):
                 return False
             if state == LOOKING:
-                raise DatasetError(f"'{identity}' is still being looked at: wait a moment, or set its start yourself.")
-            rows = draft or found.suggested_rows(ends)
-            as_suggested = rows == found.suggested_rows(ends) and rows != (0, found.recording.rows)
+                raise DatasetError(
+                    f"The start of '{identity}' is still being computed: wait a moment, or set it yourself."
+                )
+            suggested = current.suggested_rows(ends)
+            rows = draft or suggested
+            as_suggested = rows == suggested and rows != (0, current.recording.rows)
 
             def make() -> None:
-                if as_suggested and found.state != ADJUSTED:
-                    trim.accept_suggestions(self.dataset, [found], who, offset=ends)
+                if as_suggested and current.state != ADJUSTED:
+                    trim.accept_suggestions(self.dataset, [current], who, offset=ends)
                 else:
-                    trim.set_rows(self.dataset, found, *rows, who)
+                    trim.set_rows(self.dataset, current, *rows, who)
 
-            made = self._decide(visit, identity, "trim", make)
+            changed = self._decide(visit, identity, "trim", make)
             self._drafts.pop(identity, None)
         self._changed()
-        return made
+        return changed
 
     def exclude(self, visit: str, identity: str, who: str, why: str) -> bool:
         """Exclude a recording; raise ConfigError without a reason."""
-        return self._mark(visit, Mark(self.info(identity).id, "exclude", who, _reason(why)))
+        return self._mark(visit, Mark(self.info(identity).id, "exclude", who, _check_reason(why)))
 
     def include(self, visit: str, identity: str, who: str) -> bool:
         """Take an excluded recording back into use."""
@@ -381,7 +394,7 @@ class Review:
 
     def accept_finding(self, visit: str, finding: Finding, who: str, why: str) -> bool:
         """Mark a finding as known and harmless; raise ConfigError without a reason."""
-        return self._mark(visit, Mark(finding.about, "accept", who, _reason(why), check=finding.check))
+        return self._mark(visit, Mark(finding.about, "accept", who, _check_reason(why), check=finding.check))
 
     def reopen_finding(self, visit: str, finding: Finding, who: str) -> bool:
         """Reopen an accepted finding."""
@@ -397,8 +410,7 @@ class Review:
             "unaccept": mark.check not in before.accepted,
         }[mark.action]:
             return False
-        make = lambda: append_marks(self.path, [mark])  # noqa: E731, RUF100
-        return self._decide(visit, mark.recording, mark.action, make, mark.check)
+        return self._decide(visit, mark.recording, mark.action, partial(append_marks, self.path, [mark]), mark.check)
 
     def history(self, visit: str) -> Sequence[ReviewDecision]:
         """Return the decisions of a browser tab that can be undone, the oldest first."""
@@ -416,10 +428,10 @@ class Review:
                 return None
             self._standing = self._marks.states()
             last, now = history[-1], self.standing(history[-1].recording)
-            if aspect(last, now) != aspect(last, last.after):
+            if last.changed_part(now) != last.changed_part(last.after):
                 history.pop()
                 raise DatasetError(
-                    f"'{last.recording}' was decided anew since, in another window or program: that stays as it is."
+                    f"'{last.recording}' has been changed in another window or program since then: nothing is undone."
                 )
             mark = Mark(last.recording, last.action, who, check=last.check)
             append_marks(self.path, [inverse_mark(mark, last.before, who, why)])
@@ -428,7 +440,7 @@ class Review:
         self._changed()
         return last
 
-    # Side by side -------------------------------------------------------------------------------------------------
+    # Overlay ------------------------------------------------------------------------------------------------------
 
     def overlay(self, gesture: str) -> GestureOverlay:
         """Return the overlay of all used recordings of a gesture, with the checks that flagged some."""
@@ -438,7 +450,7 @@ class Review:
             if row.info.gesture != gesture or row.state == EXCLUDED or shape is None:
                 continue
             standing = self.standing(identity)
-            # Assume even steps: accurate enough for a plot, and no file is read.
+            # Even steps are accurate enough for a plot, and no file is read.
             per_row = shape.seconds / max(1, row.info.rows)
             stop = row.info.rows if standing.stop < 0 else standing.stop
             odd = dict.fromkeys(f.check for f in row.open if f.check in ODD)
@@ -446,7 +458,74 @@ class Review:
         return build_overlay(curves)
 
 
-def _reason(why: str) -> str:
+def _check_reason(why: str) -> str:
     if not why.strip():
-        raise ConfigError("This needs a reason: say why, in a few words.")
+        raise ConfigError("A reason is missing: give it in a few words.")
     return why.strip()
+
+
+_MAX_REVIEWS = 3
+_MAX_ADDRESS = 1500
+
+
+class Reviews:
+    """The reviews of the studio, one for each data set, and stored selections of recordings."""
+
+    def __init__(self, workspace: Workspace) -> None:
+        self._workspace = workspace
+        self._selections = workspace.folder / "selections"
+        self._lock = threading.Lock()
+        self._opened: OrderedDict[Path, Review] = OrderedDict()
+
+    def open(self, path: str | os.PathLike[str]) -> Review:
+        """Open the review of a data set inside the folders of the studio; may take seconds.
+
+        Raises:
+            ConfigError: for a folder outside the studio. DatasetError: for a folder that is no valid data set.
+        """
+        place = self._workspace.inside(path)
+        with self._lock:
+            review = self._opened.get(place)
+            if review is None:
+                review = self._opened[place] = Review(place)
+            else:
+                review.renew()
+            self._opened.move_to_end(place)
+            oldest = [self._opened.popitem(last=False)[1] for _ in range(len(self._opened) - _MAX_REVIEWS)]
+        for each in oldest:
+            each.close()
+        return review
+
+    def close(self) -> None:
+        """Stop the background threads of all reviews."""
+        for review in self._opened.values():
+            review.close()
+
+    def address(self, dataset: Path, recordings: Sequence[str], title: str = "") -> str:
+        """Return the address of the review page for a selection of recordings; ``title`` stands above the table.
+
+        A long list is stored in ``<home>/selections/`` under its hash, so that the address stays short and valid.
+        """
+        query = urlencode([("dataset", str(dataset)), ("title", title), *(("recordings", r) for r in recordings)])
+        if len(query) <= _MAX_ADDRESS:
+            return f"/review?{query}"
+        selection = {"dataset": str(dataset), "recordings": list(recordings), "title": title}
+        text = json.dumps(selection, ensure_ascii=False)
+        key = hashlib.sha256(text.encode()).hexdigest()[:16]
+        self._selections.mkdir(parents=True, exist_ok=True)
+        write_file(self._selections / f"{key}.json", text)
+        return f"/review?{urlencode({'dataset': str(dataset), 'selection': key})}"
+
+    def selection(self, key: str) -> tuple[str, list[str]]:
+        """Read a stored selection: its title and the ids.
+
+        Raises:
+            ConfigError: for an unknown key.
+        """
+        try:
+            if not key.isalnum():
+                raise ValueError
+            selection = json.loads((self._selections / f"{key}.json").read_text(encoding="utf-8"))
+            return str(selection["title"]), [str(r) for r in selection["recordings"]]
+        except (OSError, ValueError, KeyError, TypeError):
+            raise ConfigError(f"The selection '{key}' does not exist: follow the link again.") from None

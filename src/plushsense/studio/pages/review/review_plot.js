@@ -8,10 +8,10 @@ const LETTERS = ["x", "u", "s", "i", "+", "-", "0", ",", ".", ";", ":", "<", ">"
 const REPEATED = ["ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown", ",", ".", "<", ">", ";", ":"];
 
 export default {
-  template: '<div role="img" :aria-label="said" tabindex="-1" :data-shown="shown"><div ref="place"></div></div>',
+  template: '<div role="img" :aria-label="text" tabindex="-1" :data-recording="recording"><div ref="place"></div></div>',
   props: { label: String, height: Number, legend: Boolean, keyed: Boolean, resourcePath: String },
   data() {
-    return { said: this.label, shown: "" };
+    return { text: this.label, recording: "" };
   },
   async mounted() {
     await this.$nextTick();
@@ -66,7 +66,7 @@ export default {
       if (event.repeat && !REPEATED.includes(key)) return;
       if (key === "+" || key === "-" || key === "0") return this.zoom(key === "+" ? 0.5 : key === "-" ? 2 : 0);
       this.pressed = performance.now();
-      this.$emit("key", { key, shift: event.shiftKey, shown: this.shown });
+      this.$emit("key", { key, shift: event.shiftKey, recording: this.recording });
     },
     build() {
       this.u?.destroy();
@@ -97,7 +97,7 @@ export default {
         event.preventDefault();
         const box = over.getBoundingClientRect();
         const x = this.u.posToVal(event.clientX - box.left, "x"), v = this.u.posToVal(event.clientY - box.top, "y");
-        this.$emit("pick", { x, y: v, button, shift: event.shiftKey, shown: this.shown });
+        this.$emit("pick", { x, y: v, button, shift: event.shiftKey, recording: this.recording });
       };
       over.addEventListener("click", (event) => pick(event, "left"));
       over.addEventListener("contextmenu", (event) => pick(event, "right"));
@@ -152,10 +152,10 @@ export default {
         ctx.fillText(m.label, at, line);
       });
       ctx.restore();
-      if (this.pressed && this.drawn !== this.shown) {
+      if (this.pressed && this.drawn !== this.recording) {
         const since = this.pressed;
         this.pressed = 0;
-        this.drawn = this.shown;
+        this.drawn = this.recording;
         requestAnimationFrame(() => this.times.push(performance.now() - since));
       }
     },
@@ -167,22 +167,22 @@ export default {
     show(p) {
       if (!this.ready(() => this.show(p))) return;
       const same = this.u && JSON.stringify([p.series, p.lanes, p.y, p.range]) === this.kind;
-      const kept = this.u && p.id === this.shown && p.keep ? { ...this.u.scales.x } : null;
+      const kept = this.u && p.id === this.recording && p.keep ? { ...this.u.scales.x } : null;
       this.p = p;
-      this.said = p.label;
+      this.text = p.label;
       this.marks = p.marks;
       this.cut = p.cut;
-      this.shown = p.id;
+      this.recording = p.id;
       if (same) this.u.setData(p.data, !kept);
       else this.build();
       this.kind = JSON.stringify([p.series, p.lanes, p.y, p.range]);
       if (kept) this.u.setScale("x", { min: kept.min, max: kept.max });
     },
     remark(id, marks, cut, label) {
-      if (!this.ready(() => this.remark(id, marks, cut, label)) || id !== this.shown) return;
+      if (!this.ready(() => this.remark(id, marks, cut, label)) || id !== this.recording) return;
       this.marks = marks;
       this.cut = cut;
-      this.said = label;
+      this.text = label;
       this.u?.redraw(false);
     },
     zoom(factor, at) {
@@ -197,7 +197,7 @@ export default {
       }
       if (high - low < 0.02) return;
       this.u.setScale("x", { min: low, max: high });
-      if (this.p.thinned) this.$emit("zoomed", { low, high, shown: this.shown });
+      if (this.p.thinned) this.$emit("zoomed", { low, high, recording: this.recording });
     },
   },
 };

@@ -18,7 +18,7 @@ export default {
           <td>{{ r.gesture }}</td>
           <td class="ps-number">{{ r.seconds }}</td>
           <td><span v-for="f in r.findings" class="ps-finding" :data-severity="f.severity">{{ f.text }}</span></td>
-          <td><span class="ps-state" :data-state="r.state">{{ r.said }}</span></td>
+          <td><span class="ps-state" :data-state="r.state">{{ r.state_text }}</span></td>
           <td><svg class="ps-spark" viewBox="0 0 100 24" preserveAspectRatio="none" role="img" :aria-label="spark">
             <rect v-if="r.kept" :x="r.kept[0]" y="0" :width="r.kept[1] - r.kept[0]" height="24" class="ps-kept"/>
             <polyline :points="r.points"/></svg></td>

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 from nicegui import ui
 from nicegui.element import Element
@@ -11,45 +11,30 @@ from nicegui.element import Element
 from plushsense.dataset.quality.findings import Finding
 from plushsense.studio.app.shell import AFFECT_SIGNS, tag
 from plushsense.studio.app.words import Words
+from plushsense.studio.pages.review.controller import SORTS, ReviewController
 from plushsense.studio.pages.review.review import ReviewedRecording
-
-if TYPE_CHECKING:
-    from plushsense.studio.pages.review.controller import ReviewController
 
 
 class ReviewTable(Element, component="review_table.js"):
     """Browser component that displays rows of recordings.
 
     Args:
-        columns: dictionaries with ``key``, ``label`` and ``sorts`` (whether a click sorts by it), from left to right.
-        spark: text alternative of the small curves.
+        words: the texts of the page.
         on_sort: called with the key of a column.
         on_open: called with the id of a recording.
     """
 
-    def __init__(
-        self,
-        caption: str,
-        columns: Sequence[dict[str, Any]],
-        *,
-        spark: str,
-        on_sort: Callable[[str], Any],
-        on_open: Callable[[str], Any],
-    ) -> None:
+    def __init__(self, words: Words, on_sort: Callable[[str], Any], on_open: Callable[[str], Any]) -> None:
         super().__init__()
-        self._props["caption"] = caption
-        self._props["columns"] = list(columns)
-        self._props["rows"] = []
-        self._props["spark"] = spark
+        columns = [{"key": k, "label": words(f"review.{k}"), "sorts": k in SORTS} for k in (*SORTS, "path")]
+        self._props.update(caption=words("review.table"), columns=columns, rows=[], spark=words("review.spark"))
         self.classes("w-full")
         self.on("sort", lambda event: on_sort(str(event.args)))
         self.on("open", lambda event: on_open(str(event.args)))
 
-    def show(self, rows: Sequence[dict[str, Any]], *, sort: str, down: bool, current: str, caption: str) -> None:
-        """Display rows: ``id, person, gesture, seconds, findings [{severity, text}], state, said, points, kept``."""
-        self._props["rows"] = list(rows)
-        self._props["sort"], self._props["down"] = sort, down
-        self._props["current"], self._props["caption"] = current, caption
+    def show(self, rows: list[dict[str, Any]], sort: str, down: bool, current: str) -> None:
+        """Display rows, each with the texts of the columns, ``findings``, ``points`` and ``kept``."""
+        self._props.update({"rows": rows, "sort": sort, "down": down, "current": current})
         self.update()
 
 
@@ -63,14 +48,24 @@ def finding_text(words: Words, finding: Finding) -> str:
     return f"{SEVERITY_SIGNS[finding.severity]} {words(f'review.severity_{finding.severity}')}: {finding.check}"
 
 
+def finding_button(desk: ReviewController, finding: Finding, recording: str = "") -> ui.button:
+    """Add the button that accepts a finding, or reopens an accepted one, while ``recording`` is displayed."""
+
+    async def reopen() -> None:
+        await desk.decide(recording or desk.current, lambda: desk.review.reopen_finding(desk.visit, finding, desk.name))
+
+    key, action = ("reopen", reopen) if finding.accepted else ("accept_finding", lambda: ask_reason(desk, finding))
+    return ui.button(desk.words(f"review.{key}"), on_click=action).props("no-caps flat dense")
+
+
 def ask_reason(desk: ReviewController, finding: Finding | None = None) -> None:
     """Open a dialog for a reason, then exclude the displayed recording or accept the finding."""
-    words, visible = desk.words, desk.current
-    title = (
-        words("review.why_exclude", id=visible)
-        if finding is None
-        else words("review.why_accept", check=finding.check, about=finding.about or desk.review.dataset.head.name)
-    )
+    words, recording = desk.words, desk.current
+    if finding is None:
+        title = words("review.why_exclude", id=recording)
+    else:
+        about = finding.about or desk.review.dataset.head.name
+        title = words("review.why_accept", check=finding.check, about=about)
 
     async def answer(why: str) -> None:
         if not why.strip():
@@ -80,12 +75,12 @@ def ask_reason(desk: ReviewController, finding: Finding | None = None) -> None:
         dialog.close()
         review, visit = desk.review, desk.visit
         if finding is None:
-            await desk.decide(visible, lambda: review.exclude(visit, visible, desk.name, why), move=True)
+            await desk.decide(recording, lambda: review.exclude(visit, recording, desk.name, why), move=True)
         else:
-            await desk.decide(visible, lambda: review.accept_finding(visit, finding, desk.name, why))
+            await desk.decide(recording, lambda: review.accept_finding(visit, finding, desk.name, why))
 
     with desk.page_slot, ui.dialog() as dialog:
-        # Close without a transition, because the next key belongs to the page again.
+        # Close without a transition, because the next key is a command of the page again.
         dialog.props(f'aria-label="{words("review.reason")}" transition-duration=0')
         with tag(ui.card().classes("w-full"), "reason"):
             ui.label(title).classes("text-lg font-bold").style("overflow-wrap: anywhere")
@@ -95,9 +90,9 @@ def ask_reason(desk: ReviewController, finding: Finding | None = None) -> None:
                     button = ui.button(reason, on_click=lambda reason=reason: answer(reason)).props("no-caps outline")
                     if number == 0:
                         button.props("autofocus")
-            field = ui.input(words("review.own_reason")).props("outlined").classes("w-full")
+            field = ui.input(words("review.own_reason")).classes("w-full")
             tag(field, "own-reason").on("keydown.enter", lambda: answer(field.value or ""))
-            error = tag(ui.label().props("role=alert").classes("ps-said-error"), "reason-error")
+            error = tag(ui.label().props("role=alert").classes("ps-message-error"), "reason-error")
             with ui.row().classes("w-full justify-end"):
                 ui.button(words("review.cancel"), on_click=dialog.close).props("no-caps flat")
                 go = words("review.exclude_go") if finding is None else words("review.accept_finding")
@@ -108,7 +103,6 @@ def ask_reason(desk: ReviewController, finding: Finding | None = None) -> None:
 
 PER_PAGE = 50
 _SPARK = 40
-_SORTED = ("recording", "person", "gesture", "seconds", "findings", "state")
 SIGNS = {
     "looking": "…",
     "suggested": "⋯",
@@ -120,8 +114,6 @@ SIGNS = {
     "labelled": "▤",
 }
 """Sign of each state; the word follows it."""
-# The broad plus is missing in many fonts.
-AFFECTS = {affect: sign.replace("＋", "+") for affect, sign in AFFECT_SIGNS.items()}
 
 
 class RecordingTableView:
@@ -129,7 +121,6 @@ class RecordingTableView:
 
     def __init__(self, desk: ReviewController) -> None:
         self.desk = desk
-        self.first = 0
         words = desk.words
         with tag(ui.column().classes("w-full"), "list") as self.place:
             with ui.row().classes("w-full items-center gap-2"):
@@ -143,37 +134,34 @@ class RecordingTableView:
                 tag(start, "start")
                 tag(ui.button(words("review.undo"), on_click=desk.undo).props("no-caps outline"), "undo-list")
                 self.again = tag(ui.button(on_click=self._check).props("no-caps outline"), "check-again")
-            columns = [{"key": k, "label": words(f"review.{k}"), "sorts": True} for k in _SORTED]
-            columns.append({"key": "path", "label": words("review.path"), "sorts": False})
-            self.table = ReviewTable(
-                words("review.table"), columns, spark=words("review.spark"), on_sort=self._sort, on_open=desk.open
-            )
-            tag(self.table, "table")
+            self.table = tag(ReviewTable(words, self._sort, desk.open), "table")
             with tag(ui.expansion().classes("w-full"), "elsewhere") as self.elsewhere:
                 self.others = ui.column().classes("w-full")
+        self._others_content: object = None
 
-    def fill(self) -> None:
+    def draw(self) -> None:
         """Display the current page of the table."""
         desk, words = self.desk, self.desk.words
         n = len(desk.order)
-        self.first = max(0, min(self.first, (n - 1) // PER_PAGE * PER_PAGE))
-        part = desk.order[self.first : self.first + PER_PAGE]
+        first = desk.first_row = max(0, min(desk.first_row, (n - 1) // PER_PAGE * PER_PAGE))
+        ids = desk.order[first : first + PER_PAGE]
         rows = desk.review.rows
-        visible = [self._cells(rows[i]) for i in part if i in rows]
-        message = words("review.range", first=self.first + 1 if n else 0, last=self.first + len(part), n=n)
-        self.range.set_text(message if n else words("review.none_fit"))
-        self.before.set_enabled(self.first > 0)
-        self.after.set_enabled(self.first + PER_PAGE < n)
-        self.table.show(visible, sort=desk.by, down=desk.down, current=desk.current, caption=words("review.table"))
+        text = words("review.range", first=first + 1, last=first + len(ids), n=n) if n else words("review.none_fit")
+        self.range.set_text(text)
+        self.before.set_enabled(first > 0)
+        self.after.set_enabled(first + PER_PAGE < n)
+        self.table.show([self._cells(rows[i]) for i in ids if i in rows], desk.by, desk.down, desk.current)
         unchecked = desk.review.unchecked
         self.again.set_visibility(unchecked > 0)
         self.again.set_text(words("review.check_again", n=unchecked))
         self._fill_others()
 
+    refresh = draw
+
     def _cells(self, row: ReviewedRecording) -> dict[str, Any]:
         desk, words = self.desk, self.desk.words
         shape = desk.review.prepared.shapes.get(row.id)
-        points, kept = "", None
+        points, kept_range = "", None
         if shape is not None and len(shape.size) > 1:
             step = -(-len(shape.size) // _SPARK)
             heights = [max(shape.size[i : i + step]) for i in range(0, len(shape.size), step)]
@@ -181,10 +169,10 @@ class RecordingTableView:
             points = " ".join(
                 f"{100 * i / max(1, len(heights) - 1):.0f},{23 - 22 * h / top:.0f}" for i, h in enumerate(heights)
             )
-            standing, of = desk.review.standing(row.id), max(1, row.info.rows)
-            if standing.trimmed and not standing.excluded:
-                stop = of if standing.stop < 0 else min(standing.stop, of)
-                kept = [round(100 * min(standing.start, stop) / of, 1), round(100 * stop / of, 1)]
+            marks, total = desk.review.standing(row.id), max(1, row.info.rows)
+            if marks.trimmed and not marks.excluded:
+                stop = total if marks.stop < 0 else min(marks.stop, total)
+                kept_range = [round(100 * min(marks.start, stop) / total, 1), round(100 * stop / total, 1)]
         by_check = {f.check: f for f in reversed(row.findings) if not f.accepted}
         findings = [{"severity": f.severity, "text": finding_text(words, f)} for f in reversed(by_check.values())]
         if not findings and row.findings:
@@ -192,53 +180,43 @@ class RecordingTableView:
         return {
             "id": row.id,
             "person": desk.person(row.info.subject),
-            "gesture": f"{AFFECTS[row.affect]}\u00a0{words.gesture(row.info.gesture)}",
+            "gesture": f"{AFFECT_SIGNS[row.affect]}\u00a0{words.gesture(row.info.gesture)}",
             "seconds": f"{desk.words.number(row.seconds, 2)} s",
             "findings": findings,
             "state": row.state,
-            "said": f"{SIGNS[row.state]} {words(f'review.state_{row.state}')}",
+            "state_text": f"{SIGNS[row.state]} {words(f'review.state_{row.state}')}",
             "points": points,
-            "kept": kept,
+            "kept": kept_range,
         }
 
     def _fill_others(self) -> None:
         desk, words = self.desk, self.desk.words
-        found = desk.review.findings_elsewhere()
-        self.elsewhere.set_visibility(bool(found))
-        key = [(f.about, f.check, f.accepted) for f in found]
-        if key == getattr(self, "_others", None):
+        findings = desk.review.findings_elsewhere()
+        self.elsewhere.set_visibility(bool(findings))
+        content = [(f.about, f.check, f.accepted) for f in findings]
+        if content == self._others_content:
             return
-        self._others = key
-        self.elsewhere.set_text(words("review.elsewhere", n=len(found)))
+        self._others_content = content
+        self.elsewhere.set_text(words("review.elsewhere", n=len(findings)))
         self.others.clear()
         with self.others:
-            for f in found:
+            for f in findings:
                 with ui.row().classes("w-full items-center no-wrap"):
                     ui.label(finding_text(words, f)).style("min-width: 140px")
                     ui.label(f"{f.about or words('review.dataset')}: {f.message}").classes("flex-grow")
-                    if f.accepted:
-                        ui.button(
-                            words("review.reopen"),
-                            on_click=lambda f=f: desk.decide(
-                                desk.current, lambda: desk.review.reopen_finding(desk.visit, f, desk.name)
-                            ),
-                        ).props("no-caps flat dense")
-                    else:
-                        ui.button(words("review.accept_finding"), on_click=lambda f=f: ask_reason(desk, f)).props(
-                            "no-caps flat dense"
-                        )
+                    finding_button(desk, f)
 
     def turn(self, by: int) -> None:
         """Move by some pages of the table."""
-        self.first += by * PER_PAGE
-        self.fill()
+        self.desk.first_row += by * PER_PAGE
+        self.draw()
 
     def _sort(self, key: str) -> None:
         desk = self.desk
         desk.by, desk.down = key, not desk.down if desk.by == key else False
         desk.arrange()
-        self.first = 0
-        self.fill()
+        desk.first_row = 0
+        self.draw()
 
     async def _start(self) -> None:
         rows, order = self.desk.review.rows, self.desk.order

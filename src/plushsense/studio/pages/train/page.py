@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +12,8 @@ from plushsense.core.errors import PlushSenseError
 from plushsense.models.arch import DEFAULT_FILTERS, DEFAULT_SYMBOL, NORMS, PADDINGS
 from plushsense.scoring.splits import parse_split
 from plushsense.studio.app.jobs import DONE, RUNNING, Jobs, StudioJob
-from plushsense.studio.app.shell import Page, html, on_change, query_path, tag
-from plushsense.studio.pages.train.jobs_section import JobsSection
-from plushsense.studio.pages.train.requests import (
+from plushsense.studio.app.shell import Page, html, on_change, query_path, section, tag
+from plushsense.studio.pages.train.jobs import (
     EVALUATE,
     KINDS,
     PAPER,
@@ -23,6 +22,7 @@ from plushsense.studio.pages.train.requests import (
     SWEEP,
     TRAIN,
     JobRequest,
+    JobsSection,
     free_name,
     grids,
     job_request,
@@ -38,7 +38,6 @@ _ADVANCED: dict[str, tuple[str, ...]] = {
     SWEEP: ("architectures", "filters", "batches", "padding", "context", "classes", "device"),
     SEARCH: ("architectures", "filters", "batches", "padding", "context", "classes", "device", "share"),
 }
-_WORDS = {"architectures": "archs"}
 _PLACEHOLDERS = {
     "arch": DEFAULT_SYMBOL,
     "filters": ",".join(map(str, DEFAULT_FILTERS)),
@@ -73,39 +72,37 @@ class TrainingForm:
         self._values[EVALUATE] |= {"split": SPLITS[0], "preset": "people"}
         self._values[SWEEP] |= {"grid": PAPER}
         self._values[SEARCH] |= {"grid": PAPER}
-        self._dry: StudioJob | None = None
-        self._asked: JobRequest | None = None
-        self._agreed = ""
+        # The running estimate and what it is for; the key of the last estimate that was displayed.
+        self._estimate_job: StudioJob | None = None
+        self._estimate_request: JobRequest | None = None
+        self._estimated = ""
         w = self._words
-        with (
-            ui.element("section")
-            .classes("ps-card w-full column no-wrap ps-tight")
-            .props(f'aria-label="{w("train.new")}"')
-        ):
-            ui.label(w("train.new")).classes("text-lg").props('role="heading" aria-level="2"')
+        with section(w("train.new")):
             if not self._datasets:
                 ui.label(w("train.no_data"))
                 return
             with ui.row().classes("w-full items-center"):
-                box = ui.select(self._datasets, label=w("train.data"), value=self._dataset, on_change=self._chosen)
+                box = ui.select(
+                    self._datasets, label=w("train.data"), value=self._dataset, on_change=self._choose_dataset
+                )
                 tag(box.classes("w-80"), "dataset")
                 self._facts = tag(ui.row().classes("items-center"), "facts")
             kinds = {kind: w(f"train.kinds.{kind}") for kind in KINDS}
-            radio = ui.radio(kinds, value=self._kind, on_change=self._kind_chosen).props("inline")
+            radio = ui.radio(kinds, value=self._kind, on_change=self._choose_kind).props("inline")
             tag(radio, "kind").props(f'aria-label="{w("train.kind")}"')
-            self._told = tag(ui.label().classes("ps-dim"), "told")
-            self._fields = ui.column().classes("w-full ps-tight")
+            self._kind_about = tag(ui.label().classes("ps-dim"), "kind-about")
+            self._fields = ui.column().classes("w-full ps-small-gap")
             self._buttons()
         self._build()
 
     def _buttons(self) -> None:
         w = self._words
         with ui.row().classes("items-center"):
-            look = ui.button(w("train.estimate"), icon="schedule", on_click=self._estimate).props("outline no-caps")
-            tag(look, "estimate")
+            estimate = ui.button(w("train.estimate"), icon="schedule", on_click=self._estimate).props("outline no-caps")
+            tag(estimate, "estimate")
             start = ui.button(w("train.start"), icon="play_arrow", on_click=self._start).props("unelevated no-caps")
             tag(start, "start")
-        self._plan = tag(ui.column().classes("w-full ps-tight").props('role="status"'), "plan")
+        self._plan = tag(ui.column().classes("w-full ps-small-gap").props('role="status"'), "plan")
         with ui.expansion(w("train.command"), icon="terminal").classes("w-full"):
             self._command = tag(ui.label().classes("ps-code"), "command")
 
@@ -114,32 +111,32 @@ class TrainingForm:
         if not self._dataset:
             return
         self._facts.clear()
-        path = Path(self._dataset)
         with self._page.show_errors():
-            found = await run.io_bound(self._results.facts, self._page.workspace.inside(path))
-            if found is None:
+            facts = await run.io_bound(self._results.facts, self._page.workspace.inside(self._dataset))
+            if facts is None:
                 return
             w = self._words
-            message = w("train.facts", people=found.people, recordings=found.recordings, gestures=len(found.gestures))
             with self._facts:
-                ui.label(message)
-                if found.simulated:
+                ui.label(
+                    w("train.facts", people=facts.people, recordings=facts.recordings, gestures=len(facts.gestures))
+                )
+                if facts.simulated:
                     html(score_labels(w, False, True))
                     ui.label(w("shell.simulation")).classes("ps-dim")
-            if not found.streams and self._values[TRAIN]["context"] == ANYWHERE:
+            if not facts.streams and self._values[TRAIN]["context"] == ANYWHERE:
                 self._values[TRAIN]["context"] = "loop"
                 self._build()
                 with self._facts:
                     ui.label(w("train.no_streams")).classes("ps-dim")
 
-    async def _chosen(self, event: Any) -> None:
+    async def _choose_dataset(self, event: Any) -> None:
         self._dataset = str(event.value)
         self._values[TRAIN].pop("name", None)
         self._page.say("")
         self._build()
         await self.read()
 
-    def _kind_chosen(self, event: Any) -> None:
+    def _choose_kind(self, event: Any) -> None:
         self._kind = str(event.value)
         self._page.say("")
         self._build()
@@ -148,12 +145,10 @@ class TrainingForm:
 
     def _build(self) -> None:
         """Build the fields of the chosen kind."""
-        self._told.set_text(self._words(f"train.told.{self._kind}"))
+        self._kind_about.set_text(self._words(f"train.kind_about.{self._kind}"))
         self._fields.clear()
         with self._fields:
-            {TRAIN: self._of_train, EVALUATE: self._of_evaluate, SWEEP: self._of_grid, SEARCH: self._of_grid}[
-                self._kind
-            ]()
+            {TRAIN: self._of_train, EVALUATE: self._of_evaluate}.get(self._kind, self._of_grid)()
             with ui.expansion(self._words("train.advanced"), icon="tune").classes("w-full") as more:
                 tag(more, "advanced")
                 with ui.row().classes("w-full"):
@@ -166,127 +161,124 @@ class TrainingForm:
         self._values[TRAIN].setdefault("name", free_name(self._page.workspace, self._jobs, title))
         with ui.row().classes("w-full"):
             self._field("name", wide=True)
-            self._select("context", self._contexts())
-            self._select("preset", {name: self._words(f"train.presets.{name}") for name in PRESETS})
+            self._select("context", self._texts("contexts", ("", *TRAIN_CONTEXTS)))
+            self._select("preset", self._texts("presets", PRESETS))
             self._field("epochs")
             self._field("seed")
 
     def _of_evaluate(self) -> None:
         with ui.row().classes("w-full"):
-            self._select("split", {split: self._words(f"train.splits.{split}") for split in SPLITS})
-            self._select("preset", {name: self._words(f"train.presets.{name}") for name in PRESETS})
-            self._select("context", self._contexts())
+            self._select("split", self._texts("splits", SPLITS))
+            self._select("preset", self._texts("presets", PRESETS))
+            self._select("context", self._texts("contexts", ("", *TRAIN_CONTEXTS)))
             self._field("epochs")
             self._field("seed")
         self._split_line()
 
     def _of_grid(self) -> None:
         w = self._words
-        known = {PAPER: w("train.grids.paper" if self._kind == SWEEP else "train.grids.search")}
-        known |= {str(path): path.name for path in grids(self._page.workspace)}
+        options = {PAPER: w("train.grids.paper" if self._kind == SWEEP else "train.grids.search")}
+        options |= {str(path): path.name for path in grids(self._page.workspace)}
         with ui.row().classes("w-full"):
-            self._select("grid", known)
-            own = {split: w(f"train.splits.{split}") for split in SPLITS}
-            self._select("split", {"": w("train.splits.default"), **own})
+            self._select("grid", options)
+            self._select("split", self._texts("splits", ("", *SPLITS)))
             if self._kind == SWEEP:
                 self._field("grid_epochs", key="epochs")
             else:
                 for key in ("max_parameters", "max_state_bytes", "max_macs_per_step"):
                     self._field(key)
             self._field("seeds")
-        ui.label(w("train.grids_told", folder=self._page.workspace.folder)).classes("ps-dim")
+        ui.label(w("train.grids_about", folder=self._page.workspace.folder)).classes("ps-dim")
         self._split_line()
 
-    def _contexts(self) -> dict[str, str]:
-        return {
-            "": self._words("train.contexts.default"),
-            **{name: self._words(f"train.contexts.{name}") for name in TRAIN_CONTEXTS},
-        }
+    def _texts(self, table: str, keys: Iterable[str]) -> dict[str, str]:
+        """Return options with their texts; "" stands for the default."""
+        return {key: self._words(f"train.{table}.{key or 'default'}") for key in keys}
 
     def _split_line(self) -> None:
-        self._split_row = tag(ui.row().classes("items-center"), "split-told")
-        self._say_split()
+        self._split_row = tag(ui.row().classes("items-center"), "split-about")
+        self._describe_split()
 
-    def _say_split(self) -> None:
+    def _describe_split(self) -> None:
         """Display how far the scores of the chosen split can be trusted."""
         self._split_row.clear()
-        split = self._values[self._kind].get("split") or ("windows:holdout" if self._paper() else "")
+        values = self._values[self._kind]
+        paper = self._kind == SWEEP and values.get("grid") == PAPER
+        split = values.get("split") or ("windows:holdout" if paper else "")
         if not split:
             return
         with self._split_row:
             if parse_split(split).leaky:
                 html(score_labels(self._words, True, False))
-                ui.label(self._words("train.leaky_told"))
+                ui.label(self._words("train.leaky_about"))
             elif split.startswith("by-recording"):
-                ui.label(self._words("train.known_told"))
+                ui.label(self._words("train.known_about"))
 
-    def _paper(self) -> bool:
-        return self._kind == SWEEP and self._values[SWEEP].get("grid") == PAPER
+    def _field(self, text: str, *, key: str = "", wide: bool = False) -> None:
+        """Build the field of a setting: a choice, a number, a checkbox or text.
 
-    def _field(self, word: str, *, key: str = "", wide: bool = False) -> None:
-        """Build the field of a setting: a choice, a number, a checkbox or text."""
-        name = key or word
-        label = self._words(f"train.{_WORDS.get(word, word)}")
-        values = self._values[self._kind]
-        if word in _CHOICES:
-            self._select(word, {"": self._words("train.as_default"), **{one: one for one in _CHOICES[word]}})
-        elif word in ("fit_decisions", "int8"):
-            box: Any = ui.checkbox(label, value=bool(values.get(name)), on_change=self._keeper(name))
-            tag(box, name)
+        Args:
+            text: key of its label.
+            key: the setting, if it differs from ``text``.
+        """
+        name = key or text
+        label = self._words(f"train.{text}")
+        value = self._values[self._kind].get(name)
+        if text in _CHOICES:
+            self._select(text, {"": self._words("train.as_default"), **{one: one for one in _CHOICES[text]}})
+        elif text in ("fit_decisions", "int8"):
+            tag(ui.checkbox(label, value=bool(value), on_change=self._store(name)), name)
         else:
-            number = word in _NUMBERS
-            held = values.get(name)
-            box = ui.input(label, value="" if held is None else str(held), placeholder=_PLACEHOLDERS.get(word))
-            box.on_value_change(self._keeper(name, _whole if number else _text))
+            number = text in _NUMBERS
+            box = ui.input(label, value="" if value is None else str(value), placeholder=_PLACEHOLDERS.get(text))
+            box.on_value_change(self._store(name, _integer if number else _text))
             box.props('inputmode="numeric"' if number else "").classes("w-80" if wide else "w-64")
             tag(box, name)
 
     def _select(self, key: str, options: Mapping[str, str]) -> None:
-        held = self._values[self._kind].get(key, "")
-        value = held if held in options else next(iter(options))
+        stored = self._values[self._kind].get(key, "")
+        value = stored if stored in options else next(iter(options))
         label = self._words(f"train.{key}")
-        tag(ui.select(dict(options), label=label, value=value, on_change=self._keeper(key)).classes("w-96"), key)
+        tag(ui.select(dict(options), label=label, value=value, on_change=self._store(key)).classes("w-96"), key)
 
-    def _keeper(self, key: str, read: Callable[[Any], Any] | None = None) -> Callable[[Any], None]:
+    def _store(self, key: str, read: Callable[[Any], Any] | None = None) -> Callable[[Any], None]:
+        """Return an event handler that stores the value of a field."""
         kind = self._kind
 
-        def keep(event: Any) -> None:
+        def store(event: Any) -> None:
             self._values[kind][key] = read(event.value) if read else event.value
             if key in ("split", "grid") and kind != TRAIN:
-                self._say_split()
+                self._describe_split()
             self._changed()
 
-        return keep
+        return store
 
     def _changed(self) -> None:
         """Update the shell command, and remove an estimate that no longer applies."""
         try:
-            now = self._order()
+            request = self._request()
         except PlushSenseError:
             self._command.set_text("")
         else:
-            self._command.set_text(now.command)
-            if self._agreed == now.key:
+            self._command.set_text(request.command)
+            if self._estimated == request.key:
                 return
-        if self._agreed:
-            self._agreed = ""
+        if self._estimated:
+            self._estimated = ""
             self._plan.clear()
 
-    def _order(self) -> JobRequest:
-        return job_request(
-            self._page.workspace,
-            self._jobs,
-            {**self._values[self._kind], "kind": self._kind, "dataset": self._dataset},
-        )
+    def _request(self) -> JobRequest:
+        form = {**self._values[self._kind], "kind": self._kind, "dataset": self._dataset}
+        return job_request(self._page.workspace, self._jobs, form)
 
-    # Looking and beginning ------------------------------------------------------------------------------------
+    # Estimates and starts -------------------------------------------------------------------------------------
 
     def _estimate(self) -> None:
         self._page.say("")
         self.close()
         with self._page.show_errors():
-            self._asked = self._order()
-            self._dry = self._jobs.start(self._asked.task, self._asked.dry, self._asked.title)
+            request = self._estimate_request = self._request()
+            self._estimate_job = self._jobs.start(request.task, request.dry, request.title)
             self._plan.clear()
             with self._plan, ui.row().classes("items-center"):
                 ui.spinner(size="sm")
@@ -295,57 +287,57 @@ class TrainingForm:
     def _start(self) -> None:
         self._page.say("")
         with self._page.show_errors():
-            now = self._order()
-            if now.task in (SWEEP, SEARCH) and self._agreed != now.key:
-                self._page.say(self._words("train.changed" if self._agreed else "train.look_first"), "warning")
+            request = self._request()
+            if request.task in (SWEEP, SEARCH) and self._estimated != request.key:
+                self._page.say(self._words("train.changed" if self._estimated else "train.look_first"), "warning")
                 return
-            self._jobs.start(now.task, now.spec, now.title)
-            self._agreed = ""
+            self._jobs.start(request.task, request.spec, request.title)
+            self._estimated = ""
             self._plan.clear()
             self._values[TRAIN].pop("name", None)
             self._build()
 
     def close(self) -> None:
         """Stop a running estimate."""
-        if self._dry is not None and self._dry.state == RUNNING:
-            self._jobs.stop(self._dry.id)
-        self._dry = None
+        if self._estimate_job is not None and self._estimate_job.state == RUNNING:
+            self._jobs.stop(self._estimate_job.id)
+        self._estimate_job = None
 
     def refresh(self) -> None:
         """Display the estimate when it is ready."""
-        job, asked = self._dry, self._asked
-        if job is None or asked is None or job.state == RUNNING:
+        job, request = self._estimate_job, self._estimate_request
+        if job is None or request is None or job.state == RUNNING:
             return
-        self._dry = None
+        self._estimate_job = None
         self._plan.clear()
         if job.state != DONE:
             self._page.say(job.message, "error" if job.message else "info")
             return
         try:
-            same = self._order().key == asked.key
+            same = self._request().key == request.key
         except PlushSenseError:
             same = False
         with self._plan:
-            self._show_plan(job.result, asked.task)
+            self._show_plan(job.result, request.task)
             for sentence in job.warnings:
                 ui.label(f"• {sentence}").classes("ps-dim")
             if not same:
                 ui.label(self._words("train.changed"))
         if same and not job.result.get("problems"):
-            self._agreed = asked.key
+            self._estimated = request.key
 
     def _show_plan(self, plan: Mapping[str, Any], task: str) -> None:
         w = self._words
         if plan.get("problems"):
-            with ui.element("div").classes("ps-said ps-said-error w-full").props('role="alert"'):
+            with ui.element("div").classes("ps-message ps-message-error w-full").props('role="alert"'):
                 ui.label(w("train.problems"))
                 for problem in plan["problems"]:
                     ui.label(f"• {problem}")
             return
         html(score_labels(w, plan["leaky"], plan["simulated"]))
-        visible = {key: plan[key] for key in ("people", "classes", "windows", "folds", "epochs") if key in plan}
         if task in (TRAIN, EVALUATE):
-            text = w("train.plan_one", **visible, parameters=f"{plan['parameters']:,}", macs=_power(plan["macs"]))
+            counts = {key: plan[key] for key in ("people", "classes", "windows", "folds", "epochs") if key in plan}
+            text = w("train.plan_one", **counts, parameters=f"{plan['parameters']:,}", macs=_power(plan["macs"]))
         elif task == SWEEP:
             counts = {key: plan[key] for key in ("trials", "trainings", "folds", "seeds", "held", "split")}
             text = w("train.plan_grid", **counts, macs=_power(plan["macs"]))
@@ -369,8 +361,8 @@ def _power(value: float) -> str:
     return f"{digits}·10{str(int(power)).translate(str.maketrans('0123456789-', '⁰¹²³⁴⁵⁶⁷⁸⁹⁻'))}"
 
 
-def _whole(text: Any) -> Any:
-    """Convert digits into an integer; return other text unchanged, for the check of the settings."""
+def _integer(text: Any) -> Any:
+    """Convert digits into an integer; return other text unchanged, which the check of the settings refuses."""
     plain = str(text).strip()
     return int(plain) if plain.removeprefix("-").isdecimal() else plain
 
@@ -391,8 +383,8 @@ async def show(page: Page) -> None:
     ui.label(page.words("train.intro")).classes("ps-dim")
     rows = await run.io_bound(results.rows)
     form = TrainingForm(page, jobs, results)
-    work = JobsSection(page, jobs, lambda identity: visible.open(identity))
-    visible = ResultsSection(page, results, rows or [])
+    job_list = JobsSection(page, jobs, lambda identity: table.open(identity))
+    table = ResultsSection(page, results, rows or [])
     context.client.on_delete(form.close)
 
     pending = False
@@ -407,8 +399,8 @@ async def show(page: Page) -> None:
             return
         pending = False
         form.refresh()
-        if work.refresh():
-            await visible.reload()
+        if job_list.refresh():
+            await table.reload()
 
     on_change(jobs.changed, mark)
     ui.timer(_DRAWN_S, draw)

@@ -5,16 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote, urlencode
 
 from markupsafe import Markup
 from nicegui import run, ui
 
 from plushsense.core.gestures import NOBODY
 from plushsense.dataset.store import UNKNOWN_SUBJECT
-from plushsense.studio.app.shell import AFFECT_SIGNS, Page, html, named, tag
+from plushsense.studio.app.shell import AFFECT_SIGNS, Page, address, heading, html, scroll_region, tag
 from plushsense.studio.app.words import Words
-from plushsense.studio.pages.review.selection import Reviews
+from plushsense.studio.pages.review.review import Reviews
 from plushsense.studio.pages.train.results import (
     EVALUATION,
     HELD_BACK,
@@ -29,8 +28,8 @@ from plushsense.studio.pages.train.results import (
     score_labels,
     score_text,
 )
+from plushsense.studio.widgets.elements import table_html
 
-_TABLE = Markup('<table class="ps-table"><thead><tr>{}</tr></thead><tbody>{}</tbody></table>')
 _CLICKS = '(e) => { const b = e.target.closest("[data-cell]"); if (b) emit(b.dataset.cell); }'
 
 
@@ -40,37 +39,37 @@ class ResultDetailsView:
     def __init__(self, page: Page, results: StoredResults) -> None:
         self._page, self._results, self._words = page, results, page.words
         self._place = tag(ui.column().classes("w-full"), "details")
-        self._found: ResultDetails | None = None
+        self._details: ResultDetails | None = None
         self._by = "gesture"
-        self._asked = 0
+        self._clicks = 0
 
     async def open(self, row: ResultRow) -> None:
         """Display the details of a result."""
-        self._found = await run.io_bound(self._results.details, row)
+        self._details = await run.io_bound(self._results.details, row)
         self._draw()
         ui.run_javascript("setTimeout(() => document.querySelector('[data-test=details]')?.scrollIntoView(), 60)")
 
     def _close(self) -> None:
-        self._found = None
+        self._details = None
         self._place.clear()
 
     def _draw(self) -> None:
         self._place.clear()
-        d, w = self._found, self._words
+        d, w = self._details, self._words
         if d is None:
             return
         row = d.row
-        with self._place, ui.element("section").classes("ps-card w-full column no-wrap ps-tight") as card:
+        with self._place, ui.element("section").classes("ps-card w-full column no-wrap ps-small-gap") as card:
             card.props(f'aria-label="{w("train.details")}"')
             with ui.row().classes("w-full items-center"):
                 title = f"{row.data} · {row.network} · {row.split} · {row.context}"
-                ui.label(title).classes("text-weight-bold").props('role="heading" aria-level="3"')
+                heading(title, 3).classes("text-weight-bold", remove="text-lg")
                 html(score_labels(w, row.leaky, row.simulated))
                 ui.space()
                 close = ui.button(icon="close", on_click=self._close, color=None).props("flat round dense")
                 close.props(f'aria-label="{w("train.close")}"')
             if row.leaky:
-                ui.label(w("train.leaky_told"))
+                ui.label(w("train.leaky_about"))
             if row.kind == TRAINING:
                 self._training(d)
             if d.by_gesture is None:
@@ -83,76 +82,73 @@ class ResultDetailsView:
     def _training(self, d: ResultDetails) -> None:
         w, facts = self._words, d.facts
         checked = sorted(set(facts.get("validation_subjects", [])) - {NOBODY, UNKNOWN_SUBJECT})
-        message = w(
+        text = w(
             "train.facts_training" if d.row.spread == HELD_BACK else "train.facts_same",
             trained=len(set(facts.get("subjects", [])) - {NOBODY, UNKNOWN_SUBJECT}),
             checked=len(checked),
             names=", ".join(checked) or "–",
             message=facts.get("scores", {}).get("said", ""),
         )
-        ui.label(message)
+        ui.label(text)
         with ui.row():
-            path = quote(str(d.row.path), safe="")
-            ui.link(w("train.to_live"), f"/live?model={path}").classes("ps-link")
-            ui.link(w("train.to_export"), f"/export?model={path}").classes("ps-link")
+            for to in ("live", "export"):
+                ui.link(w(f"train.to_{to}"), address(to, model=d.row.path)).classes("ps-link")
 
     # Confusions -----------------------------------------------------------------------------------------------
 
     def _confusions(self, d: ResultDetails) -> None:
         w = self._words
-        ui.label(w("train.confusion")).classes("text-weight-bold").props('role="heading" aria-level="4"')
-        ui.label(w("train.confusion_told" if d.clickable else "train.confusion_kept")).classes("ps-dim")
+        heading(w("train.confusion"), 4)
+        ui.label(w("train.confusion_about" if d.clickable else "train.confusion_kept")).classes("ps-dim")
         choices = {"gesture": w("train.by_gesture"), "affect": w("train.by_affect")}
-        radio = ui.radio(choices, value=self._by, on_change=self._turned).props("inline")
+        radio = ui.radio(choices, value=self._by, on_change=self._group).props("inline")
         tag(radio, "by").props(f'aria-label="{w("train.confusion")}"')
-        box = (
-            ui.element("div")
-            .classes("ps-sideways")
-            .props(f'role="region" tabindex="0" aria-label="{w("train.confusion")}"')
-        )
-        tag(box, "confusion").on("click", self._clicked, js_handler=_CLICKS)
-        with box:
+        box = tag(scroll_region(w("train.confusion")), "confusion")
+        with box.on("click", self._clicked, js_handler=_CLICKS):
             self._table = html()
         self._cell = tag(ui.column().classes("w-full").props('aria-live="polite"'), "cell")
         self._tabulate()
 
-    def _turned(self, event: Any) -> None:
+    def _group(self, event: Any) -> None:
         self._by = str(event.value)
         self._cell.clear()
         self._tabulate()
 
+    def _confusion(self) -> Confusion | None:
+        """Return the displayed matrix."""
+        d = self._details
+        if d is None:
+            return None
+        return d.by_affect if self._by == "affect" and d.by_affect is not None else d.by_gesture
+
     def _tabulate(self) -> None:
-        d = self._found
-        if d is None or d.by_gesture is None:
-            return
-        by_affect = self._by == "affect"
-        visible = d.by_affect if by_affect and d.by_affect is not None else d.by_gesture
-        self._table.set_content(confusion_table(self._words, visible, by_affect, d.clickable))
+        d, confusion = self._details, self._confusion()
+        if d is not None and confusion is not None:
+            self._table.set_content(confusion_table(self._words, confusion, self._by == "affect", d.clickable))
 
     async def _clicked(self, event: Any) -> None:
-        d = self._found
-        if d is None or d.by_gesture is None or not d.clickable:
+        d, confusion = self._details, self._confusion()
+        if d is None or confusion is None or not d.clickable:
             return
-        visible = d.by_affect if self._by == "affect" and d.by_affect is not None else d.by_gesture
         i, j = (int(n) for n in str(event.args).split(","))
-        if not (0 <= i < len(visible.labels) and 0 <= j < len(visible.labels)):
+        if not (0 <= i < len(confusion.labels) and 0 <= j < len(confusion.labels)):
             return
-        self._asked += 1
-        mine = self._asked
+        self._clicks += 1
+        click = self._clicks
         with self._page.show_errors():
-            truth, message = visible.labels[i], visible.labels[j]
-            found = await run.io_bound(self._results.misread, d.row, self._gestures(truth), self._gestures(message))
-            if found is None:
+            truth, predicted = confusion.labels[i], confusion.labels[j]
+            rows = await run.io_bound(self._results.misread, d.row, self._gestures(truth), self._gestures(predicted))
+            if rows is None:
                 return
             name = self._words.affect if self._by == "affect" else self._words.gesture
-            windows = sum(one.windows for one in found)
+            windows = sum(row.windows for row in rows)
             title = self._words(
-                "train.cell_title", truth=name(truth), predicted=name(message), n=len(found), windows=windows
+                "train.cell_title", truth=name(truth), predicted=name(predicted), n=len(rows), windows=windows
             )
-            link = await run.io_bound(self._link, d.row.dataset, [one.recording for one in found], title)
+            link = await run.io_bound(self._link, d.row.dataset, [row.recording for row in rows], title)
             # Ignore the answer after a later click or another result.
-            if link is not None and mine == self._asked and self._found is d:
-                self._list(d, title, link, found)
+            if link is not None and click == self._clicks and self._details is d:
+                self._list(d, title, link, rows)
 
     def _link(self, dataset: str, recordings: list[str], title: str) -> str:
         """Return the address of the recordings in Review, or "" if the data set is not in this studio."""
@@ -162,30 +158,29 @@ class ResultDetailsView:
 
     def _gestures(self, label: str) -> list[str]:
         """Return the gestures that a label of the matrix stands for."""
-        d = self._found
+        d = self._details
         if d is None or self._by == "gesture":
             return [label]
         return [gesture for gesture, affect in d.affects.items() if (affect or "none") == label]
 
-    def _list(self, d: ResultDetails, title: str, link: str, found: Sequence[MisreadRecording]) -> None:
+    def _list(self, d: ResultDetails, title: str, link: str, rows: Sequence[MisreadRecording]) -> None:
         w = self._words
         self._cell.clear()
         with self._cell:
-            tag(ui.label(title).classes("text-weight-bold"), "cell-title").props('role="heading" aria-level="5"')
+            tag(heading(title, 5), "cell-title")
             if link:
                 tag(ui.link(w("train.all_in_review"), link).classes("ps-link"), "cell-all")
-            box = ui.element("div").classes("ps-sideways")
-            with named(box.props('role="region" tabindex="0"'), title):
-                tag(html(_recordings(w, d.row.dataset, found)), "cell-list")
+            with scroll_region(title):
+                tag(html(_recordings(w, d.row.dataset, rows)), "cell-list")
 
     # People ---------------------------------------------------------------------------------------------------
 
     def _people(self, d: ResultDetails) -> None:
         w, row = self._words, d.row
-        ui.label(w("train.people")).classes("text-weight-bold").props('role="heading" aria-level="4"')
+        heading(w("train.people"), 4)
         scores = [one["macro_f1"] for one in d.people if one["macro_f1"] is not None]
         if row.kind == EVALUATION and scores:
-            message = w(
+            text = w(
                 "train.spread",
                 accuracy=score_text(row.accuracy, row.accuracy_sd),
                 macro_f1=score_text(row.macro_f1, row.macro_f1_sd),
@@ -193,29 +188,12 @@ class ResultDetailsView:
                 low=figure(min(scores)),
                 high=figure(max(scores)),
             )
-            tag(ui.label(message), "spread")
-        head = Markup("").join(
-            Markup('<th scope="col" class="{}">{}</th>').format("" if key == "person" else "n", w(f"train.{key}"))
-            for key in ("person", "recordings", "windows", "accuracy", "macro_f1", "by_recording")
-        )
-        line = Markup('<tr><th scope="row">{}</th>' + 5 * '<td class="n">{}</td>' + "</tr>")
-        body = Markup("").join(
-            line.format(
-                one["subject"],
-                one["recordings"],
-                one["windows"],
-                figure(one["accuracy"]),
-                figure(one["macro_f1"]),
-                figure(one["by_recording_accuracy"]),
-            )
-            for one in d.people
-        )
-        with (
-            ui.element("div")
-            .classes("ps-sideways")
-            .props(f'role="region" tabindex="0" aria-label="{w("train.people")}"')
-        ):
-            tag(html(_TABLE.format(head, body)), "people")
+            tag(ui.label(text), "spread")
+        head = [w(f"train.{k}") for k in ("person", "recordings", "windows", "accuracy", "macro_f1", "by_recording")]
+        keys = ("accuracy", "macro_f1", "by_recording_accuracy")
+        cells = [(p["subject"], p["recordings"], p["windows"], *(figure(p[key]) for key in keys)) for p in d.people]
+        with scroll_region(w("train.people")):
+            tag(html(table_html(head, cells, numbers=range(1, 6), row_heads=True)), "people")
 
 
 def confusion_table(w: Words, confusion: Confusion, by_affect: bool, clickable: bool) -> Markup:
@@ -239,35 +217,27 @@ def confusion_table(w: Words, confusion: Confusion, by_affect: bool, clickable: 
                 continue
             text = Markup("{}<small>{:.0f} %</small>").format(n, 100 * share)
             if clickable:
-                button = Markup('<button data-cell="{},{}">{}<span class="ps-unseen">{}</span></button>')
+                button = Markup('<button data-cell="{},{}">{}<span class="ps-visually-hidden">{}</span></button>')
                 text = button.format(i, j, text, w("train.cell", truth=names[i], predicted=names[j]))
             shade = f"background: rgba(0, 114, 178, {0.06 + 0.44 * share:.2f})"
             cells.append(Markup('<td class="{}" style="{}">{}</td>').format(kind, shade, text))
         rows.append(Markup('<tr><th scope="row">{}</th>{}</tr>').format(names[i], Markup("").join(cells)))
-    corner = f"{w('train.truth')} ↓ / {w('train.said')} →"
+    corner = f"{w('train.truth')} ↓ / {w('train.network_answer')} →"
     return Markup(
         '<table class="ps-table ps-confusion"><thead><tr><th scope="col">{}</th>{}</tr></thead>'
         "<tbody>{}</tbody></table>"
     ).format(corner, head, Markup("").join(rows))
 
 
-def _recordings(w: Words, dataset: str, found: Sequence[MisreadRecording]) -> Markup:
-    head = Markup("").join(
-        Markup('<th scope="col">{}</th>').format(w(f"train.{key}"))
-        for key in ("person", "gesture", "predicted", "of_windows", "person_of")
-    )
-    rows = []
-    for one in found:
-        link = one.recording
+def _recordings(w: Words, dataset: str, rows: Sequence[MisreadRecording]) -> Markup:
+    cells = []
+    for row in rows:
+        link = Markup('<span data-recording="{0}">{0}</span>').format(row.recording)
         if dataset:
-            query = urlencode({"dataset": dataset, "recording": one.recording})
-            label = f"{w('train.in_review')}: {one.recording}"
-            link = Markup('<a href="/review?{}" aria-label="{}">{}</a>').format(query, label, one.recording)
-        message = ", ".join(w.gesture(label) for label in one.predicted)
-        cells = (one.subject, w.gesture(one.gesture), message, f"{one.windows} / {one.of}", link)
-        rows.append(
-            Markup('<tr data-recording="{}">{}</tr>').format(
-                one.recording, Markup("").join(Markup("<td>{}</td>").format(cell) for cell in cells)
+            link = Markup('<a data-recording="{0}" href="{1}" aria-label="{2}: {0}">{0}</a>').format(
+                row.recording, address("review", dataset=dataset, recording=row.recording), w("train.in_review")
             )
-        )
-    return _TABLE.format(head, Markup("").join(rows))
+        predicted = ", ".join(w.gesture(label) for label in row.predicted)
+        cells.append((row.subject, w.gesture(row.gesture), predicted, f"{row.windows} / {row.of}", link))
+    head = [w(f"train.{key}") for key in ("person", "gesture", "predicted", "of_windows", "person_of")]
+    return table_html(head, cells)

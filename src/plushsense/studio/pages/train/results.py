@@ -16,7 +16,7 @@ from plushsense.core.errors import BadInput, PlushSenseError
 from plushsense.core.gestures import NOBODY
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import MARKS
-from plushsense.dataset.store import HEAD, UNKNOWN_SUBJECT, DatasetHead
+from plushsense.dataset.store import HEAD, UNKNOWN_SUBJECT
 from plushsense.evaluation.scores import Predictions, read_predictions
 from plushsense.models.bundle import Bundle
 from plushsense.scoring import metrics
@@ -115,7 +115,7 @@ def of_evaluation(path: Path, dataset: Any) -> list[ResultRow]:
     context = table["context"]
     if table["train_context"] != context:
         context = f"{table['train_context']} → {context}"
-    units = table[table["over"]]
+    units = len(table[table["over"]])
     return [
         ResultRow(
             str(path.parent),
@@ -132,7 +132,7 @@ def of_evaluation(path: Path, dataset: Any) -> list[ResultRow]:
             table["simulated"],
             ", ".join(map(str, table["seeds"])),
             SUBJECTS if table["over"] == SUBJECTS else FOLDS,
-            len(units),
+            units,
             table["accuracy"]["mean"],
             table["accuracy"]["sd"],
             table["macro_f1"]["mean"],
@@ -189,16 +189,16 @@ def of_trials(path: Path, dataset: Any) -> list[ResultRow]:
 def of_bundle(path: Path, known: Any) -> list[ResultRow]:
     """Read the result stored in a bundle; ``known`` maps names of data sets to folders."""
     bundle = Bundle.load(path)
-    kept = bundle.provenance
-    scores, training = kept.get("scores", {}), kept.get("training", {})
+    origin = bundle.provenance
+    scores, training = origin.get("scores", {}), origin.get("training", {})
     arch = bundle.arch
-    name = str(kept.get("dataset", "?"))
-    split = str(scores.get("split", kept.get("split", "?")))
+    name = str(origin.get("dataset", "?"))
+    split = str(scores.get("split", origin.get("split", "?")))
     context = bundle.windowing.get("context", "?")
     if context == ANYWHERE:
         # As in evaluations: networks trained on any context are scored on whole gestures.
         context = f"{ANYWHERE} → stream"
-    held_back = sorted(set(kept.get("validation_subjects", ())) - {NOBODY, UNKNOWN_SUBJECT})
+    held_back = sorted(set(origin.get("validation_subjects", ())) - {NOBODY, UNKNOWN_SUBJECT})
     return [
         ResultRow(
             str(path),
@@ -208,11 +208,11 @@ def of_bundle(path: Path, known: Any) -> list[ResultRow]:
             known.get(name, ""),
             name,
             f"{arch.symbol} {'/'.join(map(str, arch.filters))} {arch.padding}",
-            f"{kept.get('preset', '?')}, {training.get('epochs', '?')}",
+            f"{origin.get('preset', '?')}, {training.get('epochs', '?')}",
             split,
             str(context),
             bool(scores.get("leaky")),
-            bool(kept.get("simulated")),
+            bool(origin.get("simulated")),
             str(training.get("seed", "?")),
             # If recordings or windows are held back, the network was trained on the same people.
             *((HELD_BACK, len(held_back)) if split == WHOLE_PEOPLE else (TRAININGS, 1)),
@@ -223,7 +223,7 @@ def of_bundle(path: Path, known: Any) -> list[ResultRow]:
             arch.parameters,
             arch.macs_per_step,
             path.stat().st_mtime,
-            (str(kept.get("dataset_hash", ""))[:_HASH], *bundle.gestures.labels, *held_back),
+            (str(origin.get("dataset_hash", ""))[:_HASH], *bundle.gestures.labels, *held_back),
         )
     ]
 
@@ -243,7 +243,7 @@ def read_json(path: Path) -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as cause:
-        raise BadInput(f"'{path}' cannot be read ({cause}): make this result again.") from None
+        raise BadInput(f"'{path}' cannot be read ({cause}): compute this result again.") from None
 
 
 def _number(text: str) -> float | None:
@@ -330,7 +330,7 @@ class StoredResults:
         for row in self._rows():
             if row.id == identity:
                 return row
-        raise BadInput("This result is no longer there: its folder was moved or deleted.")
+        raise BadInput("This result does not exist any more: its folder was moved or deleted.")
 
     def details(self, row: ResultRow) -> ResultDetails:
         """Read the details of a result.
@@ -359,9 +359,8 @@ class StoredResults:
             by_gesture = _confusion({"labels": table["labels"], "counts": counts})
             return ResultDetails(row, by_gesture, sum_by_affect(by_gesture, affects), affects)
         bundle = Bundle.load(row.path)
-        kept = bundle.provenance
         affects = {g.label: g.affect for g in bundle.gestures.gestures}
-        return ResultDetails(row, affects=affects, facts={**kept, "fitted": bundle.decision.get("fitted")})
+        return ResultDetails(row, affects=affects, facts={**bundle.provenance, "fitted": bundle.decision.get("fitted")})
 
     def misread(self, row: ResultRow, truth: Sequence[str], predicted: Sequence[str]) -> list[MisreadRecording]:
         """Return the recordings of a cell, those with the most windows first.
@@ -369,9 +368,9 @@ class StoredResults:
         Raises:
             MissingExtraError: without polars. BadInput: if the predictions are missing.
         """
-        found = self._once(row.path / PREDICTIONS, lambda path, _: read_predictions(path), None, refuse=True)
-        assert isinstance(found, Predictions)
-        return recordings_of_cell(found, truth, predicted)
+        predictions = self._once(row.path / PREDICTIONS, lambda path, _: read_predictions(path), None, refuse=True)
+        assert predictions is not None
+        return recordings_of_cell(predictions, truth, predicted)
 
     def facts(self, dataset: Path) -> DatasetCounts:
         """Return counts of a data set, cached until its files change.
@@ -379,42 +378,40 @@ class StoredResults:
         Raises:
             PlushSenseError: if the folder is no data set.
         """
-        seen = tuple(_stamp(dataset / name) for name in (HEAD, "recordings.csv", MARKS))
+
+        def stamps() -> tuple[Any, ...]:
+            return tuple(_stamp(dataset / name) for name in (HEAD, "recordings.csv", MARKS))
+
         key = ("facts", dataset)
-        if key not in self._read or self._read[key][0] != seen:
+        if self._read.get(key, (None,))[0] != stamps():
             data = open_dataset(dataset)
             people = {r.subject for r in data.used} & set(data.subjects)
-            made = {r.gesture for r in data.used}
-            labels = tuple(label for label in data.gestures.labels if label in made)
-            card = DatasetCounts(
-                data.head.name, len(people), len(data.used), labels, len(data.streams), data.head.simulated
+            used = {r.gesture for r in data.used}
+            labels = tuple(label for label in data.gestures.labels if label in used)
+            # Opening may have rewritten the index: stamp the files afterwards.
+            self._read[key] = (
+                stamps(),
+                DatasetCounts(
+                    data.head.name, len(people), len(data.used), labels, len(data.streams), data.head.simulated
+                ),
             )
-            # Opening may have rewritten the index.
-            seen = tuple(_stamp(dataset / name) for name in (HEAD, "recordings.csv", MARKS))
-            self._read[key] = (seen, card)
-        found: DatasetCounts = self._read[key][1]
-        return found
-
-    def is_simulated(self, dataset: Path) -> bool:
-        """Return whether a data set comes from a virtual toy."""
-        try:
-            return DatasetHead.read(dataset).simulated
-        except PlushSenseError:
-            return False
+        counts: DatasetCounts = self._read[key][1]
+        return counts
 
     def _once(self, path: Path, read: Callable[[Path, Any], T], more: Any, refuse: bool = False) -> T | None:
+        """Return ``read(path, more)``, cached until the file changes; None for a file that cannot be read."""
         key, stamp = (read.__name__, path), (_stamp(path), repr(more))
-        held = self._read.get(key)
-        if held is None or held[0] != stamp:
+        cached = self._read.get(key)
+        if cached is None or cached[0] != stamp:
             try:
-                held = (stamp, read(path, more))
+                cached = (stamp, read(path, more))
             except (PlushSenseError, OSError, KeyError, ValueError, TypeError):
                 if refuse:
                     raise
-                held = (stamp, None)
-            self._read[key] = held
-        found: T | None = held[1]
-        return found
+                cached = (stamp, None)
+            self._read[key] = cached
+        result: T | None = cached[1]
+        return result
 
 
 def recordings_of_cell(
@@ -422,25 +419,25 @@ def recordings_of_cell(
 ) -> list[MisreadRecording]:
     """Return the recordings with windows of ``truth`` classified as ``predicted``, the most windows first."""
     labels = np.array(predictions.labels, dtype=np.str_)
-    message, was = labels[predictions.predicted], labels[predictions.truth]
-    inside = np.isin(was, list(truth)) & np.isin(message, list(predicted))
-    found = []
+    answers, gestures = labels[predictions.predicted], labels[predictions.truth]
+    inside = np.isin(gestures, list(truth)) & np.isin(answers, list(predicted))
+    rows = []
     for recording in np.unique(predictions.recording[inside]).tolist():
         mine = predictions.recording == recording
         hits = mine & inside
         first = int(np.flatnonzero(hits)[0])
-        names, counts = np.unique(message[hits], return_counts=True)
-        found.append(
+        names, counts = np.unique(answers[hits], return_counts=True)
+        rows.append(
             MisreadRecording(
                 recording,
                 str(predictions.subject[first]),
-                str(was[first]),
+                str(gestures[first]),
                 tuple(names[np.argsort(-counts, kind="stable")].tolist()),
                 int(hits.sum()),
                 int(mine.sum()),
             )
         )
-    return sorted(found, key=lambda one: (-one.windows, one.recording))
+    return sorted(rows, key=lambda row: (-row.windows, row.recording))
 
 
 def sum_by_affect(confusion: Confusion, affects: Mapping[str, str | None]) -> Confusion:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -10,8 +11,9 @@ from typing import Any
 from markupsafe import Markup
 from nicegui import run, ui
 
-from plushsense.studio.app.shell import Page, html, named, tag
-from plushsense.studio.pages.train.pareto_plot import pareto_options, pareto_table
+from plushsense.scoring.metrics import pareto_front
+from plushsense.studio.app.shell import Page, heading, html, named, scroll_region, section, tag
+from plushsense.studio.app.words import Words
 from plushsense.studio.pages.train.result_details import ResultDetailsView
 from plushsense.studio.pages.train.results import (
     EVALUATION,
@@ -23,8 +25,9 @@ from plushsense.studio.pages.train.results import (
     score_labels,
     score_text,
 )
+from plushsense.studio.widgets.elements import table_html
 
-_SHOWN = 60
+_MAX_ROWS = 60
 _NONE = float("-inf")
 
 # Sort key of each column.
@@ -44,7 +47,7 @@ _SORTS: dict[str, Callable[[ResultRow], Any]] = {
     "when": lambda r: r.when_s,
 }
 _NUMBERS = ("over", "accuracy", "macro_f1", "parameters", "macs")
-# Columns that are first sorted downwards.
+# Columns that are sorted downwards at the first click.
 _DOWN = ("accuracy", "macro_f1", "when", "over")
 
 
@@ -59,11 +62,8 @@ class ResultsSection:
         self._all = False
         self._open = ""
         w = self._words
-        with (
-            ui.element("section").classes("w-full column no-wrap ps-tight").props(f'aria-label="{w("train.results")}"')
-        ):
-            ui.label(w("train.results")).classes("text-lg").props('role="heading" aria-level="2"')
-            ui.label(w("train.results_told")).classes("ps-dim")
+        with section(w("train.results"), classes=""):
+            ui.label(w("train.results_about")).classes("ps-dim")
             with ui.row().classes("items-center"):
                 self._by_data = ui.select({"": w("train.all_data")}, value="", label=w("train.data"))
                 tag(self._by_data.classes("w-64"), "filter-data").on_value_change(self._filtered)
@@ -71,14 +71,8 @@ class ResultsSection:
                 kinds |= {kind: w(f"train.rows.{kind}") for kind in (EVALUATION, TRIAL, TRAINING)}
                 self._by_kind = ui.select(kinds, value="", label=w("train.filter_kind"))
                 tag(self._by_kind.classes("w-64"), "filter-kind").on_value_change(self._filtered)
-            self._table = (
-                ui.element("div")
-                .classes("ps-sideways")
-                .props(f'role="region" tabindex="0" aria-label="{w("train.results")}"')
-            )
-            tag(self._table, "results")
-            self._table.on("click", self._clicked, js_handler=CLICKS)
-            with self._table:
+            table = tag(scroll_region(w("train.results")), "results")
+            with table.on("click", self._clicked, js_handler=_CLICKS):
                 self._html = html()
             self._pareto = ui.column().classes("w-full")
             self._details = ResultDetailsView(page, results)
@@ -114,10 +108,10 @@ class ResultsSection:
             self._down = not self._down if which == self._sort else which in _DOWN
             self._sort = which
             self._draw()
-            refocus(f"sort:{which}")
+            _refocus(f"sort:{which}")
         elif what == "open":
             await self.open(which)
-            refocus(str(event.args))
+            _refocus(str(event.args))
         elif what == "all":
             self._all = True
             self._draw()
@@ -132,26 +126,23 @@ class ResultsSection:
     def _draw(self) -> None:
         chosen = [r for r in self._rows if self._data in ("", r.data) and self._kind in ("", r.kind)]
         chosen.sort(key=_SORTS[self._sort], reverse=self._down)
-        self._html.set_content(self._as_table(chosen) if chosen else self._none())
+        empty = Markup('<p class="ps-dim">{}</p>').format(self._words("train.no_results"))
+        self._html.set_content(self._as_table(chosen) if chosen else empty)
         self._draw_pareto(chosen)
-
-    def _none(self) -> Markup:
-        return Markup('<p class="ps-dim">{}</p>').format(self._words("train.no_results"))
 
     def _as_table(self, rows: list[ResultRow]) -> Markup:
         w = self._words
         head = [Markup('<th scope="col">{}</th>').format(w("train.columns.open"))]
         for key in _SORTS:
-            on = key == self._sort
-            state = f' aria-sort="{"descending" if self._down else "ascending"}"' if on else ""
-            arrow = (" ▼" if self._down else " ▲") if on else ""
-            kind = ' class="n"' if key in _NUMBERS else ""
+            sorts = key == self._sort
+            state = f' aria-sort="{"descending" if self._down else "ascending"}"' if sorts else ""
+            arrow = (" ▼" if self._down else " ▲") if sorts else ""
+            kind = ' class="ps-number"' if key in _NUMBERS else ""
             cell = Markup(f'<th scope="col"{kind}{state}><button data-do="sort:{key}">{{}}{arrow}</button></th>')
             head.append(cell.format(w(f"train.columns.{key}")))
-        visible = rows if self._all else rows[:_SHOWN]
-        body = Markup("").join(self._as_row(row) for row in visible)
+        body = Markup("").join(self._as_row(row) for row in (rows if self._all else rows[:_MAX_ROWS]))
         more = Markup("")
-        if len(rows) > len(visible):
+        if len(rows) > _MAX_ROWS and not self._all:
             more = Markup('<p><button data-do="all">{}</button></p>').format(w("train.all_rows", n=len(rows)))
         return Markup(
             '<table class="ps-table"><caption>{}</caption><thead><tr>{}</tr></thead><tbody>{}</tbody></table>{}'
@@ -176,7 +167,7 @@ class ResultsSection:
         }
         name = row.path.stem if row.kind == TRAINING else row.network
         columns = Markup("").join(
-            Markup('<td class="{}" data-column="{}">{}</td>').format("n" if key in _NUMBERS else "", key, text)
+            Markup('<td class="{}" data-column="{}">{}</td>').format("ps-number" if key in _NUMBERS else "", key, text)
             for key, text in cells.items()
         )
         chosen = ' aria-selected="true"' if row.id == self._open else ""
@@ -202,17 +193,16 @@ class ResultsSection:
         if self._group not in groups:
             self._group = max(groups, key=lambda name: len(groups[name]))
         with self._pareto:
-            ui.label(w("train.pareto")).classes("text-lg").props('role="heading" aria-level="3"')
+            heading(w("train.pareto"), 3)
             with ui.row().classes("items-center"):
                 box = ui.select(list(groups), value=self._group, label=w("train.pareto_group"))
                 tag(box.classes("w-96"), "pareto-group")
                 labels = tag(html(), "pareto-marks")
             plot = ui.echart({}, renderer="svg").classes("ps-pareto")
             tag(plot, "pareto").props('role="img"')
-            ui.label(w("train.pareto_told")).classes("ps-dim")
-            with ui.expansion(w("train.pareto_table"), icon="table_rows").classes("w-full") as more:
-                table = tag(html().classes("ps-sideways"), "pareto-table")
-            tag(more, "pareto-data")
+            ui.label(w("train.pareto_about")).classes("ps-dim")
+            with tag(ui.expansion(w("train.pareto_table"), icon="table_rows").classes("w-full"), "pareto-data"):
+                table = tag(html().classes("ps-scroll-x"), "pareto-table")
 
         def draw() -> None:
             group = groups[self._group]
@@ -239,13 +229,13 @@ def comparable_groups(rows: Sequence[ResultRow], kind: Callable[[str], str]) -> 
     A group has the same data, kind, split, context, classes and held-back people. Groups of one name are numbered, such
     as those of a data set before and after a change.
     """
-    found: dict[tuple[Any, ...], list[ResultRow]] = {}
+    comparable: dict[tuple[Any, ...], list[ResultRow]] = {}
     for row in rows:
         if row.macro_f1 is not None:
-            found.setdefault((row.data, row.kind, row.split, row.context, *row.apart), []).append(row)
+            comparable.setdefault((row.data, row.kind, row.split, row.context, *row.apart), []).append(row)
     groups: dict[str, list[ResultRow]] = {}
-    for key, several in sorted(found.items(), key=lambda item: -max(row.when_s for row in item[1])):
-        if len(several) < 2:
+    for key, group in sorted(comparable.items(), key=lambda item: -max(row.when_s for row in item[1])):
+        if len(group) < 2:
             continue
         data, which, split, context = key[:4]
         name = plain = " · ".join((data, kind(which), split, context))
@@ -253,16 +243,148 @@ def comparable_groups(rows: Sequence[ResultRow], kind: Callable[[str], str]) -> 
         while name in groups:
             number += 1
             name = f"{plain} ({number})"
-        groups[name] = several
+        groups[name] = group
     return groups
 
 
-CLICKS = '(e) => { const b = e.target.closest("[data-do]"); if (b) emit(b.dataset.do); }'
+_CLICKS = '(e) => { const b = e.target.closest("[data-do]"); if (b) emit(b.dataset.do); }'
 
 
-def refocus(what: str) -> None:
-    """Set the focus to a button again after its table was rebuilt."""
+def _refocus(what: str) -> None:
+    """Focus a button again after its table was rebuilt."""
     ui.run_javascript(
         f"setTimeout(() => [...document.querySelectorAll('[data-do]')]"
         f".find((b) => b.dataset.do === {json.dumps(what)})?.focus(), 60)"
     )
+
+
+# CSS variables, so that the plot follows a change of the colour scheme.
+_INK, _DIM, _LINE, _BACKGROUND = "var(--ps-ink)", "var(--ps-dim)", "var(--ps-line)", "var(--train-page)"
+_FRONT, _POINT = "#D55E00", "#0072B2"
+_TICKS = (1, 2, 5)
+
+
+def pareto_rows(rows: Sequence[ResultRow]) -> list[ResultRow]:
+    """Return the Pareto front of macro-F1 and parameters, the smallest network first."""
+    scored = [row for row in rows if row.macro_f1 is not None]
+    on_front = pareto_front([(float(row.macro_f1 or 0.0), float(row.parameters)) for row in scored])
+    return sorted((row for row, best in zip(scored, on_front, strict=True) if best), key=lambda row: row.parameters)
+
+
+def pareto_options(rows: Sequence[ResultRow], *, x: str, y: str, leaky: str) -> dict[str, Any]:
+    """Return the options of an ECharts plot of scored rows, for its SVG renderer.
+
+    Args:
+        rows: results with a macro-F1.
+        x: title of the axis of parameters, which is logarithmic.
+        y: title of the axis of macro-F1.
+        leaky: word added to the labels of leaky results, which are hollow diamonds.
+    """
+    front = pareto_rows(rows)
+    ids = {row.id for row in front}
+    low_x, high_x = _log_range([row.parameters for row in rows])
+    bars: list[list[float | None]] = []
+    for row in rows:
+        if row.macro_f1_sd is not None:
+            score = row.macro_f1 or 0.0
+            bars += [[row.parameters, score - row.macro_f1_sd], [row.parameters, score + row.macro_f1_sd], [None, None]]
+    points = [_point(row, row.id in ids, leaky, math.sqrt(low_x * high_x)) for row in rows]
+    line = {"type": "line", "showSymbol": False, "silent": True, "emphasis": {"disabled": True}}
+    return {
+        "animation": False,
+        "grid": {"left": 70, "right": 24, "top": 20, "bottom": 56},
+        # Rich text is drawn, not parsed as HTML.
+        "tooltip": {"renderMode": "richText", "confine": True},
+        "xAxis": {
+            "type": "log",
+            "min": low_x,
+            "max": high_x,
+            "axisLabel": {"customValues": _ticks(low_x, high_x), ":formatter": _SHORT, "color": _INK},
+            "axisTick": {"customValues": _ticks(low_x, high_x)},
+            **_axis(x, 32),
+        },
+        "yAxis": {
+            "type": "value",
+            "scale": True,
+            "axisLabel": {":formatter": "(v) => v.toFixed(2)", "color": _INK},
+            **_axis(y, 48),
+        },
+        "series": [
+            {**line, "data": bars, "lineStyle": {"color": _DIM, "width": 1.5}},
+            {**line, "data": [[r.parameters, r.macro_f1] for r in front], "lineStyle": {"color": _FRONT, "width": 2}},
+            {
+                "type": "scatter",
+                "data": points,
+                "emphasis": {"disabled": True},
+                "labelLayout": {"hideOverlap": True},
+            },
+        ],
+    }
+
+
+def pareto_table(w: Words, rows: Sequence[ResultRow]) -> Markup:
+    """Render the data of the plot as a table, the smallest network first."""
+    ids = {row.id for row in pareto_rows(rows)}
+    head = [w(f"train.columns.{key}") for key in ("network", "schedule", "parameters", "macro_f1")]
+    cells = [
+        (
+            row.network,
+            f"{row.schedule} ({w('train.leaky')})" if row.leaky else row.schedule,
+            f"{row.parameters:,}",
+            score_text(row.macro_f1, row.macro_f1_sd),
+            "✓" if row.id in ids else "–",
+        )
+        for row in sorted(rows, key=lambda row: row.parameters)
+    ]
+    return table_html([*head, w("train.pareto_front")], cells, numbers=(2, 3))
+
+
+_SHORT = "(v) => v >= 1000 ? `${v / 1000}k` : `${v}`"
+
+
+def _point(row: ResultRow, front: bool, leaky: str, middle: float) -> dict[str, Any]:
+    name = f"{row.network.rpartition(' ')[0]}, {row.schedule.partition(', ')[2]}"
+    if row.leaky:
+        name = f"{name} ({leaky})"
+    text = f"{name}: {row.parameters:,}, {score_text(row.macro_f1, row.macro_f1_sd)}"
+    hollow = {"color": _BACKGROUND, "borderColor": _FRONT, "borderWidth": 2.5}
+    return {
+        "name": name,
+        "value": [row.parameters, row.macro_f1],
+        "symbol": "diamond" if row.leaky else "circle",
+        # Of overlapping labels, ECharts keeps that of the larger symbol.
+        "symbolSize": 13 if front else 10,
+        "itemStyle": {"opacity": 1, **(hollow if row.leaky else {"color": _POINT, "borderColor": _BACKGROUND})},
+        "label": {
+            "show": True,
+            "formatter": "{b}",
+            "position": "right" if row.parameters < middle else "left",
+            "minMargin": 4,
+            "color": _INK,
+            "fontWeight": "bold" if front else "normal",
+        },
+        "tooltip": {"formatter": text},
+    }
+
+
+def _axis(name: str, gap: int) -> dict[str, Any]:
+    return {
+        "name": name,
+        "nameLocation": "middle",
+        "nameGap": gap,
+        "nameTextStyle": {"color": _INK},
+        "axisLine": {"lineStyle": {"color": _DIM}},
+        "splitLine": {"lineStyle": {"color": _LINE}},
+    }
+
+
+def _log_range(values: Sequence[int]) -> tuple[float, float]:
+    """Return limits of a logarithmic axis, with a margin around the values."""
+    low, high = math.log10(min(values)), math.log10(max(values))
+    margin = max(0.15, 0.08 * (high - low))
+    return 10 ** (low - margin), 10 ** (high + margin)
+
+
+def _ticks(low: float, high: float) -> list[float]:
+    decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    return [m * 10.0**e for e in decades for m in _TICKS if low <= m * 10.0**e <= high]

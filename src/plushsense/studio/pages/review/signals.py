@@ -1,118 +1,38 @@
-"""Signals of one recording and overlays of a gesture, and the component that plots them."""
+"""Signals, deviation curves and overlays of recordings, and the background thread that prepares a review.
+
+Trim suggestions and deviation shapes depend only on raw files. They are cached in the folder ``cache/`` of the data
+set, which may be deleted, is not part of backups, and is emptied when a person is forgotten. Findings also depend on
+the marks and are computed again on request.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
+import json
+import threading
+import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, field, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from nicegui.element import Element
-from nicegui.events import GenericEventArguments
 from numpy.typing import NDArray
 
+from plushsense.core.errors import ForgottenError, PlushSenseError
+from plushsense.core.files import write_file
 from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import Frames
+from plushsense.core.version import __version__
+from plushsense.dataset.files import CACHE
+from plushsense.dataset.onset import SPEC, Suggestion
+from plushsense.dataset.quality.checking import CheckReport, check
 from plushsense.dataset.store import Dataset, RecordingInfo
-from plushsense.dataset.trimming import row_times_s
-from plushsense.reports.quality_figures import deviation
-from plushsense.studio.pages.review.preparation import FULL, DeviationShape
-
-_VENDOR = Path(__file__).parents[2] / "widgets" / "vendor" / "uplot"
-
-
-class ReviewPlot(Element, component="review_plot.js"):
-    """Browser component that plots curves over seconds with marks, and reports clicks and keys.
-
-    Args:
-        label: text alternative while nothing is plotted.
-        on_pick: called with {x, y, button ("left" or "right"), shift, shown (id of the plotted recording)}.
-        on_key: called with {key, shift, shown}, except for keys typed into a field or a dialog.
-        on_zoom: called with {low, high, shown} after zooming into thinned curves.
-    """
-
-    def __init__(
-        self,
-        label: str,
-        *,
-        height: int = 330,
-        legend: bool = True,
-        on_pick: Callable[[dict[str, Any]], Any],
-        on_key: Callable[[dict[str, Any]], Any] | None = None,
-        on_zoom: Callable[[dict[str, Any]], Any] | None = None,
-    ) -> None:
-        super().__init__()
-        self.add_resource(_VENDOR)
-        self._props["label"] = label
-        self._props["height"] = height
-        self._props["legend"] = legend
-        self._props["keyed"] = on_key is not None
-        self.classes("w-full")
-        for event, card in (("pick", on_pick), ("key", on_key), ("zoomed", on_zoom)):
-            if card is not None:
-                self.on(event, _with_args(card))
-
-    def show(
-        self,
-        identity: str,
-        label: str,
-        x: Sequence[float],
-        curves: Sequence[Sequence[float | None]],
-        series: Sequence[dict[str, Any]],
-        *,
-        x_title: str,
-        y_title: str = "",
-        lanes: Sequence[tuple[float, str]] = (),
-        limits: tuple[float, float] | None = None,
-        marks: Sequence[dict[str, Any]] = (),
-        cut: Sequence[tuple[float, float]] = (),
-        thinned: bool = False,
-        keep: bool = False,
-    ) -> None:
-        """Plot another set of curves.
-
-        Args:
-            identity: id sent back with every click and key.
-            label: text alternative.
-            lanes: (position, name) that replace the numbers of the y-axis.
-            limits: range of the y-axis.
-            marks: vertical lines with ``x``, ``label``, ``stroke`` and ``dash``.
-            cut: shaded ranges (from, to).
-            keep: whether to keep the zoom if the recording is the same.
-        """
-        payload = {
-            "id": identity,
-            "label": label,
-            "data": [x, *curves],
-            "series": list(series),
-            "xTitle": x_title,
-            "y": y_title,
-            "lanes": [list(lane) for lane in lanes],
-            "range": list(limits) if limits else None,
-            "marks": list(marks),
-            "cut": [list(c) for c in cut],
-            "from": x[0] if x else 0.0,
-            "thinned": thinned,
-            "keep": keep,
-        }
-        self.run_method("show", payload)
-
-    def remark(
-        self, identity: str, marks: Sequence[dict[str, Any]], cut: Sequence[tuple[float, float]], label: str
-    ) -> None:
-        """Move the marks of the plotted recording."""
-        self.run_method("remark", identity, list(marks), [list(c) for c in cut], label)
-
-    def zoom(self, factor: float) -> None:
-        """Scale the visible range by ``factor`` around the first mark; 0 displays the whole recording."""
-        self.run_method("zoom", factor)
-
-
-def _with_args(card: Callable[[dict[str, Any]], Any]) -> Callable[[GenericEventArguments], Any]:
-    return lambda event: card(dict(event.args))
-
+from plushsense.dataset.trimming import row_times_s, suggest_trims
+from plushsense.reports.quality import scale_of
+from plushsense.reports.quality_figures import deviation, line
+from plushsense.studio.app.workspace import ChangeSignal
 
 ALL, ACTIVITY = "all", "activity"
 BEFORE_S = 2.0
@@ -266,10 +186,10 @@ class DeviationCurve:
     why: str = ""
 
 
-def trimmed_curve(identity: str, path: DeviationShape, start_s: float, stop_s: float, why: str = "") -> DeviationCurve:
+def trimmed_curve(identity: str, shape: DeviationShape, start_s: float, stop_s: float, why: str = "") -> DeviationCurve:
     """Return the curve of a recording between ``start_s`` and ``stop_s``."""
-    size = np.array(path.size, dtype=np.float64) / FULL
-    at = np.linspace(0.0, path.seconds, len(size)) if len(size) else size
+    size = np.array(shape.size, dtype=np.float64) / FULL
+    at = np.linspace(0.0, shape.seconds, len(size)) if len(size) else size
     inside = (at >= start_s) & (at <= stop_s) if len(size) else size.astype(bool)
     return DeviationCurve(identity, max(0.0, stop_s - start_s), size[inside], why)
 
@@ -309,3 +229,179 @@ def build_overlay(curves: Sequence[DeviationCurve]) -> GestureOverlay:
     x = np.linspace(0.0, end, _GRID)
     table = [np.interp(x, np.linspace(0.0, c.seconds, len(c.size)), c.size, right=np.nan) for c in drawn]
     return GestureOverlay(drawn, x, np.array(table).reshape(len(drawn), _GRID))
+
+
+CACHE_FILE = "review.json"
+FULL = 1000
+"""Value of `DeviationShape.size` at the typical deviation."""
+_BATCH = 25
+# Shortest time between two notifications of progress.
+_NOTIFY_S = 0.3
+# Pauses between two recordings, so that pages get the interpreter; longer while a page was used in the last seconds.
+_PAUSE_S = 0.0005
+_LONG_PAUSE_S = 0.015
+_BUSY_S = 1.5
+
+
+class _Closed(Exception):
+    """Raised in the worker thread when the studio closes."""
+
+
+@dataclass(frozen=True)
+class DeviationShape:
+    """The deviation of a whole recording from rest, in a few points.
+
+    ``size`` (≤ 160,): deviation of all channels from rest, `FULL` where it is typical, at even steps over ``seconds``.
+    """
+
+    seconds: float
+    size: tuple[int, ...]
+
+
+@dataclass
+class ReviewPreparation:
+    """Results computed so far by one background thread.
+
+    Attributes:
+        scale: (C,) typical deviation of each channel; empty until it is known.
+        progress: (step, done, total), or None if nothing runs; ``step`` is "suggestions" or "checks".
+        message: error message of the last run, or "".
+    """
+
+    changed: ChangeSignal
+    suggestions: dict[str, Suggestion] = field(default_factory=dict)
+    shapes: dict[str, DeviationShape] = field(default_factory=dict)
+    scale: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    checked: CheckReport | None = None
+    progress: tuple[str, int, int] | None = None
+    message: str = ""
+    _thread: threading.Thread | None = field(default=None, repr=False)
+    _next: Dataset | None = field(default=None, repr=False)
+    _lock: Any = field(default_factory=threading.Lock, repr=False)
+    _closed: bool = False
+    _notified_s: float = 0.0
+    _used_s: float = 0.0
+
+    def begin(self, dataset: Dataset) -> None:
+        """Start computing missing results and checking ``dataset`` with its marks; return at once.
+
+        A call during a run starts another run after it.
+        """
+        with self._lock:
+            if self._thread is not None and self._thread.is_alive():
+                self._next = dataset
+                return
+            self._thread = threading.Thread(target=self._run, args=(dataset,), daemon=True)
+            self._thread.start()
+
+    def step_back(self) -> None:
+        """Slow the background thread for a while, because a page needs the interpreter."""
+        self._used_s = time.monotonic()
+
+    def wait(self, seconds: float) -> None:
+        """Wait until the background thread is done, at most ``seconds``."""
+        if self._thread is not None:
+            self._thread.join(seconds)
+
+    def close(self) -> None:
+        """Stop the background thread and wait for it."""
+        self._closed = True
+        self.wait(5.0)
+
+    def _run(self, dataset: Dataset | None) -> None:
+        while dataset is not None:
+            try:
+                self.message = ""
+                self._make(dataset)
+                self.progress = ("checks", 0, len(dataset.recordings))
+                self.checked = check(dataset, progress=self._steps("checks"))
+            except _Closed:
+                return
+            except PlushSenseError as refusal:
+                self.message = str(refusal)
+            except OSError as cause:
+                self.message = f"'{dataset.path}' cannot be read: {cause.strerror or cause}."
+            with self._lock:
+                dataset, self._next = self._next, None
+                if dataset is None:
+                    self.progress, self._thread = None, None
+            self.changed.notify()
+
+    def _steps(self, what: str, before: int = 0, total: int = 0) -> Callable[[int, int], None]:
+        def step(done: int, of: int) -> None:
+            if self._closed:
+                raise _Closed
+            self.progress = (what, before + done, total or of)
+            time.sleep(_LONG_PAUSE_S if time.monotonic() - self._used_s < _BUSY_S else _PAUSE_S)
+            if time.monotonic() - self._notified_s > _NOTIFY_S:
+                self._notified_s = time.monotonic()
+                self.changed.notify()
+
+        return step
+
+    def _make(self, dataset: Dataset) -> None:
+        keys = {r.id: _key(r) for r in dataset.recordings}
+        self._read_cache(dataset, keys)
+        missing = [r for r in dataset.recordings if r.id not in self.shapes]
+        if not missing:
+            return
+        if not len(self.scale):
+            self.scale = scale_of(dataset)
+        total, before = len(dataset.recordings), len(dataset.recordings) - len(missing)
+        missing.sort(key=lambda r: (r.stream, r.id))
+        for first in range(0, len(missing), _BATCH):
+            part, step = missing[first : first + _BATCH], self._steps("suggestions", before + first, total)
+            if not dataset.layout.is_labelled:
+                self.suggestions |= {t.recording.id: t.suggestion for t in suggest_trims(dataset, part, step)}
+            self.shapes |= {r.id: shape_of(dataset, r, self.scale) for r in part}
+            step(len(part), total)
+        self._write_cache(dataset, keys)
+
+    def _read_cache(self, dataset: Dataset, keys: dict[str, str]) -> None:
+        with contextlib.suppress(OSError, ValueError, TypeError, KeyError, AttributeError):
+            cached = json.loads((dataset.path / CACHE / CACHE_FILE).read_text(encoding="utf-8"))
+            if cached["made_by"] != _made_by() or len(cached["scale"]) != dataset.layout.n_channels:
+                return
+            self.scale = np.array(cached["scale"], dtype=np.float64)
+            for identity, (key, suggestion, seconds, size) in cached["recordings"].items():
+                if keys.get(identity) != key:
+                    continue
+                if suggestion is not None:
+                    self.suggestions[identity] = Suggestion(*suggestion)
+                self.shapes[identity] = DeviationShape(float(seconds), tuple(map(int, size)))
+
+    def _write_cache(self, dataset: Dataset, keys: dict[str, str]) -> None:
+        recordings = {
+            identity: (
+                key,
+                astuple(self.suggestions[identity]) if identity in self.suggestions else None,
+                self.shapes[identity].seconds,
+                self.shapes[identity].size,
+            )
+            for identity, key in keys.items()
+        }
+        content = json.dumps({"made_by": _made_by(), "scale": self.scale.tolist(), "recordings": recordings})
+        # On a disk that cannot be written, everything is computed again each time.
+        with contextlib.suppress(OSError, ForgottenError), dataset.generation.writing():
+            (dataset.path / CACHE).mkdir(exist_ok=True)
+            write_file(dataset.path / CACHE / CACHE_FILE, content)
+
+
+def shape_of(dataset: Dataset, info: RecordingInfo, scale: NDArray[np.float64]) -> DeviationShape:
+    """Compute the deviation shape of one untrimmed recording."""
+    frames = dataset.read(replace(info, start=0, stop=info.rows))
+    if not len(frames):
+        return DeviationShape(0.0, ())
+    curve = line(frames, dataset.layout, scale, float(row_times_s(frames)[-1]))
+    size = np.minimum(np.rint(curve.size * FULL), 1e6).astype(int)
+    return DeviationShape(round(curve.lasts, 3), tuple(size.tolist()))
+
+
+def _made_by() -> str:
+    return hashlib.sha256(f"1 {__version__} {SPEC}".encode()).hexdigest()[:16]
+
+
+def _key(r: RecordingInfo) -> str:
+    """Return a hash of everything that a trim suggestion depends on."""
+    source = repr((r.sha256, r.first_row, r.rows, r.gesture, r.stream, r.stream_row))
+    return hashlib.sha256(source.encode()).hexdigest()[:16]

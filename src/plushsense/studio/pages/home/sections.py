@@ -1,0 +1,308 @@
+"""Sections of the home page: data sets, recorded sessions, and running and earlier jobs."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from nicegui import ui
+
+from plushsense.studio.app.jobs import DONE, REFUSED, RUNNING, STOPPED, Jobs, StudioJob
+from plushsense.studio.app.shell import Page, address, html, moment, named, tag
+from plushsense.studio.app.workspace import DATASETS, WORK
+from plushsense.studio.pages.home.overview import DatasetEntry, SessionEntry, WorkspaceSummary
+
+SMALL = 'outline no-caps padding="4px 12px"'
+"""Properties of the buttons in rows."""
+PAGE_OF = {
+    "check": "review",
+    "import": "review",
+    "simulate": "review",
+    "train": "train",
+    "sweep": "train",
+    "search": "train",
+    "evaluate": "train",
+    "export": "export",
+    "verify": "export",
+    "publish": "publish",
+}
+"""The page that displays the result of a task."""
+_SIGNS = {RUNNING: "▶", DONE: "✓", REFUSED: "✕", STOPPED: "■"}
+_MAX_EARLIER = 6
+_MAX_LINES = 40
+
+
+def titled_card(page: Page, title: str, name: str) -> ui.card:
+    """Add a card with a heading that screen readers find as a region."""
+    box = tag(ui.card().classes("ps-card w-full").props("flat"), name)
+    named(box.props("role=region"), page.words(title))
+    with box:
+        html(page.words(title), "h2")
+    return box
+
+
+def simulation_badge(page: Page) -> None:
+    """Add the mark of a simulation."""
+    ui.label(page.words("home.simulated")).classes("ps-simulated")
+
+
+def page_links(page: Page, pages: tuple[str, ...], name: str, **query: Any) -> None:
+    """Add links to pages that open with ``query``; screen readers also read ``name``."""
+    for to in pages:
+        text = page.words(f"pages.{to}")
+        named(ui.link(text, address(to, **query)).classes("ps-link"), f"{text}: {name}")
+
+
+class DatasetSection:
+    """Section that lists the data sets, with links to the pages that use them."""
+
+    def __init__(self, page: Page, jobs: Jobs) -> None:
+        self._page, self._jobs = page, jobs
+        with titled_card(page, "home.datasets", "datasets"):
+            self._rows = ui.column().classes("w-full ps-small-gap")
+
+    def fill(self, summary: WorkspaceSummary) -> None:
+        """Display the data sets."""
+        self._rows.clear()
+        with self._rows:
+            if not summary.datasets:
+                ui.label(self._page.words("home.no_datasets")).classes("ps-dim")
+            for entry in summary.datasets:
+                self._row(entry)
+
+    def _row(self, entry: DatasetEntry) -> None:
+        page, words = self._page, self._page.words
+        with tag(ui.column().classes("ps-row w-full"), "dataset"):
+            with ui.row().classes("items-center w-full ps-small-gap"):
+                ui.label(entry.name).classes("text-weight-bold")
+                if entry.simulated:
+                    simulation_badge(page)
+            if entry.refused:
+                ui.label(entry.refused).classes("ps-bad")
+                return
+            excluded = f" ({words('home.excluded', n=entry.excluded)})" if entry.excluded else ""
+            facts = [
+                words("home.people", n=entry.people),
+                words("home.recordings", n=entry.recordings) + excluded,
+                _size(page, entry.bytes),
+                entry.layout,
+            ]
+            ui.label(" · ".join(facts)).classes("ps-dim")
+            checks = [j for j in self._jobs.all("check") if j.spec.get("dataset") == str(entry.path)]
+            last = next((j for j in checks if j.state == DONE and j.result.get("dataset") == str(entry.path)), None)
+            ui.label(_findings(page, last.result) if last is not None else words("home.unchecked"))
+            with ui.row().classes("items-center ps-small-gap"):
+                page_links(page, ("review", "train", "publish"), entry.name, dataset=entry.path)
+                if not any(j.state == RUNNING for j in checks):
+                    check = ui.button(words("home.check"), on_click=lambda: self._check(entry))
+                    named(check.props(SMALL), f"{words('home.check')}: {entry.name}")
+
+    def _check(self, entry: DatasetEntry) -> None:
+        with self._page.show_errors():
+            title = self._page.words("home.check_title", name=entry.name)
+            self._jobs.start("check", {"dataset": str(entry.path)}, title)
+
+
+def _size(page: Page, count: float) -> str:
+    return f"{page.words.number(count / 1e6, 1)} MB" if count < 1e9 else f"{page.words.number(count / 1e9, 2)} GB"
+
+
+def _findings(page: Page, result: dict[str, Any]) -> str:
+    """Summarise the findings of a check in one line."""
+    counts = result.get("by_severity") or {}
+    return page.words(
+        "home.findings",
+        undecided=result.get("undecided", 0),
+        warnings=counts.get("warning", 0),
+        notes=counts.get("info", 0),
+    )
+
+
+class SessionSection:
+    """Section that lists the recorded sessions and makes data sets of them."""
+
+    def __init__(self, page: Page, jobs: Jobs) -> None:
+        self._page, self._jobs = page, jobs
+        self._chosen: set[str] = set()
+        self._displayed: tuple[object, ...] = ()
+        self._box = titled_card(page, "home.sessions", "sessions")
+        with self._box:
+            self._inner = ui.column().classes("w-full ps-small-gap")
+        self._box.set_visibility(False)
+
+    def fill(self, summary: WorkspaceSummary) -> None:
+        """Display the sessions; the selection stays as long as they do not change."""
+        readable = [d for d in summary.datasets if not d.refused]
+        current = (summary.sessions, tuple((d.path, d.name, d.simulated, d.layout) for d in readable))
+        if current == self._displayed:
+            return
+        self._displayed = current
+        self._chosen = {str(s.path) for s in summary.sessions if s.waiting}
+        self._box.set_visibility(bool(summary.sessions))
+        self._inner.clear()
+        with self._inner:
+            for batch in summary.batches():
+                self._batch(batch, readable)
+            for entry in summary.sessions:
+                if entry.refused or not entry.recordings:
+                    ui.label(self._describe(entry)).classes("ps-bad" if entry.refused else "ps-dim")
+
+    def _batch(self, batch: tuple[SessionEntry, ...], datasets: list[DatasetEntry]) -> None:
+        page, words = self._page, self._page.words
+        with tag(ui.column().classes("ps-row w-full"), "batch"):
+            if batch[0].simulated:
+                simulation_badge(page)
+            scroll = ui.column().classes("ps-scroll w-full ps-no-gap").props("tabindex=0 role=group")
+            with named(scroll, words("home.sessions")):
+                for entry in batch:
+                    box = ui.checkbox(self._describe(entry), value=str(entry.path) in self._chosen)
+                    box.on_value_change(lambda e, entry=entry: self._choose(entry, bool(e.value)))
+            with ui.row().classes("items-end ps-small-gap w-full"):
+                name = tag(ui.input(words("home.name")).classes("ps-wide"), "new-name")
+                make = ui.button(words("home.make"), on_click=lambda: self._make(batch, str(name.value or "")))
+                tag(make.props("unelevated no-caps"), "make")
+            first = batch[0]
+            fitting = [d for d in datasets if (d.simulated, d.layout) == (first.simulated, first.layout)]
+            if fitting:
+                with ui.row().classes("items-end ps-small-gap w-full"):
+                    names = {str(d.path): d.name for d in fitting}
+                    to = ui.select(names, value=next(iter(names)), label=words("home.add_to")).classes("ps-wide")
+                    add = ui.button(words("home.add"), on_click=lambda: self._add(batch, str(to.value)))
+                    tag(add.props("outline no-caps"), "add")
+
+    def _describe(self, entry: SessionEntry) -> str:
+        words = self._page.words
+        if entry.refused:
+            return f"{entry.subject}/{entry.session}: {entry.refused}"
+        facts = [
+            entry.subject,
+            words("home.session", name=entry.session),
+            moment(entry.start_s),
+            words("home.recordings", n=entry.recordings),
+            words("home.finished" if entry.finished else "home.unfinished"),
+        ]
+        if entry.datasets:
+            facts.append(words("home.kept", names=", ".join(f"“{n}”" for n in entry.datasets)))
+        return " · ".join(facts)
+
+    def _choose(self, entry: SessionEntry, chosen: bool) -> None:
+        (self._chosen.add if chosen else self._chosen.discard)(str(entry.path))
+
+    def _make(self, batch: tuple[SessionEntry, ...], name: str) -> None:
+        with self._page.show_errors():
+            place = self._page.workspace.new(DATASETS, name)
+            self._start(batch, {"dest": str(place), "name": place.name}, place.name)
+
+    def _add(self, batch: tuple[SessionEntry, ...], dataset: str) -> None:
+        with self._page.show_errors():
+            place = self._page.workspace.inside(dataset)
+            self._start(batch, {"dest": str(place), "add": True}, self._page.workspace.title(place))
+
+    def _start(self, batch: tuple[SessionEntry, ...], spec: dict[str, object], name: str) -> None:
+        workspace = self._page.workspace
+        chosen = [str(s.path) for s in batch if str(s.path) in self._chosen]
+        if not chosen:
+            self._page.say(self._page.words("home.none_chosen"), "warning")
+            return
+        spec |= {"sessions": chosen, "recordings": str(workspace.recordings), "work": str(workspace.folder / WORK)}
+        self._page.say("")
+        self._jobs.start("import", spec, self._page.words("home.import_title", name=name))
+
+
+class JobList:
+    """Section of running and earlier jobs; rows change in place, so that a focused button keeps the focus."""
+
+    def __init__(self, page: Page, jobs: Jobs) -> None:
+        self._page, self._jobs = page, jobs
+        self._displayed: tuple[Any, ...] | None = None
+        self._progress_bars: dict[str, tuple[ui.label, ui.linear_progress]] = {}
+        with titled_card(page, "home.work", "work"):
+            self._rows = ui.column().classes("w-full ps-small-gap")
+        self.update()
+
+    def update(self) -> None:
+        """Display the current state of the jobs."""
+        jobs = self._jobs.all()
+        running = [j for j in jobs if j.state == RUNNING]
+        displayed = [*running, *[j for j in jobs if j.state != RUNNING][:_MAX_EARLIER]]
+        current = tuple((j.id, j.state) for j in displayed)
+        if current != self._displayed:
+            self._displayed = current
+            self._rows.clear()
+            self._progress_bars.clear()
+            with self._rows:
+                if not current:
+                    ui.label(self._page.words("home.no_work")).classes("ps-dim")
+                for job in displayed:
+                    with tag(ui.column().classes("ps-row w-full ps-small-gap"), f"job-{job.state}"):
+                        self._row(job)
+        for job in running:
+            label, bar = self._progress_bars[job.id]
+            text, share = self._progress(job)
+            label.set_text(text)
+            bar.set_value(share or 0.0)
+            bar.set_visibility(share is not None)
+
+    def _row(self, job: StudioJob) -> None:
+        words = self._page.words
+        ui.label(f"{_SIGNS[job.state]} {job.title}").classes("text-weight-bold ps-break")
+        if job.state == RUNNING:
+            label = tag(ui.label(), "job-progress")
+            bar = ui.linear_progress(0.0, show_value=False, size="10px").props("rounded")
+            self._progress_bars[job.id] = (label, named(bar, job.title))
+        else:
+            ui.label(f"{words(f'home.{job.state}')} · {moment(job.ended_s or job.begun_s)}").classes("ps-dim")
+        if job.state == REFUSED:
+            ui.label(job.message).classes("ps-bad ps-break")
+        if job.state == DONE:
+            self._result(job)
+        with ui.row().classes("items-center ps-small-gap"):
+            if job.state == DONE:
+                page_links(
+                    self._page, (PAGE_OF.get(job.task, "home"),), job.title, dataset=job.result.get("dataset") or ""
+                )
+            if job.state == RUNNING:
+                self._button("stop", job, lambda: self._jobs.stop(job.id))
+                return
+            if job.state == STOPPED and not job.spec.get("archive"):
+                self._button("again", job, lambda: self._jobs.resume(job.id))
+            self._button("drop", job, lambda: self._jobs.drop(job.id))
+
+    def _button(self, key: str, job: StudioJob, action: Callable[[], object]) -> None:
+        def clicked() -> None:
+            with self._page.show_errors():
+                action()
+
+        label = self._page.words(f"home.{key}")
+        button = ui.button(label, on_click=clicked).props(SMALL)
+        tag(named(button, f"{label}: {job.title}"), f"job-{key}")
+
+    def _progress(self, job: StudioJob) -> tuple[str, float | None]:
+        """Return the progress as text, and as a share if it is known."""
+        minutes, seconds = divmod(int(max(0.0, time.time() - job.begun_s)), 60)
+        text = f"{self._page.words('home.running')} · {minutes}:{seconds:02d}"
+        done, total = job.progress.get("done"), job.progress.get("total")
+        if isinstance(done, int | float) and isinstance(total, int | float) and total > 0:
+            return f"{text} · {done:g} / {total:g}", min(1.0, done / total)
+        return text, None
+
+    def _result(self, job: StudioJob) -> None:
+        page, words, result = self._page, self._page.words, job.result
+        if job.task == "check":
+            ui.label(_findings(page, result))
+        if job.task in ("import", "simulate"):
+            people = result.get("subjects", result.get("people", 0))
+            facts = [words("home.recordings", n=result["recordings"]), words("home.people", n=people)]
+            if job.spec.get("add"):
+                facts.append(words("home.new", n=result["added"]["recordings"]))
+            ui.label(" · ".join(facts))
+        warnings = [str(w) for w in (*job.warnings, *result.get("warnings", ()))]
+        rejected = [f"{r['file']}: {r['reason']}" for r in result.get("rejected", ())]
+        for key, lines in (("warnings", warnings), ("rejected", rejected)):
+            if lines:
+                with ui.expansion(words(f"home.{key}", n=len(lines))).classes("w-full").props("dense"):
+                    for line in lines[:_MAX_LINES]:
+                        ui.label(line).classes("ps-break ps-note")
+                    if len(lines) > _MAX_LINES:
+                        ui.label(words("home.more", n=len(lines) - _MAX_LINES)).classes("ps-dim")

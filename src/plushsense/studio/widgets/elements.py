@@ -1,0 +1,354 @@
+"""Elements that several pages use: facts, tables, plots, pictures of gestures, and the panel of running jobs."""
+
+from __future__ import annotations
+
+import base64
+import time
+from collections.abc import Awaitable, Callable, Collection, Iterable, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import jinja2
+from markupsafe import Markup
+from nicegui import run, ui
+from nicegui.element import Element
+from nicegui.events import GenericEventArguments
+
+from plushsense.core.gestures import plain_label
+from plushsense.studio.app.jobs import DONE, REFUSED, RUNNING, Jobs, StudioJob
+from plushsense.studio.app.shell import Kind, Page, html, named, on_change, scroll_region, tag
+from plushsense.studio.app.words import Words
+from plushsense.studio.app.workspace import Workspace
+
+_CSS = Path(__file__).with_name("elements.css")
+_RECENT_S = 900.0
+_TITLES = {
+    "export": "export.doing",
+    "profile": "export.counting",
+    "verify": "export.verifying",
+    "publish": "publish.doing",
+    "validate": "publish.checking",
+    "pseudonymise": "publish.renaming",
+}
+
+
+def style() -> None:
+    """Add the style sheet; call it once a page."""
+    ui.add_css(_CSS.read_text(encoding="utf-8"))
+
+
+def scroll_to(name: str) -> None:
+    """Scroll to the element tagged with this name."""
+    ui.run_javascript(f"document.querySelector('[data-test=\"{name}\"]')?.scrollIntoView()")
+
+
+def text(message: str, kind: str = "p", classes: str = "") -> ui.html:
+    """Add plain text as an HTML element."""
+    return html(message, kind).classes(classes)
+
+
+def notice(message: str, kind: Kind = "warning") -> ui.html:
+    """Add a sentence in a coloured box."""
+    return text(message, classes=f"ps-message ps-message-{kind} w-full")
+
+
+def verdict(good: bool | None, word: str) -> Markup:
+    """Return a verdict as sign, word and colour; None means unknown."""
+    kind, sign = {True: ("good", "✓"), False: ("bad", "✗"), None: ("none", "–")}[good]
+    return Markup('<span class="ps-verdict ps-verdict-{}">{} {}</span>').format(kind, sign, word)
+
+
+def facts(rows: Sequence[tuple[str, str]]) -> ui.html:
+    """Add a list of names and values; skip empty values."""
+    line = Markup("<dt>{}</dt><dd>{}</dd>")
+    return html(Markup("").join(line.format(*row) for row in rows if row[1]), "dl").classes("ps-facts")
+
+
+def table_html(
+    head: Sequence[str],
+    rows: Iterable[Sequence[Any]],
+    *,
+    caption: str = "",
+    numbers: Collection[int] = (),
+    row_heads: bool = False,
+) -> Markup:
+    """Return a table; cells are text or Markup.
+
+    Args:
+        numbers: the columns that are aligned right.
+        row_heads: whether the first cell of each row is its heading.
+    """
+
+    def line(cells: Sequence[Any], heads: Collection[int], scope: str) -> Markup:
+        parts = []
+        for n, cell in enumerate(cells):
+            kind = "th" if n in heads else "td"
+            attributes = (f' scope="{scope}"' if n in heads else "") + (' class="ps-number"' if n in numbers else "")
+            parts.append(Markup(f"<{kind}{attributes}>{{}}</{kind}>").format(cell))
+        return Markup("<tr>{}</tr>").format(Markup("").join(parts))
+
+    body = Markup("").join(line(row, (0,) if row_heads else (), "row") for row in rows)
+    return Markup('<table class="ps-table">{}<thead>{}</thead><tbody>{}</tbody></table>').format(
+        Markup("<caption>{}</caption>").format(caption) if caption else "", line(head, range(len(head)), "col"), body
+    )
+
+
+def table(caption: str, head: Sequence[str], rows: Sequence[Sequence[str]], numbers: Sequence[int] = ()) -> ui.element:
+    """Add a table with a caption in a box that scrolls sideways; see `table_html`."""
+    with scroll_region(caption) as box:
+        html(table_html(head, rows, caption=caption, numbers=numbers))
+    return box
+
+
+def link(message: str, to: str) -> Markup:
+    """Return a link for a table cell."""
+    return Markup('<a class="ps-link" href="{}">{}</a>').format(to, message)
+
+
+def size(count: int) -> str:
+    """Format a number of bytes."""
+    for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if count >= factor:
+            return f"{count / factor:.1f} {unit}"
+    return f"{count} B"
+
+
+def title_of(words: Words, job: StudioJob) -> str:
+    """Return the title of a job in the language of this visitor; the stored one is in that of who started it."""
+    return words(_TITLES[job.task], name=Path(job.spec["place"]).name)
+
+
+async def titles(workspace: Workspace) -> dict[str, str]:
+    """Return the data sets to choose from: path to name."""
+    return await run.io_bound(lambda: {str(p): f"{workspace.title(p)} ({p.name})" for p in workspace.datasets()}) or {}
+
+
+_VENDOR = Path(__file__).parent / "vendor" / "uplot"
+
+
+class Plot(Element, component="plot.js"):
+    """Curves over x with vertical marks and one y-axis, drawn by uPlot.
+
+    Args:
+        label: name for screen readers.
+        series: a dictionary for each curve: ``label``, ``stroke`` (a colour), and optionally ``width``, ``dash``,
+            ``points`` (False), ``fill``, ``show``.
+        x, y: titles of the axes, with units.
+        height: in pixels; the width is that of the surrounding element.
+        window_s: length of the visible window of a live plot, see `push`.
+        range_y: limits of the y-axis; None to fit the data.
+        values_y: whether the y-axis has values.
+        on_pick: called with (x, "left" or "right", whether shift is held) for every click.
+    """
+
+    def __init__(
+        self,
+        label: str,
+        series: Sequence[dict[str, Any]],
+        *,
+        x: str = "",
+        y: str = "",
+        height: int = 240,
+        window_s: float = 0.0,
+        range_y: tuple[float, float] | None = None,
+        values_y: bool = True,
+        on_pick: Callable[[float, str, bool], Any] | None = None,
+    ) -> None:
+        super().__init__()
+        self.add_resource(_VENDOR)
+        self._props.update(label=label, series=[dict(s) for s in series], xTitle=x, yTitle=y, height=height)
+        self._props.update(windowS=window_s, rangeY=list(range_y) if range_y else None, valuesY=values_y)
+        self._props.update(pickable=on_pick is not None, start=None)
+        self.classes("w-full")
+        if on_pick is not None:
+
+            def picked(event: GenericEventArguments) -> Any:
+                return on_pick(float(event.args["x"]), str(event.args["button"]), bool(event.args["shift"]))
+
+            self.on("pick", picked)
+
+    def begin(
+        self, x: Sequence[float], curves: Sequence[Sequence[float | None]], marks: Sequence[dict[str, Any]] = ()
+    ) -> Plot:
+        """Set the curves that the plot displays when the page opens; call it while the page is built."""
+        self._props["start"] = {"data": [list(x), *map(list, curves)], "marks": list(marks)}
+        return self
+
+    def show(
+        self,
+        x: Sequence[float],
+        curves: Sequence[Sequence[float | None]],
+        marks: Sequence[dict[str, Any]] | None = None,
+        series: Sequence[dict[str, Any]] | None = None,
+    ) -> None:
+        """Replace all curves, and the marks and the series if given; None in a curve is a gap."""
+        self.run_method("show", [list(x), *map(list, curves)], marks, series)
+
+    def push(self, x: Sequence[float], curves: Sequence[Sequence[float]]) -> None:
+        """Append samples at the right end of a live plot; those that leave its window are dropped."""
+        self.run_method("push", list(x), [list(c) for c in curves])
+
+    def lines(self, marks: Sequence[dict[str, Any]]) -> None:
+        """Set the vertical lines: ``x``, ``label``, ``stroke``, and optionally ``dash`` ([6, 4]), ``to`` (end of a
+        shaded range) and ``row`` (vertical place of the label).
+        """
+        self.run_method("setMarks", list(marks))
+
+
+# Pictures ---------------------------------------------------------------------------------------------------------
+
+PICTURES = "pictures"
+"""Folder of a user's own pictures in the studio's folder: ``pictures/<label>.svg`` or ``.png``."""
+MAX_PICTURE = 1_000_000
+"""Largest accepted file of a user's own picture, in bytes."""
+_MIME_TYPES = {".svg": "image/svg+xml", ".png": "image/png"}
+
+
+@cache
+def _drawings() -> dict[str, Markup]:
+    """Return the SVG elements of each gesture by its plain label, and of the toy alone by ""."""
+    template = Path(__file__).with_name("pictures.svg.j2").read_text(encoding="utf-8")
+    module = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined).from_string(template).module
+    return {plain_label(label): drawing for label, drawing in module.drawings.items()}  # type: ignore[attr-defined]
+
+
+def picture(label: str, name: str = "") -> Markup:
+    """Return the drawing of a gesture as SVG, for an unknown label that of the toy alone.
+
+    Args:
+        name: name for screen readers; the label by default.
+    """
+    drawing = _drawings().get(plain_label(label), _drawings()[""])
+    return Markup(
+        '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 320 250" role="img" aria-label="{name}"><title>{name}'
+        '</title><rect width="320" height="250" rx="16" fill="#fff7ea"/>{drawing}</svg>'
+    ).format(name=name or label, drawing=drawing)
+
+
+def own_picture(home: Path, label: str) -> str:
+    """Return the user's own picture of a gesture as a ``data:`` address for an ``<img>``, or "".
+
+    An ``<img>`` runs no scripts of an SVG. Only a regular file in ``pictures`` of at most `MAX_PICTURE` bytes is used.
+    """
+    folder = home / PICTURES
+    if not folder.is_dir():
+        return ""
+    for path in sorted(folder.iterdir()):
+        mime_type = _MIME_TYPES.get(path.suffix.lower())
+        if mime_type is None or plain_label(path.stem) != plain_label(label) or path.is_symlink() or not path.is_file():
+            continue
+        if path.stat().st_size <= MAX_PICTURE:
+            return f"data:{mime_type};base64,{base64.b64encode(path.read_bytes()).decode('ascii')}"
+    return ""
+
+
+# Running jobs -----------------------------------------------------------------------------------------------------
+
+
+class WorkPanel:
+    """The running jobs of some tasks with their progress, a button that stops each, and the outcome of the last one.
+
+    Args:
+        tasks: the tasks whose jobs are displayed.
+        progress_text: returns the progress of a running job as text.
+        ended: called when a job is done that was started here or was running when the page was opened.
+        changed: called when a job was started or has ended.
+    """
+
+    def __init__(
+        self,
+        page: Page,
+        tasks: Sequence[str],
+        progress_text: Callable[[StudioJob], str],
+        ended: Callable[[StudioJob], Awaitable[None]],
+        changed: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._page, self._tasks, self._progress_text = page, tasks, progress_text
+        self._ended, self._changed = ended, changed
+        self._jobs = page.workspace.part(Jobs)
+        self._watched = {j.id for j in self._jobs.all(*tasks) if j.state == RUNNING}
+        self._closed: set[str] = set()
+        self._state: tuple[Any, ...] | None = None
+        self._bars: dict[str, tuple[ui.linear_progress, ui.label]] = {}
+        self._box = tag(ui.column().classes("ps-work w-full"), "work")
+        # A parent for timers that is not cleared with the box.
+        self._after = ui.element("div").classes("hidden")
+        on_change(self._jobs.changed, self.refresh)
+        self.refresh()
+
+    def running(self, *tasks: str) -> bool:
+        """Return whether a job of these tasks is running."""
+        return any(j.state == RUNNING for j in self._jobs.all(*tasks))
+
+    async def start(self, task: str, spec: dict[str, Any]) -> StudioJob:
+        """Start a job."""
+        self._closed |= {j.id for j in self._jobs.all(*self._tasks) if j.state != RUNNING}
+        title = self._page.words(_TITLES[task], name=Path(spec["place"]).name)
+        job = await run.io_bound(lambda: self._jobs.start(task, spec, title))
+        assert job is not None
+        self._watched.add(job.id)
+        self.refresh()
+        return job
+
+    def refresh(self) -> None:
+        """Display the current state of the jobs."""
+        jobs = self._jobs.all(*self._tasks)
+        running = [j for j in jobs if j.state == RUNNING]
+        last = next((j for j in jobs if j.state != RUNNING), None)
+        if last and (last.state == DONE or last.id in self._closed or time.time() - last.ended_s > _RECENT_S):
+            last = None
+        state = (tuple(j.id for j in running), last and (last.id, last.state))
+        if state != self._state:
+            self._state = state
+            self._build(running, last)
+            self._changed()
+        for job in running:
+            self._update(job)
+        for job in jobs:
+            if job.id in self._watched and job.state != RUNNING:
+                self._watched.discard(job.id)
+                if job.state == DONE:
+                    with self._after:
+                        ui.timer(0.0, lambda job=job: self._ended(job), once=True)
+
+    def _build(self, running: Sequence[StudioJob], last: StudioJob | None) -> None:
+        words = self._page.words
+        self._box.clear()
+        self._bars = {}
+        with self._box:
+            for job in running:
+                with ui.column().classes("ps-card w-full"):
+                    with ui.row().classes("w-full items-center"):
+                        text(title_of(words, job), "h2", "col-grow")
+                        stop = ui.button(words("export.stop"), icon="stop", on_click=lambda job=job: self._stop(job))
+                        tag(stop.props("outline no-caps"), "stop")
+                    # Not a status element: screen readers would read out every step.
+                    where = ui.label("").classes("ps-dim")
+                    bar = ui.linear_progress(0.0, show_value=False, size="12px")
+                    named(bar, title_of(words, job))
+                    self._bars[job.id] = (bar, tag(where, "where"))
+            if last is not None:
+                bad = last.state == REFUSED
+                message = last.message if bad else words("export.stopped", title=title_of(words, last))
+                row = ui.row().classes(
+                    f"ps-message ps-message-{'error' if bad else 'warning'} w-full items-center no-wrap"
+                )
+                with tag(row.props(f'role="{"alert" if bad else "status"}"'), "ended"):
+                    ui.label(message).classes("flex-grow").style("overflow-wrap: anywhere")
+                    close = ui.button(icon="close", on_click=lambda: self._close(last.id))
+                    close.props(f'flat round dense color=inherit aria-label="{words("shell.close")}"')
+
+    def _update(self, job: StudioJob) -> None:
+        bar, where = self._bars[job.id]
+        total = job.progress.get("total") or 0
+        bar.set_value(job.progress.get("done", 0) / total if total else 0.0)
+        bar.props["indeterminate"] = not total
+        where.set_text(self._progress_text(job))
+
+    def _close(self, identity: str) -> None:
+        self._closed.add(identity)
+        self.refresh()
+
+    def _stop(self, job: StudioJob) -> None:
+        self._jobs.stop(job.id)
