@@ -36,8 +36,8 @@ import plushsense as ps
 from plushsense.cli.search import report_search
 from plushsense.core.errors import PlushSenseError
 from plushsense.experiments.search.halving import Costs, Rung, Scores, SearchSpec, halving
-from plushsense.experiments.search.run import prepare
-from plushsense.experiments.sweep.run import Sweep, report_jobs
+from plushsense.experiments.search.run import prepare, search
+from plushsense.experiments.sweep.run import Sweep, report_jobs, sweep
 from plushsense.models.arch import PAPER_ARCHITECTURES
 from plushsense.trials.grid import GridSpec
 
@@ -169,13 +169,11 @@ def prove(args: argparse.Namespace) -> int:
     began, searches = time.monotonic(), []
     for seeds in (every, *((seed,) for seed in every)):
         say(f"search with {'seed' if len(seeds) == 1 else 'seeds'} {', '.join(map(str, seeds))}")
-        found = ps.search(
-            dataset, grid, **limits, **changes, seeds=seeds, workers=args.workers, progress=report_search()
-        )
+        found = search(dataset, grid, **limits, **changes, seeds=seeds, workers=args.workers, progress=report_search())
         searches.append(found.summary)
     say(f"searches: {time.monotonic() - began:.0f} s; now the grid")
     at = tuple(sorted({*args.rungs, *(e for e in args.at if e < last)}))
-    swept = ps.sweep(
+    swept = sweep(
         dataset, grid, **changes, epochs=at, seeds=every, workers=args.workers, table=report_jobs,
     )  # fmt: skip
     if swept.summary["done"] < swept.summary["trials"]:

@@ -32,6 +32,7 @@ import plushsense as ps
 from plushsense.models.arch import PAPER_ARCHITECTURES, PAPER_FILTERS, Arch
 from plushsense.models.net import Net
 from plushsense.training.fast.net import FastNet
+from plushsense.windows.cut import WindowSpec
 
 WINDOWS, CHANNELS, CLASSES, SAMPLES = 3936, 11, 18, 250
 APART, NESTED = 100 + 250 + 1000, 1000
@@ -238,7 +239,7 @@ def data(path: str) -> tuple[Tensor, Tensor, Any]:
     """Return the looped windows of a data set, scaled; their classes; and the windows."""
     from plushsense.windows.features import Scaler
 
-    windows = ps.cut_windows(ps.open_dataset(Path(path)), ps.WindowSpec(context="loop"))
+    windows = ps.cut_windows(ps.open_dataset(Path(path)), WindowSpec(context="loop"))
     scaled = Scaler.fit(windows.x).apply(windows.x)
     return torch.from_numpy(scaled), torch.from_numpy(windows.y.astype(np.int64)), windows
 

@@ -22,7 +22,10 @@ from typing import Any
 
 import plushsense as ps
 from plushsense.core.errors import PlushSenseError
+from plushsense.experiments.baselines.run import baselines
+from plushsense.experiments.sweep.run import sweep
 from plushsense.trials.paper import CHOSEN, TABLE4
+from plushsense.windows.cut import WindowSpec
 
 UNTESTED = "Untested on the original archive, which was not available to this project."
 LEAKY = "leaky: windows of one recording are in both the training and the test set"
@@ -96,7 +99,7 @@ class Paper:
         self.simulated = self.dataset.head.simulated
 
     def data(self) -> list[Row]:
-        windows = ps.cut_windows(self.dataset, ps.WindowSpec(context="loop"))
+        windows = ps.cut_windows(self.dataset, WindowSpec(context="loop"))
         people = str(len(self.dataset.subjects)) if self.dataset.subjects else "not known"
         return [
             Row("data", "recordings", "1326", str(len(self.dataset.recordings))),
@@ -112,7 +115,7 @@ class Paper:
             ]
             say(f"{symbol} with {', '.join(filter_sets)}")
             # The paper's grid, reduced to the trials of its Table 4.
-            swept = ps.sweep(
+            swept = sweep(
                 self.dataset,
                 "paper",
                 architectures=(symbol,),
@@ -155,7 +158,7 @@ class Paper:
         return rows
 
     def baselines(self) -> list[Row]:
-        result = ps.baselines(
+        result = baselines(
             self.dataset,
             splits=("windows:5",),
             models=dict.fromkeys(("forest",) if self.quick else (name for name, _, _ in BASELINES)),

@@ -8,10 +8,11 @@ import sys
 from pathlib import Path
 
 import plushsense as ps
+from plushsense.workflow.api import simulate
 
 
 def main(out: Path, people: int = 6, epochs: int = 15, seconds: float = 20.0) -> None:
-    ps.simulate(out / "recordings", people=people, repetitions=2)
+    simulate(out / "recordings", people=people, repetitions=2)
     ps.import_recordings(out / "recordings", out / "DS", layout="plush-15")
     dataset = ps.open_dataset(out / "DS")
     print(dataset)

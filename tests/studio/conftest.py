@@ -97,9 +97,10 @@ def shots() -> Callable[[Page, str], None]:
 def furniture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A studio's folder with a data set of six virtual people and a little trained bundle; read only: take a `copy`."""
     import plushsense as ps
+    from plushsense.workflow.api import simulate
 
     home = tmp_path_factory.mktemp("furniture") / "home"
-    ps.simulate(home / "made", people=6, repetitions=1, dataset=home / "datasets" / "virtual")
+    simulate(home / "made", people=6, repetitions=1, dataset=home / "datasets" / "virtual")
     shutil.rmtree(home / "made")
     trained = ps.train(home / "datasets" / "virtual", preset="loso", epochs=12, context="anywhere")
     (home / "bundles").mkdir()

@@ -37,10 +37,10 @@ def workspace(tmp_path: Path) -> Iterator[Workspace]:
 @pytest.fixture(scope="module")
 def virtual(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A data set of two virtual people; read only."""
-    import plushsense as ps
+    from plushsense.workflow.api import simulate
 
     folder = tmp_path_factory.mktemp("virtual")
-    ps.simulate(folder / "made", people=2, repetitions=1, dataset=folder / "set")
+    simulate(folder / "made", people=2, repetitions=1, dataset=folder / "set")
     return folder / "set"
 
 

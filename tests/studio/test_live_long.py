@@ -40,9 +40,10 @@ _ROWS = (
 def reader(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A bundle trained on sixteen virtual people, as the train page does it."""
     import plushsense as ps
+    from plushsense.workflow.api import simulate
 
     folder = tmp_path_factory.mktemp("reader")
-    ps.simulate(folder / "made", people=16, repetitions=2, dataset=folder / "set")
+    simulate(folder / "made", people=16, repetitions=2, dataset=folder / "set")
     trained = ps.train(folder / "set", preset="people", epochs=60, context="anywhere")
     return trained.save(folder / "reader.plush")
 

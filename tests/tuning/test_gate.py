@@ -25,6 +25,7 @@ from plushsense.tuning.gate import GateFit, fit_gate, measure_gate, signal_sizes
 from plushsense.tuning.gate_rules import BETWEEN, CALM, LEFT_OUT, material_of
 from plushsense.windows.clock import resample
 from plushsense.windows.features import network_inputs
+from plushsense.workflow.api import simulate
 
 PLUSH = load_layout("plush-15")
 BLOWS = ("Tail hit 1", "Tail hit 2", "Tail pull")
@@ -35,7 +36,7 @@ STRANGERS = range(101, 106)
 def virtual(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     """Twelve virtual people, each gesture twice."""
     folder = tmp_path_factory.mktemp("gate")
-    ps.simulate(folder / "raw", people=12, repetitions=2, dataset=folder / "DS")
+    simulate(folder / "raw", people=12, repetitions=2, dataset=folder / "DS")
     return open_dataset(folder / "DS")
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import plushsense as ps
 from plushsense.core.errors import ConfigError
 from plushsense.core.gestures import load_gestures
 from plushsense.core.layouts import load_layout
@@ -24,6 +23,7 @@ from plushsense.tuning.rule_baseline import (
     fit_rule_baseline,
     sensors_of,
 )
+from plushsense.workflow.api import simulate
 
 PLUSH = load_layout("plush-15")
 PLAN = BaselineSettings(shock=40_000, touch_shock=4_000, swing=300)
@@ -95,7 +95,7 @@ def test_what_goes_on_when_nothing_is_heard_ends() -> None:
 @pytest.fixture(scope="module")
 def virtual(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     folder = tmp_path_factory.mktemp("old")
-    ps.simulate(folder / "raw", people=6, repetitions=2, dataset=folder / "DS")
+    simulate(folder / "raw", people=6, repetitions=2, dataset=folder / "DS")
     return open_dataset(folder / "DS")
 
 

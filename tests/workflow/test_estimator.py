@@ -16,6 +16,8 @@ import pytest
 
 import plushsense as ps
 from plushsense.core.errors import ArchError, ArrayError, ConfigError
+from plushsense.core.gestures import load_gestures
+from plushsense.core.layouts import load_layout
 from plushsense.dataset.store import Dataset
 from plushsense.models.reference import softmax
 
@@ -212,7 +214,7 @@ def test_affects_come_from_the_gesture_set() -> None:
     x, y, _ = waves()
     model = small().fit(x, np.array(["Tail pull", "head stroke 1"])[y])
     assert model.to_bundle().gestures.affects == ("none", "none")
-    named = model.to_bundle(ps.load_gestures("plush-18"))
+    named = model.to_bundle(load_gestures("plush-18"))
     assert (named.gestures.labels, named.gestures.affects) == (("Tail pull", "head stroke 1"), ("negative", "positive"))
 
 
@@ -269,7 +271,7 @@ def test_what_does_not_fit_is_refused_in_a_sentence() -> None:
     rows = x.reshape(60, -1)
     holes = x.copy()
     holes[4, 1, 7] = np.nan
-    accel = ps.load_layout("accel-3")
+    accel = load_layout("accel-3")
     three = np.round(1000 * np.concatenate([x, x[:, :1]], axis=1))
     for match, model, X, labels, groups in (
         (r"1 of 60 windows, first in window 4, channel 1, sample 7", small(), holes, y, None),

@@ -7,11 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 import plushsense as ps
 from plushsense.dataset.store import Dataset
 from plushsense.deploy.emit import without_people
+from plushsense.workflow.datasets import forget
 
 Cli = Callable[..., Any]
 
@@ -80,7 +79,7 @@ def test_an_exported_model_of_the_data_set_is_a_question_too(dataset: Dataset, b
     ours = replace(ps.load(bundle), provenance={"dataset": dataset.head.name, "subjects": 3, "validation_subjects": 1})
     ours.save(tmp_path / "ours.plush")
     replace(ours, provenance=ours.provenance | {"dataset": "another"}).save(tmp_path / "other.plush")
-    found = ps.forget(dataset.path, "P1", bundles=[tmp_path]).bundles
+    found = forget(dataset.path, "P1", bundles=[tmp_path]).bundles
     assert [(Path(b.bundle).name, b.certain) for b in found] == [("ours.plush", False)]
     assert "does not say who" in found[0].message
 
@@ -92,12 +91,12 @@ def test_a_bundle_of_another_data_set_is_only_a_question(dataset: Dataset, bundl
     shutil.rmtree(dataset.path / "recordings" / "P5")
     shutil.rmtree(dataset.path / "streams" / "P5")
     (dataset.path / "index.json").unlink()
-    found = ps.forget(dataset.path, "P1", bundles=[bundle])
+    found = forget(dataset.path, "P1", bundles=[bundle])
     assert [b.certain for b in found.bundles] == [False]
     assert "look whether" in found.bundles[0].message
     assert not found.done
     head.write_text(text)
-    again = ps.forget(dataset.path, "P1", bundles=[bundle]).bundles
+    again = forget(dataset.path, "P1", bundles=[bundle]).bundles
     assert not again[0].certain, "another content"
     assert "earlier state" in again[0].message or ps.load(bundle).provenance["dataset"] != dataset.head.name
 
@@ -124,9 +123,3 @@ def test_forget_takes_the_evaluations_that_hold_the_person(cli: Cli, dataset: Da
     left = "".join(p.read_text(errors="replace") for p in dataset.path.rglob("*") if p.suffix in (".json", ".toml"))
     assert "P3" not in left
     assert json.loads((dataset.path / "forgotten.jsonl").read_text())["files"] == 7
-
-
-@pytest.mark.parametrize("name", ["pseudonymise", "backup", "check_backup", "restore", "forget"])
-def test_the_python_face_offers_it(name: str) -> None:
-    assert callable(getattr(ps, name))
-    assert name in ps.__all__

@@ -15,11 +15,11 @@ import polars
 import pytest
 from polars.testing import assert_frame_equal
 
-import plushsense as ps
 from plushsense.core.errors import ConfigError, DivergedError
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.store import Dataset
 from plushsense.experiments.search.run import SearchProgress, search
+from plushsense.experiments.sweep.run import sweep
 
 SMALL: dict[str, Any] = {
     "architectures": ("5_5d2", "9", "3d1_9d2", "20"),
@@ -45,7 +45,7 @@ def test_its_scores_are_those_of_trainings_without_a_stop(dataset: Dataset, reco
     told: list[SearchProgress] = []
     found = search(dataset, seeds=(0, 1), progress=told.append, **QUICK, **SMALL)
     other = import_recordings(recordings, tmp_path / "other", layout="accel-3").dataset
-    whole = ps.sweep(other, epochs=(1, 2, 4), seeds=(0, 1), out=tmp_path / "o", **grid_keys())
+    whole = sweep(other, epochs=(1, 2, 4), seeds=(0, 1), out=tmp_path / "o", **grid_keys())
     scores = {(row["arch"], row["epochs"]): row for row in whole.trials.iter_rows(named=True)}
     s = found.summary
     assert [rung["epochs"] for rung in s["rungs"]] == [1, 2, 4] and s["rungs"][0]["entered"] == 4
@@ -85,7 +85,7 @@ def test_its_scores_are_those_of_trainings_without_a_stop(dataset: Dataset, reco
 
 def test_a_sweep_and_a_search_share_their_trainings(dataset: Dataset, tmp_path: Path, recordings: Path) -> None:
     first = search(dataset, **QUICK, **SMALL)
-    swept = ps.sweep(dataset, epochs=(4,), out=tmp_path / "o", **grid_keys())
+    swept = sweep(dataset, epochs=(4,), out=tmp_path / "o", **grid_keys())
     assert swept.summary["trainings_resumed"] == 2 * len(first.summary["finalists"])
     again = search(dataset, **QUICK, **SMALL)
     assert again.out == first.out
@@ -96,7 +96,7 @@ def test_a_sweep_and_a_search_share_their_trainings(dataset: Dataset, tmp_path: 
     }
     # A sweep's training holds no state: what goes on from it begins again, with the same outcome.
     other = import_recordings(recordings, tmp_path / "other", layout="accel-3").dataset
-    ps.sweep(other, epochs=(1,), out=tmp_path / "p", **grid_keys())
+    sweep(other, epochs=(1,), out=tmp_path / "p", **grid_keys())
     after = search(other, **QUICK, **SMALL)
     assert after.summary["trainings_resumed"] == 8
     assert [rung["networks"] for rung in after.summary["rungs"]] == [

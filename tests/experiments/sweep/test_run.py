@@ -16,7 +16,6 @@ import polars
 import pytest
 from polars.testing import assert_frame_equal
 
-import plushsense as ps
 from plushsense.core.errors import ConfigError, DivergedError, TrainingError
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.store import Dataset
@@ -114,7 +113,7 @@ def test_it_goes_on_and_is_made_again_from_the_journal(dataset: Dataset, tmp_pat
     )
     assert first.summary["leaky"] and "leaky" in repr(first)
     shutil.rmtree(first.out)
-    again = ps.sweep(dataset.path, epochs=(1, 2), **SMALL)
+    again = sweep(dataset.path, epochs=(1, 2), **SMALL)
     assert again.summary["resumed"] == again.summary["trials"] == 8
     assert_frame_equal(again.trials, first.trials, check_exact=True)
     journal = sorted((dataset.path / "cache" / "sweeps").iterdir())
