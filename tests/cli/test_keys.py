@@ -7,13 +7,13 @@ import sys
 
 import pytest
 
-from plushsense.cli.terminal import Held, orderly_end
+from plushsense.cli.terminal import KeyRepeatFilter, interrupt_on_signals
 
 
 def pressed(*keys: tuple[float, str]) -> list[str]:
     """Which of these keys, each at its second, count."""
-    held = Held()
-    return [key for at_s, key in keys if not held.again(key, at_s)]
+    held = KeyRepeatFilter()
+    return [key for at_s, key in keys if not held.repeats(key, at_s)]
 
 
 def test_a_space_bar_that_is_held_is_one_press() -> None:
@@ -36,7 +36,7 @@ def test_a_request_to_end_is_an_interrupt_and_only_once(name: str) -> None:
     before = signal.getsignal(number)
     if before is not signal.SIG_DFL:
         pytest.skip(f"{name} is taken here")
-    with orderly_end():
+    with interrupt_on_signals():
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(number)
         signal.raise_signal(number)

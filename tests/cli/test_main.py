@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from plushsense.cli.main import VERBS
+from plushsense.cli.main import VERBS, load_verb
 from plushsense.cli.settings import report_epochs
 from plushsense.dataset.store import Dataset
 from plushsense.models.bundle import Bundle
@@ -399,7 +399,7 @@ def test_settings_that_fit_are_taken_as_their_type(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("verb", "words", "said"),
     [
-        ("evaluate", ["DS"], "finished folds are kept"),
+        ("evaluate", ["DS"], "finished work is kept"),
         ("train", ["DS"], "no bundle was written"),
         ("import", ["a", "b", "--layout", "accel-3"], "nothing was written"),
         ("simulate", ["a"], "nothing was written"),
@@ -409,12 +409,11 @@ def test_settings_that_fit_are_taken_as_their_type(tmp_path: Path) -> None:
 def test_what_is_left_when_stopped(
     verb: str, words: list[str], said: str, cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import importlib
-
     def stopped(_: object) -> int:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(importlib.import_module(f"plushsense.cli.{VERBS[verb][0]}"), "run", stopped)
+    add, _ = load_verb(verb)
+    monkeypatch.setattr("plushsense.cli.main.load_verb", lambda _: (add, stopped))
     ran = cli(verb, *words)
     assert ran.status == 130
     assert said in ran.err

@@ -150,7 +150,7 @@ def test_a_person_at_a_terminal(tmp_path: Path, pty_possible: None) -> None:
     press(" ")
     until("RECORDING")
     press("q")
-    until("q again quits")
+    until("press q again to quit")
     press("q")
     assert process.stdout is not None
     said = json.loads(process.stdout.read())

@@ -6,35 +6,32 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from plushsense.cli.evaluate import figure
-from plushsense.cli.output import emit, say, table
-from plushsense.cli.settings import add_settings, settings, warn
+from plushsense.cli.output import emit, figure, say, spread, table, warn
+from plushsense.cli.settings import add_settings, add_workers, marks, settings
 from plushsense.jobs.progress import ProgressReporter
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("dataset", metavar="DATASET", help="data set folder, with streams")
+    parser.add_argument("dataset", metavar="DATASET", help="data set folder, with session streams")
     parser.add_argument(
         "--split", metavar="SPLIT", default="by-subject:5", help="by-subject:K (5) or leave-one-subject-out"
     )
     parser.add_argument(
         "--withhold",
         action="store_true",
-        help="also train without each gesture, and ask whether it is noticed as unknown: as many trainings again for "
-        "each",
+        help="also train without each gesture in turn and measure how well it is detected as unknown; for each gesture "
+        "as many trainings again",
     )
     parser.add_argument(
         "--coverage",
         type=float,
         default=0.9,
         metavar="SHARE",
-        help="share of steps in which the set of classes shall hold the true one (0.9)",
+        help="share of steps in which the set of classes must contain the true one (0.9)",
     )
-    parser.add_argument("--workers", type=int, metavar="N", help="trainings at a time (default 0: one a processor)")
+    add_workers(parser, "trainings")
     parser.add_argument(
-        "--out",
-        metavar="DIR",
-        help="folder for abstaining.json and risk-coverage.png (default: DATASET/abstaining)",
+        "--out", metavar="DIR", help="folder for abstaining.json and risk-coverage.png (default: DATASET/abstaining)"
     )
     add_settings(parser)
 
@@ -44,9 +41,8 @@ def run(args: argparse.Namespace) -> int:
 
     config = settings(args, workers=args.workers)
     out = Path(args.out) if args.out else Path(args.dataset) / "abstaining"
-
     reporter = ProgressReporter("training", "networks", keep=True)
-    found = abstaining(
+    result = abstaining(
         args.dataset,
         config,
         split=args.split,
@@ -57,67 +53,61 @@ def run(args: argparse.Namespace) -> int:
         warn=warn,
     )
     say(f"written: {out}")
-    emit(args, {**found.to_dict(), "out": str(out)}, lines(found.to_dict()))
+    emit(args, {**result.to_dict(), "out": str(out)}, lines(result.to_dict()))
     return 0
 
 
-def lines(found: dict[str, Any]) -> list[str]:
-    """Format the figures as text."""
-    out = ["SIMULATION: of the virtual toy; it says nothing about a real one."] if found["simulated"] else []
+def lines(result: dict[str, Any]) -> list[str]:
+    """Format the scores as text."""
+    out = marks({**result, "leaky": False})
     out.append(
-        f"{found['recordings']} gestures of {found['people']} people left out, answered at their end in the stream; "
-        f"{100 * found['accuracy']:.1f} % right\n"
+        f"{result['recordings']} gestures of {result['people']} people left out, classified at their "
+        f"end in the stream; {100 * result['accuracy']:.1f} % correct\n"
     )
     rows = [
         (
             row["confidence"],
             figure(row["aurc"]),
             figure(row["gain"]),
-            _spread(row["gain_by_person"]),
+            spread(row["gain_by_person"]),
             figure(row["coverage_at_risk_20"]),
             figure(row["auroc_right"]),
         )
-        for row in found["confidences"]
+        for row in result["confidences"]
     ]
     head = ("confidence", "AURC", "oracle's gain", "by person", "coverage at 20 % wrong", "AUROC right")
     out.append(table(head, rows))
-    out.append(f"\nAURC of chance {figure(found['aurc_random'])}, of an oracle {figure(found['aurc_oracle'])}")
-    stated = found["stated_coverage"]
+    out.append(f"\nAURC of chance {figure(result['aurc_random'])}, of an oracle {figure(result['aurc_oracle'])}")
+    stated = result["stated_coverage"]
     out.append(
-        f"sets stated to hold the truth in {100 * stated['stated']:g} % held it in {_spread(stated['by_person'])} "
-        f"of the {stated['on']} (over people; least {figure(stated['least'])}), with "
+        f"sets of classes fitted to contain the true one in {100 * stated['stated']:g} % contain it in "
+        f"{spread(stated['by_person'])} of the {stated['on']} (over people; least {figure(stated['least'])}), with "
         f"{stated['classes_in_set']:.1f} classes in them"
     )
-    if found["free_choice"]:
-        out += ["", "gestures that the network was never meant to know (free choice and the rarer ones):"]
-        out += _unknown({"": found["free_choice"]})
-    if found["withheld"]:
+    if result["free_choice"]:
+        out += ["", "gestures that are not among the classes (free choice and rare ones):"]
+        out += _unknown({"": result["free_choice"]})
+    if result["withheld"]:
         out += [
             "",
-            "each gesture withheld from the training (AUROC against the known ones, over folds):",
-            *_unknown(found["withheld"]),
+            "each gesture withheld from training in turn (AUROC against the known ones, over folds):",
+            *_unknown(result["withheld"]),
         ]
-        mean = found["withheld_mean"]
-        out.append("mean over gestures: " + ", ".join(f"{name} {_spread(s)}" for name, s in mean.items()))
+        mean = result["withheld_mean"]
+        out.append("mean over gestures: " + ", ".join(f"{name} {spread(s)}" for name, s in mean.items()))
     return out
 
 
 def _unknown(rows: dict[str, Any]) -> list[str]:
-    shown = [
+    cells = [
         (
             label or "all of these",
             row["recordings"],
-            *(_spread(row["auroc"][name]) for name in ("softmax, smoothed", "logit, smoothed", "energy")),
-            _spread(row["known_passed"]),
-            _spread(row["unknown_caught"]),
+            *(spread(row["auroc"][name]) for name in ("softmax, smoothed", "logit, smoothed", "energy")),
+            spread(row["known_passed"]),
+            spread(row["unknown_caught"]),
         )
         for label, row in rows.items()
     ]
     head = ("gesture", "recordings", "AUROC softmax", "logit", "energy", "known passed", "unknown caught")
-    return [table(head, shown)]
-
-
-def _spread(score: dict[str, Any]) -> str:
-    if score["mean"] is None:
-        return "-"
-    return f"{score['mean']:.3f}" + ("" if score["sd"] is None else f" ± {score['sd']:.3f}")
+    return [table(head, cells)]

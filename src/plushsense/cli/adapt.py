@@ -6,46 +6,44 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from plushsense.cli.evaluate import figure, spread
-from plushsense.cli.output import emit, say, table
-from plushsense.cli.settings import add_settings, marks, settings, warn
+from plushsense.cli.output import emit, figure, say, spread, table, warn
+from plushsense.cli.settings import add_settings, marks, settings
 from plushsense.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from plushsense.experiments.adaptation import Adapted
 
-_WAYS = """
+_EXAMPLES = """
   plushsense adapt model.plush RECORDINGS --out mine.plush      a person's folder as the recorder left it, or a data set
   plushsense adapt model.plush DS --subject S07 --use 2 --out mine.plush
-  plushsense adapt mine.plush --undo --out model.plush          the bundle as it was, byte for byte
-  plushsense adapt --evaluate DS                                how much it helps people left out (needs PyTorch)
+  plushsense adapt mine.plush --undo --out model.plush          restores the bundle byte for byte
+  plushsense adapt --evaluate DS                                measures the gain on people left out (needs PyTorch)
 
-A bundle that own recordings do not show to become better stays as it is: nothing is written, exit status 1.
+Where the person's own recordings show no gain, nothing is written and the exit status is 1.
 """
 
 
 def add(parser: argparse.ArgumentParser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = _WAYS
-    parser.add_argument("bundle", metavar="BUNDLE", nargs="?", help="the bundle to adapt; it is never changed")
-    parser.add_argument("recordings", metavar="RECORDINGS", nargs="?", help="a data set, or a recorder's folder")
-    parser.add_argument("--out", metavar="BUNDLE", help="the bundle to write")
-    parser.add_argument("--force", action="store_true", help="replace another bundle that is already there")
-    parser.add_argument(
-        "--subject", metavar="CODE", help="whose recordings (may be left out where there is one person)"
-    )
-    parser.add_argument(
+    parser.epilog = _EXAMPLES
+    add = parser.add_argument
+    add("bundle", metavar="BUNDLE", nargs="?", help="bundle to adapt; it is not changed")
+    add("recordings", metavar="RECORDINGS", nargs="?", help="data set, or a recorder's folder")
+    add("--out", metavar="BUNDLE", help="bundle to write")
+    add("--force", action="store_true", help="replace another bundle at --out")
+    add("--subject", metavar="CODE", help="person whose recordings are used (default: the only one)")
+    add(
         "--use",
         type=int,
         metavar="N",
-        help="only the first N recordings of each gesture adapt, and the rest are scored before and after (default: "
-        "all adapt, and each is scored by a bundle adapted without it; with --evaluate: 2)",
+        help="adapt with the first N recordings of each gesture and score the rest before and after (default: adapt "
+        "with all, and score each with a bundle adapted without it; with --evaluate: 2)",
     )
-    parser.add_argument("--undo", action="store_true", help="write the bundle as it was before it was adapted")
-    parser.add_argument("--evaluate", metavar="DATASET", help="train networks and adapt them to people left out")
-    parser.add_argument("--split", metavar="SPLIT", help="of --evaluate: leave-one-subject-out (default), by-subject:K")
-    parser.add_argument("--choices", type=int, metavar="N", help="of --evaluate: so many random choices more (0)")
-    parser.add_argument("--int8", action="store_true", help="of --evaluate: the deployed networks too")
+    add("--undo", action="store_true", help="write the bundle as it was before it was adapted")
+    add("--evaluate", metavar="DATASET", help="train networks and adapt them to people left out")
+    add("--split", metavar="SPLIT", help="split of --evaluate: leave-one-subject-out (default) or by-subject:K")
+    add("--choices", type=int, metavar="N", help="further random choices of recordings for --evaluate (0)")
+    add("--int8", action="store_true", help="with --evaluate: also adapt the 8-bit networks")
     add_settings(parser)
 
 
@@ -55,12 +53,10 @@ def run(args: argparse.Namespace) -> int:
     if args.bundle is None or (args.recordings is None) != args.undo:
         raise ConfigError("Give BUNDLE and RECORDINGS, or BUNDLE --undo, or --evaluate DATASET.")
     if args.out is None:
-        raise ConfigError(
-            "--out is missing: say where the bundle is to be written; the one that is given never changes."
-        )
+        raise ConfigError("--out is missing: give the bundle to write; the given bundle is never changed.")
     out = Path(args.out)
     if out.exists() and Path(args.bundle).exists() and out.samefile(args.bundle):
-        raise ConfigError(f"'{out}' is the bundle that is adapted, which is never changed: choose another --out.")
+        raise ConfigError(f"'{out}' is the bundle to adapt, which is never changed: choose another --out.")
     if out.exists() and not args.force:
         raise ConfigError(f"'{out}' is already there: choose another --out, or --force to replace it.")
     if args.undo:
@@ -82,9 +78,8 @@ def _undo(args: argparse.Namespace, out: Path) -> int:
     bundle = Bundle.load(args.bundle)
     subject = bundle.adapted_to
     restore_original(bundle).save(out)
-    emit(
-        args, {"bundle": str(out), "undone": True, "subject": subject}, f"{out}: as before it was adapted to {subject}"
-    )
+    result = {"bundle": str(out), "undone": True, "subject": subject}
+    emit(args, result, f"{out}: as before it was adapted to {subject}")
     return 0
 
 
@@ -94,12 +89,12 @@ def _lines(done: Adapted, out: Path) -> list[str]:
     head = (
         f"{out}: adapted to {done.subject}{mark}" if personal.accepted else "nothing written: the bundle stays as it is"
     )
-    text = [head, f"{personal.reason}." if personal.accepted else f"why: {personal.reason}."]
+    text = [head, f"{personal.reason}." if personal.accepted else f"reason: {personal.reason}."]
     if done.tested is not None:
-        one, other = done.tested
+        before, after = done.tested
         text.append(
-            f"on {one.recordings} recordings that did not adapt it: {other.right} right, before {one.right}; log loss "
-            f"{other.log_loss:.3f}, before {one.log_loss:.3f}."
+            f"on {before.recordings} recordings that were not used to adapt: {after.right} correct, before "
+            f"{before.right}; log loss {after.log_loss:.3f}, before {before.log_loss:.3f}."
         )
     return text
 
@@ -110,7 +105,7 @@ def _evaluate(args: argparse.Namespace) -> int:
     given = {"BUNDLE": args.bundle, "--out": args.out, "--subject": args.subject, "--undo": args.undo or None}
     for name, value in given.items():
         if value is not None:
-            raise ConfigError(f"--evaluate trains its own networks for everybody: leave {name} out.")
+            raise ConfigError(f"--evaluate trains its own networks for all people: leave {name} out.")
     result = evaluate_adapting(
         args.evaluate,
         settings(args),
@@ -129,9 +124,9 @@ def _evaluation_lines(e: dict[str, Any]) -> list[str]:
     out = marks({**e, "leaky": False})
     out.append(
         f"split {e['split']}, context {e['context']}; {e['use']} recordings of each gesture adapt, the rest test; "
-        f"{e['choices']} choices, {100 * e['refused']:.1f} % left the bundle as it is\n"
+        f"{e['choices']} choices of recordings, {100 * e['refused']:.1f} % left the bundle as it is\n"
     )
-    for engine, found in e["engines"].items():
+    for engine, scores in e["engines"].items():
         rows = [
             (
                 row["subject"],
@@ -140,24 +135,24 @@ def _evaluation_lines(e: dict[str, Any]) -> list[str]:
                 f"{row['right_change']:.1f}",
                 row["right_change_worst"],
             )
-            for row in found["people"]
+            for row in scores["people"]
         ]
-        head = ("subject", "tested", "accuracy", "after", "macro-F1", "after", "more right", "worst choice")
+        head = ("subject", "tested", "accuracy", "after", "macro-F1", "after", "more correct", "worst choice")
         out += [f"{engine}\n", table(head, rows), ""]
         for score, name in (("accuracy", "accuracy"), ("macro_f1", "macro-F1")):
             for when in ("before", "after", "gain", "first"):
-                said = "gain, first ones adapt" if when == "first" else when
-                out.append(f"{name} {said:<24}{spread(found[score][when])}")
-        right = found["right"]
+                label = "gain, first recordings" if when == "first" else when
+                out.append(f"{name} {label:<24}{spread(scores[score][when])}")
+        right = scores["right"]
         out.append(
-            f"recordings right, after less before: mean {right['mean']:.1f}; the person who gains least "
+            f"recordings correct, after minus before: mean {right['mean']:.1f}; the person who gains least "
             f"{right['worst_mean']:.1f}, the worst single choice {right['worst']}; people worse by more than one: "
             f"{right['worse_people']}, choices: {100 * right['worse_choices']:.1f} %\n"
         )
     if e["agreement"]:
         same = e["agreement"]
         out.append(
-            f"float and int8 say the same on {100 * same['before']:.1f} % of the windows, after adapting "
+            f"float and int8 agree on {100 * same['before']:.1f} % of the windows, after adapting "
             f"{100 * same['after']:.1f} %"
         )
-    return [*out, "Where a person recorded all in one session, what lasts until another day is not shown."]
+    return [*out, "For people with one session, this does not show whether the gain lasts until another day."]

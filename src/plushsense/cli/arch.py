@@ -12,20 +12,20 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "spec",
         metavar="SPEC",
-        help="architecture symbol: kernel lengths in samples, joined by _, dilations after d (14d1_39d2_41d4)",
+        help="architecture: kernel lengths in samples, joined by _, dilations after d (14d1_39d2_41d4)",
     )
-    parser.add_argument("--filters", required=True, metavar="N,N,...", help="filters by layer, for example 8,12,16")
+    parser.add_argument("--filters", required=True, metavar="N,N,...", help="filters of each layer, such as 8,12,16")
     parser.add_argument("--padding", default="stream", help="stream (default), causal or mirror")
     parser.add_argument("--norm", default="batch", help="batch (default) or layer")
-    parser.add_argument("--channels", type=int, default=11, metavar="N", help="channels read (11)")
-    parser.add_argument("--classes", type=int, default=18, metavar="N", help="classes told apart (18)")
+    parser.add_argument("--channels", type=int, default=11, metavar="N", help="number of input channels (11)")
+    parser.add_argument("--classes", type=int, default=18, metavar="N", help="number of classes (18)")
     parser.add_argument("--window", type=int, default=250, metavar="N", help="window in samples (250: 2.5 s at 100 Hz)")
     parser.add_argument("--step", type=int, default=5, metavar="N", help="samples between two live decisions (5)")
     parser.add_argument(
         "--pool",
         type=int,
         metavar="N",
-        help="positions averaged, in samples, stream padding only (default: fills the window)",
+        help="samples that a decision averages, stream padding only (default: fill the window)",
     )
 
 

@@ -1,34 +1,25 @@
-"""``plushsense backup DATASET FILE.zip`` and ``plushsense backup --check FILE.zip``."""
+"""``plushsense backup DATASET FILE.zip``, ``backup --check FILE.zip`` and ``restore FILE.zip DEST``."""
 
 from __future__ import annotations
 
 import argparse
 
 from plushsense.cli.output import emit, say
+from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.jobs.progress import ProgressReporter
 
 
 def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("dataset", metavar="DATASET", nargs="?", help="data set folder")
-    parser.add_argument("file", metavar="FILE", nargs="?", help="the new zip file")
-    parser.add_argument("--check", metavar="FILE", help="read a backup through and say whether it is whole")
+    parser.add_argument("file", metavar="FILE", nargs="?", help="new zip file")
+    parser.add_argument("--check", metavar="FILE", help="check that a backup is complete, and write nothing")
 
 
 def run(args: argparse.Namespace) -> int:
-    from plushsense.core.errors import ConfigError, DatasetError
-    from plushsense.dataset.backup import backup, check_backup
+    from plushsense.dataset.backup import backup
 
     if args.check:
-        if args.dataset or args.file:
-            raise ConfigError("--check reads one backup and writes nothing: give  plushsense backup --check FILE.zip")
-        try:
-            whole = check_backup(args.check, progress=ProgressReporter("reading"))
-        except DatasetError as refusal:
-            say(f"plushsense: {refusal}")
-            emit(args, {"file": args.check, "valid": False, "problem": str(refusal)}, f"{args.check}: not whole")
-            return 1
-        emit(args, {**whole.to_dict(), "valid": True}, f"{args.check}: whole, {_counts(whole.to_dict())}")
-        return 0
+        return _check(args)
     if not args.file:
         raise ConfigError("Give the data set and the new file:  plushsense backup DATASET FILE.zip")
     done = backup(args.dataset, args.file, progress=ProgressReporter("saving")).to_dict()
@@ -38,5 +29,40 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _counts(found: dict[str, object]) -> str:
-    return f"{found['recordings']} recordings of {found['subjects']} people, {found['files']} files"
+def _check(args: argparse.Namespace) -> int:
+    from plushsense.dataset.backup import check_backup
+
+    if args.dataset or args.file:
+        raise ConfigError("--check reads one backup and writes nothing: give  plushsense backup --check FILE.zip")
+    try:
+        found = check_backup(args.check, progress=ProgressReporter("reading")).to_dict()
+    except DatasetError as error:
+        say(f"plushsense: {error}")
+        emit(args, {"file": args.check, "valid": False, "problem": str(error)}, f"{args.check}: not valid")
+        return 1
+    emit(args, {**found, "valid": True}, f"{args.check}: valid, {_counts(found)}")
+    return 0
+
+
+def add_restore(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("file", metavar="FILE", help="zip file written by plushsense backup")
+    parser.add_argument("dest", metavar="DEST", help="new or empty folder for the data set")
+
+
+def run_restore(args: argparse.Namespace) -> int:
+    from plushsense.dataset.backup import restore
+
+    dataset = restore(args.file, args.dest, progress=ProgressReporter("restoring"))
+    result = {
+        "dataset": args.dest,
+        "recordings": len(dataset.recordings),
+        "subjects": len(dataset.subjects),
+        "streams": len(dataset.streams),
+        "hash": dataset.hash,
+    }
+    emit(args, result, f"{args.dest}: restored {result['recordings']} recordings of {result['subjects']} people")
+    return 0
+
+
+def _counts(table: dict[str, object]) -> str:
+    return f"{table['recordings']} recordings of {table['subjects']} people, {table['files']} files"

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from plushsense.cli.output import emit, say
-from plushsense.cli.settings import add_settings, add_work, listed, settings, warn
+from plushsense.cli.output import emit, say, warn
+from plushsense.cli.settings import add_out, add_settings, add_work, listed, settings
 from plushsense.jobs.progress import ProgressReporter
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--split",
         default="leave-one-subject-out,windows:5",
         metavar="SPLIT,...",
-        help="splits side by side (default: leave-one-subject-out,windows:5, the second leaky); as for evaluate",
+        help="splits to compare, as for evaluate (default: leave-one-subject-out,windows:5, the second leaky)",
     )
     parser.add_argument(
         "--models",
@@ -34,16 +34,16 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--features",
         default="statistics,flattened",
         metavar="NAME,...",
-        help="what classical models read: statistics, 8 a channel, flattened, all samples, or both (default)",
+        help="input of classical models: statistics (8 a channel), flattened (all samples), or both (default)",
     )
-    parser.add_argument("--pca", default="both", help="for classical models: both (default), no or yes")
+    parser.add_argument("--pca", default="both", help="PCA for classical models: both (default), no or yes")
     add_work(parser, "folds")
-    parser.add_argument(
-        "--out",
-        metavar="DIR",
-        help="folder for baselines.json, .csv, .html and .png (default: one in DATASET/evaluations/ for each settings)",
+    add_out(
+        parser,
+        "baselines.json, .csv, .html and .png",
+        "in DATASET/evaluations/, named by the settings",
+        "a comparison of other settings or data",
     )
-    parser.add_argument("--force", action="store_true", help="replace a comparison of other settings or data in --out")
     add_settings(parser)
 
 
@@ -53,14 +53,14 @@ def run(args: argparse.Namespace) -> int:
 
     config = settings(args, workers=args.workers)
     dataset = open_dataset(args.dataset)
-    asked: dict[str, Any] = {"splits": listed(args.split), "models": listed(args.models)}
-    asked |= {"features": listed(args.features), "pca": args.pca}
-    name = f"baselines_{comparison_id(dataset, config, **asked)[:8]}"
+    choice: dict[str, Any] = {"splits": listed(args.split), "models": listed(args.models)}
+    choice |= {"features": listed(args.features), "pca": args.pca}
+    name = f"baselines_{comparison_id(dataset, config, **choice)[:8]}"
     out = Path(args.out) if args.out else dataset.path / "evaluations" / name
     result = baselines(
         dataset,
         config,
-        **asked,
+        **choice,
         out=out,
         overwrite=args.force,
         cluster=args.cluster,
@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def lines(result: dict[str, Any]) -> list[str]:
-    """Format the table as text, one line a program, with an explanation."""
+    """Format the table as text, one line for each model, with an explanation."""
     from plushsense.experiments.baselines.report import (
         COUNTS,
         LEAKY,

@@ -6,28 +6,24 @@ import argparse
 import time
 from pathlib import Path
 
-from plushsense.cli.evaluate import spread
-from plushsense.cli.output import emit, say, table
-from plushsense.jobs.progress import ProgressReporter
+from plushsense.cli.output import emit, say, spread, table
+from plushsense.cli.settings import report_stages
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--quick", action="store_true", help="fewer people, fewer epochs: under a minute and a half")
-    parser.add_argument(
-        "--out", metavar="DIR", default="plushsense-demo", help="where everything is left (plushsense-demo)"
-    )
+    parser.add_argument("--quick", action="store_true", help="fewer people and epochs: under 90 seconds")
+    parser.add_argument("--out", metavar="DIR", default="plushsense-demo", help="output folder (plushsense-demo)")
 
 
 def run(args: argparse.Namespace) -> int:
     from plushsense.workflow.demo import SIMULATION, run_demo
 
     began = time.monotonic()
-    bars = {what: ProgressReporter(f"     {what}") for what in ("recording", "importing", "training", "folds")}
     say(f"PlushSense demo. {SIMULATION}")
-    done = run_demo(Path(args.out), quick=args.quick, stage=say, progress=lambda what, at, of: bars[what](at, of))
-    scores, heard = done["scores"], done["live"]["gestures"]
-    rows = [(f"{g['t_s']:.1f}", g["performed"], g["said"], g["affect"], g["said_affect"]) for g in heard]
-    right = sum(g["affect"] == g["said_affect"] for g in heard)
+    done = run_demo(Path(args.out), quick=args.quick, stage=say, progress=report_stages(indent=5 * " "))
+    scores, gestures = done["scores"], done["live"]["gestures"]
+    rows = [(f"{g['t_s']:.1f}", g["performed"], g["said"], g["affect"], g["said_affect"]) for g in gestures]
+    right = sum(g["affect"] == g["said_affect"] for g in gestures)
     summary = done["live"]["summary"]
     emit(
         args,
@@ -38,9 +34,9 @@ def run(args: argparse.Namespace) -> int:
             f"  accuracy {spread(scores['accuracy'])}",
             f"  macro-F1 {spread(scores['macro_f1'])}",
             "",
-            "Live, a virtual person it never met; what it said as each gesture ended:",
-            table(("at s", "performed", "said", "affect", "said"), rows),
-            f"  affect right at the end of {right} of {len(heard)} gestures; "
+            "Live, a virtual person left out of the training; the decision at the end of each gesture:",
+            table(("at s", "performed", "decided", "affect", "decided"), rows),
+            f"  affect correct at the end of {right} of {len(gestures)} gestures; "
             f"{summary['decisions_per_s']:.1f} decisions a second, {summary['counters']['lost']} lines lost, "
             f"{summary['counters']['malformed']} malformed",
             "",

@@ -1,4 +1,4 @@
-"""``plushsense devices``: what is there; ``--lsl-out URL`` hands a toy on to LSL."""
+"""``plushsense devices`` lists toys; ``plushsense devices --lsl-out URL`` publishes one as an LSL stream."""
 
 from __future__ import annotations
 
@@ -10,15 +10,19 @@ from plushsense.core.errors import ConfigError
 
 def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--scan-s", type=float, default=3.0, metavar="S", help="how long to look for Bluetooth toys and LSL streams (3)"
+        "--scan-s",
+        type=float,
+        default=3.0,
+        metavar="S",
+        help="seconds to search for Bluetooth and LSL devices (3)",
     )
     parser.add_argument(
         "--lsl-out",
         metavar="URL",
-        help="instead: publish this toy as an LSL stream, waiting for it when it goes away, until Ctrl-C",
+        help="publish this toy as an LSL stream until Ctrl-C instead, and reconnect when it disappears",
     )
-    parser.add_argument("--lsl-name", metavar="NAME", help="of that stream (default: PlushSense)")
-    parser.add_argument("--layout", metavar="NAME", help="of that toy: a name or a TOML file (default: plush-15)")
+    parser.add_argument("--lsl-name", metavar="NAME", help="name of that stream (default: PlushSense)")
+    parser.add_argument("--layout", metavar="NAME", help="layout of that toy: name or TOML file (default: plush-15)")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -30,7 +34,7 @@ def run(args: argparse.Namespace) -> int:
 
     listing = list_devices(args.scan_s)
     rows = [(d.url, d.name, d.description) for d in listing.devices]
-    emit(args, listing.to_dict(), table(("URL", "name", "what"), rows))
+    emit(args, listing.to_dict(), table(("URL", "name", "description"), rows))
     if not args.json:
         for note in listing.notes:
             say(note)

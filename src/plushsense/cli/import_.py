@@ -8,16 +8,16 @@ from plushsense.cli.output import emit, say
 from plushsense.core.errors import ConfigError
 from plushsense.jobs.progress import ProgressReporter
 
-SHOWN_WARNINGS = 20
-SHAPES = """
+_MOST_WARNINGS = 20
+_SOURCES = """
 SRC is one of
-  a folder of sessions   OUT/<subject>/<session>/session.json, as plushsense record leaves them
-  a folder a person      P01/<label>_<epoch ms>_<rows>.csv and fulldatastream.csv, as the authors' recorder leaves them
-  a folder a label       as the authors' anonymising step leaves them; --subjects map.csv says whose the files are
+  folders of sessions    OUT/<subject>/<session>/session.json, as plushsense record writes them
+  a folder per person    P01/<label>_<epoch ms>_<rows>.csv and fulldatastream.csv, as the authors' recorder writes them
+  a folder per label     as the authors' anonymising step writes them; --subjects map.csv names the person of each file
   CSVs with labels       s01/anything.csv with a label on every row (layout phone-6)
   FILE.zip               of any of these folders
   FILE.xdf               of LabRecorder: markers that name gestures begin recordings (extra lsl); also inside folders
-  FILE.csv, .parquet     one table, a row a sample: subject, [session], [recording], label, time and the channels
+  FILE.csv, .parquet     one table, one sample a row: subject, [session], [recording], label, time and the channels
 
 Each file is imported unchanged, left out or rejected with a reason. More in docs/importing.md.
 """
@@ -25,42 +25,39 @@ Each file is imported unchanged, left out or rejected with a reason. More in doc
 
 def add(parser: argparse.ArgumentParser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = SHAPES
-    parser.add_argument("source", metavar="SRC", help="what was recorded: a folder, or a .zip, .xdf, .parquet or .csv")
-    parser.add_argument("dest", metavar="DEST", help="the new data set folder; with --add one that is there")
-    parser.add_argument(
+    parser.epilog = _SOURCES
+    add = parser.add_argument
+    add("source", metavar="SRC", help="folder or .zip, .xdf, .parquet or .csv file of recordings")
+    add("dest", metavar="DEST", help="new data set folder; with --add an existing one")
+    add(
         "--layout",
         metavar="NAME",
-        help="sensor layout: plush-15, plush-14, accel-3, phone-6, or a TOML file; sessions say theirs themselves",
+        help="sensor layout: plush-15, plush-14, accel-3, phone-6, or a TOML file; our sessions contain theirs",
     )
-    parser.add_argument(
+    add(
         "--gestures",
         metavar="NAME",
         help="gesture set: plush-18 or a TOML file (default: plush-18 for plush layouts, else from the labels)",
     )
-    parser.add_argument(
+    add(
         "--subjects",
         default="folder",
         metavar="FILE",
-        help="who is recorded: folder (default: the folder's name), or a CSV file with the columns file,subject",
+        help="person of each file: folder (default: the folder's name), or a CSV file with the columns file,subject",
     )
-    parser.add_argument(
-        "--people", metavar="FILE", help="age group, gender and consent: a CSV file with the column subject"
-    )
-    parser.add_argument(
-        "--add", action="store_true", help="add what is new to the data set DEST; what is there stays as it is"
-    )
-    parser.add_argument(
+    add("--people", metavar="FILE", help="age group, gender and consent: a CSV file with the column subject")
+    add("--add", action="store_true", help="add new recordings to the data set DEST; existing ones are not changed")
+    add(
         "--column",
         action="append",
         default=[],
         metavar="ROLE=NAME",
-        help="a table's column: subject, session, recording, label, time or a channel; stream=NAME of an XDF file",
+        help="column of a table: subject, session, recording, label, time or a channel; stream=NAME in an XDF file",
     )
-    parser.add_argument("--max-gb", type=float, metavar="GB", help="how much a zip may unpack to, in GB (default: 8)")
-    parser.add_argument("--name", help="name of the data set (default: the source's)")
-    parser.add_argument("--licence", default="", help="licence, as an SPDX name (default: not said)")
-    parser.add_argument("--consent", default="", metavar="TEXT", help="consent statement (default: not said)")
+    add("--max-gb", type=float, metavar="GB", help="largest unpacked size of a zip file (default: 8)")
+    add("--name", help="name of the data set (default: the source's)")
+    add("--licence", default="", help="licence, as an SPDX name (default: none)")
+    add("--consent", default="", metavar="TEXT", help="consent statement (default: none)")
 
 
 def _columns(texts: list[str]) -> dict[str, str]:
@@ -92,10 +89,10 @@ def run(args: argparse.Namespace) -> int:
     )
     result = done.to_dict()
     if not args.json:
-        for line in result["warnings"][:SHOWN_WARNINGS]:
+        for line in result["warnings"][:_MOST_WARNINGS]:
             say(f"warning: {line}")
-        if len(result["warnings"]) > SHOWN_WARNINGS:
-            say(f"... and {len(result['warnings']) - SHOWN_WARNINGS} more warnings; all are in {args.dest}/*.csv")
+        if len(result["warnings"]) > _MOST_WARNINGS:
+            say(f"... and {len(result['warnings']) - _MOST_WARNINGS} more warnings; all are in {args.dest}/*.csv")
         for what, entries in (("left out", done.left_out), ("rejected", done.rejected)):
             for entry in entries:
                 say(f"{what}: {entry['file']}: {entry['reason']}")
@@ -112,5 +109,5 @@ def run(args: argparse.Namespace) -> int:
 
 def _whole_bytes(gigabytes: float) -> int:
     if not 0 < gigabytes < 1e6:
-        raise ConfigError(f"--max-gb is {gigabytes:g}; it must be above 0.")
+        raise ConfigError(f"--max-gb is {gigabytes:g}: give a number above 0.")
     return int(gigabytes * 1e9)

@@ -1,15 +1,19 @@
-"""``plushsense info DATASET|BUNDLE``."""
+"""``plushsense info DATASET|BUNDLE`` and ``plushsense stats DATASET [--by COLUMN] [--channels]``."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from plushsense.cli.output import emit, table
 
+if TYPE_CHECKING:
+    from plushsense.dataset.statistics import Duration, SummaryStatistics
+
 
 def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("path", metavar="PATH", help="a data set folder or a .plush bundle")
+    parser.add_argument("path", metavar="PATH", help="data set folder or .plush bundle")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -46,3 +50,63 @@ def _bundle(args: argparse.Namespace) -> int:
         result["adapted"] = {key: value for key, value in bundle.personal.items() if key != "original"}
     emit(args, result, [f"{key:<20}{value}" for key, value in result.items()])
     return 0
+
+
+def add_stats(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("dataset", metavar="DATASET", help="data set folder")
+    parser.add_argument(
+        "--by", metavar="COLUMN", help="group by subject, age_group, gender or another column of subjects.csv"
+    )
+    parser.add_argument("--channels", action="store_true", help="add mean and standard deviation of every channel")
+
+
+def run_stats(args: argparse.Namespace) -> int:
+    from plushsense.dataset.index import open_dataset
+    from plushsense.dataset.statistics import channel_table, duration_table
+
+    dataset = open_dataset(args.dataset)
+    durations = duration_table(dataset, args.by)
+    channels = channel_table(dataset) if args.channels else []
+    trimmed = sum(r.stop - r.start < r.rows for r in dataset.used)
+    result: dict[str, Any] = {
+        "dataset": dataset.head.name,
+        "by": args.by,
+        "simulated": dataset.head.simulated,
+        "recordings": len(dataset.used),
+        "trimmed": trimmed,
+        "durations": [d.to_dict() for d in durations],
+        "channels": [c.to_dict() for c in channels],
+    }
+    simulated = " (a simulation: it says nothing about people)" if dataset.head.simulated else ""
+    text = [f"{dataset.head.name}{simulated}: {len(dataset.used)} recordings, {trimmed} trimmed", ""]
+    text += ["Whole recordings", _duration_table(durations, args.by, after=False), ""]
+    if trimmed:
+        text += ["After trimming", _duration_table(durations, args.by, after=True), ""]
+    if channels:
+        head = ("gesture", "channel", "unit", "rows", "mean", "sd")
+        rows = [(c.gesture, c.channel, c.unit, c.rows, f"{c.mean:.4g}", f"{c.sd:.4g}") for c in channels]
+        text += ["Channels, after trimming", table(head, rows)]
+    emit(args, result, text)
+    return 0
+
+
+def _duration_table(durations: list[Duration], by: str | None, after: bool) -> str:
+    head = ("gesture", *((by,) if by else ()))
+    head += ("recordings", "people", "mean s", "median s", "variance s²", "range s", "rows")
+    return table(head, [_duration_row(d, bool(by), after) for d in durations])
+
+
+def _duration_row(d: Duration, grouped: bool, after: bool) -> tuple[object, ...]:
+    s: SummaryStatistics = d.after_s if after else d.before_s
+    rows: SummaryStatistics = d.after_rows if after else d.before_rows
+    return (
+        d.gesture,
+        *([d.group] if grouped else []),
+        d.recordings,
+        d.people,
+        f"{s.mean:.2f}",
+        f"{s.median:.2f}",
+        None if s.variance is None else f"{s.variance:.3f}",
+        f"{s.min:.2f}–{s.max:.2f}",
+        f"{rows.min:.0f}–{rows.max:.0f}, mean {rows.mean:.0f}",
+    )

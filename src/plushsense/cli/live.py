@@ -16,62 +16,46 @@ if TYPE_CHECKING:
     from plushsense.runtime.classifier import Decision, GestureEvent, State
 
 STATES = {
-    "warming": "getting to know what goes on",
+    "warming": "collecting the first samples",
     "tracking": "reading",
     "no signal": "no signal",
-    "sensor fault": "sensor fault: what the sensors say cannot be believed",
+    "sensor fault": "sensor fault: the readings are not plausible",
 }
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
+    add = parser.add_argument
+    add(
         "--device",
         required=True,
         metavar="URL",
-        help="the toy: serial:///dev/ttyUSB0, ble://name:PlushName, tcp://host:port, lsl://NAME, "
-        "replay:///path/stream.csv?speed=0, virtual://?person=7 (plushsense devices lists what is there)",
+        help="toy: serial:///dev/ttyUSB0, ble://name:PlushName, tcp://host:port, lsl://NAME, "
+        "replay:///path/stream.csv?speed=0, virtual://?person=7 (plushsense devices lists those connected)",
     )
-    parser.add_argument("--model", required=True, metavar="BUNDLE", help="a .plush bundle")
-    parser.add_argument(
+    add("--model", required=True, metavar="BUNDLE", help=".plush bundle")
+    add(
         "--engine",
         default="float",
         choices=("float", "int8", "both"),
-        help="float (default); int8: whole numbers, bit for bit what the toy's C answers; both: decides as int8, and "
-        "the summary says how often float agreed",
+        help="float (default); int8: integers, bit for bit as the toy's C computes; both: decide with int8 and report "
+        "in the summary how often float agrees",
     )
-    parser.add_argument(
-        "--seconds",
-        type=float,
-        metavar="S",
-        help="stop after so many seconds of the toy's clock (default: when it ends)",
-    )
-    parser.add_argument(
-        "--smoothing",
-        type=float,
-        metavar="S",
-        help="time constant of the smoothing, seconds; 0: off (default: the bundle's)",
-    )
-    shown = parser.add_mutually_exclusive_group()
-    shown.add_argument(
-        "--events",
-        action="store_true",
-        help="only the lines with an event, no signal, a fault, or that all is well again",
-    )
-    shown.add_argument("--text", action="store_true", help="the same as sentences for people, not JSON")
-    parser.add_argument(
-        "--reconnect", action="store_true", help="wait for a toy that goes away, and go on when it is back"
-    )
-    parser.add_argument(
+    add("--seconds", type=float, metavar="S", help="stop after this much of the toy's time (default: at its end)")
+    add("--smoothing", type=float, metavar="S", help="time constant of the smoothing; 0: off (default: the bundle's)")
+    output = parser.add_mutually_exclusive_group()
+    output.add_argument("--events", action="store_true", help="print only lines with an event or a change of state")
+    output.add_argument("--text", action="store_true", help="print events and states as sentences instead of JSON")
+    add("--reconnect", action="store_true", help="wait for a toy that disconnects")
+    add(
         "--reactions",
         metavar="NAME|FILE",
-        help="say what the toy does about it, too: standard, gentle (roughness is never answered with a show), or a "
-        "TOML file of your own",
+        help="also print the reactions of the toy: standard, gentle (never rewards rough touch), or a TOML file",
     )
 
 
 def run(args: argparse.Namespace) -> int:
     from plushsense.devices.opening import open_device
-    from plushsense.live.loop import run_live as run_loop
+    from plushsense.live.loop import run_live
     from plushsense.live.reactions import Reactor, load_reactions
     from plushsense.models.bundle import Bundle
     from plushsense.runtime.classifier import BothEngines
@@ -89,17 +73,17 @@ def run(args: argparse.Namespace) -> int:
             f"reading {args.device}; {bundle.arch.symbol}, a decision every "
             f"{classifier.step_s * 1000:.0f} ms; Ctrl-C ends"
         )
-        live = run_loop(device, classifier, seconds=args.seconds)
+        live = run_live(device, classifier, seconds=args.seconds)
         try:
             state: State | None = None
             for decision in live:
                 reactions = reactor.push(decision) if reactor else []
                 if args.text or args.events:
-                    news, state = decision.state != state, decision.state
-                    if not (news or decision.events or reactions):
+                    changed, state = decision.state != state, decision.state
+                    if not (changed or decision.events or reactions):
                         continue
                 if args.text:
-                    lines = format_update(decision, news, reactions)
+                    lines = format_update(decision, changed, reactions)
                 else:
                     more = {"reactions": [r.to_dict() for r in reactions]} if reactor else {}
                     lines = [json.dumps(decision.to_dict() | more, ensure_ascii=False)]
@@ -113,11 +97,11 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def format_update(decision: Decision, news: bool, reactions: Sequence[Reaction] = ()) -> list[str]:
-    """Format lines for people: changes of events, reactions, and each new state."""
+def format_update(decision: Decision, state_changed: bool, reactions: Sequence[Reaction] = ()) -> list[str]:
+    """Format changes of events, reactions, and the new state where it changed, as lines of text."""
     lines = [f"{event.t_s:9.2f} s  {_event(event)}" for event in decision.events]
     lines += [f"{reaction.t_s:9.2f} s    {_reaction(reaction)}" for reaction in reactions]
-    if news:
+    if state_changed:
         lines.append(f"{decision.t_s:9.2f} s  {STATES[decision.state]}")
     return lines
 
@@ -132,6 +116,6 @@ def _event(event: GestureEvent) -> str:
 
 
 def _reaction(reaction: Reaction) -> str:
-    shown = [f"eyes {reaction.eyes}", *([reaction.sound] if reaction.sound else [])]
-    lasting = f" for {reaction.seconds:g} s" if reaction.seconds else ""
-    return f"the toy: {', '.join(shown)}{lasting}"
+    parts = [f"eyes {reaction.eyes}", *([reaction.sound] if reaction.sound else [])]
+    duration = f" for {reaction.seconds:g} s" if reaction.seconds else ""
+    return f"the toy: {', '.join(parts)}{duration}"

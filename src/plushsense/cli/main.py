@@ -1,6 +1,7 @@
-"""``plushsense VERB …``: finds the verb, runs it, and turns every refusal into one sentence.
+"""Run ``plushsense VERB ...``: load the verb's module, parse its options, and report errors as one sentence.
 
-A verb is a module with ``add(parser)`` and ``run(args) -> int``; only the one that was asked for is loaded.
+A verb is a pair of functions ``add(parser)`` and ``run(args) -> int`` in a module of this package. In `VERBS`,
+``module:name`` means the functions ``add_name`` and ``run_name``. Only the module of the given verb is imported.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import errno
 import importlib
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from plushsense.cli.output import Parser, say, utf8
 from plushsense.core.errors import PlushSenseError, nearest
@@ -19,80 +20,85 @@ from plushsense.core.version import __version__
 from plushsense.jobs.progress import close_active
 
 VERBS: dict[str, tuple[str, str]] = {
-    "demo": ("demo", "the whole path on a virtual toy, in a few minutes"),
-    "devices": ("devices", "what toys are there, and the URL that opens each"),
-    "record": ("record", "record a session with a toy: prompts, countdown, nothing lost"),
-    "import": ("import_", "make a data set from recordings"),
-    "check": ("check", "what may be wrong in a data set, what to do about it, and decisions as marks"),
-    "trim": ("trim", "where each gesture begins: suggested, then accepted, adjusted or undone"),
-    "stats": ("stats", "how long gestures last, before and after trimming"),
-    "info": ("info", "what a data set or a model bundle holds"),
-    "publish": ("publish", "a package that strangers can find, open and cite, proved by validators"),
-    "pseudonymise": ("pseudonymise", "a copy of a data set with random codes and moved dates"),
-    "backup": ("backup", "one file that restores a data set, with a check"),
-    "restore": ("restore", "bring a data set back from a backup"),
-    "forget": ("forget", "take a person out of a data set, for good"),
-    "arch": ("arch", "count a network: parameters, receptive field, multiply-accumulates, state"),
+    "demo": ("demo", "run the whole pipeline on a virtual toy, in a few minutes"),
+    "devices": ("devices", "list the toys that can be reached, and the URL that opens each"),
+    "record": ("record", "record a session with a toy, guided by prompts"),
+    "import": ("import_", "create a data set from recordings"),
+    "check": ("check", "check the quality of a data set, and mark decisions about findings"),
+    "trim": ("trim", "suggest where each gesture begins, and accept, adjust or undo trims"),
+    "stats": ("info:stats", "show how long gestures last, before and after trimming"),
+    "info": ("info", "show what a data set or a model bundle contains"),
+    "publish": ("publish", "write a data set as a package with standard metadata, and validate it"),
+    "pseudonymise": ("privacy:pseudonymise", "copy a data set with random codes and shifted dates"),
+    "backup": ("backup", "save a data set as one checked file, or check such a file"),
+    "restore": ("backup:restore", "restore a data set from a backup"),
+    "forget": ("privacy:forget", "remove a person from a data set permanently"),
+    "arch": ("arch", "count a network's parameters, receptive field, multiply-accumulates and state"),
     "train": ("train", "train one network and save it as a bundle"),
-    "evaluate": ("evaluate", "how good it is, on people it never met"),
-    "abstain": ("abstain", "whether it knows when it does not know, on people it never met"),
-    "stream-eval": ("stream_eval", "whole streams against what really happened: events, false events, how soon"),
-    "baselines": ("baselines", "classical programs, LSTMs and our network side by side, and what a leaky split hides"),
-    "sweep": ("sweep", "train and compare every network of a grid, and go on after whatever stopped it"),
-    "search": ("search", "the best network within limits of size, for a share of what a whole sweep costs"),
-    "report": ("report", "one HTML page from evaluations and bundles, or of a sweep"),
-    "export": ("export", "C for the toy that gives the same answers, bit for bit"),
+    "evaluate": ("evaluate", "cross-validate a network on people left out of the training"),
+    "abstain": ("abstain", "measure how well the confidence predicts errors, on people left out"),
+    "stream-eval": ("stream_eval", "score the events in whole streams: hits, false events, latency"),
+    "baselines": ("baselines", "compare classical models, LSTMs and our network on the same splits"),
+    "sweep": ("sweep", "train and compare every network of a grid"),
+    "search": ("search", "find the best network within limits of size, at a share of the cost of a sweep"),
+    "report": ("report", "write an HTML page of evaluations and bundles, or of a sweep"),
+    "export": ("export", "write C for the toy that gives the same answers, bit for bit"),
     "verify": ("verify", "prove that the C of an export gives the same answers, here and on emulated chips"),
-    "profile": ("profile", "what an export costs on a chip: instructions, bytes, stack, and an estimate of the time"),
-    "live": ("live", "read a toy and say what it feels, 20 times a second"),
-    "adapt": ("adapt", "adapt a bundle to one person from a minute of their gestures, where that helps; undo"),
-    "protocol": ("protocol", "the paper's real-time protocol: who answers which touch, and how soon"),
-    "studio": ("studio", "the whole work in a browser, on this machine alone"),
-    "toy": ("toy", "a virtual toy that speaks the wire format over a pty or TCP"),
-    "simulate": ("simulate", "recordings of virtual people, as the authors' recorder would leave them"),
+    "profile": ("profile", "measure what an export costs on a chip: instructions, bytes, stack, estimated time"),
+    "live": ("live", "classify the touches of a toy live, 20 times a second"),
+    "adapt": ("adapt", "adapt a bundle to one person, or undo it"),
+    "protocol": ("protocol", "run the paper's real-time protocol: which system answers which touch, and how soon"),
+    "studio": ("studio", "open the web application, by default for this machine only"),
+    "toy": ("virtual:toy", "serve a virtual toy on a pseudo terminal, a TCP port or an LSL stream"),
+    "simulate": ("virtual:simulate", "write recordings of virtual people, as the authors' recorder writes them"),
 }
 
-# What a stopped verb has left; the others leave nothing that would need a word.
-STOPPED = {
-    "demo": "what was finished is kept, and the same command goes on from there",
-    "evaluate": "finished folds are kept, and the same command goes on from there",
-    "abstain": "finished trainings are kept, and the same command goes on from there",
-    "stream-eval": "finished folds are kept, and the same command goes on from there",
-    "sweep": "finished trainings are kept, and the same command goes on from there",
-    "search": "finished trainings are kept, and the same command goes on from there",
-    "baselines": "finished folds are kept, and the same command goes on from there",
-    "simulate": "nothing was written",
-    "import": "nothing was written, or with --add nothing by halves: the same command goes on",
-    "record": "what was recorded is kept, and the same command goes on from there",
-    "pseudonymise": "nothing was written",
+_RESUMES = "finished work is kept; give the same command again to resume"
+# What an interrupted verb leaves behind; verbs that write nothing are not listed.
+INTERRUPTED = {
+    **dict.fromkeys(("demo", "evaluate", "abstain", "stream-eval", "sweep", "search", "baselines"), _RESUMES),
+    **dict.fromkeys(("simulate", "pseudonymise", "restore", "protocol", "export"), "nothing was written"),
+    "import": "nothing was written; with --add no file is half written: give the same command again to resume",
+    "record": "what was recorded is kept; give the same command again to resume",
     "backup": "no backup was written",
-    "restore": "nothing was written",
-    "forget": "the same command finishes what was begun",
-    "studio": "everything is kept, and the same command goes on from there",
-    "publish": "there is no zip; a folder that was written whole can be proved with  plushsense publish --check OUT",
-    "train": "no bundle was written",
-    "adapt": "no bundle was written; of --evaluate, trained networks are kept",
+    "forget": "give the same command again to finish the removal",
+    "studio": "everything is kept; give the same command again to resume",
+    "publish": "there is no zip file; check a complete folder with  plushsense publish --check OUT",
+    "train": "no bundle was written; give the same command again to resume the training",
+    "adapt": "no bundle was written; networks that --evaluate trained are kept",
     "report": "no page was written",
-    "protocol": "nothing was written",
-    "export": "nothing was written",
     "verify": "nothing was changed",
 }
 
 
 def _overview() -> str:
     width = max(map(len, VERBS))
-    lines = [f"  {name:<{width}}  {what}" for name, (_, what) in VERBS.items()]
+    lines = [f"  {name:<{width}}  {summary}" for name, (_, summary) in VERBS.items()]
     return (
-        "PlushSense: software that understands how people touch a soft toy.\n\n"
+        "PlushSense: touch gesture recognition for soft toys.\n\n"
         "usage: plushsense VERB [options]      plushsense VERB --help\n\n"
         + "\n".join(lines)
-        + "\n\nEvery verb takes --json: one JSON object on standard output and nothing else there.\n"
-        "Exit status: 0 done, 1 the check said no, 2 bad input (one sentence).\n"
+        + "\n\nEvery verb accepts --json: print one JSON object on standard output and nothing else there.\n"
+        "Exit status: 0 success, 1 a check failed, 2 invalid input.\n"
     )
 
 
+def load_verb(verb: str) -> tuple[Callable[[argparse.ArgumentParser], None], Callable[[argparse.Namespace], int]]:
+    """Import the functions ``add`` and ``run`` of a verb.
+
+    Raises:
+        PlushSenseError: for an unknown verb.
+    """
+    if verb not in VERBS:
+        raise PlushSenseError(f"Unknown verb '{verb}': accepted are {', '.join(VERBS)}.{nearest(verb, VERBS)}")
+    module_name, colon, name = VERBS[verb][0].partition(":")
+    module = importlib.import_module(f"plushsense.cli.{module_name}")
+    suffix = f"_{name}" if colon else ""
+    return getattr(module, f"add{suffix}"), getattr(module, f"run{suffix}")
+
+
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit status."""
+    """Run the command line and return the exit status."""
     utf8()
     words = list(sys.argv[1:] if argv is None else argv)
     if not words or words[0] in ("-h", "--help", "help"):
@@ -101,50 +107,46 @@ def main(argv: Sequence[str] | None = None) -> int:
     if words[0] == "--version":
         sys.stdout.write(f"plushsense {__version__}\n")
         return 0
-    verb, rest = words[0], words[1:]
+    verb = words[0]
     try:
-        if verb not in VERBS:
-            raise PlushSenseError(f"Unknown verb '{verb}': accepted are {', '.join(VERBS)}.{nearest(verb, VERBS)}")
-        module, what = VERBS[verb]
-        command = importlib.import_module(f"plushsense.cli.{module}")
-        parser = Parser(prog=f"plushsense {verb}", description=what[0].upper() + what[1:] + ".")
-        command.add(parser)
+        add, run = load_verb(verb)
+        summary = VERBS[verb][1]
+        parser = Parser(prog=f"plushsense {verb}", description=summary[0].upper() + summary[1:] + ".")
+        add(parser)
+        json_help = "print one JSON object on standard output and nothing else there (default: text)"
         if verb == "live":
-            said = "changes nothing: decisions are JSON always, one object a line"
-        else:
-            said = "one JSON object on standard output, and nothing else there (default: text)"
-        parser.add_argument("--json", action="store_true", help=said)
-        args: argparse.Namespace = parser.parse_args(rest)
-        return int(command.run(args))
-    except PlushSenseError as refusal:
-        say(f"plushsense: {refusal}")
+            json_help = "no effect: decisions are always JSON, one object a line"
+        parser.add_argument("--json", action="store_true", help=json_help)
+        return int(run(parser.parse_args(words[1:])))
+    except PlushSenseError as error:
+        say(f"plushsense: {error}")
         return 2
     except KeyboardInterrupt:
-        say(f"plushsense: stopped; {STOPPED[verb]}." if verb in STOPPED else "plushsense: stopped.")
+        say(f"plushsense: stopped; {INTERRUPTED[verb]}." if verb in INTERRUPTED else "plushsense: stopped.")
         return 130
-    except OSError as cause:
-        if _reader_gone(cause):
-            # The reader of our output went away (`| head`): not our failure.
+    except OSError as error:
+        if _output_closed(error):
+            # The reader of standard output has ended (`| head`): not a failure of ours.
             with contextlib.suppress(OSError):
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 0
-        say(f"plushsense: {_in_words(cause)}")
+        say(f"plushsense: {_sentence(error)}")
         return 2
     finally:
         close_active()
 
 
-def _reader_gone(cause: OSError) -> bool:
+def _output_closed(error: OSError) -> bool:
     """Return whether standard output has no reader any more, which Windows reports as an invalid argument."""
-    if isinstance(cause, BrokenPipeError):
+    if isinstance(error, BrokenPipeError):
         return True
-    return sys.platform == "win32" and cause.errno == errno.EINVAL and cause.filename is None
+    return sys.platform == "win32" and error.errno == errno.EINVAL and error.filename is None
 
 
-def _in_words(cause: OSError) -> str:
-    """Format a refusal of the operating system as a sentence with the path."""
-    paths = " and ".join(f"'{os.fsdecode(p)}'" for p in (cause.filename, cause.filename2) if isinstance(p, str | bytes))
-    why = cause.strerror or str(cause) or type(cause).__name__
+def _sentence(error: OSError) -> str:
+    """Format an error of the operating system as a sentence with the path."""
+    paths = " and ".join(f"'{os.fsdecode(p)}'" for p in (error.filename, error.filename2) if isinstance(p, str | bytes))
+    why = error.strerror or str(error) or type(error).__name__
     if not paths:
         return f"The system refused: {why}."
     return f"{paths} cannot be used: {why[0].lower()}{why[1:]}; check the path and whether you may write there."

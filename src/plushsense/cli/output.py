@@ -16,7 +16,7 @@ from plushsense.reports.table import Table
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser whose refusals are PlushSense's: one sentence, the nearest known option, status 2."""
+    """An argument parser that raises ConfigError with one sentence and the nearest known option."""
 
     words: Sequence[str] = ()
 
@@ -27,7 +27,7 @@ class Parser(argparse.ArgumentParser):
         return parsed
 
     def error(self, message: str) -> NoReturn:
-        # An option misspelt is also one that is missing, which argparse notices first.
+        # Where a required option is misspelt, argparse reports only that it is missing.
         known = [o for action in self._actions for o in action.option_strings]
         typed = [word.partition("=")[0] for word in self.words if word.startswith("--") and word != "--"]
         unknown = [word for word in typed if not any(option.startswith(word) for option in known)]
@@ -38,17 +38,22 @@ class Parser(argparse.ArgumentParser):
 
 
 def utf8() -> None:
-    """Set the output to UTF-8, whatever the console's code page."""
+    """Set standard output and standard error to UTF-8, whatever the console's code page is."""
     for stream, errors in ((sys.stdout, "strict"), (sys.stderr, "backslashreplace")):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(encoding="utf-8", errors=errors)
 
 
 def say(text: str) -> None:
-    """Print a message on standard error; a closed terminal is no error."""
+    """Print a message on standard error; a closed terminal is ignored."""
     with contextlib.suppress(OSError):
         sys.stderr.write(text + "\n")
         sys.stderr.flush()
+
+
+def warn(sentence: str) -> None:
+    """Print a warning on standard error."""
+    say(f"warning: {sentence}")
 
 
 def emit(args: argparse.Namespace, result: dict[str, Any], text: str | Iterable[str]) -> None:
@@ -62,5 +67,19 @@ def emit(args: argparse.Namespace, result: dict[str, Any], text: str | Iterable[
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Return a plain text table; numbers to the right."""
+    """Format a plain text table; columns of numbers are aligned to the right."""
     return Table.of(head, rows).text()
+
+
+def figure(value: float | None) -> str:
+    """Format a score with three digits; a dash for None."""
+    return "-" if value is None else f"{value:z.3f}"
+
+
+def spread(score: dict[str, Any]) -> str:
+    """Format mean, standard deviation and interval: ``0.573 ± 0.120 (95 % 0.52 to 0.62)``."""
+    mean, sd, ci = score["mean"], score["sd"], score.get("ci95")
+    if mean is None:
+        return "-"
+    interval = f" (95 % {ci[0]:z.3f} to {ci[1]:z.3f})" if ci else ""
+    return f"{mean:z.3f}" + ("" if sd is None else f" ± {sd:.3f}{interval}")

@@ -27,74 +27,69 @@ _STAGES = {
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("out", metavar="OUT", help="a folder that plushsense export made")
+    parser.add_argument("out", metavar="OUT", help="folder written by plushsense export")
     parser.add_argument(
         "--target",
         action="append",
         default=[],
         metavar="NAME",
-        help="xtensa, cortex-m4, cortex-m0, riscv32, or host for sizes only; several with commas (default: every "
-        "emulator that is installed here)",
+        help="xtensa, cortex-m4, cortex-m0, riscv32, or host for sizes only; several joined by commas (default: every "
+        "installed emulator)",
     )
+    parser.add_argument("--optimise", default="O2", choices=("O2", "O3", "Os"), help="compiler optimisation (O2)")
     parser.add_argument(
-        "--optimise", default="O2", choices=("O2", "O3", "Os"), help="how the compilers optimise (default: O2)"
-    )
-    parser.add_argument(
-        "--trust",
-        action="store_true",
-        help="compile and run C that is not what this version writes, as it is in OUT (default: such an export is "
-        "refused)",
+        "--trust", action="store_true", help="compile and run C files of OUT that this version would not write"
     )
 
 
 def run(args: argparse.Namespace) -> int:
     from plushsense.deploy.profile import profile
 
-    found = profile(
+    result = profile(
         args.out,
         listed(*args.target),
         optimise=f"-{args.optimise}",
         trust=args.trust,
         progress=ProgressReporter("targets"),
     )
-    for name, packages in found.missing.items():
+    for name, packages in result.missing.items():
         say(f"left out: {name}, which needs Debian's {' '.join(packages)}")
-    emit(args, found.to_dict(), format_profile(found))
+    emit(args, result.to_dict(), format_profile(result))
     return 0
 
 
-def format_profile(found: Profile) -> list[str]:
+def format_profile(profile: Profile) -> list[str]:
     """Format the profile as text."""
-    arch = found.arch
-    layers = ", ".join(f"{name} {macs:,}" for name, macs in found.macs_by_layer.items())
+    arch = profile.arch
+    layers = ", ".join(f"{name} {macs:,}" for name, macs in profile.macs_by_layer.items())
     return [
-        f"{arch.title}: a step is {arch.step} samples, {found.step_ms:g} ms; compiled with {found.optimise}",
+        f"{arch.title}: a step is {arch.step} samples, {profile.step_ms:g} ms; compiled with {profile.optimise}",
         f"  MACs a step  {arch.macs_per_step:,} ({layers})",
-        *_counts(found),
+        *_counts(profile),
         "",
-        *_bytes(list(found.costs.values())),
-        *_times(found),
+        *_bytes(list(profile.costs.values())),
+        *_times(profile),
     ]
 
 
-def _counts(found: Profile) -> list[str]:
+def _counts(profile: Profile) -> list[str]:
     from plushsense.deploy.profile import STEPS
 
-    costs = [c for c in found.costs.values() if c.stages]
+    costs = [c for c in profile.costs.values() if c.stages]
     if not costs:
         return []
     rows: list[list[str]] = [[words, *(f"{c.stages[key]:,}" for c in costs)] for key, words in _STAGES.items()]
     rows += [
         ["whole step", *(f"{c.step:,}" for c in costs)],
         ["dearest step", *(f"{c.step_most:,}" for c in costs)],
-        [f"longest gap ({found.facts['gap_ms']} ms), one call", *(f"{c.gap:,}" for c in costs)],
+        [f"longest gap ({profile.facts['gap_ms']} ms), one call", *(f"{c.gap:,}" for c in costs)],
         ["plush_begin, once", *(f"{c.begin:,}" for c in costs)],
-        ["network, for each MAC", *(f"{c.stages['network'] / found.arch.macs_per_step:.2f}" for c in costs)],
+        ["network, for each MAC", *(f"{c.stages['network'] / profile.arch.macs_per_step:.2f}" for c in costs)],
     ]
-    window, times = found.window_instructions, found.arch.macs_per_window / found.arch.macs_per_step
+    window, times = profile.window_instructions, profile.arch.macs_per_window / profile.arch.macs_per_step
     again = (
-        f"Were the whole span of {found.arch.span} samples recomputed at every step: {found.arch.macs_per_window:,} "
-        f"MACs, {times:.0f} times as many; by the same count for each MAC about "
+        f"Recomputing the whole span of {profile.arch.span} samples at every step takes {profile.arch.macs_per_window:,} "
+        f"MACs, {times:.0f} times as many; with the same instructions for each MAC about "
         + ", ".join(f"{window[c.target] / 1e6:.1f} M on {c.target}" for c in costs)
         + " (estimate)."
     )
@@ -142,10 +137,10 @@ def _bytes(costs: list[Cost]) -> list[str]:
     return ["Bytes", table(["", *(c.target for c in costs)], rows), *textwrap.wrap(proof, 118)]
 
 
-def _times(found: Profile) -> list[str]:
+def _times(profile: Profile) -> list[str]:
     from plushsense.deploy.profile import SUMMARY
 
-    if not found.estimates:
+    if not profile.estimates:
         return []
     rows = [
         [
@@ -156,16 +151,16 @@ def _times(found: Profile) -> list[str]:
             f"{e.low_ms:.2g} to {e.high_ms:.2g}",
             e.answer,
         ]
-        for e in found.estimates.values()
+        for e in profile.estimates.values()
     ]
     why: dict[str, list[str]] = {}
-    for e in found.estimates.values():
+    for e in profile.estimates.values():
         why.setdefault(e.core.reasons, []).append(e.core.title.partition(" (")[0])
     return [
         "",
         *textwrap.wrap(f"Time of a step, ESTIMATED. {SUMMARY}", 118),
         table(
-            ["chip", "MHz", "counted on", "cycles an instruction", "ms a step", f"fits {1000 / found.step_ms:g} Hz"],
+            ["chip", "MHz", "counted on", "cycles an instruction", "ms a step", f"fits {1000 / profile.step_ms:g} Hz"],
             rows,
         ),
         "Where the bounds come from:",

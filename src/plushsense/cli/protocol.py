@@ -11,37 +11,23 @@ from plushsense.jobs.progress import ProgressReporter
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--model", required=True, metavar="BUNDLE", help="a .plush bundle")
-    parser.add_argument("--people", type=int, metavar="N", help="virtual people (5, as in the paper)")
-    parser.add_argument(
-        "--first",
-        type=int,
-        metavar="N",
-        help="number of the first virtual person (1001: nobody met them)",
-    )
-    parser.add_argument("--seed", type=int, metavar="N", help="of the virtual population (1)")
-    parser.add_argument("--repetitions", type=int, metavar="N", help="of each gesture by each person (3)")
-    parser.add_argument("--dataset", metavar="DS", help="recorded sessions instead: a data set with session streams")
-    parser.add_argument(
-        "--session",
-        metavar="DIR",
-        help="recorded sessions instead: a folder as a recorder leaves it, stream and recordings",
-    )
-    parser.add_argument(
-        "--subjects", metavar="NAME,...", help="people of DS or DIR (default: all that the network never met)"
-    )
-    parser.add_argument(
+    add = parser.add_argument
+    add("--model", required=True, metavar="BUNDLE", help=".plush bundle")
+    add("--people", type=int, metavar="N", help="number of virtual people (5, as in the paper)")
+    add("--first", type=int, metavar="N", help="number of the first virtual person (1001: in no data set)")
+    add("--seed", type=int, metavar="N", help="seed of the virtual population (1)")
+    add("--repetitions", type=int, metavar="N", help="recordings of each gesture by each person (3)")
+    add("--dataset", metavar="DS", help="use recorded sessions: a data set with session streams")
+    add("--session", metavar="DIR", help="use recorded sessions: a folder of recordings with their stream")
+    add("--subjects", metavar="NAME,...", help="people of DS or DIR (default: all that the network was not trained on)")
+    add(
         "--engine",
         default="float",
         choices=("float", "int8"),
-        help="float (default), or int8: the toy's own arithmetic",
+        help="float (default), or int8: the toy's arithmetic",
     )
-    parser.add_argument(
-        "--no-rules", action="store_true", help="leave out the old heuristic, which has to be tuned first"
-    )
-    parser.add_argument(
-        "--out", metavar="DIR", help="folder for protocol.html, table.csv, trials.csv and protocol.json"
-    )
+    add("--no-rules", action="store_true", help="leave out the rule baseline, which has to be fitted first")
+    add("--out", metavar="DIR", help="folder for protocol.html, table.csv, trials.csv and protocol.json")
 
 
 def run(args: argparse.Namespace) -> int:

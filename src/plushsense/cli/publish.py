@@ -5,46 +5,33 @@ from __future__ import annotations
 import argparse
 
 from plushsense.cli.output import emit, say
-from plushsense.cli.settings import listed
+from plushsense.cli.settings import listed, report_stages
 from plushsense.core.errors import ConfigError
-from plushsense.jobs.progress import ProgressReporter
 
-SHOWN_PROBLEMS = 20
+_MOST_PROBLEMS = 20
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("dataset", metavar="DATASET", nargs="?", help="data set folder")
-    parser.add_argument("out", metavar="OUT", nargs="?", help="new or empty folder; the zip is OUT.zip beside it")
-    parser.add_argument("--check", metavar="PACKAGE", help="only prove a package that is there, a folder or a zip")
-    parser.add_argument("--licence", default="", metavar="SPDX", help="as CC-BY-4.0 (default: what dataset.toml says)")
-    parser.add_argument(
-        "--contact", default="", metavar="WHO", help='as "Name <mail>" (default: what dataset.toml says)'
-    )
-    parser.add_argument(
-        "--consent", default="", metavar="TEXT", help="what the people agreed to (default: what dataset.toml says)"
-    )
-    parser.add_argument("--save", action="store_true", help="also write these three into dataset.toml")
-    parser.add_argument("--no-streams", action="store_true", help="leave out what lay between the recordings")
-    parser.add_argument("--allow-excluded", action="store_true", help="publish excluded recordings too, marked")
-    parser.add_argument(
-        "--allow-columns",
-        default="",
-        metavar="A,B",
-        help="columns of subjects.csv besides age_group and gender (default: none)",
-    )
-    parser.add_argument(
+    add = parser.add_argument
+    add("dataset", metavar="DATASET", nargs="?", help="data set folder")
+    add("out", metavar="OUT", nargs="?", help="new or empty folder; the zip file is OUT.zip")
+    add("--check", metavar="PACKAGE", help="validate an existing package, a folder or a zip file, and write nothing")
+    add("--licence", default="", metavar="SPDX", help="licence, such as CC-BY-4.0 (default: from dataset.toml)")
+    add("--contact", default="", metavar="WHO", help='contact as "Name <mail>" (default: from dataset.toml)')
+    add("--consent", default="", metavar="TEXT", help="consent statement (default: from dataset.toml)")
+    add("--save", action="store_true", help="write licence, contact and consent into dataset.toml")
+    add("--no-streams", action="store_true", help="leave out the session streams between the recordings")
+    add("--allow-excluded", action="store_true", help="publish excluded recordings too, marked")
+    add("--allow-columns", default="", metavar="A,B", help="columns of subjects.csv besides age_group and gender")
+    add(
         "--key",
         metavar="FILE",
-        help="secret that fixes the shifts of time for later versions; made if absent (default: drawn anew)",
+        help="secret that fixes the time shifts for later versions; created if absent (default: random each time)",
     )
-    parser.add_argument("--bids", action="store_true", help="add a Motion-BIDS-like tree")
-    parser.add_argument(
-        "--no-reidentification",
-        action="store_true",
-        help="do not look whether people can be recognised; the package says that nobody looked",
-    )
-    parser.add_argument("--seed", type=int, default=1, metavar="N", help="of the re-identification (1)")
-    parser.add_argument("--thorough", action="store_true", help="slow validators read all rows of the streams too")
+    add("--bids", action="store_true", help="add a tree in the manner of Motion-BIDS")
+    add("--no-reidentification", action="store_true", help="do not test whether people can be recognised")
+    add("--seed", type=int, default=1, metavar="N", help="seed of the re-identification (1)")
+    add("--thorough", action="store_true", help="let slow validators read all rows of the streams")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -57,9 +44,9 @@ def _check(args: argparse.Namespace) -> int:
     if args.dataset:
         raise ConfigError("Give either DATASET OUT, or --check PACKAGE, not both.")
     checked = validate_package(args.check, thorough=args.thorough)
-    _say_problems(args, checked.to_dict()["problems"])
-    said = "valid" if checked.valid else f"not valid: {len(checked.problems)} problems"
-    emit(args, {"package": args.check, **checked.to_dict()}, f"{args.check}: {said}")
+    _print_problems(args, checked.to_dict()["problems"])
+    verdict = "valid" if checked.valid else f"not valid: {len(checked.problems)} problems"
+    emit(args, {"package": args.check, **checked.to_dict()}, f"{args.check}: {verdict}")
     return 0 if checked.valid else 1
 
 
@@ -68,11 +55,6 @@ def _publish(args: argparse.Namespace) -> int:
 
     if not args.dataset or not args.out:
         raise ConfigError("Publishing needs DATASET and OUT, or --check PACKAGE.  See  plushsense publish --help")
-    bars: dict[str, ProgressReporter] = {}
-
-    def report_progress(what: str, done: int, total: int) -> None:
-        bars.setdefault(what, ProgressReporter(what))(done, total)
-
     done = publish_dataset(
         args.dataset,
         args.out,
@@ -88,23 +70,23 @@ def _publish(args: argparse.Namespace) -> int:
         reidentification=not args.no_reidentification,
         seed=args.seed,
         thorough=args.thorough,
-        progress=report_progress,
+        progress=report_stages(),
     )
     result = done.to_dict()
     if not args.json:
         for line in [*result["warnings"], *result["notes"]]:
             say(f"note: {line}")
-    _say_problems(args, result["problems"])
+    _print_problems(args, result["problems"])
     megabytes = f"{result['bytes'] / 1e6:.1f} MB"
-    said = f"valid; {result['zip']}" if done.valid else f"not valid: {len(result['problems'])} problems, no zip"
-    emit(args, result, f"{args.out}: {done.files} files, {megabytes}, {said}; {result['seconds']} s")
+    verdict = f"valid; {result['zip']}" if done.valid else f"not valid: {len(result['problems'])} problems, no zip"
+    emit(args, result, f"{args.out}: {done.files} files, {megabytes}, {verdict}; {result['seconds']} s")
     return 0 if done.valid else 1
 
 
-def _say_problems(args: argparse.Namespace, problems: list[dict[str, str]]) -> None:
+def _print_problems(args: argparse.Namespace, problems: list[dict[str, str]]) -> None:
     if args.json:
         return
-    for p in problems[:SHOWN_PROBLEMS]:
+    for p in problems[:_MOST_PROBLEMS]:
         say(f"{p['validator']}: {p['file'] or 'package'}: {p['problem']}")
-    if len(problems) > SHOWN_PROBLEMS:
-        say(f"... and {len(problems) - SHOWN_PROBLEMS} more; --json lists all")
+    if len(problems) > _MOST_PROBLEMS:
+        say(f"... and {len(problems) - _MOST_PROBLEMS} more; --json lists all")

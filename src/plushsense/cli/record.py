@@ -20,69 +20,61 @@ if TYPE_CHECKING:
 _DRAW_S = 0.1
 _WAIT_S = 0.02
 
-ABOUT = """\
-The screen says what the person is to do. Press SPACE, three seconds are counted down, the recording begins; press
-SPACE again when the gesture is over. Whatever happens (a pulled cable, a crash, a full disk), what was recorded stays:
-give the same command again, and the session goes on where it stood.
+_DESCRIPTION = """\
+The screen shows the prompt. Press SPACE: after a countdown of three seconds the recording begins. Press SPACE again
+when the gesture is over. After an interruption (a pulled cable, a crash, a full disk), give the same command again:
+what was recorded is kept, and the session resumes.
 
-keys: SPACE start and stop   r make the last one again   s skip   b back   p pause   n note   q quit
-Where keys come from a script instead of a keyboard, a point waits a second of the toy's time, and SPACE waits for the
+keys: SPACE start and stop   r redo the last   s skip   b back   p pause   n note   q quit
+Where standard input is not a keyboard, a point waits for one second of the toy's time, and SPACE waits for the
 countdown:   printf ' ... ' | plushsense record ...   makes one recording of three seconds.
 """
 
 
 def add(parser: argparse.ArgumentParser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.description = f"{parser.description}\n\n{ABOUT}"
-    parser.add_argument("out", metavar="OUT", help="folder for all recordings; gets OUT/SUBJECT/SESSION/")
-    parser.add_argument(
+    parser.description = f"{parser.description}\n\n{_DESCRIPTION}"
+    add = parser.add_argument
+    add("out", metavar="OUT", help="folder for all recordings; gets OUT/SUBJECT/SESSION/")
+    add(
         "--device",
         required=True,
         metavar="URL",
-        help="the toy: serial:///dev/ttyUSB0, serial://COM3, tcp://host:port; virtual:// to try it without one",
+        help="toy: serial:///dev/ttyUSB0, serial://COM3, tcp://host:port; virtual:// to try it without one",
     )
-    parser.add_argument(
-        "--subject", metavar="CODE", help="the person's code, such as S01; never a name (none: the toy alone)"
-    )
-    parser.add_argument(
-        "--session", metavar="NAME", help="name of the session (default: the unfinished one, or a number)"
-    )
-    parser.add_argument("--new", action="store_true", help="begin a new session even if the last one is unfinished")
-    parser.add_argument(
+    add("--subject", metavar="CODE", help="code of the person, such as S01, never a name (default: nobody)")
+    add("--session", metavar="NAME", help="name of the session (default: the unfinished one, or a number)")
+    add("--new", action="store_true", help="begin a new session even if the last one is unfinished")
+    add(
         "--protocol",
         metavar="NAME",
-        help="what is recorded: plush-17 (default: the paper's 17 gestures, 3 times), quick (to try it), rest (the toy "
-        "alone), or a TOML file of your own",
+        help="protocol: plush-17 (default: the paper's 17 gestures, 3 times), quick (a short trial), rest (the toy at "
+        "rest), or a TOML file",
     )
-    parser.add_argument(
-        "--words", metavar="NAME", help="which wording of the prompts, such as child (default: default)"
+    add("--words", metavar="NAME", help="wording of the prompts, such as child (default: default)")
+    add("--age-group", default="", metavar="WORD", help="such as child, teen, adult (default: none)")
+    add("--gender", default="", metavar="WORD", help="as the person says (default: none)")
+    add(
+        "--consent",
+        default="",
+        metavar="REF",
+        help="number of the signed consent form (required to publish)",
     )
-    parser.add_argument(
-        "--age-group", default="", metavar="WORD", help="such as child, teen, adult (default: not said)"
-    )
-    parser.add_argument("--gender", default="", metavar="WORD", help="as the person says (default: not said)")
-    parser.add_argument(
-        "--consent", default="", metavar="REF", help="number of the signed consent form (without it: never published)"
-    )
-    parser.add_argument(
-        "--layout", metavar="NAME", help="the toy's firmware: plush-15 (default), plush-14, or a TOML file"
-    )
-    parser.add_argument("--speed", type=float, metavar="X", help="times real time at which a virtual toy runs (1)")
-    parser.add_argument(
+    add("--layout", metavar="NAME", help="firmware of the toy: plush-15 (default), plush-14, or a TOML file")
+    add("--speed", type=float, metavar="X", help="speed of a virtual toy relative to real time (1)")
+    add(
         "--auto",
         type=float,
         nargs="?",
         const=5.0,
         metavar="S",
-        help="press the space bar by itself and record S seconds (5) each time: for trying it, and for the toy at rest",
+        help="start and stop each recording automatically after S seconds (5): for trials and for the toy at rest",
     )
-    parser.add_argument(
-        "--simulated", action="store_true", help="the toy is `plushsense toy`: mark the recordings as a simulation"
-    )
+    add("--simulated", action="store_true", help="mark as a simulation, where the toy is `plushsense toy`")
 
 
 def run(args: argparse.Namespace) -> int:
-    from plushsense.cli.terminal import Screen, keys, orderly_end
+    from plushsense.cli.terminal import Screen, interrupt_on_signals, keys
     from plushsense.core.version import __version__
     from plushsense.recording.recorder import Recorder
     from plushsense.recording.session import OpenSession
@@ -97,23 +89,23 @@ def run(args: argparse.Namespace) -> int:
     from plushsense.recording.states import AutoRecording
 
     software = f"plushsense {__version__}"
-    wanted = _request(args)
-    folder, known = session_folder(Path(args.out), wanted, args.session, args.new)
-    with open_toy(with_speed(args.device, wanted.speed), session_layout(wanted, folder, known)) as device:
-        head = session_head(wanted, folder, known is None, device.layout, software)
-        notices = _notices(wanted, head, known is None)
+    request = _request(args)
+    folder, known = session_folder(Path(args.out), request, args.session, args.new)
+    with open_toy(with_speed(args.device, request.speed), session_layout(request, folder, known)) as device:
+        head = session_head(request, folder, known is None, device.layout, software)
+        notices = _notices(request, head, known is None)
         for notice in notices:
             say(f"warning: {notice}")
         session = OpenSession(folder, head)
         for sentence in session.progress.repairs:
-            say(f"mended: {sentence}")
+            say(f"repaired: {sentence}")
         auto = AutoRecording(args.auto) if args.auto is not None else None
-        recorder = Recorder(session, device, speed=wanted.speed, auto=auto, software=software)
+        recorder = Recorder(session, device, speed=request.speed, auto=auto, software=software)
         prompt_virtual(recorder)
         title = f"{head.subject}, session {folder.name}: {session.protocol.title}"
         screen = Screen(recorder, title, notices)
         try:
-            with orderly_end(), recorder, keys() as typed:
+            with interrupt_on_signals(), recorder, keys() as typed:
                 _drive(recorder, typed, screen, auto is not None)
         finally:
             screen.close()
@@ -121,8 +113,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _report(args: argparse.Namespace, recorder: Recorder) -> int:
-    """Say what came of it; 2 where the toy or the disk ended it."""
-    status, standing = recorder.status(), recorder.session.progress
+    """Print the result; return 2 where the toy or the disk ended the session."""
+    status = recorder.status()
     finished = status.done + status.skipped >= status.steps
     result: dict[str, Any] = {
         "folder": status.folder,
@@ -138,12 +130,12 @@ def _report(args: argparse.Namespace, recorder: Recorder) -> int:
         "reconnects": status.reconnects,
         "gaps": recorder.gaps,
         "finished": finished,
-        "resumed": standing.resumed,
+        "resumed": recorder.session.progress.resumed,
     }
     stopped = status.failed or recorder.over
     text = f"{status.folder}: {status.done} of {status.steps} recorded"
     text += f", {status.skipped} skipped" if status.skipped else ""
-    text += "." if finished else "; the same command goes on from here."
+    text += "." if finished else "; give the same command again to resume."
     emit(args, result | ({"stopped": stopped} if stopped else {}), text)
     if stopped and not finished:
         say(f"plushsense: {stopped}")
@@ -170,25 +162,25 @@ def _request(args: argparse.Namespace) -> SessionRequest:
     )
 
 
-def _notices(wanted: SessionRequest, head: SessionHead, fresh: bool) -> list[str]:
+def _notices(request: SessionRequest, head: SessionHead, fresh: bool) -> list[str]:
     """Return the notices to print before a session."""
     from plushsense.recording.setup import is_pseudo_terminal, lacks_consent
 
-    said = []
-    if is_pseudo_terminal(wanted, head):
-        said.append("This port is a pseudo terminal: if it is `plushsense toy`, quit and add --simulated.")
+    notices = []
+    if is_pseudo_terminal(request, head):
+        notices.append("This port is a pseudo terminal: if it is `plushsense toy`, quit and add --simulated.")
     if fresh and lacks_consent(head):
-        said.append("No consent reference (--consent): recorded as missing, and publishing will refuse it.")
-    return said
+        notices.append("No consent reference (--consent): recorded as missing, and publishing will refuse it.")
+    return notices
 
 
 def _drive(recorder: Recorder, typed: KeySource, screen: Screen, auto: bool) -> None:  # noqa: C901
     """Turn keys into commands and update the screen until the session ends."""
-    from plushsense.cli.terminal import END, Held
+    from plushsense.cli.terminal import END, KeyRepeatFilter
 
     note: str | None = None
-    leaving = False
-    held = Held()
+    confirming = False
+    repeats = KeyRepeatFilter()
     commands: dict[str, Callable[[], None]] = {
         " ": recorder.space,
         "r": recorder.redo,
@@ -207,7 +199,7 @@ def _drive(recorder: Recorder, typed: KeySource, screen: Screen, auto: bool) -> 
                 return
             recorder.wait("finished", timeout_s=_DRAW_S)
             continue
-        repeated = key is not None and held.again(key, time.monotonic())
+        repeated = key is not None and repeats.repeats(key, time.monotonic())
         if not key or (repeated and note is None and not typed.script):
             continue
         if note is not None:
@@ -221,25 +213,23 @@ def _drive(recorder: Recorder, typed: KeySource, screen: Screen, auto: bool) -> 
         elif key in "nN":
             note = ""
         elif key in "qQ":
-            if status.state == "recording" and not leaving:
-                leaving = True
-                recorder.show_message(
-                    "Recording: q again quits, and this one is to be made again; SPACE stops it first."
-                )
+            if status.state == "recording" and not confirming:
+                confirming = True
+                recorder.show_message("Recording: press q again to quit and discard it, or SPACE to stop it first.")
                 continue
             return
         elif typed.script and key == ".":
-            _toy_second(recorder)
+            _wait_toy_second(recorder)
         elif key.lower() in commands:
             if typed.script:
-                _settled(recorder, key)
+                _wait_ready(recorder, key)
             commands[key.lower()]()
             if typed.script:
                 recorder.wait("idle", "recording", "paused", "finished")
-        leaving = False
+        confirming = False
 
 
-def _settled(recorder: Recorder, key: str) -> None:
+def _wait_ready(recorder: Recorder, key: str) -> None:
     """Wait until a script's key can take effect, since a script cannot see the screen."""
     recorder.wait("idle", "recording", "paused", "finished")
     while key == " " and (s := recorder.status()).state == "recording":
@@ -250,7 +240,7 @@ def _settled(recorder: Recorder, key: str) -> None:
         time.sleep(_WAIT_S)
 
 
-def _toy_second(recorder: Recorder) -> None:
+def _wait_toy_second(recorder: Recorder) -> None:
     until = recorder.toy_s + 1.0
     while recorder.toy_s < until and recorder.status().state != "stopped":
         time.sleep(_WAIT_S)

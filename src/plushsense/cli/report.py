@@ -4,36 +4,27 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from plushsense.cli.output import emit
 from plushsense.core.errors import ConfigError
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "out",
-        metavar="OUT.html|SWEEP",
-        help="the page to write: a new file, or a report to replace; or a folder that sweep wrote",
-    )
-    parser.add_argument("--dataset", metavar="DATASET", help="data set folder (needed for a page of evaluations)")
-    parser.add_argument(
+    repeated: dict[str, Any] = {"action": "append", "default": []}
+    add = parser.add_argument
+    add("out", metavar="OUT.html|SWEEP", help="page to write, new or an earlier report; or a folder written by sweep")
+    add("--dataset", metavar="DATASET", help="data set folder (required for a page of evaluations)")
+    add(
         "--evaluation",
-        action="append",
+        **repeated,
         metavar="DIR",
-        help="a folder that evaluate wrote; may be given again (default: all of DATASET/evaluations)",
+        help="folder written by evaluate; can be repeated (default: all in DATASET/evaluations)",
     )
-    parser.add_argument(
-        "--model",
-        action="append",
-        metavar="FILE",
-        default=[],
-        help="a bundle, for its model card; may be given again (default: none)",
-    )
-    parser.add_argument("--title", metavar="TEXT", help="heading of the page (default: the data set's name)")
-    parser.add_argument("--page", metavar="FILE", help="of a sweep: the page to write (default: SWEEP/report.html)")
-    parser.add_argument(
-        "--mlflow", metavar="WHERE", help="of a sweep: log its finished trials to MLflow too, a folder or a URI"
-    )
+    add("--model", **repeated, metavar="FILE", help="bundle to describe; can be repeated")
+    add("--title", metavar="TEXT", help="heading of the page (default: the data set's name)")
+    add("--page", metavar="FILE", help="page of a sweep (default: SWEEP/report.html)")
+    add("--mlflow", metavar="WHERE", help="also log the finished trials of a sweep to MLflow, a folder or a URI")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -43,15 +34,15 @@ def run(args: argparse.Namespace) -> int:
     if is_sweep(args.out):
         return _sweep(args)
     if args.dataset is None or args.page or args.mlflow:
-        what = "--dataset is missing" if args.dataset is None else "--page and --mlflow are for a sweep"
+        problem = "--dataset is missing" if args.dataset is None else "--page and --mlflow are for a sweep"
         raise ConfigError(
-            f"'{args.out}' is not a folder that sweep wrote, and {what}: give a sweep's folder, or  "
+            f"'{args.out}' is not a folder written by sweep, and {problem}: give a sweep's folder, or  "
             "plushsense report OUT.html --dataset DATASET"
         )
     folder = Path(args.dataset) / "evaluations"
-    found = args.evaluation or [str(p.parent) for p in sorted(folder.glob("*/evaluation.json"))]
-    path = write_report(args.out, args.dataset, found, args.model, args.title)
-    emit(args, {"report": str(path), "evaluations": len(found), "models": len(args.model)}, str(path))
+    evaluations = args.evaluation or [str(p.parent) for p in sorted(folder.glob("*/evaluation.json"))]
+    path = write_report(args.out, args.dataset, evaluations, args.model, args.title)
+    emit(args, {"report": str(path), "evaluations": len(evaluations), "models": len(args.model)}, str(path))
     return 0
 
 

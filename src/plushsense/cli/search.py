@@ -7,9 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from plushsense.cli.evaluate import figure
-from plushsense.cli.output import emit, say, table
-from plushsense.cli.settings import add_networks, add_work, marks, warn
+from plushsense.cli.output import emit, figure, say, table, warn
+from plushsense.cli.settings import add_networks, add_work, marks
 from plushsense.cli.sweep import several
 from plushsense.jobs.progress import ProgressReporter
 

@@ -1,4 +1,4 @@
-"""The options that verbs share, and the settings they make."""
+"""Options that several verbs share, the settings they resolve to, and the progress displays of long work."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import argparse
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
-from plushsense.cli.output import say
 from plushsense.jobs.progress import ProgressReporter
 
 if TYPE_CHECKING:
@@ -14,65 +13,65 @@ if TYPE_CHECKING:
     from plushsense.workflow.config import RunConfig
 
 
-def listed(*given: str) -> list[str]:
+def listed(*values: str) -> list[str]:
     """Split the values of an option given with commas or several times: ``A,B``."""
-    return [word.strip() for each in given for word in each.split(",") if word.strip()]
+    return [word.strip() for value in values for word in value.split(",") if word.strip()]
 
 
 def add_settings(parser: argparse.ArgumentParser) -> None:
-    """Network, training and windows. Nothing given: the preset's, or the configuration file's."""
-    parser.add_argument(
-        "--arch",
-        metavar="SPEC",
-        help="architecture symbol: kernel lengths in samples, dilations after d (14d1_19d2_19d4)",
-    )
-    parser.add_argument("--filters", metavar="N,N,...", help="filters by layer (8,12,16)")
-    parser.add_argument(
-        "--padding", help="stream, causal or mirror (default: the preset's; paper mirror, others stream)"
-    )
-    parser.add_argument("--norm", help="batch (default) or layer")
-    parser.add_argument(
+    """Add the options of network, training and windows; their defaults are those of the preset or of --config."""
+    add = parser.add_argument
+    add("--arch", metavar="SPEC", help="architecture: kernel lengths in samples, dilations after d (14d1_19d2_19d4)")
+    add("--filters", metavar="N,N,...", help="filters of each layer (8,12,16)")
+    add("--padding", help="stream, causal or mirror (default: the preset's; paper mirror, others stream)")
+    add("--norm", help="normalisation: batch (default) or layer")
+    add(
         "--preset",
-        help="training schedule: people (default, 60 epochs), loso or paper (at most 150, stops early), search (250)",
+        help="training schedule: people (default, 60 epochs), loso or paper (at most 150, stop early), search (250)",
     )
-    parser.add_argument(
+    add(
         "--context",
-        help="what a short gesture's window holds before it: stream, the real past, or loop, the gesture over and "
-        "over (default: the preset's; people and loso stream, paper and search loop); anywhere, to train for live "
-        "work: decisions anywhere in the stream, idleness among them (scored as stream)",
+        help="what the window of a short gesture holds before it: stream, the recorded past; loop, the gesture "
+        "repeated; anywhere, windows from all of the stream with idleness as a class, for live use, scored as stream "
+        "(default: the preset's; people and loso stream, paper and search loop)",
     )
-    parser.add_argument(
-        "--pool-s",
-        type=float,
-        metavar="S",
-        help="seconds of the signal that a decision averages (default: 2.5 s in all)",
-    )
-    parser.add_argument(
+    add("--pool-s", type=float, metavar="S", help="seconds that a decision averages (default: 2.5 s in all)")
+    add(
         "--classes",
         metavar="LABELS",
-        help="shared (default: made by 90 %% of the people, no free choice), all, or labels joined by commas",
+        help="shared (default: gestures that 90 %% of the people made, without free choice), all, or labels joined by "
+        "commas",
     )
-    parser.add_argument("--epochs", type=int, metavar="N", help="epochs at most (default: the preset's)")
-    parser.add_argument("--batch", type=int, metavar="N", help="windows a batch (64)")
-    parser.add_argument("--seed", type=int, metavar="N", help="seed of the split and of the training (0)")
-    parser.add_argument(
-        "--device", choices=("auto", "cpu", "cuda"), help="where to train (default auto: cuda where it is available)"
-    )
-    parser.add_argument(
+    add("--epochs", type=int, metavar="N", help="maximum number of epochs (default: the preset's)")
+    add("--batch", type=int, metavar="N", help="windows in a batch (64)")
+    add("--seed", type=int, metavar="N", help="seed of the split and of the training (0)")
+    add("--device", choices=("auto", "cpu", "cuda"), help="where to train (default auto: cuda if available)")
+    add(
         "--config",
         metavar="FILE",
-        help="TOML file with the tables windows, model, training, evaluation, live; options go over it (default: none)",
+        help="TOML file with the tables windows, model, training, evaluation, live; other options override it",
     )
 
 
-def add_work(parser: argparse.ArgumentParser, what: str) -> None:
-    """Add the options of parallel work; ``what`` runs side by side: "folds", "trainings"."""
-    parser.add_argument("--workers", type=int, metavar="N", help=f"{what} at a time (default 0: one a processor)")
+def add_workers(parser: argparse.ArgumentParser, jobs: str) -> None:
+    """Add the option for the number of processes; ``jobs`` names what runs in parallel: "folds", "trainings"."""
+    parser.add_argument("--workers", type=int, metavar="N", help=f"{jobs} in parallel (default 0: one per processor)")
+
+
+def add_work(parser: argparse.ArgumentParser, jobs: str) -> None:
+    """Add the options of parallel work on this machine or a cluster."""
+    add_workers(parser, jobs)
     parser.add_argument(
         "--cluster",
         metavar="ADDRESS",
-        help="work on a Ray cluster instead: auto, local, HOST:PORT or ray://HOST:10001 (default: on this machine)",
+        help="run on a Ray cluster: auto, local, HOST:PORT or ray://HOST:10001 (default: on this machine)",
     )
+
+
+def add_out(parser: argparse.ArgumentParser, files: str, default: str, replaced: str) -> None:
+    """Add ``--out``, a folder for ``files``, and ``--force``, which replaces what ``replaced`` names."""
+    parser.add_argument("--out", metavar="DIR", help=f"folder for {files} (default: {default})")
+    parser.add_argument("--force", action="store_true", help=f"replace {replaced} in --out")
 
 
 def add_networks(parser: argparse.ArgumentParser) -> None:
@@ -85,13 +84,13 @@ def add_networks(parser: argparse.ArgumentParser) -> None:
 
 
 def marks(result: Mapping[str, Any]) -> list[str]:
-    """Return the notes that must stand before any score: simulation, leaky split."""
-    said = []
+    """Return the notices to print above scores: simulation, leaky split."""
+    notices = []
     if result["simulated"]:
-        said.append("SIMULATION: these scores are of the virtual toy and say nothing about a real one.")
+        notices.append("SIMULATION: these scores are of the virtual toy and say nothing about a real one.")
     if result["leaky"]:
-        said.append("LEAKY: windows of one recording stand on both sides of this split; the scores flatter.")
-    return said
+        notices.append("LEAKY: windows of one recording are on both sides of this split; the scores are too high.")
+    return notices
 
 
 def settings(args: argparse.Namespace, **evaluation: Any) -> RunConfig:
@@ -114,17 +113,12 @@ def settings(args: argparse.Namespace, **evaluation: Any) -> RunConfig:
     )
 
 
-def warn(sentence: str) -> None:
-    """Print a warning on standard error."""
-    say(f"warning: {sentence}")
-
-
 def report_epochs(title: str = "training") -> Callable[[int, int, dict[str, Any]], None]:
     """Return a callback that reports the epochs of one training."""
     reporters: dict[str, ProgressReporter] = {}
 
     def report(epoch: int, epochs: int, row: dict[str, Any]) -> None:
-        loss = row["train_loss"]  # fine-tuning has a small one of another kind
+        loss = row["train_loss"]  # the loss of fine-tuning is of another kind, and small
         text = f"loss {loss:{'.3f' if loss >= 0.01 else '.1e'}}"
         if row["validation_accuracy"] is not None:
             text += f", validation accuracy {row['validation_accuracy']:.3f}"
@@ -142,5 +136,15 @@ def report_folds(title: str) -> Callable[[FoldProgress], None]:
     def report(at: FoldProgress) -> None:
         detail = f"{at.fold} epoch {at.epoch}" if at.epoch else ""
         reporter(at.done, at.folds, detail=detail, resumed=at.resumed)
+
+    return report
+
+
+def report_stages(indent: str = "") -> Callable[[str, int, int], None]:
+    """Return a callback that reports work in stages: (name of the stage, done, total)."""
+    reporters: dict[str, ProgressReporter] = {}
+
+    def report(stage: str, done: int, total: int) -> None:
+        reporters.setdefault(stage, ProgressReporter(indent + stage))(done, total)
 
     return report

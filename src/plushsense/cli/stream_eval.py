@@ -6,60 +6,55 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from plushsense.cli.output import emit, say, table
-from plushsense.cli.settings import add_settings, listed, report_folds, settings, warn
+from plushsense.cli.output import emit, say, table, warn
+from plushsense.cli.settings import add_settings, add_workers, listed, marks, report_folds, settings
+from plushsense.core.errors import ConfigError
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "source", metavar="DATASET|FOLDER", help="data set; with --model also a folder of recordings with their stream"
-    )
-    parser.add_argument("--model", metavar="BUNDLE", help="a .plush bundle, with its own decision settings")
-    parser.add_argument(
-        "--subjects", metavar="P01,P02", help="whose streams, for --model (default: all it was not trained on)"
-    )
-    parser.add_argument(
+    add = parser.add_argument
+    add("source", metavar="DATASET|FOLDER", help="data set; with --model also a folder of recordings with their stream")
+    add("--model", metavar="BUNDLE", help="replay streams through this bundle with its decision settings")
+    add("--subjects", metavar="P01,P02", help="people to score with --model (default: all it was not trained on)")
+    add(
         "--split",
         metavar="SPLIT",
-        help="instead of --model: train and tune each fold, compare all systems; by-subject:5 or leave-one-subject-out",
+        help="instead of --model, train and fit each fold and compare all systems: by-subject:5, leave-one-subject-out",
     )
-    parser.add_argument(
+    add(
         "--systems",
         metavar="NAME,...",
-        help="for --split, which to compare: argmax, smoothed, hysteresis, hybrid, anywhere-smoothed, anywhere, full "
+        help="systems to compare with --split: argmax, smoothed, hysteresis, hybrid, anywhere-smoothed, anywhere, full "
         "(default: all)",
     )
-    parser.add_argument(
+    add(
         "--late",
         type=float,
         default=1.0,
         metavar="S",
-        help="how long after its end a gesture may still be answered, seconds (1)",
+        help="seconds after its end in which a gesture counts as hit (1)",
     )
-    parser.add_argument(
+    add(
         "--anywhere-pool",
         type=float,
         metavar="S",
-        help="for --split: seconds that networks trained anywhere in the stream pool (default: as the others)",
+        help="with --split: seconds that networks trained with context anywhere average (default: as the others)",
     )
-    parser.add_argument("--workers", type=int, metavar="N", help="folds at a time (default 0: one a processor)")
-    parser.add_argument("--out", metavar="DIR", help="for --split: folder for the page, figures, CSV and JSON")
-    parser.add_argument("--force", action="store_true", help="replace a benchmark that is in --out")
+    add_workers(parser, "folds")
+    add("--out", metavar="DIR", help="with --split: folder for the page, figures, CSV and JSON")
+    add("--force", action="store_true", help="replace an earlier benchmark in --out")
     add_settings(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    from plushsense.core.errors import ConfigError
-
     if (args.model is None) == (args.split is None):
         raise ConfigError("Give either --model BUNDLE, to replay streams through it, or --split by-subject:5.")
     if not 0.0 <= args.late <= 10.0:
         raise ConfigError(f"--late is {args.late:g}: accepted are 0 to 10 seconds.")
-    return _one(args) if args.model is not None else _folds(args)
+    return _run_model(args) if args.model is not None else _run_split(args)
 
 
-def _one(args: argparse.Namespace) -> int:
-    from plushsense.core.errors import ConfigError
+def _run_model(args: argparse.Namespace) -> int:
     from plushsense.experiments.streams.run import stream_eval
 
     if args.out or args.systems or args.anywhere_pool is not None:
@@ -75,12 +70,11 @@ def _one(args: argparse.Namespace) -> int:
     return 0
 
 
-def _folds(args: argparse.Namespace) -> int:
-    from plushsense.core.errors import ConfigError
+def _run_split(args: argparse.Namespace) -> int:
     from plushsense.experiments.streams.run import PAGE, stream_benchmark
 
     if args.subjects:
-        raise ConfigError("--subjects belongs to --model: a split scores everybody once.")
+        raise ConfigError("--subjects belongs to --model: a split scores all people.")
     config = settings(args, workers=args.workers)
     result = stream_benchmark(
         args.source,
@@ -97,7 +91,7 @@ def _folds(args: argparse.Namespace) -> int:
     if args.out:
         result["out"] = args.out
         say(f"written: {Path(args.out) / PAGE}")
-    emit(args, result, _compared(result))
+    emit(args, result, _format_systems(result))
     return 0
 
 
@@ -109,20 +103,8 @@ def _rate(value: float | None) -> str:
     return "-" if value is None else f"{value:.0f}" if value >= 10 else f"{value:.1f}"
 
 
-_HEAD = (
-    "truths",
-    "hits",
-    "deleted",
-    "events",
-    "false",
-    "fragmented",
-    "merged",
-    "recall",
-    "F1",
-    "false/h",
-    "median s",
-    "90 % s",
-)
+_COUNTS = ("truths", "hits", "deleted", "events", "false", "fragmented", "merged")
+_HEAD = (*_COUNTS, "recall", "F1", "false/h", "median s", "90 % s")
 
 
 def _row(s: dict[str, Any]) -> tuple[object, ...]:
@@ -138,13 +120,11 @@ def _row(s: dict[str, Any]) -> tuple[object, ...]:
 
 
 def _marks(result: dict[str, Any]) -> list[str]:
-    if not result["simulated"]:
-        return []
-    return ["SIMULATION: these figures are of the virtual toy and say nothing about a real one.", ""]
+    return [*marks({**result, "leaky": False}), ""] if result["simulated"] else []
 
 
 def _format_model(result: dict[str, Any]) -> list[str]:
-    """Format one model's figures as text: a row a person, a row a gesture, then all."""
+    """Format the scores of one model as text: a row for each person and gesture, then all."""
     people = [
         (person + (" TRAINED ON" if row["trained_on"] else ""), *_row(row)) for person, row in result["people"].items()
     ]
@@ -158,16 +138,16 @@ def _format_model(result: dict[str, Any]) -> list[str]:
         "",
         f"{result['hours']:.2f} h of streams, {result['uncovered_hours']:.2f} h outside of any true gesture",
         f"false events: {result['confused']} within another gesture; outside {place['all']}, of these "
-        f"{place['rest']} at rest ({_rate(result['at_rest_per_hour'])} an hour), {place['other']} in gestures that the "
-        "model does not know",
+        f"{place['rest']} at rest ({_rate(result['at_rest_per_hour'])} an hour), {place['other']} in gestures that are "
+        "not among the classes",
         f"outside of true gestures {_rate(result['outside_per_uncovered_hour'])} an hour",
         result["note"],
         *([f"TRAINED ON {', '.join(result['trained_on'])}: no result"] if result["trained_on"] else []),
     ]
 
 
-def _compared(result: dict[str, Any]) -> list[str]:
-    """Format the systems as text: a row a system and setting, then false events at equal recall."""
+def _format_systems(result: dict[str, Any]) -> list[str]:
+    """Format the scores of the systems as text: a row for each setting, then false events at equal recall."""
     rows = [
         (system["title"], how, *_row(system[how]))
         for system in result["systems"].values()
@@ -179,9 +159,9 @@ def _compared(result: dict[str, Any]) -> list[str]:
     for row in result["at_recall"]:
         cells = [f"{row['recall']:.2f}"]
         for name in names:
-            found = row["systems"][name]
-            ratio = "" if found["ratio"] is None or name == result["reference"] else f" (x {found['ratio']:.2f})"
-            cells.append(_rate(found["false_events_per_hour"]) + ratio)
+            cell = row["systems"][name]
+            ratio = "" if cell["ratio"] is None or name == result["reference"] else f" (x {cell['ratio']:.2f})"
+            cells.append(_rate(cell["false_events_per_hour"]) + ratio)
         equal.append(cells)
     people = len(result["subjects"])
     return [
@@ -190,7 +170,7 @@ def _compared(result: dict[str, Any]) -> list[str]:
         "",
         table(("system", "setting", *_HEAD), rows),
         "",
-        "plain: no threshold; balanced, cheapest: highest F1 and lowest cost on those who tune",
+        "plain: no threshold; balanced, cheapest: highest F1 and lowest cost on the people used for fitting",
         "",
         *(["false events an hour at equal recall:", "", table(("recall", *names), equal), ""] if equal else []),
         result["note"],

@@ -6,6 +6,7 @@ import argparse
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 from plushsense.cli.output import say
 from plushsense.core.errors import ConfigError
@@ -14,34 +15,28 @@ _HOME = "PlushSense"
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
+    repeated: dict[str, Any] = {"action": "append", "default": []}
+    add = parser.add_argument
+    add(
         "--home",
         metavar="DIR",
-        help="the folder that holds what is made: recordings, data sets, bundles, exports (default: PlushSense in your "
-        "home folder); pages see nothing outside it and what is named here",
+        help="folder of recordings, data sets, bundles and exports (default: PlushSense in your home folder); pages "
+        "see nothing outside of it except the data sets and bundles given here",
     )
-    parser.add_argument(
-        "--dataset", metavar="DIR", action="append", default=[], help="a data set that lies elsewhere; several times"
-    )
-    parser.add_argument(
-        "--model", metavar="BUNDLE", action="append", default=[], help="a bundle that lies elsewhere; several times"
-    )
-    parser.add_argument(
-        "--device", metavar="URL", action="append", default=[], help="a toy to choose from; several times"
-    )
-    parser.add_argument("--speed", type=float, default=1.0, metavar="X", help="times real time of a virtual toy (1)")
-    parser.add_argument(
+    add("--dataset", metavar="DIR", **repeated, help="data set elsewhere; can be repeated")
+    add("--model", metavar="BUNDLE", **repeated, help="bundle elsewhere; can be repeated")
+    add("--device", metavar="URL", **repeated, help="toy to offer; can be repeated")
+    add("--speed", type=float, default=1.0, metavar="X", help="speed of a virtual toy relative to real time (1)")
+    add(
         "--host",
         default="127.0.0.1",
         metavar="ADDRESS",
-        help="where to listen (default: 127.0.0.1, this machine alone); elsewhere, such as 0.0.0.0 for a tablet, a "
-        "one-time token is asked for",
+        help="address to listen on (default: 127.0.0.1, this machine only); another, such as 0.0.0.0 for a tablet, "
+        "requires a one-time token",
     )
-    parser.add_argument(
-        "--name", metavar="NAME", action="append", default=[], help="a name under which browsers may call this machine"
-    )
-    parser.add_argument("--port", type=int, metavar="N", help="default: 8137 or the next free one; 0: any")
-    parser.add_argument("--no-show", action="store_true", help="open no browser")
+    add("--name", metavar="NAME", **repeated, help="host name under which browsers may open this machine")
+    add("--port", type=int, metavar="N", help="port (default: 8137 or the next free one; 0: any)")
+    add("--no-show", action="store_true", help="do not open a browser")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -52,9 +47,9 @@ def run(args: argparse.Namespace) -> int:
     from plushsense.studio.app.workspace import Workspace
 
     if not 0.0 < args.speed <= 1000.0:
-        raise ConfigError(f"--speed is {args.speed:g}; above 0 to 1000 is accepted.")
+        raise ConfigError(f"--speed is {args.speed:g}; give a number above 0 and up to 1000.")
     if args.port is not None and not 0 <= args.port <= 65535:
-        raise ConfigError(f"--port is {args.port}; 0 to 65535 is accepted.")
+        raise ConfigError(f"--port is {args.port}; give 0 to 65535.")
     for url in args.device:
         parse_url(url)
     for folder in args.dataset:
@@ -77,14 +72,8 @@ def run(args: argparse.Namespace) -> int:
             sys.stdout.write(json.dumps({"url": address, "home": str(workspace.folder)}) + "\n")
             sys.stdout.flush()
         else:
-            say(f"The studio is at  {address}   Ctrl-C ends it. Everything stays in {workspace.folder}")
+            say(f"The studio is at  {address}   Ctrl-C ends it. All files are in {workspace.folder}")
 
-    serve(
-        workspace,
-        host=args.host,
-        port=args.port,
-        names=tuple(args.name),
-        show=not args.no_show,
-        on_ready=on_ready,
-    )
+    names = tuple(args.name)
+    serve(workspace, host=args.host, port=args.port, names=names, show=not args.no_show, on_ready=on_ready)
     return 0

@@ -6,9 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from plushsense.cli.evaluate import figure
-from plushsense.cli.output import emit, say, table
-from plushsense.cli.settings import add_networks, add_work, marks, warn
+from plushsense.cli.output import emit, figure, say, table, warn
+from plushsense.cli.settings import add_networks, add_work, marks
 
 # Keys of the grid that an option changes, each an attribute of the arguments.
 _CHANGES = (

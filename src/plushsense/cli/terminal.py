@@ -22,46 +22,45 @@ from plushsense.recording.recorder import Recorder
 from plushsense.recording.status import RecorderStatus
 
 END = "\x04"
-"""What `Keys.get` gives when nothing will come any more."""
+"""The key that a source returns at its end."""
 
-
-HELD_S = {" ": 0.7, "r": 0.1, "s": 0.1, "b": 0.1}
-"""A key that comes again so soon is held down. Keyboards begin to repeat after about half a second, then every 0.03 s;
-the space bar, which is leant on, has no use twice within that time, and the others may be pressed in a row."""
+REPEAT_S = {" ": 0.7, "r": 0.1, "s": 0.1, "b": 0.1}
+"""Seconds within which the same key counts as held down. Keyboards repeat after about 0.5 s, then every 0.03 s. Nobody
+needs the space bar twice within 0.7 s; the other keys may be pressed in quick succession."""
 
 
 class KeySource(Protocol):
-    """Source of keys; ``script``: they are not typed by a person who sees a screen."""
+    """Source of keys; with ``script`` they come from a file or a pipe, not from a person at a keyboard."""
 
     script: bool
 
     def get(self, timeout_s: float) -> str | None:
-        """Return the next key, None when none came in time, `END` when none can come any more."""
+        """Return the next key, None after the timeout, `END` at the end of the source."""
         ...
 
 
 class _Script:
-    """Characters of standard input where that is no terminal."""
+    """Characters of standard input where it is not a terminal."""
 
     script = True
 
     def __init__(self) -> None:
-        self._came: queue.Queue[str] = queue.Queue()
+        self._keys: queue.Queue[str] = queue.Queue()
         threading.Thread(target=self._work, name="plushsense-keys", daemon=True).start()
 
     def _work(self) -> None:
-        # Not through sys.stdin: a thread that waits in it would stop the program from ending.
+        # Not sys.stdin: a thread that waits in it would prevent the program from ending.
         decoder = codecs.getincrementaldecoder("utf-8")("replace")
         with contextlib.suppress(OSError, ValueError):
             fd = sys.stdin.fileno()
             while data := os.read(fd, 1024):
                 for text in decoder.decode(data):
-                    self._came.put(text)
-        self._came.put(END)
+                    self._keys.put(text)
+        self._keys.put(END)
 
     def get(self, timeout_s: float) -> str | None:
         try:
-            return self._came.get(timeout=timeout_s)
+            return self._keys.get(timeout=timeout_s)
         except queue.Empty:
             return None
 
@@ -86,8 +85,8 @@ class _Posix:
                 data = b""
             if not data:
                 return END
-            # Arrow and function keys come as a sequence that begins with Escape: they are no letters. Ctrl-D is a key
-            # like q: it may be a slip.
+            # Arrow and function keys send a sequence that begins with Escape: ignore it. Ctrl-D may be a slip: it is
+            # treated like q, which asks before it discards a recording.
             if not (data.startswith(b"\x1b") and len(data) > 1):
                 self._waiting.extend(self._decoder.decode(data).replace(END, "q"))
         return self._waiting.popleft() if self._waiting else None
@@ -119,7 +118,7 @@ class _Windows:
 
 @contextmanager
 def keys() -> Iterator[KeySource]:
-    """Yield keys as they are pressed; the terminal is restored afterwards."""
+    """Yield a source of single key presses; restore the terminal afterwards."""
     if not sys.stdin.isatty():
         yield _Script()
     elif sys.platform == "win32":
@@ -134,44 +133,44 @@ def keys() -> Iterator[KeySource]:
             tty.setcbreak(fd)
             yield _Posix()
         finally:
-            with contextlib.suppress(termios.error):  # it may be gone
+            with contextlib.suppress(termios.error):  # the terminal may be closed
                 termios.tcsetattr(fd, termios.TCSADRAIN, before)
 
 
-class Held:
-    """Tells a key that is held down, and so comes again and again, from one that is pressed anew."""
+class KeyRepeatFilter:
+    """Detects the automatic repetition of a key that is held down."""
 
     def __init__(self) -> None:
         self._key: str | None = None
         self._at_s = float("-inf")
 
-    def again(self, key: str, at_s: float) -> bool:
-        """Return whether ``key``, pressed at ``at_s`` seconds, only repeats the last one while it is held."""
-        held = key == self._key and at_s - self._at_s < HELD_S.get(key.lower(), 0.0)
+    def repeats(self, key: str, at_s: float) -> bool:
+        """Return whether ``key`` at ``at_s`` seconds is the repetition of a key that is held down."""
+        repeated = key == self._key and at_s - self._at_s < REPEAT_S.get(key.lower(), 0.0)
         self._key, self._at_s = key, at_s
-        return held
+        return repeated
 
 
 @contextmanager
-def orderly_end() -> Iterator[None]:
-    """Have ``kill``, and a terminal that is closed, end the work as Ctrl-C does: in order, and only once."""
-    asked = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGBREAK") if hasattr(signal, name)]
-    # Who started it with nohup wants it to go on.
-    asked = [number for number in asked if signal.getsignal(number) is signal.SIG_DFL]
+def interrupt_on_signals() -> Iterator[None]:
+    """Raise KeyboardInterrupt once when the process is killed or its terminal is closed, as for Ctrl-C."""
+    handled = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGBREAK") if hasattr(signal, name)]
+    # A signal that is ignored already, as with nohup, stays ignored.
+    handled = [number for number in handled if signal.getsignal(number) is signal.SIG_DFL]
     if threading.current_thread() is not threading.main_thread():
-        asked = []
+        handled = []
 
     def end(number: int, frame: object) -> None:
-        for other in asked:
+        for other in handled:
             signal.signal(other, signal.SIG_IGN)
         raise KeyboardInterrupt
 
-    for number in asked:
+    for number in handled:
         signal.signal(number, end)
     try:
         yield
     finally:
-        for number in asked:
+        for number in handled:
             signal.signal(number, signal.SIG_DFL)
 
 
@@ -180,18 +179,18 @@ _REMIND_S = 20.0
 _WIDEST = 90
 
 KEYS = {
-    "idle": "SPACE start   s skip   r last one again   b back   p pause   n note   q quit",
+    "idle": "SPACE start   s skip   r redo the last   b back   p pause   n note   q quit",
     "countdown": "SPACE cancel",
-    "recording": "SPACE stop   r break off and make it again   p break off and pause   n note   q quit",
+    "recording": "SPACE stop   r cancel and repeat   p cancel and pause   n note   q quit",
     "saving": "",
-    "paused": "p go on   n note   q quit",
-    "finished": "q close   r last one again   b back   n note",
+    "paused": "p resume   n note   q quit",
+    "finished": "q close   r redo the last   b back   n note",
     "stopped": "",
 }
 
 
 def _state(s: RecorderStatus) -> tuple[str, str]:
-    """Return the line that says the state and the key to press, and its colour."""
+    """Return the line with the state and the key to press, and its colour."""
     if s.state == "idle":
         if s.signal == "none":
             return "WAITING FOR THE TOY: switch it on, bring it near", _RED
@@ -202,30 +201,30 @@ def _state(s: RecorderStatus) -> tuple[str, str]:
         return f"GET READY … {math.ceil(s.countdown_s)}", _BLUE
     if s.state == "recording":
         if s.away:
-            return f"RECORDING  {s.elapsed_s:4.1f} s   THE TOY IS AWAY: check cable and battery", _RED
+            return f"RECORDING  {s.elapsed_s:4.1f} s   TOY DISCONNECTED: check cable and battery", _RED
         if s.left_s < _REMIND_S and s.elapsed_s > _REMIND_S:
-            return f"STILL RECORDING  {s.elapsed_s:4.1f} s   SPACE stops; it ends by itself in {s.left_s:.0f} s", _RED
+            return f"STILL RECORDING  {s.elapsed_s:4.1f} s   SPACE stops; stops by itself in {s.left_s:.0f} s", _RED
         return f"RECORDING  {s.elapsed_s:4.1f} s   Press SPACE when the gesture is over", _GREEN
     if s.state == "saving":
         return "SAVING …", _BLUE
     if s.state == "paused":
-        return "PAUSED.  Press p to go on", _BLUE
+        return "PAUSED.  Press p to resume", _BLUE
     return ("ALL RECORDED.  Press q to close" if s.state == "finished" else "STOPPED"), _GREEN
 
 
-def _toy(s: RecorderStatus) -> list[tuple[str, str]]:
-    """Return two lines on the signal, each with its colour."""
+def _signal(s: RecorderStatus) -> list[tuple[str, str]]:
+    """Return the two lines about the signal, each with its colour."""
     words = {
         "good": ("good", ""),
-        "fair": ("fair: some readings are lost or spoilt; bring the toy nearer", ""),
-        "poor": ("POOR: many readings are lost or spoilt; bring the toy nearer, check its battery", _RED),
-        "none": ("NONE: the toy is silent", _RED),
-        "unreadable": ("UNREADABLE: lines come, but none is a frame", _RED),
+        "fair": ("fair: some readings are lost or damaged; bring the toy nearer", ""),
+        "poor": ("POOR: many readings are lost or damaged; bring the toy nearer, check its battery", _RED),
+        "none": ("NONE: the toy sends nothing", _RED),
+        "unreadable": ("UNREADABLE: the toy sends lines, but none is a frame", _RED),
     }
-    heard = f"   {s.rate_hz:.0f} readings a second" if s.rate_hz else ""
+    rate = f"   {s.rate_hz:.0f} readings a second" if s.rate_hz else ""
     text, colour = words[s.signal]
     return [
-        (f"Signal {text}{heard}", colour),
+        (f"Signal {text}{rate}", colour),
         (
             f"jitter {s.jitter_ms:.1f} ms   lost {s.lost}   unreadable {s.malformed}   out of range {s.garbage}   "
             f"gaps {s.gaps}   reconnected {s.reconnects}",
@@ -239,8 +238,8 @@ def lines(
 ) -> list[str]:
     """Return the screen as at most ``height`` lines, no wider than ``width``.
 
-    Where there is no room, what a session can be led without goes first: blank lines, rules, counters; what is to be
-    made, its state and the keys stay longest.
+    Where there is no room, lines of the highest rank are left out first: blank lines, rules, counters. The gesture, the
+    state and the keys are left out last.
     """
     out: list[tuple[int, str]] = []
 
@@ -256,7 +255,7 @@ def lines(
     put(6, _bar(s, width))
     put(8, "")
     if s.state not in ("finished", "stopped"):
-        again = "   (recorded; this makes it again)" if s.existing else ""
+        again = "   (recorded before; this one replaces it)" if s.existing else ""
         name = f"{_BOLD}{s.step.gesture[: max(1, width - 2)]}{_OFF}"
         out.append((0, f"  {name}   {s.step.repetition} of {s.repetitions}{again}"))
         put(8, "")
@@ -268,12 +267,12 @@ def lines(
     put(7, rule)
     if s.next_step is not None and s.state != "finished":
         put(5, f"Next  {s.next_step.gesture}, {s.next_step.repetition} of {s.repetitions}")
-    for rank, (text, colour) in zip((3, 6), _toy(s), strict=True):
+    for rank, (text, colour) in zip((3, 6), _signal(s), strict=True):
         put(rank, text, colour)
     if s.file:
         put(7, f"Last  {s.file}", _DIM)
     put(7, rule)
-    put(1, f"Note: {typing}▏   (Enter keeps it, Esc forgets it)" if typing is not None else KEYS[s.state])
+    put(1, f"Note: {typing}▏   (Enter saves it, Esc discards it)" if typing is not None else KEYS[s.state])
     while len(out) > max(1, height):
         worst = max(rank for rank, _ in out)
         del out[max(n for n, (rank, _) in enumerate(out) if rank == worst)]
@@ -286,39 +285,39 @@ def _bar(s: RecorderStatus, width: int) -> str:
 
 
 class Screen:
-    """Shows a recorder on standard error: redrawn in place on a terminal, else a line for every change."""
+    """Displays a recorder on standard error: redrawn in place on a terminal, else one line for each change."""
 
     def __init__(self, recorder: Recorder, title: str, notices: Sequence[str] = ()) -> None:
-        """Prepare a screen; ``notices`` stay visible all the time."""
+        """Prepare a screen; ``notices`` are always visible."""
         self._title = title
         self._notices = notices
         self._terminal = sys.stderr.isatty()
-        self._said = self._message = ""
-        # Told by the recorder's threads, written by the caller's: a log that nobody reads must hold up no frame.
+        self._line = self._message = ""
+        # The recorder's threads add messages and the caller's thread writes them: a blocked log must not delay a frame.
         self._messages: SimpleQueue[str] = SimpleQueue()
         if self._terminal:
             if sys.platform == "win32":
-                os.system("")  # wakes the console's escape sequences
-            # A screen of its own, no cursor, no wrapped lines.
+                os.system("")  # enables escape sequences in the console
+            # Alternate screen, no cursor, no wrapped lines.
             sys.stderr.write("\x1b[?1049h\x1b[?25l\x1b[?7l\x1b[2J")
         else:
-            recorder.subscribe(self._line)
+            recorder.subscribe(self._on_change)
 
     def draw(self, status: RecorderStatus, typing: str | None = None) -> None:
-        """Show this moment."""
+        """Draw the status; ``typing`` is an unfinished note."""
         self._write_messages()
         if self._terminal:
-            # Standard output may be a file: it is the screen's size that counts. Some terminals do not know theirs.
+            # Standard output may be a file. Some terminals report the size 0.
             size = os.get_terminal_size(sys.stderr.fileno())
             width, height = (size.columns or 80) - 1, (size.lines or 24) - 1
-            shown = lines(status, self._title, self._notices, typing, max(1, min(_WIDEST, width)), height)
-            sys.stderr.write("\x1b[H" + "".join(f"{line}\x1b[K\n" for line in shown) + "\x1b[J")
+            screen = lines(status, self._title, self._notices, typing, max(1, min(_WIDEST, width)), height)
+            sys.stderr.write("\x1b[H" + "".join(f"{line}\x1b[K\n" for line in screen) + "\x1b[J")
             sys.stderr.flush()
 
-    def _line(self, what: str, s: RecorderStatus) -> None:
-        """Return one change as a line for a log or a screen reader."""
+    def _on_change(self, what: str, s: RecorderStatus) -> None:
+        """Add a line for a change, for a log or a screen reader."""
         where = f"{s.step.gesture}, {s.step.repetition} of {s.repetitions}"
-        said = {
+        line = {
             "idle": f"{s.done} of {s.steps}. {where}: {s.step.prompt}",
             "countdown": f"countdown: {where}" if s.state == "countdown" else "",
             "recording": f"recording: {where}",
@@ -329,9 +328,9 @@ class Screen:
         }.get(what, "")
         if s.message and s.message != self._message:
             self._messages.put(s.message + "\n")
-        if said and said != self._said:
-            self._messages.put(said + "\n")
-            self._said = said
+        if line and line != self._line:
+            self._messages.put(line + "\n")
+            self._line = line
         self._message = s.message
 
     def _write_messages(self) -> None:
@@ -341,7 +340,7 @@ class Screen:
             sys.stderr.flush()
 
     def close(self) -> None:
-        """Write what is left, and give the terminal back as it was; nothing to do for one that is gone."""
+        """Write the remaining messages and restore the terminal; a closed terminal is ignored."""
         with contextlib.suppress(OSError):
             self._write_messages()
         if self._terminal:

@@ -7,29 +7,27 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from plushsense.cli.evaluate import figure
-from plushsense.cli.output import emit
-from plushsense.cli.settings import add_settings, report_epochs, settings, warn
+from plushsense.cli.output import emit, figure, warn
+from plushsense.cli.settings import add_settings, report_epochs, settings
 from plushsense.core.errors import ConfigError
 
 
 def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("dataset", metavar="DATASET", help="data set folder")
-    parser.add_argument("--out", metavar="FILE", default="model.plush", help="the bundle to write (model.plush)")
-    parser.add_argument("--force", action="store_true", help="replace a bundle that is already there")
+    parser.add_argument("--out", metavar="FILE", default="model.plush", help="bundle to write (model.plush)")
+    parser.add_argument("--force", action="store_true", help="replace an existing bundle")
     parser.add_argument(
         "--quantize-aware",
         type=int,
         default=0,
         metavar="EPOCHS",
-        help="fine-tune for 8 bits after the training, for so many epochs (default 0: off; training says when it "
-        "would be worth it)",
+        help="fine-tune for 8 bits for this many epochs after the training (0); training reports where it would help",
     )
     parser.add_argument(
         "--no-fit-decisions",
         dest="fit_decisions",
         action="store_false",
-        help="leave out how decisions are made: the default settings instead of those that suit the people held back",
+        help="use the default decision settings instead of fitting them on the validation people",
     )
     add_settings(parser)
 
@@ -38,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
     from plushsense.workflow.api import train, unfinished
 
     if Path(args.out).exists() and not args.force:
-        raise ConfigError(f"'{args.out}' is already there: choose another --out, or --force to replace it.")
+        raise ConfigError(f"'{args.out}' is already there: choose another --out, or replace it with --force.")
     done = train(
         args.dataset,
         settings(args),
@@ -54,12 +52,7 @@ def run(args: argparse.Namespace) -> int:
     mark = "  [SIMULATION]" if scores["simulated"] else ""
     emit(
         args,
-        {
-            "bundle": str(bundle),
-            "history": done.history,
-            "scores": scores,
-            "decision": done.bundle.decision,
-        },
+        {"bundle": str(bundle), "history": done.history, "scores": scores, "decision": done.bundle.decision},
         [
             f"{bundle}: {done.bundle.arch.symbol}, {done.bundle.arch.parameters:,} parameters, "
             f"epoch {scores['best_epoch']} of {len(done.history)} kept{mark}",
@@ -86,14 +79,14 @@ def decided(decision: Mapping[str, Any]) -> list[str]:
         return []
     people = "1 person" if fitted["people"] == 1 else f"{fitted['people']} people"
     events, answers = fitted["events"], fitted.get("answers")
-    said = f"Decisions fitted on {people} who {'was' if fitted['people'] == 1 else 'were'} held back"
+    text = f"Decisions fitted on {people} who {'was' if fitted['people'] == 1 else 'were'} held back"
     if "cost" in events:
-        said += f" ({fitted['gestures']} gestures in {60 * fitted['hours']:.0f} min of streams): an event's cost "
-        said += f"{figure(events['cost_before'])} with the defaults, "
-        said += f"{figure(events['cost'])} now" if events["moved"] else "and nothing was found that is surely better"
+        text += f" ({fitted['gestures']} gestures in {60 * fitted['hours']:.0f} min of streams): an event's cost "
+        text += f"{figure(events['cost_before'])} with the defaults, "
+        text += f"{figure(events['cost'])} now" if events["moved"] else "and no settings are reliably better"
     else:
-        said += "; no stream of theirs, so events keep the defaults"
-    out = [said + "."]
+        text += "; they have no streams, so events keep the defaults"
+    out = [text + "."]
     gate = fitted.get("gate")
     if gate:
         out.append(_gate(gate))
@@ -106,12 +99,12 @@ def decided(decision: Mapping[str, Any]) -> list[str]:
 
 
 def _gate(gate: Mapping[str, Any]) -> str:
-    """Format what the gate's fit found on its people, or why there is no gate."""
+    """Format the scores of the fitted gate, or the reason why there is none."""
     if "reason" in gate:
         return f"No gate for energetic gestures: {gate['reason']}."
     false = gate["false_alarms_per_hour"]
-    often = "" if false is None else f", with {false:.1f} false alarms an hour"
+    alarms = "" if false is None else f", with {false:.1f} false alarms an hour"
     return (
-        f"Gate fitted on {gate['people']} people: it notices {100 * gate['recall']:.0f} % of their "
-        f"{gate['recordings']} energetic recordings{often}."
+        f"Gate fitted on {gate['people']} people: it detects {100 * gate['recall']:.0f} % of their "
+        f"{gate['recordings']} energetic recordings{alarms}."
     )

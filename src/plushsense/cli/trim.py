@@ -12,42 +12,38 @@ from plushsense.jobs.progress import ProgressReporter
 if TYPE_CHECKING:
     from plushsense.dataset.trimming import TrimResult
 
-LINES = 20
+_LINES = 20
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("dataset", metavar="DATASET", help="data set folder")
-    parser.add_argument(
-        "--only", metavar="GLOB", default="*", help="recordings to show, draw and accept, as 'P01/*' (default: all)"
+    repeated: dict[str, Any] = {"action": "append", "default": []}
+    add = parser.add_argument
+    add("dataset", metavar="DATASET", help="data set folder")
+    add(
+        "--only",
+        metavar="GLOB",
+        default="*",
+        help="recordings to list, plot and accept: 'P01/*' (default: all)",
     )
-    parser.add_argument(
-        "--accept", action="append", default=[], metavar="ID|GLOB", help="mark what is suggested for these; repeatable"
-    )
-    parser.add_argument(
-        "--accept-above", type=float, metavar="C", help="mark every suggestion of at least this confidence, 0 to 1"
-    )
-    parser.add_argument(
+    add("--accept", **repeated, metavar="ID|GLOB", help="mark the suggestions for these recordings; can be repeated")
+    add("--accept-above", type=float, metavar="C", help="mark all suggestions of at least this confidence, 0 to 1")
+    add(
         "--set",
         nargs=2,
-        action="append",
-        default=[],
+        **repeated,
         metavar=("ID", "FROM:TO"),
-        help="keep these seconds of one recording, as 0.35:2.1, 0.35: or :2.1; repeatable",
+        help="keep these seconds of one recording, such as 0.35:2.1, 0.35: or :2.1; can be repeated",
     )
-    parser.add_argument(
-        "--undo", action="append", default=[], metavar="ID|GLOB", help="take these marks back; repeatable"
-    )
-    parser.add_argument(
+    add("--undo", **repeated, metavar="ID|GLOB", help="remove the marks of these recordings; can be repeated")
+    add(
         "--offset",
         action=argparse.BooleanOptionalAction,
         default=False,
-        help="accept the suggested end too (default: the start alone, as in the paper)",
+        help="accept the suggested end too (default: only the start, as in the paper)",
     )
-    parser.add_argument("--who", metavar="NAME", help="who decides, kept in the mark (default: the login name)")
-    parser.add_argument("--why", default="", metavar="TEXT", help="why, kept in the mark (default: nothing)")
-    parser.add_argument(
-        "--plot", metavar="FILE.png|DIR", help="draw recordings, the least sure first: one page, or all into a folder"
-    )
+    add("--who", metavar="NAME", help="person who decides, stored with the mark (default: login name)")
+    add("--why", default="", metavar="TEXT", help="reason, stored with the mark")
+    add("--plot", metavar="FILE.png|DIR", help="plot recordings, least confident first: one page, or all into a folder")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -75,12 +71,12 @@ def run(args: argparse.Namespace) -> int:
 
         least_sure_first = sorted(result.trims, key=lambda t: t.suggestion.onset_confidence)
         drawn = save_trims(result.dataset, least_sure_first, Path(args.plot), args.offset)
-    _tell(args, result, drawn)
+    _print(args, result, drawn)
     return 0
 
 
 def _decides(args: argparse.Namespace) -> bool:
-    """Return whether the options ask for marks rather than a look."""
+    """Return whether the options change marks."""
     return bool(args.accept or args.set or args.undo) or args.accept_above is not None
 
 
@@ -96,7 +92,7 @@ def _seconds(text: str) -> tuple[float | None, float | None]:
         raise ConfigError(f"--set was given '{text}': seconds as FROM:TO are accepted, such as 0.35:2.1.") from None
 
 
-def _tell(args: argparse.Namespace, done: TrimResult, drawn: list[Path]) -> None:
+def _print(args: argparse.Namespace, done: TrimResult, drawn: list[Path]) -> None:
     accepted, states = done.accepted, done.states
     result: dict[str, Any] = {
         "recordings": [t.to_dict(args.offset) for t in done.trims],
@@ -109,7 +105,7 @@ def _tell(args: argparse.Namespace, done: TrimResult, drawn: list[Path]) -> None
         "undone": list(done.undone),
         "plots": [str(path) for path in drawn],
     }
-    # After a decision, what it changed; the rest was shown when it was made.
+    # After a decision only the changed recordings are listed.
     decided = _decides(args)
     rows = [
         (
@@ -125,17 +121,17 @@ def _tell(args: argparse.Namespace, done: TrimResult, drawn: list[Path]) -> None
         if not decided or r["recording"] in done.changed
     ]
     if not args.json and (args.accept or args.accept_above is not None):
-        less_sure = " or not sure enough" if args.accept_above else ""
+        below = " or below the confidence" if args.accept_above else ""
         say(
-            f"accepted {len(accepted.marked)}, already so {len(accepted.already)}, "
-            f"no visible onset{less_sure} {len(accepted.not_visible)}, "
+            f"accepted {len(accepted.marked)}, accepted before {len(accepted.already)}, "
+            f"no visible onset{below} {len(accepted.not_visible)}, "
             f"kept as set by hand {len(accepted.kept_by_hand)}"
         )
     if not args.json and args.set:
-        say(f"adjusted {len(done.adjusted)}, already so {len(args.set) - len(done.adjusted)}")
+        say(f"adjusted {len(done.adjusted)}, unchanged {len(args.set) - len(done.adjusted)}")
     if not args.json and args.undo:
         say(f"undone {len(done.undone)}")
     counts = ", ".join(f"{n} {state}" for state, n in sorted(states.items()))
     head = ("recording", "rows", "start s", "stop s", "confidence", "state", "note")
-    shown = [] if decided and not 0 < len(rows) <= LINES else [table(head, rows), ""]
-    emit(args, result, [*shown, f"{len(done.trims)} recordings{': ' if counts else ''}{counts}", *map(str, drawn)])
+    listing = [] if decided and not 0 < len(rows) <= _LINES else [table(head, rows), ""]
+    emit(args, result, [*listing, f"{len(done.trims)} recordings{': ' if counts else ''}{counts}", *map(str, drawn)])

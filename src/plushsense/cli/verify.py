@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from plushsense.cli.output import emit, table
-from plushsense.cli.settings import listed, warn
+from plushsense.cli.output import emit, table, warn
+from plushsense.cli.settings import listed
 from plushsense.core.errors import ConfigError
 from plushsense.jobs.progress import ProgressReporter
 
@@ -19,37 +19,29 @@ _SAMPLES = 100_000
 def add(parser: argparse.ArgumentParser) -> None:
     from plushsense.deploy.targets import TARGETS
 
-    parser.add_argument("export", metavar="OUT", help="export folder, as plushsense export leaves it")
-    parser.add_argument(
+    repeated: dict[str, Any] = {"action": "append", "default": []}
+    add = parser.add_argument
+    add("export", metavar="OUT", help="folder written by plushsense export")
+    add(
         "--target",
         metavar="NAME",
-        action="append",
-        default=[],
-        help=f"{', '.join(TARGETS)}; several with commas (default: all whose compilers and emulators are installed "
-        "here)",
+        **repeated,
+        help=f"{', '.join(TARGETS)}; several joined by commas (default: all with installed compilers and emulators)",
     )
-    parser.add_argument(
-        "--dataset", metavar="DS", help="also stream these recordings through the C; nothing of them is kept"
-    )
-    parser.add_argument(
-        "--subject", metavar="CODE", action="append", default=[], help="only this person of DS; several with commas"
-    )
-    parser.add_argument(
+    add("--dataset", metavar="DS", help="also stream these recordings through the C; nothing of them is stored")
+    add("--subject", metavar="CODE", **repeated, help="only these people of DS; several joined by commas")
+    add(
         "--samples",
         metavar="N",
         type=int,
-        help=f"samples to stream besides the golden vectors: of DS ({_SAMPLES:,}), or made up (default: none)",
+        help=f"samples to stream besides the golden vectors: of DS ({_SAMPLES:,}), else synthetic (default: none)",
     )
-    parser.add_argument(
-        "--faults",
-        action="store_true",
-        help="also apply mutants (deliberate errors), one at a time; each must be detected (minutes)",
-    )
-    parser.add_argument(
+    add("--faults", action="store_true", help="also test that deliberate errors (mutants) are detected; takes minutes")
+    add(
         "--trust",
         action="store_true",
-        help="compile and run C that is not what this version writes, as it is in OUT; it can do whatever you can on "
-        "this computer, and the result says that it is not ours (default: such an export is refused)",
+        help="compile and run C files that this version would not write (default: refuse them); they can do whatever "
+        "you can on this computer, and the result says that they are not ours",
     )
 
 
@@ -65,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
         raise ConfigError(f"--samples is {args.samples}: give 1 or more.")
     export = Export(args.export)
     if changed := changed_copies(export.folder):
-        warn(f"only the originals are proved, and these copies of them were changed: {', '.join(changed)}")
+        warn(f"only the originals are verified; these copies of them were changed: {', '.join(changed)}")
     if args.dataset:
         vectors = export.recorded(open_dataset(args.dataset), listed(*args.subject), args.samples or _SAMPLES)
         if args.samples and sum(v.samples for v in vectors) < args.samples:
@@ -96,7 +88,7 @@ def _text(done: VerificationReport) -> list[str]:
             by_mutant.setdefault((m.kind, m.name), {})[m.target] = (
                 "caught" if m.caught else "not shown" if m.silent else "NOT CAUGHT"
             )
-        outcomes = [(*mutant, *(found.get(t, "") for t in targets)) for mutant, found in by_mutant.items()]
+        outcomes = [(*mutant, *(row.get(t, "") for t in targets)) for mutant, row in by_mutant.items()]
         lines += ["", table(("kind", "mutant", *targets), outcomes)]
         if any(m.silent for m in done.mutants):
             lines += ["", "not shown: no test scenario of this network depends on that line of the rules."]
@@ -105,7 +97,7 @@ def _text(done: VerificationReport) -> list[str]:
     elif done.passed:
         lines += ["", "Every number of every answer is equal."]
     elif not done.decisions:
-        lines += ["", "Nothing is proven: in none of the answers the toy had stopped warming. Export the model again."]
+        lines += ["", "Nothing is proven: the toy was still warming up in all answers. Export the model again."]
     else:
         lines += ["", "A mutant was not detected: the golden vectors of this export are too weak for it."]
     if not done.own:

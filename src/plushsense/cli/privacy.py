@@ -1,0 +1,122 @@
+"""``plushsense pseudonymise DATASET OUT --key FILE`` and ``plushsense forget DATASET SUBJECT [--yes]``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from plushsense.cli.output import emit, say
+from plushsense.core.errors import ConfigError
+from plushsense.jobs.progress import ProgressReporter
+
+if TYPE_CHECKING:
+    from plushsense.workflow.datasets import Forgotten
+
+_MOST_FILES = 10
+
+
+def add_pseudonymise(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("dataset", metavar="DATASET", help="data set folder; it is not changed")
+    parser.add_argument("out", metavar="OUT", help="new or empty folder for the copy")
+    parser.add_argument(
+        "--key",
+        required=True,
+        metavar="FILE",
+        help="CSV file of people and codes, outside of both data sets; an existing one is extended",
+    )
+    parser.add_argument("--words", metavar="FILE", help="file of words, one a line, that the copy must not contain")
+    parser.add_argument("--drop-notes", action="store_true", help="leave out notes and reasons in free text")
+
+
+def run_pseudonymise(args: argparse.Namespace) -> int:
+    from plushsense.dataset.privacy.pseudonymise import pseudonymise
+
+    words: list[str] = []
+    if args.words:
+        try:
+            words = Path(args.words).read_text(encoding="utf-8-sig").splitlines()
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigError(f"--words '{args.words}' cannot be read ({error}): give a text file in UTF-8.") from None
+    done = pseudonymise(
+        args.dataset,
+        args.out,
+        key=args.key,
+        words=words,
+        drop_notes=args.drop_notes,
+        progress=ProgressReporter("rewriting"),
+    )
+    result = done.to_dict()
+    if not args.json:
+        for finding in done.findings:
+            where = f"{finding['file']}{':' + str(finding['line']) if finding['line'] else ''}: "
+            say(f"finding: {where if finding['file'] else ''}{finding['message']}")
+    emit(
+        args,
+        result,
+        f"{args.out}: {result['recordings']} recordings of {result['subjects']} people under pseudonyms, "
+        f"{result['files']} files; {len(done.findings)} findings to read.\n"
+        f"The key is {args.key}: store it apart from the data, and never publish it.",
+    )
+    return 0
+
+
+def add_forget(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("dataset", metavar="DATASET", help="data set folder")
+    parser.add_argument("subject", metavar="SUBJECT", help="code of the person")
+    parser.add_argument("--yes", action="store_true", help="remove; without it only list what would go (status 1)")
+    parser.add_argument(
+        "--bundles",
+        action="append",
+        default=[],
+        metavar="DIR",
+        help="also search this folder for models trained on the person; can be repeated",
+    )
+
+
+def run_forget(args: argparse.Namespace) -> int:
+    from plushsense.workflow.datasets import forget
+
+    result = forget(args.dataset, args.subject, bundles=args.bundles)
+    confirmed = args.yes or (not args.json and sys.stdin.isatty() and _confirm(result, args.subject))
+    if confirmed:
+        result = forget(args.dataset, args.subject, confirm=True, bundles=args.bundles)
+    emit(args, result.to_dict(), _removal_lines(result))
+    if not confirmed:
+        say(f"plushsense: nothing was removed; to do it:  plushsense forget {args.dataset} {args.subject} --yes")
+    return 0 if confirmed else 1
+
+
+def _confirm(result: Forgotten, subject: str) -> bool:
+    say("\n".join(_removal_lines(result)))
+    say(f"This cannot be undone. To continue, type the person's code ({subject}):")
+    return sys.stdin.readline().strip() == subject
+
+
+def _removal_lines(result: Forgotten) -> list[str]:
+    plan = result.plan
+    lines = []
+    if plan.absent:
+        lines.append(
+            f"'{plan.subject}' is not in the data set (check the code; codes of removed people are not kept); only "
+            "files that may be derived from the person are listed:"
+        )
+    lines.append(
+        f"{'removed' if result.done else 'to remove'}: {len(plan.files)} files of '{plan.subject}' ({plan.raw} raw), "
+        f"{plan.marks} marks, {'their line in the people table, ' if plan.listed else ''}{len(plan.caches)} caches, "
+        f"{len(plan.evaluations)} evaluations, {len(plan.leftovers)} unfinished leftovers"
+    )
+    paths = [*plan.files[:_MOST_FILES], *plan.caches, *plan.evaluations, *plan.leftovers]
+    lines += [f"  {path}" for path in paths]
+    if len(plan.files) > _MOST_FILES:
+        lines.append(f"  … and {len(plan.files) - _MOST_FILES} more files")
+    lines += [f"still contains the code, check it: {path}" for path in plan.mentions]
+    lines += [f"bundle: {b.bundle}: {b.message}" for b in result.bundles]
+    if plan.published:
+        lines.append(f"published as https://doi.org/{plan.published}: publish a new version without them")
+    lines.append(
+        "Out of reach: backups, published copies, copies under pseudonyms and their key, evaluations and models kept "
+        "elsewhere. docs/privacy.md says what to do about them."
+    )
+    return lines
