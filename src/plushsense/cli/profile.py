@@ -88,7 +88,7 @@ def _counts(profile: Profile) -> list[str]:
     ]
     window, times = profile.window_instructions, profile.arch.macs_per_window / profile.arch.macs_per_step
     again = (
-        f"Recomputing the whole span of {profile.arch.span} samples at every step takes {profile.arch.macs_per_window:,} "
+        f"Recomputing all {profile.arch.span} samples of the span at every step takes {profile.arch.macs_per_window:,} "
         f"MACs, {times:.0f} times as many; with the same instructions for each MAC about "
         + ", ".join(f"{window[c.target] / 1e6:.1f} M on {c.target}" for c in costs)
         + " (estimate)."

@@ -1,4 +1,4 @@
-"""Text documents from Jinja templates that lie beside the code which fills them."""
+"""Fill Jinja templates that are stored beside the code which uses them; base installs have jinja2."""
 
 from __future__ import annotations
 
@@ -9,28 +9,35 @@ from typing import Any
 
 
 def fill_text(package: str, template: str, **values: Any) -> str:
-    """Fill the template of a text document; values are inserted as they are.
+    """Fill the template of a text document; values are inserted unchanged.
 
     Filters: ``cell`` (of a Markdown table), ``c_comment`` (see `c_comment`), ``json``.
 
     Args:
-        package: the package whose folder holds ``template`` and the templates that it includes.
+        package: the package whose folder contains ``template`` and the templates that it includes.
     """
     text: str = _environment(package).get_template(template).render(**values)
     return text
 
 
+def fill_html(package: str, template: str, **values: Any) -> str:
+    """Fill the template of an HTML page as `fill_text` does; values are escaped."""
+    page: str = _environment(package, html=True).get_template(template).render(**values)
+    return page
+
+
 @cache
-def _environment(package: str) -> Any:
+def _environment(package: str, html: bool = False) -> Any:
     import jinja2
 
     folder = resources.files(package)
     environment = jinja2.Environment(
         loader=jinja2.FunctionLoader(lambda name: folder.joinpath(name).read_text(encoding="utf-8")),
+        autoescape=html,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
-        keep_trailing_newline=True,
+        keep_trailing_newline=not html,
     )
     environment.filters["cell"] = lambda text: text.replace("|", "\\|").replace("\n", " ")
     environment.filters["c_comment"] = c_comment

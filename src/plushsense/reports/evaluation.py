@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -17,37 +18,19 @@ from plushsense.scoring.metrics import METRICS, column_metrics
 AFFECT_MARKS = {"positive": "+ positive", "neutral": "o neutral", "negative": "− negative", "none": "none"}
 
 
-def write_evaluation_report(
-    path: str | Path,
-    *,
-    title: str,
-    dataset: Mapping[str, Any],
-    evaluations: Sequence[Mapping[str, Any]],
-    models: Sequence[Mapping[str, Any]],
-    simulated: bool,
-) -> Path:
-    """Write one self-contained HTML report and return its path; an older report is replaced in one step.
+def write_evaluation_report(path: str | Path, **content: Any) -> Path:
+    """Write one self-contained HTML report and return its path; an earlier report is replaced in one step.
 
     Args:
-        path: the .html file to write; its folder is made.
-        title: the heading of the page.
-        dataset: name, subjects, recordings, gestures, streams, layout, licence, hash, warnings (numbers or
-            lists).
-        evaluations: ``Evaluation.to_dict()`` each; ``title`` and ``model`` may be added to name it, ``simulated``
-            and ``dataset`` (name, hash) to say what it was made on.
-        models: one model card each (symbol, filters, …, provenance); ``title`` may be added.
-        simulated: whether the data set is a simulation. It, or any evaluation or model that says so, puts a
-            banner on top; every table of simulated scores is marked.
-
-    Every key may be missing: the report prints a dash. All texts are escaped.
+        path: the .html file to write; its folder is created.
+        content: the arguments of `render`.
 
     Raises:
-        ConfigError: when the file cannot be written, or exists and is no report.
+        ConfigError: when the file cannot be written, or exists and is not a report.
         MissingExtraError: when jinja2 or matplotlib is not installed.
     """
     target = check_page_path(path)
-    page = render(title=title, dataset=dataset, evaluations=evaluations, models=models, simulated=simulated)
-    return write_page(target, page)
+    return write_page(target, render(**content))
 
 
 def render(
@@ -58,7 +41,17 @@ def render(
     models: Sequence[Mapping[str, Any]],
     simulated: bool,
 ) -> str:
-    """Return the report as one HTML text; arguments as for `write_evaluation_report`."""
+    """Return the report as HTML. Every key of the mappings may be missing: the report then prints a dash.
+
+    Args:
+        title: heading of the page.
+        dataset: name, subjects, recordings, gestures, streams, layout, licence, hash, warnings (numbers or lists).
+        evaluations: ``Evaluation.to_dict()`` of each; optional ``title`` and ``model`` name it, ``simulated`` and
+            ``dataset`` (name, hash) describe its data.
+        models: a model card of each (symbol, filters, …, provenance, optional ``title``).
+        simulated: whether the data set is a simulation. A banner is printed if it, an evaluation or a model is
+            simulated.
+    """
     named = [
         {
             **evaluation,
@@ -69,7 +62,7 @@ def render(
         for evaluation in evaluations
     ]
     cards = [_model(model) for model in models]
-    # Where all scores are simulated, one banner says so; otherwise every simulated row bears a mark.
+    # Where all scores are simulated, the banner is enough; otherwise every simulated row is marked.
     wholly = simulated and all(evaluation["simulated"] for evaluation in named)
     any_simulated = simulated or any(part["simulated"] for part in (*named, *cards))
     return render_page(
@@ -91,7 +84,7 @@ def render(
 
 
 def _evaluation(key: str, evaluation: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values of one evaluation in the template."""
+    """Return the template's values for one evaluation."""
     nobody = evaluation.get("nobody")
     histories = [history for history in evaluation.get("histories") or () if history]
     return {
@@ -105,9 +98,8 @@ def _evaluation(key: str, evaluation: Mapping[str, Any]) -> dict[str, Any]:
         "metrics": metric_table(evaluation),
         "contexts": context_table(evaluation),
         "deployed": deployed_values(evaluation),
-        "nobody": None
-        if not nobody
-        else {name: count(nobody.get(name)) for name in ("recordings", "windows")}
+        "nobody": nobody
+        and {name: count(nobody.get(name)) for name in ("recordings", "windows")}
         | {"accuracy": number(nobody.get("accuracy"))},
         "classes": class_rows(evaluation),
         "confusions": [
@@ -159,7 +151,7 @@ def comparison_rows(evaluations: Sequence[Mapping[str, Any]]) -> list[dict[str, 
 
 
 def metric_table(evaluation: Mapping[str, Any]) -> Table:
-    """Return one row for each metric; the mean over all classes, as the paper has it, is always over folds."""
+    """Return one row for each metric. The mean over all classes, as in the paper, is always over folds."""
     names = {key: f"{m.title} ({m.note})" if m.note else m.title for key, m in METRICS.items()}
     folds = wording.count_of(evaluation, "folds")
     names["macro_f1_all_classes"] = f"Macro-F1, all classes (as the paper), over {folds}"
@@ -186,7 +178,7 @@ def metric_table(evaluation: Mapping[str, Any]) -> Table:
 
 
 def context_table(evaluation: Mapping[str, Any]) -> Table | None:
-    """Return one row for each kind of context among the scored windows; None where it is not known."""
+    """Return one row for each kind of context among the scored windows; None where unknown."""
     columns = (
         Column("context", "Context of the window"),
         Column("windows", "Windows", "count"),
@@ -202,10 +194,10 @@ def context_table(evaluation: Mapping[str, Any]) -> Table | None:
 
 def deployed_values(evaluation: Mapping[str, Any]) -> dict[str, Any] | None:
     """Return the scores of the 8-bit networks, means and a table by person or fold; None where not evaluated."""
-    found = evaluation.get("int8")
-    if not isinstance(found, Mapping):
+    int8 = evaluation.get("int8")
+    if not isinstance(int8, Mapping):
         return None
-    unit = "subject" if found.get("over") == "subjects" else "fold"
+    unit = "subject" if int8.get("over") == "subjects" else "fold"
     columns = (
         Column(unit, "Person" if unit == "subject" else "Fold"),
         *(
@@ -216,13 +208,13 @@ def deployed_values(evaluation: Mapping[str, Any]) -> dict[str, Any] | None:
         Column("macro_f1_loss", "Macro-F1\nlost", "share"),
         Column("agreement", "Same\nanswer", "share"),
     )
-    loss = found.get("loss") or {}
+    loss = int8.get("loss") or {}
     return {
-        "table": Table("deployed", "Deployed in 8 bits", columns, tuple(found["rows"])),
-        "macro_f1": mean_sd(found.get("macro_f1")),
+        "table": Table("deployed", "Deployed in 8 bits", columns, tuple(int8["rows"])),
+        "macro_f1": mean_sd(int8.get("macro_f1")),
         "loss": mean_sd(loss.get("macro_f1")),
         "interval": interval(loss.get("macro_f1")),
-        "agreement": number(found.get("agreement")),
+        "agreement": number(int8.get("agreement")),
     }
 
 
@@ -244,12 +236,7 @@ def subject_rows(evaluations: Sequence[Mapping[str, Any]]) -> list[dict[str, Any
 
 def _natural(name: str) -> tuple[tuple[int, int, str], ...]:
     """Return a sort key that puts P2 before P10."""
-    pieces: list[str] = []
-    for letter in name:
-        if pieces and pieces[-1][-1].isdecimal() == letter.isdecimal():
-            pieces[-1] += letter
-        else:
-            pieces.append(letter)
+    pieces = ("".join(letters) for _, letters in groupby(name, str.isdecimal))
     return tuple((0, int(p), "") if p.isdecimal() else (1, 0, p) for p in pieces)
 
 
@@ -270,7 +257,7 @@ def class_rows(evaluation: Mapping[str, Any]) -> list[dict[str, str]]:
 
 
 def confusion_rows(confusion: Any) -> dict[str, Any] | None:
-    """Return a confusion matrix ({labels, counts}) as rows of cells with count, percent and shade; None without one."""
+    """Return the rows of a confusion matrix ({labels, counts}) with count, percent and shade; None without one."""
     if not isinstance(confusion, Mapping) or not confusion.get("labels"):
         return None
     labels = [str(label) for label in confusion["labels"]]
@@ -279,26 +266,22 @@ def confusion_rows(confusion: Any) -> dict[str, Any] | None:
         return None
     rows = []
     for i, share in enumerate(row_shares(counts)):
-        cells = []
-        for j, part in enumerate(share):
-            background, ink = shade(float(part))
-            title = f"{labels[i]} read as {labels[j]}: {int(counts[i, j])} windows, {100 * part:.1f} %"
-            cells.append(
-                {
-                    "count": count(int(counts[i, j])) if counts[i, j] else "·",
-                    "percent": f"{100 * part:.0f}" if part >= 0.005 else "<1",
-                    "bg": background,
-                    "ink": ink,
-                    "right": i == j,
-                    "title": title,
-                }
-            )
+        cells = [
+            {
+                "count": count(int(counts[i, j])) if counts[i, j] else "·",
+                "percent": f"{100 * part:.0f}" if part >= 0.005 else "<1",
+                **dict(zip(("bg", "ink"), shade(float(part)), strict=True)),
+                "right": i == j,
+                "title": f"{labels[i]} read as {labels[j]}: {int(counts[i, j])} windows, {100 * part:.1f} %",
+            }
+            for j, part in enumerate(share)
+        ]
         rows.append({"label": labels[i], "cells": cells, "total": count(int(counts[i].sum()))})
     return {"labels": labels, "rows": rows}
 
 
 def dataset_rows(dataset: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return the data set as (name, value) pairs: the known keys in order, then the others as they are."""
+    """Return the data set as (name, value) pairs: the known keys in order, then all others."""
     gestures = dataset.get("gestures")
     named = f" ({text(gestures)})" if isinstance(gestures, Sequence) and not isinstance(gestures, str) else ""
     rows = [
@@ -312,8 +295,7 @@ def dataset_rows(dataset: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("Hash (SHA-256)", text(dataset.get("hash"))),
         ("Warnings at import", count(dataset.get("warnings"))),
     ]
-    known = {"name", "subjects", "people", "recordings", "gestures", "streams"}
-    known |= {"layout", "licence", "hash", "warnings"}
+    known = {"name", "subjects", "people", "recordings", "gestures", "streams", "layout", "licence", "hash", "warnings"}
     return rows + [
         (key.replace("_", " ").capitalize(), text(value)) for key, value in dataset.items() if key not in known
     ]
@@ -348,9 +330,13 @@ def model_rows(model: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("Multiply-accumulates a step", count(model.get("macs_per_step"))),
         ("State on the chip (int8)", count(state, "bytes") if state else DASH),
     ]
+    # The main keys come first; without any hash, the page has a dash for it.
+    hash_key = "data_hash" if "data_hash" in provenance else "dataset_hash"
+    first = ["dataset", hash_key, "subjects", "preset", "code_version"]
+    others = [key for key in provenance if key not in first and key != "scores"]
     return rows + [
         (_PROVENANCE.get(key, key.replace("_", " ").capitalize()), _provenance(provenance.get(key)))
-        for key in _provenance_keys(provenance)
+        for key in first + others
     ]
 
 
@@ -362,13 +348,6 @@ _PROVENANCE = {
     "preset": "Training preset",
     "code_version": "Code version",
 }
-
-
-def _provenance_keys(provenance: Mapping[str, Any]) -> list[str]:
-    """Return provenance keys: the known ones first (data, people, preset, code), then the others as they are."""
-    hash_key = "data_hash" if "data_hash" in provenance else "dataset_hash"
-    first = ["dataset", hash_key, "subjects", "preset", "code_version"]
-    return first + [key for key in provenance if key not in first and key != "scores"]
 
 
 def _provenance(value: Any) -> str:

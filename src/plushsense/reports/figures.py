@@ -1,4 +1,7 @@
-"""Figures that several reports share: confusion matrix and training curves; their formats, and shades for tables."""
+"""Figures that several reports share, their file formats, shades for tables, and labels of points.
+
+Labels are placed here and not by adjustText, which needs SciPy, may leave overlaps and cannot leave a label out.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import base64
 import io
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +18,9 @@ from numpy.typing import NDArray
 from plushsense.core.errors import ConfigError, need
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.transforms import Bbox
 
 # Okabe and Ito's blue and vermillion, told apart with any colour vision; the line style says the same.
 _TRAIN, _VALIDATION = ("#0072b2", "-", "training"), ("#d55e00", "--", "validation")
@@ -194,3 +200,103 @@ def row_shares(counts: NDArray[Any]) -> NDArray[np.float64]:
     shares = np.zeros_like(table)
     np.divide(table, totals, out=shares, where=totals > 0)
     return shares
+
+
+_DISTANCES_PT = (9.0, 14.0, 22.0, 32.0, 44.0, 58.0, 74.0, 92.0, 112.0)
+_DIRECTIONS = tuple((float(np.cos(a)), float(np.sin(a))) for a in np.arange(16) * np.pi / 8)
+_POINT_PT = 6.5
+_NEAR_PT = 10.0
+_GAP_PT = 2.5
+
+
+@dataclass(frozen=True)
+class LabelledPoint:
+    """A point in data coordinates; one without a label is only not to be covered."""
+
+    x: float
+    y: float
+    label: str
+
+
+def place_labels(
+    figure: Figure,
+    axes: Axes,
+    points: Sequence[LabelledPoint],
+    *,
+    avoid: Sequence[tuple[float, float, float, float]] = (),
+    size: float = 7.5,
+) -> None:
+    """Write labels beside their points, at the nearest place that covers neither a point nor a label.
+
+    A thin line connects a distant label with its point. A label without a free place is left out; the table beside the
+    figure contains it.
+
+    Args:
+        avoid: straight lines in data coordinates (left, bottom, right, top) that no label may cover.
+        size: font size in points.
+    """
+    from matplotlib.transforms import Bbox
+
+    # Positions in pixels are known only after the layout.
+    figure.draw_without_rendering()
+    pixel = figure.dpi / 72
+    at = axes.transData.transform([(p.x, p.y) for p in points]) if points else np.empty((0, 2))
+    taken = [Bbox.from_bounds(x, y, 0, 0).padded(_POINT_PT * pixel) for x, y in at]
+    for left, bottom, right, top in avoid:
+        taken.append(Bbox(axes.transData.transform([(left, bottom), (right, top)])).padded(pixel))
+    inside = axes.get_window_extent()
+    for (x, y), point in zip(at, points, strict=True):
+        if not point.label:
+            continue
+        text = axes.annotate(
+            point.label,
+            (point.x, point.y),
+            xytext=(0, 0),
+            textcoords="offset points",
+            fontsize=size,
+            ha="center",
+            va="center",
+            linespacing=1.2,
+            zorder=6,
+            parse_math=False,
+            bbox={"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.75},
+        )
+        text.set_in_layout(False)
+        extent = text.get_window_extent()
+        width, height = extent.width + 2 * _GAP_PT * pixel, extent.height
+        for distance in _DISTANCES_PT:
+            box = _free_box(x, y, width, height, distance * pixel, taken, inside)
+            if box is not None:
+                break
+        else:
+            text.remove()
+            continue
+        taken.append(box)
+        text.set_position((((box.x0 + box.x1) / 2 - x) / pixel, ((box.y0 + box.y1) / 2 - y) / pixel))
+        if distance > _NEAR_PT:
+            nearest = np.clip((x, y), box.min, box.max)
+            line = axes.annotate(
+                "",
+                (point.x, point.y),
+                xytext=((nearest[0] - x) / pixel, (nearest[1] - y) / pixel),
+                textcoords="offset points",
+                arrowprops={"arrowstyle": "-", "color": "#777777", "linewidth": 0.6, "shrinkA": 0, "shrinkB": 3},
+                zorder=4,
+            )
+            line.set_in_layout(False)
+
+
+def _free_box(
+    x: float, y: float, width: float, height: float, distance: float, taken: Sequence[Bbox], inside: Bbox
+) -> Bbox | None:
+    """Return the first free box at a distance from a point; horizontal and vertical directions come first."""
+    from matplotlib.transforms import Bbox
+
+    for dx, dy in sorted(_DIRECTIONS, key=lambda d: min(abs(d[0]), abs(d[1]))):
+        left = x + dx * (distance + width / 2) - width / 2
+        bottom = y + dy * (distance + height / 2) - height / 2
+        box = Bbox.from_bounds(left, bottom, width, height)
+        within = inside.x0 <= box.x0 and box.x1 <= inside.x1 and inside.y0 <= box.y0 and box.y1 <= inside.y1
+        if within and not box.count_overlaps(taken):
+            return box
+    return None

@@ -1,4 +1,4 @@
-"""HTML pages that load nothing from outside: templates, and files that replace only what PlushSense wrote."""
+"""Render self-contained HTML pages, and write them without replacing files that are not reports."""
 
 from __future__ import annotations
 
@@ -10,68 +10,60 @@ from typing import Any
 
 from plushsense.core.errors import ConfigError, need
 from plushsense.core.files import write_file
+from plushsense.core.templates import fill_html
 from plushsense.reports import wording
 
 ENDINGS = (".html", ".htm")
-# The base template writes it; a file that has it is a report, and may be replaced by one.
+_PACKAGE = "plushsense.reports"
+# The base template contains it; only a file that contains it is replaced by a report.
 GENERATOR = '<meta name="generator" content="PlushSense">'
 _HEAD_BYTES = 4096
 
 
 def render_page(template: str, **values: Any) -> str:
-    """Return a page from a template of this package in the style of all pages; texts are escaped.
+    """Return a page in the style of all pages; texts are escaped.
 
     Args:
-        template: the file name; it extends ``base.html.j2``.
-        values: of the template. ``title`` and ``simulated`` are needed; ``made`` and the texts of the simulation's
-            banner have defaults.
+        template: file name of a template of this package, which extends ``base.html.j2``.
+        values: ``title`` and ``simulated`` are required; the texts of the simulation banner have defaults.
 
     Raises:
         MissingExtraError: when jinja2 is not installed.
     """
-    jinja2 = need("jinja2", "reports")
-    folder = resources.files("plushsense.reports")
-    environment = jinja2.Environment(
-        loader=jinja2.FunctionLoader(lambda name: folder.joinpath(name).read_text(encoding="utf-8")),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    style = resources.files(_PACKAGE).joinpath("page.css").read_text(encoding="utf-8")
     defaults = {
         "made": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "simulated_title": wording.SIMULATED_TITLE,
         "simulated_words": wording.SIMULATED_WORDS,
-        "style": need("markupsafe", "reports").Markup(folder.joinpath("page.css").read_text(encoding="utf-8")),
+        "style": need("markupsafe", "reports").Markup(style),
     }
-    page: str = environment.get_template(template).render(defaults | values)
-    return page
+    return fill_html(_PACKAGE, template, **(defaults | values))
 
 
 def check_page_path(path: str | Path) -> Path:
-    """Return the path when a report may be written there: a new .html file, or an older report to replace.
+    """Return the path if a report can be written there: a new .html file, or an earlier report to replace.
 
     Raises:
         ConfigError: for another ending, a folder, or a file that is not a report of PlushSense.
     """
     target = Path(path)
     if target.suffix.lower() not in ENDINGS:
-        raise ConfigError(f"A report is an HTML page, and '{target}' does not end in .html or .htm: name it so.")
+        raise ConfigError(f"'{target}' does not end in .html or .htm, and a report is an HTML page: change the name.")
     if target.is_dir():
-        raise ConfigError(f"'{target}' is a folder: name a file in it for the report.")
+        raise ConfigError(f"'{target}' is a folder: give a file in it for the report.")
     if target.exists():
         try:
             with target.open("rb") as file:
                 ours = GENERATOR.encode() in file.read(_HEAD_BYTES)
         except OSError as cause:
-            raise ConfigError(f"'{target}' exists and cannot be read ({cause.strerror}): name another file.") from cause
+            raise ConfigError(f"'{target}' exists and cannot be read ({cause.strerror}): give another file.") from cause
         if not ours:
-            raise ConfigError(f"'{target}' exists and is not a report of PlushSense: name another file.")
+            raise ConfigError(f"'{target}' exists and is not a report of PlushSense: give another file.")
     return target
 
 
 def write_page(target: Path, page: str) -> Path:
-    """Write a page to a path that `check_page_path` accepted, in one step.
+    """Write a page in one step to a path that `check_page_path` has accepted.
 
     Raises:
         ConfigError: when the file cannot be written.
@@ -81,7 +73,7 @@ def write_page(target: Path, page: str) -> Path:
         write_file(target, page)
     except OSError as cause:
         raise ConfigError(
-            f"The report '{target}' cannot be written ({cause.strerror}): name a file where you may write."
+            f"The report '{target}' cannot be written ({cause.strerror}): give a file in a folder where you may write."
         ) from cause
     return target
 
@@ -91,10 +83,10 @@ _LIST_HEAD = "Tables and figures of a PlushSense sweep report; `plushsense repor
 
 
 def earlier_files(folder: Path) -> list[str]:
-    """Return the names of the files that an earlier report left in a folder.
+    """Return the names of the files that an earlier report wrote to a folder.
 
     Raises:
-        ConfigError: when the folder holds something else.
+        ConfigError: when the folder contains other files.
     """
     if not folder.exists():
         return []
@@ -104,12 +96,12 @@ def earlier_files(folder: Path) -> list[str]:
     except (OSError, ValueError):
         lines, empty = [], False
     if not empty and lines[:1] != [_LIST_HEAD]:
-        raise ConfigError(f"'{folder}' exists and is not of a report of PlushSense: name another page.")
+        raise ConfigError(f"'{folder}' exists and is not the folder of a report: give another page.")
     return [name for name in lines[1:] if name and Path(name).name == name and name != _LIST]
 
 
 def write_files(folder: Path, files: Mapping[str, bytes], earlier: Sequence[str]) -> None:
-    """Write files, each in one step, and remove those of an earlier report that are not among them.
+    """Write files, each in one step, and remove files of an earlier report that have other names.
 
     Raises:
         ConfigError: when a file cannot be written.
@@ -125,5 +117,5 @@ def write_files(folder: Path, files: Mapping[str, bytes], earlier: Sequence[str]
         write_file(folder / _LIST, "\n".join([_LIST_HEAD, *files, ""]).encode())
     except OSError as cause:
         raise ConfigError(
-            f"The report's files cannot be written to '{folder}' ({cause.strerror}): name a page where you may write."
+            f"The report's files cannot be written to '{folder}' ({cause.strerror}): give another page."
         ) from cause

@@ -18,7 +18,6 @@ from plushsense.experiments.sweep import tables as sweep_tables
 from plushsense.experiments.sweep.report import confusion_words, sections_of, write_report
 from plushsense.experiments.sweep.results import read_sweep
 from plushsense.models.arch import PAPER_ARCHITECTURES, PAPER_FILTERS
-from plushsense.reports.labels import overlap
 from plushsense.scoring.metrics import accuracy_complexity_ratio
 from plushsense.trials import paper
 from support.made_sweep import make_sweep
@@ -173,11 +172,10 @@ def test_labels_of_a_front_cover_neither_each_other_nor_the_edge(whole):
     figure = sweep_figures.pareto(read_sweep(whole), "parameters")
     axes = figure.axes[0]
     boxes = [t.get_window_extent() for t in axes.texts if t.get_text()]
-    plain = [(b.x0, b.y0, b.x1, b.y1) for b in boxes]
-    assert len(plain) >= 3
-    assert not any(overlap(a, b) for i, a in enumerate(plain) for b in plain[:i])
+    assert len(boxes) >= 3
+    assert not any(box.count_overlaps(boxes[:i]) for i, box in enumerate(boxes))
     inside = axes.get_window_extent()
-    assert all(inside.x0 <= b[0] and b[2] <= inside.x1 and inside.y0 <= b[1] and b[3] <= inside.y1 for b in plain)
+    assert all(inside.x0 <= b.x0 and b.x1 <= inside.x1 and inside.y0 <= b.y0 and b.y1 <= inside.y1 for b in boxes)
 
 
 def test_the_confusion_is_by_affect_and_counted(tmp_path):

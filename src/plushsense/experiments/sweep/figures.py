@@ -22,7 +22,6 @@ from plushsense.experiments.sweep.tables import (
     table4,
 )
 from plushsense.reports import figures
-from plushsense.reports.labels import LabelledPoint, place_labels
 from plushsense.reports.table import Row, count
 from plushsense.reports.wording import describe_runs
 
@@ -175,14 +174,14 @@ def size_and_accuracy(sweep: SweepResults) -> Figure:
         x, y = [r["parameters"] for r in mine], [100 * r["accuracy"] for r in mine]
         if mine:
             axes.plot(x, y, marker, color=colour, markeredgecolor="black", markersize=8, label=_bracket(filter_set))
-        points += [LabelledPoint(a, b, str(r["arch"])) for a, b, r in zip(x, y, mine, strict=True)]
+        points += [figures.LabelledPoint(a, b, str(r["arch"])) for a, b, r in zip(x, y, mine, strict=True)]
     _log_x(axes, [p.x for p in points], "Learnable parameters")
     _room(axes, [p.y for p in points])
     axes.set_ylabel(score_label(sweep, "Highest accuracy (% of test windows)"), fontsize=9)
     axes.legend(
         title="filters", fontsize=8, title_fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5), frameon=False
     )
-    place_labels(figure, axes, points)
+    figures.place_labels(figure, axes, points)
     return figure
 
 
@@ -227,12 +226,12 @@ def pareto(sweep: SweepResults, cost: str) -> Figure:
         title="filters", fontsize=8, title_fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5), frameon=False
     )
     named = sorted(edge, key=lambda r: -r["macro_f1"])[:NAMED]
-    others = [LabelledPoint(r["value"], r["macro_f1"], "") for r in rows if r not in named]
-    labels = [LabelledPoint(r["value"], r["macro_f1"], f"{r['arch']}\n{r['filters']}") for r in named]
+    others = [figures.LabelledPoint(r["value"], r["macro_f1"], "") for r in rows if r not in named]
+    labels = [figures.LabelledPoint(r["value"], r["macro_f1"], f"{r['arch']}\n{r['filters']}") for r in named]
     corners = [*steps, (right, steps[-1][1])]
     flat = [(x, y, after, y) for (x, y), (after, _) in pairwise(corners)]
     upright = [(after, y, after, high) for (_, y), (after, high) in pairwise(corners)]
-    place_labels(figure, axes, labels + others, avoid=flat + upright)
+    figures.place_labels(figure, axes, labels + others, avoid=flat + upright)
     return figure
 
 
