@@ -59,11 +59,11 @@ def test_forget_asks_first_and_names_the_models(cli: Cli, dataset: Dataset, bund
     ran = cli("forget", dataset.path, "P1", "--bundles", models, "--json")
     assert (ran.status, ran.json["done"], ran.json["raw"]) == (1, False, 7)
     assert {p: p.read_bytes() for p in dataset.path.rglob("*") if p.is_file()} == before
-    assert "does not say who" in {Path(b["bundle"]).name: b for b in ran.json["bundles"]}["given.plush"]["message"]
+    assert "does not name people" in {Path(b["bundle"]).name: b for b in ran.json["bundles"]}["given.plush"]["message"]
     named = {Path(b["bundle"]).name: b for b in ran.json["bundles"]}
     assert named["m.plush"]["certain"]
     assert "train it again" in named["m.plush"]["message"]
-    assert "nobody knows" in named["torn.plush"]["message"]
+    assert "people are unknown" in named["torn.plush"]["message"]
     ran = cli("forget", dataset.path, "P1", "--yes", "--bundles", models)
     assert ran.status == 0
     assert "Out of reach: backups" in ran.out
@@ -81,7 +81,7 @@ def test_an_exported_model_of_the_data_set_is_a_question_too(dataset: Dataset, b
     replace(ours, provenance=ours.provenance | {"dataset": "another"}).save(tmp_path / "other.plush")
     found = forget(dataset.path, "P1", bundles=[tmp_path]).bundles
     assert [(Path(b.bundle).name, b.certain) for b in found] == [("ours.plush", False)]
-    assert "does not say who" in found[0].message
+    assert "does not name people" in found[0].message
 
 
 def test_a_bundle_of_another_data_set_is_only_a_question(dataset: Dataset, bundle: Path, tmp_path: Path) -> None:
@@ -93,7 +93,7 @@ def test_a_bundle_of_another_data_set_is_only_a_question(dataset: Dataset, bundl
     (dataset.path / "index.json").unlink()
     found = forget(dataset.path, "P1", bundles=[bundle])
     assert [b.certain for b in found.bundles] == [False]
-    assert "look whether" in found.bundles[0].message
+    assert "check whether" in found.bundles[0].message
     assert not found.done
     head.write_text(text)
     again = forget(dataset.path, "P1", bundles=[bundle]).bundles

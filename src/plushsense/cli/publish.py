@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace) -> int:
-    from plushsense.workflow.datasets import validate_package
+    from plushsense.dataset.publishing.checking import validate_package
 
     if args.dataset:
         raise ConfigError("Give either DATASET OUT, or --check PACKAGE, not both.")

@@ -27,6 +27,7 @@ from plushsense.dataset.importing.archives import UnpackLimits
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.privacy.pseudonymise import pseudonymise
+from plushsense.dataset.publishing.checking import validate_package
 from plushsense.deploy.package import changed_copies
 from plushsense.deploy.profile import profile
 from plushsense.deploy.proof.vectors import Export
@@ -35,7 +36,7 @@ from plushsense.studio.app.jobs import UNFINISHED
 from plushsense.studio.pages.export.exports import folder_digest
 from plushsense.workflow.api import simulate
 from plushsense.workflow.config import from_settings
-from plushsense.workflow.datasets import check_dataset, publish_dataset, validate_package
+from plushsense.workflow.datasets import check_dataset, publish_dataset
 from plushsense.workflow.export import export
 from plushsense.workflow.reporting import check_folder
 

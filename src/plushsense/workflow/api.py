@@ -1,7 +1,4 @@
-"""The Python face: what the command line does, as calls. A result shows itself in a notebook.
-
-This is where training and evaluation meet; neither knows of the other.
-"""
+"""Train, evaluate and load networks, and simulate recordings: the main functions of the Python API."""
 
 from __future__ import annotations
 
@@ -13,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError
 from plushsense.core.gestures import NOBODY
@@ -30,7 +28,7 @@ from plushsense.deploy.quantize import (
     quantize,
     refuse_undeployable,
 )
-from plushsense.evaluation.crossval import Evaluation, FoldOutput, FoldProgress, windows_fingerprint
+from plushsense.evaluation.crossval import EpochProgress, Evaluation, FoldOutput, FoldProgress, windows_fingerprint
 from plushsense.evaluation.crossval import evaluate as crossvalidate
 from plushsense.evaluation.scores import FoldRecord, gather_predictions
 from plushsense.evaluation.scores import compute_scores as score_predictions
@@ -60,20 +58,23 @@ if TYPE_CHECKING:
     from plushsense.training.engine import FitState
 
 
-# So long a training that was stopped can go on.
+# Unfinished trainings that are older are deleted: most are never resumed, and they were trained on people.
 _KEPT_S = 30 * 24 * 3600.0
+_SAVE_EVERY_S = 0.5
+# Training warns when float and 8 bits agree on a smaller share of the validation windows.
+_AGREEMENT = 0.95
 
 
 def unfinished(dataset: Dataset | str | os.PathLike[str]) -> Journal:
-    """Return the journal in a data set's cache that keeps the state of unfinished trainings."""
+    """Return the journal of unfinished trainings in a data set's cache."""
     if isinstance(dataset, Dataset):
         return journal_of(dataset, UNFINISHED)
     folder = Path(dataset)
     return Journal(folder / CACHE / UNFINISHED, Generation.of(folder).writing)
 
 
-class Kept:
-    """The state of one training in a journal, under a key of all that its outcome depends on."""
+class ResumableTraining:
+    """The state of one training in a journal, stored under a key of everything that its outcome depends on."""
 
     def __init__(
         self, journal: Journal | None, network: Arch, spec: TrainSpec, train: WindowSet, watched: WindowSet
@@ -84,42 +85,37 @@ class Kept:
         from plushsense.training.fit import resolve_device
 
         settings = {"arch": network.to_dict(), "training": resolve_device(spec).key(), "vectors": train.vectors}
-        # Most that was given up is never taken up again, and it was trained on people.
         journal.prune(_KEPT_S)
-        prints = [windows_fingerprint(train), windows_fingerprint(watched)]
-        self._job = job_id({"what": "training", **settings, "windows": prints})
+        fingerprints = [windows_fingerprint(train), windows_fingerprint(watched)]
+        self._job = job_id({"what": "training", **settings, "windows": fingerprints})
 
-    def found(self) -> FitState | None:
-        held = None if self._journal is None else self._journal.find(self._job)
-        if held is None:
+    def load(self) -> FitState | None:
+        """Return the saved state; None without one."""
+        entry = None if self._journal is None else self._journal.find(self._job)
+        if entry is None:
             return None
         from plushsense.training.engine import FitState
 
-        self.before_s = float(held["seconds"])
-        return FitState.from_arrays(held)
+        self.before_s = float(entry["seconds"])
+        return FitState.from_arrays(entry)
 
     def save(self, state: FitState) -> None:
+        """Save the state, if there is a journal that can be written."""
         if self._journal is not None:
             spent = self.before_s + time.monotonic() - self._began
             keep_if_possible(self._journal, self._job, {**state.to_arrays(), "seconds": spent})
 
-    def forget(self) -> None:
+    def discard(self) -> None:
+        """Delete the saved state."""
         if self._journal is not None:
             self._journal.discard(self._job)
 
 
-# Of the held-back windows, the share on which float and 8 bits have to say the same; below it training says so.
-_AGREEMENT = 0.95
-_SAVE_EVERY_S = 0.5
-
-EpochProgress = Callable[[int, int, dict[str, Any]], None]
-
-
 @dataclass(frozen=True)
 class TrainAndPredict:
-    """Train one fold and predict its test windows, as a cross-validation calls it.
+    """The job of one fold of a cross-validation: train a network and predict the test windows.
 
-    ``int8``: the network is also deployed, with ranges of the windows it was trained on, and reads the test windows.
+    With ``int8`` the network is also quantized, with the value ranges of its training windows, and predicts them too.
     """
 
     arch: Arch
@@ -143,10 +139,10 @@ class TrainAndPredict:
 
 @dataclass(frozen=True)
 class Trained:
-    """A trained network: ``bundle``, the ``history`` of its epochs, and ``scores`` with what they were taken on.
+    """A trained network: its ``bundle``, the ``history`` of its epochs, and its validation ``scores``.
 
-    ``seconds``: of training, before a stop and after. The bundle does not hold them: the same data, settings and seed
-    give the same file, byte for byte.
+    ``seconds`` is the training time, with that before an interruption. It is not in the bundle: the same data, settings
+    and seed give the same file, byte for byte.
     """
 
     bundle: Bundle
@@ -159,7 +155,7 @@ class Trained:
         return self.bundle.save(Path(path))
 
     def figure(self) -> Figure:
-        """Loss and accuracy over the epochs."""
+        """Draw loss and accuracy over the epochs."""
         from plushsense.reports.figures import training_curves
 
         return training_curves([self.history], title=self.bundle.arch.symbol)
@@ -183,22 +179,22 @@ def train(
 ) -> Trained:
     """Train one network on a data set.
 
-    Whole people validate (15 % of them, chosen by the seed), and the scores are theirs. Under presets with early
-    stopping they also decide when to stop, which flatters a little; ask `evaluate` for a figure over everybody.
-    The preset ``search`` splits windows as the paper does (70/15/15), which is leaky, and says so.
-    ``context="anywhere"`` trains for work in a stream (see `windows.anywhere`): idleness is a class then, and what is
-    scored is whole gestures with their real past.
+    Whole people are held out for validation (15 % of them, chosen by the seed), and the scores are theirs. With early
+    stopping they also decide when to stop, so the scores are slightly too high; `evaluate` scores all people. The
+    preset ``search`` splits windows as the paper does (70/15/15), which is leaky and marked so. ``context="anywhere"``
+    trains for live use (see `windows.anywhere`): idleness is a class, and whole gestures with their real past are
+    scored.
 
     Args:
         config: resolved settings; or give ``arch``, ``filters`` and settings such as ``preset="loso"``,
             ``context="loop"``, ``epochs=20``, ``seed=1``, ``classes="all"``, ``padding``, ``norm``.
-        quantize_aware: epochs of fine-tuning for 8 bits after the training (see `training.quantized`); 0: none.
-        fit_decisions: also fit how decisions are made, on the people who validate (see `live.fitting`). Settings of
-            the configuration's table ``live`` that are not the defaults stay.
-        journal: where the training keeps how far it is (see `plushsense.workflow.api`). One that was stopped or killed
-            then goes on from there and ends in the same bundle; what comes after the training is done anew.
-        progress: called with (epoch, epochs at most, the epoch's row); epochs of before a stop are told first.
-        warn: called with one sentence for everything that was left out, and when 8 bits change many answers.
+        quantize_aware: epochs of fine-tuning for 8 bits after the training (see `training.quantized`).
+        fit_decisions: also fit the decision settings on the validation people (see `tuning.decisions`). Settings in
+            ``config.live`` that are not defaults are not changed.
+        journal: stores the progress of the training (see `unfinished`). An interrupted training resumes and gives the
+            same bundle; the steps after the training are repeated.
+        progress: called with (epoch, maximum of epochs, the epoch's row), first for the epochs before an interruption.
+        warn: called with a sentence for everything that is left out, and when 8 bits change many answers.
     """
     dataset = as_dataset(dataset)
     config = config or from_settings(arch=arch, filters=filters, **settings)
@@ -215,13 +211,13 @@ def train(
     division = divide(windows, config, scored)
     train_at, test_at = division.train, division.fold.test
     if division.kind == WHOLE_PEOPLE:
-        # Decisions are fitted on the whole streams of those who validate.
+        # Decisions are fitted on the whole streams of the validation people.
         train_at = train_at[outside_streams(windows, dataset, division.fold.subjects)[train_at]]
     from plushsense.training.fit import fit, predict
 
     train_on, watched = windows.take(train_at), scored.take(division.watch)
-    state = Kept(journal, network, config.training, train_on, watched)
-    start = state.found()
+    state = ResumableTraining(journal, network, config.training, train_on, watched)
+    start = state.load()
     if start is not None and progress is not None:
         for row in start.history:
             progress(row["epoch"], config.training.epochs, row)
@@ -237,35 +233,34 @@ def train(
         tuned = fine_tune(train_on, network, weights, scaler, kept, config.training, quantize_aware, progress)
         weights = tuned.weights
     test = scored.take(test_at)
-    probabilities = predict(network, weights, scaler, test, config.training.device)
-    predictions = gather_predictions(scored, [(division.fold.name, test_at)], [probabilities])
     sizes = (len(train_at), len(division.watch), len(test_at))
     record = FoldRecord(division.fold.name, division.fold.subjects, sizes, len(fitted.history), fitted.seconds)
-    figures = score_predictions(predictions, [record], scored.affects, division.split.apart)
-    scores = {
+
+    def score(probabilities: NDArray[np.float32]) -> tuple[NDArray[np.int64], dict[str, Any], dict[str, Any]]:
+        predictions = gather_predictions(scored, [(division.fold.name, test_at)], [probabilities])
+        found = score_predictions(predictions, [record], scored.affects, division.split.apart)
+        return predictions.predicted, {name: found[name]["mean"] for name in ("accuracy", "macro_f1")}, found["nobody"]
+
+    predicted, means, nobody = score(predict(network, weights, scaler, test, config.training.device))
+    scores: dict[str, Any] = {
         "split": division.kind,
         "leaky": division.split.leaky,
-        "said": division.said,
+        "said": division.description,
         "windows": len(test_at),
-        "accuracy": figures["accuracy"]["mean"],
-        "macro_f1": figures["macro_f1"]["mean"],
-        "nobody": figures["nobody"],
+        **means,
+        "nobody": nobody,
         "best_epoch": fitted.best_epoch,
         "simulated": dataset.head.simulated,
         "int8": None,
     }
     if kept:
         integer = quantize(network, weights, scaler, Ranges.from_dict(kept))
-        deployed = gather_predictions(scored, [(division.fold.name, test_at)], [integer_probabilities(integer, test.x)])
-        after = score_predictions(deployed, [record], scored.affects, division.split.apart)
-        same = float((deployed.predicted == predictions.predicted).mean())
-        scores["int8"] = {"accuracy": after["accuracy"]["mean"], "macro_f1": after["macro_f1"]["mean"]}
-        scores["int8"] |= {"agreement": same}
-        if same < _AGREEMENT:
-            more = "more epochs of --quantize-aware" if quantize_aware else "--quantize-aware 10"
-            warn(
-                f"8 bits change {100 * (1 - same):.1f} % of the answers on the windows that were held back: try {more}"
-            )
+        deployed, means, _ = score(integer_probabilities(integer, test.x))
+        agreement = float((deployed == predicted).mean())
+        scores["int8"] = {**means, "agreement": agreement}
+        if agreement < _AGREEMENT:
+            advice = "more epochs of --quantize-aware" if quantize_aware else "--quantize-aware 10"
+            warn(f"8 bits change {100 * (1 - agreement):.1f} % of the answers on the validation windows: try {advice}")
     bundle = Bundle(
         arch=network,
         weights=weights,
@@ -292,8 +287,8 @@ def train(
     )
     if fit_decisions:
         bundle = _with_decisions(bundle, dataset, config.live, warn)
-    state.forget()
-    # Whoever is taken out before the bundle is written is not in the list of those that `forget` found.
+    state.discard()
+    # `forget` did not see this bundle: refuse it if a person was removed meanwhile.
     dataset.generation.check()
     return Trained(bundle, fitted.history, scores, state.before_s + fitted.seconds)
 
@@ -301,7 +296,7 @@ def train(
 def _with_decisions(bundle: Bundle, dataset: Dataset, given: DecideSpec, warn: Warn) -> Bundle:
     """Return the bundle with decision settings fitted on the validation people; unchanged without them."""
     if bundle.provenance["split"] != WHOLE_PEOPLE:
-        warn("decision settings are the defaults: they are fitted on whole people who were held back, and none was")
+        warn("decision settings are the defaults: fitting them needs whole people held out for validation")
         return bundle
     validated, trained = (
         set(bundle.provenance[key]) - {NOBODY, UNKNOWN_SUBJECT} for key in ("validation_subjects", "subjects")
@@ -313,7 +308,7 @@ def _with_decisions(bundle: Bundle, dataset: Dataset, given: DecideSpec, warn: W
 
 
 def _windowing(config: RunConfig) -> dict[str, Any]:
-    """Return how windows were cut, as a bundle keeps it."""
+    """Return the window settings as a bundle stores them."""
     tables = config.to_dict()
     anywhere = {"anywhere": tables["anywhere"]} if config.windows.context == ANYWHERE else {}
     return {**tables["windows"], **anywhere}
@@ -336,16 +331,16 @@ def evaluate(
 ) -> Evaluation:
     """Train and score one network for each fold of ``split``.
 
-    Finished folds are kept in the data set's ``cache`` folder; an evaluation that was stopped goes on from there.
+    Finished folds are stored in the data set's ``cache`` folder; an interrupted evaluation resumes.
 
     Args:
-        config, arch, filters, settings, warn: as for `train`, and ``train_context``, ``workers``.
+        config, arch, filters, settings, warn: as for `train`; also ``train_context`` and ``workers``.
         split: "leave-one-subject-out" (default), "by-subject:5", "by-recording:5", "windows:5" (leaky).
-        out: a folder for ``evaluation.json`` and ``predictions.parquet``; one that holds an evaluation of other
-            settings or data is refused unless ``overwrite``.
-        cluster: address of a Ray cluster that trains the folds instead of this machine's processes.
-        int8: also deploy each fold's network, with ranges of its own training windows, and score it on the same
-            windows: key ``int8`` of the result. Folds that were kept without it are trained again.
+        out: a folder for ``evaluation.json`` and ``predictions.parquet``. A folder with an evaluation of other settings
+            or data is refused unless ``overwrite``.
+        cluster: address of a Ray cluster that trains the folds.
+        int8: also score each fold's network in 8 bits on the same windows, as ``int8`` of the result. Folds that were
+            stored without it are trained again.
     """
     dataset = as_dataset(dataset)
     config = config or from_settings(arch=arch, filters=filters, **settings)
@@ -400,26 +395,26 @@ def simulate(
     dataset: str | os.PathLike[str] | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> dict[str, Any]:
-    """Write recordings of virtual people as the authors' recorder would leave them; by default in the paper's shape.
+    """Write recordings of virtual people as the authors' recorder writes them, by default as many as in the paper.
 
     Args:
         out: a new or empty folder.
-        dataset: also import them as a data set there.
-        progress: called with ("recording" or "importing", done, in all).
+        dataset: a folder to import them to as a data set.
+        progress: called with ("recording" or "importing", done, total).
     """
     from plushsense.recording.simulate import simulate as run
 
-    tell = progress or (lambda *_: None)
+    report = progress or (lambda *_: None)
     done = run(
         Path(out),
         people=people,
         repetitions=repetitions,
         seed=seed,
-        progress=lambda at, total, _: tell("recording", at, total),
+        progress=lambda at, total, _: report("recording", at, total),
     )
     summary: dict[str, Any] = dict(done.to_dict())
     if dataset is not None:
-        import_simulation(out, dataset, tell)
+        import_simulation(out, dataset, report)
         summary["dataset"] = str(dataset)
     return summary
 
@@ -427,7 +422,7 @@ def simulate(
 def import_simulation(
     source: str | os.PathLike[str], dest: str | os.PathLike[str], progress: Callable[[str, int, int], None]
 ) -> Dataset:
-    """Import what `simulate` wrote, as a data set that says what it is."""
+    """Import the recordings of `simulate` as a data set that is marked as a simulation."""
     return import_recordings(
         Path(source),
         Path(dest),

@@ -1,4 +1,4 @@
-"""Settings of one run: network, training, windows and split. A TOML file can hold them.
+"""Settings of one run: network, training, windows and split, which a TOML file may contain.
 
     [windows]     window_s, step_s, context, longest_factor
     [anywhere]    every_s, onset_s, after_s, settle_s, idle_share, busy_share
@@ -7,7 +7,7 @@
     [evaluation]  split, classes, train_context, workers, seed
     [live]        smoothing_s
 
-Flags of the command line go over the file; an unknown key is refused with the nearest known one.
+Options of the command line override the file; an unknown key is refused with the nearest known one.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from plushsense.core.toml import check_table, read_toml, refuse_unknown
 from plushsense.models.arch import DEFAULT_FILTERS, DEFAULT_SYMBOL, Arch, parse_filters
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.scoring.splits import parse_split
-from plushsense.training.spec import CONTEXT, PADDING, PRESETS, TrainSpec, preset
+from plushsense.training.spec import CONTEXT, PADDING, TrainSpec, preset
 from plushsense.windows.anywhere import AnywhereSpec
 from plushsense.windows.cut import ANYWHERE, TRAIN_CONTEXTS, WindowSpec
 
@@ -33,7 +33,7 @@ SHARED, ALL = "shared", "all"
 
 @dataclass(frozen=True)
 class ModelSpec:
-    """The network, in the terms of the toy. ``padding`` None is the preset's; ``pool_s`` None fills the window."""
+    """Settings of the network in seconds. ``padding`` None: the preset's; ``pool_s`` None: the whole window."""
 
     arch: str = DEFAULT_SYMBOL
     filters: tuple[int, ...] = DEFAULT_FILTERS
@@ -45,7 +45,7 @@ class ModelSpec:
     def __post_init__(self) -> None:
         for name, seconds in (("step_s", self.step_s), ("pool_s", self.pool_s)):
             if seconds is not None and not 0.0 < seconds <= 60.0:
-                raise ConfigError(f"{name} is {seconds}: accepted is above 0, at most 60 seconds.")
+                raise ConfigError(f"{name} is {seconds}: accepted are seconds above 0 and up to 60.")
 
     def build(self, layout: Layout, classes: int, window_s: float, padding: str) -> Arch:
         """Build the network for a toy's layout and a number of classes."""
@@ -64,10 +64,12 @@ class ModelSpec:
 
 @dataclass(frozen=True)
 class EvaluationSpec:
-    """Settings of the scoring. ``train_context`` None: training windows are cut as those that are scored.
+    """Settings of an evaluation.
 
-    ``classes`` is "shared" (gestures that at least 90 % of the people made and that are not free choice), "all", or
-    labels. ``workers`` 0: one a processor.
+    Attributes:
+        classes: "shared" (gestures that at least 90 % of the people made, without free choice), "all", or labels.
+        train_context: context of the training windows; None: that of the scored windows.
+        workers: number of processes; 0: one for each processor.
     """
 
     split: str = "leave-one-subject-out"
@@ -90,7 +92,7 @@ class EvaluationSpec:
 
     @property
     def processes(self) -> int:
-        """Worker processes."""
+        """Number of worker processes."""
         return self.workers or os.cpu_count() or 1
 
 
@@ -108,28 +110,26 @@ class RunConfig:
 
     @property
     def trained_on(self) -> WindowSpec:
-        """The windows to train on."""
+        """Settings of the training windows."""
         return replace(self.windows, context=self.evaluation.train_context or self.windows.context)
 
     @property
     def scored_on(self) -> WindowSpec:
-        """The windows to score: what is trained anywhere is scored on gestures with their real past."""
+        """Settings of the scored windows. With context "anywhere", gestures with their real past are scored."""
         return replace(self.windows, context="stream") if self.windows.context == ANYWHERE else self.windows
 
     @property
     def padding(self) -> str:
-        """The padding that is used."""
+        """The padding of the model, or else of the preset."""
         return self.model.padding or PADDING[self.preset]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON, as a bundle keeps them."""
+        """Return plain values for JSON, as a bundle stores them."""
         return asdict(self) | {"training": self.training.to_dict()}
 
     def outcome(self) -> dict[str, Any]:
-        """Return the settings that change an evaluation's figures, as plain values for JSON."""
-        evaluation = asdict(self.evaluation) | {
-            "train_context": self.evaluation.train_context or self.windows.context,
-        }
+        """Return the settings that an evaluation's scores depend on, as plain values for JSON."""
+        evaluation = asdict(self.evaluation) | {"train_context": self.trained_on.context}
         del evaluation["workers"]
         training = {k: v for k, v in self.training.key().items() if k not in ("device", "threads")}
         anywhere = {"anywhere": asdict(self.anywhere)} if self.trained_on.context == ANYWHERE else {}
@@ -157,18 +157,13 @@ _TABLES: dict[str, type[Any]] = {
     "anywhere": AnywhereSpec,
 }
 
-_DERIVED = {("windows", "span_s"): "it follows from the network; set arch, window_s or pool_s"}
-
 
 def _checked(name: str, given: Mapping[str, Any], source: str) -> dict[str, Any]:
-    """Return the values of a table, each of the type that its key accepts.
-
-    Raises:
-        ConfigError: for an unknown key, or a value of another type.
-    """
-    for key in given:
-        if (name, key) in _DERIVED:
-            raise ConfigError(f"In [{name}]{source}, {key} cannot be set: {_DERIVED[name, key]}.")
+    """Return the values of a table; raise ConfigError for an unknown key or a value of another type."""
+    if name == "windows" and "span_s" in given:
+        raise ConfigError(
+            f"In [windows]{source}, span_s cannot be set: it follows from the network; set arch, window_s or pool_s."
+        )
     if name == "model" and isinstance(given.get("filters"), str):
         given = {**given, "filters": parse_filters(given["filters"])}
     values, problems = check_table(given, _TABLES[name], f"[{name}]{source}")
@@ -178,9 +173,11 @@ def _checked(name: str, given: Mapping[str, Any], source: str) -> dict[str, Any]
 
 
 def resolve(path: str | Path | None = None, **flags: Mapping[str, Any]) -> RunConfig:
-    """Read the settings of a TOML file and put ``flags`` over them: ``resolve(None, training={"seed": 3})``.
+    """Read the settings of a TOML file and override them: ``resolve(None, training={"seed": 3})``.
 
-    A flag of None is not given. ``preset`` stands in the table ``training``.
+    Args:
+        path: a TOML file; None: only defaults.
+        flags: values of each table; None counts as not given. ``preset`` belongs to the table ``training``.
 
     Raises:
         ConfigError: for an unknown table or key (with the nearest known one) or a value that does not fit.
@@ -191,7 +188,7 @@ def resolve(path: str | Path | None = None, **flags: Mapping[str, Any]) -> RunCo
         refuse_unknown(content, _TABLES, f"'{path}'", ConfigError)
         for name, table in content.items():
             if not isinstance(table, dict):
-                raise ConfigError(f"'{name}' in '{path}' is a single value; it is a table: write  [{name}]")
+                raise ConfigError(f"'{name}' in '{path}' is a single value, but must be a table: write  [{name}]")
             tables[name].update(_checked(name, table, f" of '{path}'"))
     refuse_unknown(flags, _TABLES, "the settings", ConfigError)
     for name, given in flags.items():
@@ -210,23 +207,13 @@ def resolve(path: str | Path | None = None, **flags: Mapping[str, Any]) -> RunCo
     )
 
 
-PRESET_NAMES = tuple(PRESETS)
-
-
-# Where each setting of `train`, `evaluate` and `baselines` belongs.
+# The table of each setting of `train`, `evaluate` and `baselines`.
 _SETTINGS: dict[str, tuple[str, ...]] = {
     "windows": ("context", "window_s", "step_s", "longest_factor"),
     "model": ("arch", "filters", "padding", "norm", "pool_s"),
     "training": (
-        "preset",
-        "epochs",
-        "batch",
-        "learning_rate",
-        "halve_every",
-        "patience",
-        "device",
-        "augment",
-        "turn_deg",
+        *("preset", "epochs", "batch", "learning_rate", "halve_every", "patience", "device"),
+        *("augment", "turn_deg"),
     ),
     "evaluation": ("classes", "train_context", "workers"),
     "live": ("smoothing_s",),
@@ -235,10 +222,10 @@ _SETTINGS: dict[str, tuple[str, ...]] = {
 
 
 def from_settings(**settings: Any) -> RunConfig:
-    """Build a configuration from names: ``arch="14d1_39d2_41d4", preset="loso", epochs=20``; None counts as not given.
+    """Build a configuration from settings: ``arch="14d1_39d2_41d4", preset="loso"``; None counts as not given.
 
     Raises:
-        ConfigError: for a name that there is not, with the nearest.
+        ConfigError: for an unknown setting, with the nearest known one.
     """
     known = [key for keys in _SETTINGS.values() for key in keys] + ["seed"]
     for key in settings:

@@ -1,7 +1,4 @@
-"""The whole path on a virtual toy: record, import, train, score on people left out, live on a stranger, report.
-
-What it shows is that everything works together. Its scores are of a simulation.
-"""
+"""Run the whole pipeline on a virtual toy: record, import, train, evaluate, classify live, export, report."""
 
 from __future__ import annotations
 
@@ -17,7 +14,7 @@ from plushsense.dataset.store import Dataset
 from plushsense.deploy.emit import FACTS
 from plushsense.devices.opening import open_device
 from plushsense.devices.virtual.stream import VirtualDevice
-from plushsense.live.loop import run_live as run_loop
+from plushsense.live.loop import run_live
 from plushsense.models.bundle import Bundle
 from plushsense.runtime.classifier import StreamClassifier
 from plushsense.workflow.api import evaluate, import_simulation, simulate, train
@@ -42,7 +39,7 @@ class DemoSize:
 FULL = DemoSize(people=12, repetitions=3, epochs=60, folds=4, live_s=120.0)
 QUICK = DemoSize(people=10, repetitions=2, epochs=45, folds=2, live_s=60.0)
 
-# Data sets hold people 1 to 25: this one was never met.
+# Simulated data sets contain people 1 to 25.
 STRANGER = 101
 MARK = "plushsense-demo.txt"
 
@@ -51,32 +48,25 @@ Progress = Callable[[str, int, int], None]
 
 
 def run_demo(out: Path, *, quick: bool = False, stage: Stage, progress: Progress) -> dict[str, Any]:
-    """Run the demo into ``out``; a second run takes up what the first one finished.
+    """Run the demo into ``out``; a second run reuses the finished recordings and folds.
 
     Returns:
-        paths of ``dataset``, ``bundle`` and ``report``, ``export``, and ``scores``.
+        the paths ``dataset``, ``bundle``, ``report`` and ``export``, the ``scores``, and the ``live`` decisions.
     """
     size = QUICK if quick else FULL
     out.mkdir(parents=True, exist_ok=True)
     mark = out / MARK
     if any(out.iterdir()) and not mark.is_file():
-        raise ConfigError(f"'{out}' holds something that is not a demo: give a new or empty folder with --out.")
+        raise ConfigError(f"'{out}' contains files that are not a demo: give a new or empty folder with --out.")
     mark.write_text("Written by  plushsense demo . A simulation; this folder can be deleted.\n", encoding="utf-8")
     name = f"{size.people}x{size.repetitions}"
     stage(f"1/6  {size.people} virtual people record {size.repetitions} × 17 gestures, and the recordings are imported")
-    dataset = _dataset(
-        out / f"dataset-{name}",
-        out / f"recordings-{name}",
-        people=size.people,
-        repetitions=size.repetitions,
-        seed=1,
-        progress=progress,
-    )
+    dataset = _dataset(out / f"dataset-{name}", out / f"recordings-{name}", size, progress)
     config = resolve(None, training={"epochs": size.epochs, "halve_every": max(1, size.epochs // 4)})
-    stage(f"2/6  train {config.model.arch} on {len(dataset.subjects)} people; a few of them only watch")
+    stage(f"2/6  train {config.model.arch} on {len(dataset.subjects)} people, some of them for validation")
     trained = train(dataset, config, progress=lambda epoch, epochs, _: progress("training", epoch, epochs))
     bundle = trained.save(out / "model.plush")
-    stage(f"3/6  score it on people left out, in {size.folds} folds")
+    stage(f"3/6  evaluate it on people left out, in {size.folds} folds")
     evaluation = out / f"evaluation-{name}"
     result = evaluate(
         dataset,
@@ -86,11 +76,11 @@ def run_demo(out: Path, *, quick: bool = False, stage: Stage, progress: Progress
         overwrite=True,
         progress=lambda at: progress("folds", at.done, at.folds),
     ).to_dict()
-    stage(f"4/6  live: {size.live_s:.0f} s of a virtual person it never met")
-    heard = _live(bundle, size.live_s)
-    stage("5/6  C for the toy, which gives the same answers")
+    stage(f"4/6  live: {size.live_s:.0f} s of a virtual person left out of the training")
+    live = _live(bundle, size.live_s)
+    stage("5/6  export C for the toy, which gives the same answers")
     exported = _export(bundle, out / "export")
-    stage("6/6  report")
+    stage("6/6  write the report")
     report = write_report(out / "report.html", dataset, [evaluation], [bundle], title="PlushSense demo")
     return {
         "simulation": SIMULATION,
@@ -99,18 +89,16 @@ def run_demo(out: Path, *, quick: bool = False, stage: Stage, progress: Progress
         "report": str(report),
         "export": str(exported),
         "scores": {key: result[key] for key in ("split", "context", "leaky", "accuracy", "macro_f1", "by_recording")},
-        "live": heard,
+        "live": live,
     }
 
 
-def _dataset(
-    dest: Path, raw: Path, *, people: int, repetitions: int, seed: int, progress: Callable[[str, int, int], None]
-) -> Dataset:
-    """Simulate and import a data set of virtual people; an existing one is kept."""
+def _dataset(dest: Path, raw: Path, size: DemoSize, progress: Progress) -> Dataset:
+    """Simulate and import a data set of virtual people; open it where it exists."""
     if (dest / "dataset.toml").is_file():
         return open_dataset(dest)
     if not raw.exists():
-        simulate(raw, people=people, repetitions=repetitions, seed=seed, progress=progress)
+        simulate(raw, people=size.people, repetitions=size.repetitions, seed=1, progress=progress)
     return import_simulation(raw, dest, progress)
 
 
@@ -122,24 +110,24 @@ def _export(bundle: Path, folder: Path) -> Path:
 
 
 def _live(bundle: Path, seconds: float) -> dict[str, Any]:
-    """Compare the live answers of the model with what a virtual stranger did: affect and gesture at each end."""
+    """Compare the decision at the end of each gesture of a virtual person with the performed gesture."""
     model = Bundle.load(bundle)
     classifier = StreamClassifier(model)
     with open_device(f"virtual://?person={STRANGER}&seed=7&speed=0", model.layout) as device:
         if not isinstance(device, VirtualDevice):
             raise ConfigError("The demo needs the virtual toy.")
-        live = run_loop(device, classifier, seconds=seconds)
-        said = list(live)
+        live = run_live(device, classifier, seconds=seconds)
+        decisions = list(live)
         summary = live.summary().to_dict()
         first_ms = device.first_ms or 0
-        heard = []
+        gestures = []
         for performed in device.performed:
             end = (performed.end_ms - first_ms) / 1000.0
             begin = (performed.start_ms - first_ms) / 1000.0
-            during = [d for d in said if begin <= d.t_s <= end and d.gesture is not None]
+            during = [d for d in decisions if begin <= d.t_s <= end and d.gesture is not None]
             if during and end <= summary["seconds"]:
                 last = during[-1]
-                heard.append(
+                gestures.append(
                     {
                         "t_s": round(begin, 2),
                         "performed": performed.label,
@@ -149,4 +137,4 @@ def _live(bundle: Path, seconds: float) -> dict[str, Any]:
                         "confidence": last.confidence,
                     }
                 )
-    return {"summary": summary, "gestures": heard}
+    return {"summary": summary, "gestures": gestures}

@@ -1,4 +1,4 @@
-"""A calibration for a bundle that has none: from the data set that it was trained on, and only its training people."""
+"""Calibrate a bundle on its training data, export it, and build its stream classifier."""
 
 from __future__ import annotations
 
@@ -22,27 +22,25 @@ from plushsense.deploy.quantize import calibrated, integer_model, refuse_undeplo
 from plushsense.models.bundle import Bundle
 from plushsense.windows.anywhere import AnywhereSpec
 from plushsense.windows.cut import WindowSpec
-from plushsense.workflow.preparation import Warn, silent, windows_for
+from plushsense.workflow.preparation import WHOLE_PEOPLE, Warn, silent, windows_for
 
 if TYPE_CHECKING:
-    from plushsense.models.bundle import Bundle
     from plushsense.runtime.classifier import StreamReader
     from plushsense.runtime.decisions import DecideSpec
 
 
-# Splits that hold whole people back: their windows are told from the others by the person.
-_BY_PERSON = "validation-subjects"
+_TRIED = 512  # windows that a converter compares
 
 
 def calibrated_on(bundle: Bundle, dataset: Dataset | str | os.PathLike[str], warn: Warn = silent) -> Bundle:
-    """Return the bundle with the value ranges of its `training_windows`; a fine-tuned bundle keeps its own.
+    """Return the bundle calibrated on its `training_windows`; a fine-tuned bundle keeps its calibration.
 
     Raises:
         ArchError, BundleError: as `training_windows`.
     """
     refuse_undeployable(bundle.arch)
     if bundle.calibration and bundle.provenance.get("quantize_aware"):
-        warn("the bundle was fine-tuned for the calibration that it holds, so that it keeps it")
+        warn("the bundle was fine-tuned for its own calibration, which is kept")
         return bundle
     return calibrated(bundle, training_windows(bundle, dataset, warn))
 
@@ -50,29 +48,29 @@ def calibrated_on(bundle: Bundle, dataset: Dataset | str | os.PathLike[str], war
 def training_windows(
     bundle: Bundle, dataset: Dataset | str | os.PathLike[str], warn: Warn = silent
 ) -> NDArray[np.int32]:
-    """Cut the raw windows (N, C, T) of the people that a bundle was trained on, as its training did.
+    """Cut the raw windows (N, C, T) of the people that a bundle was trained on, as for its training.
 
     Args:
-        dataset: the one that it was trained on; warned of when its content is another by now.
+        dataset: the data set of the training; `warn` is called when its content has changed since.
 
     Raises:
         ArchError: for a network that cannot be deployed.
-        BundleError: when the training windows cannot be told from those that were held back, or are not there.
+        BundleError: when the training windows are missing, or cannot be distinguished from the validation windows.
     """
     refuse_undeployable(bundle.arch)
     dataset = as_dataset(dataset)
     origin = bundle.provenance
-    # Nobody's windows stand in every fold, held-back ones too.
     if isinstance(origin.get("subjects"), int):
         raise BundleError(
-            "The bundle belongs to an export and does not say who it was trained on, so that people held back could "
-            "slip in: give the bundle that plushsense train wrote."
+            "The bundle belongs to an export and does not name its training people, which calibration needs: give the "
+            "bundle that plushsense train wrote."
         )
+    # Windows of nobody are in the training and in the validation part.
     people = {str(s) for s in origin.get("subjects", ())} - {NOBODY}
-    if origin.get("split") != _BY_PERSON or not people:
+    if origin.get("split") != WHOLE_PEOPLE or not people:
         raise BundleError(
-            "The bundle does not say which people its training windows came from "
-            f"(split '{origin.get('split', 'unknown')}'), so that held-back ones could slip in: train it again."
+            "The bundle does not name the people of its training windows "
+            f"(split '{origin.get('split', 'unknown')}'), which calibration needs: train it again."
         )
     if dataset.layout.inputs != bundle.layout.inputs or dataset.layout.period_us != bundle.layout.period_us:
         raise BundleError(
@@ -80,24 +78,21 @@ def training_windows(
             f"'{bundle.layout.name}': give the data set that it was trained on."
         )
     if origin.get("dataset_hash") != dataset.hash:
-        warn(f"'{dataset.head.name}' has not the content that the bundle was trained on: the ranges are of what it has")
+        warn(f"'{dataset.head.name}' has changed since the training of the bundle: its present content is used")
     known = {field.name for field in fields(WindowSpec)}
     spec = WindowSpec(**{k: v for k, v in bundle.windowing.items() if k in known})
     anywhere = AnywhereSpec(**bundle.windowing.get("anywhere", {}))
     windows = windows_for(dataset, bundle.arch, spec, bundle.gestures, warn, anywhere)
-    mine = np.flatnonzero(np.isin(windows.subject, sorted(people)))
-    if not len(mine):
+    at = np.flatnonzero(np.isin(windows.subject, sorted(people)))
+    if not len(at):
         raise BundleError(
-            f"The data set '{dataset.head.name}' holds no window of the {len(people)} people the bundle was trained "
+            f"The data set '{dataset.head.name}' has no window of the {len(people)} people the bundle was trained "
             "on: give the data set that it was trained on."
         )
-    missing = sorted(people - set(windows.subject[mine].tolist()))
+    missing = sorted(people - set(windows.subject[at].tolist()))
     if missing:
-        warn(f"not in '{dataset.head.name}' any more: {', '.join(missing)}")
-    return windows.x[mine]
-
-
-_TRIED = 512  # windows
+        warn(f"no longer in '{dataset.head.name}': {', '.join(missing)}")
+    return windows.x[at]
 
 
 def export(
@@ -108,29 +103,28 @@ def export(
     also: Sequence[str] = (),
     warn: Warn = silent,
 ) -> ExportResult:
-    """Write what a toy needs to run a bundle's network: C99, the model as data, golden vectors, packages.
+    """Write the files that a toy needs to run a bundle's network: C99, the model as data, golden vectors, packages.
 
     Args:
-        bundle: with ``stream`` padding and batch normalisation.
-        out: a folder that does not exist yet, or is empty.
-        dataset: the one that the bundle was trained on; calibrates anew, or for the first time where the bundle
-            holds no calibration.
-        also: formats for other runtimes (`plushsense.deploy.convert.CONVERTERS`), as ``onnx``.
-        warn: told what may matter.
+        bundle: a bundle with ``stream`` padding and batch normalisation.
+        out: a new or empty folder.
+        dataset: the data set of the training, to calibrate on; required where the bundle has no calibration.
+        also: formats for other runtimes (`plushsense.deploy.convert.CONVERTERS`), such as ``onnx``.
+        warn: called with a sentence for everything unusual.
 
     Raises:
-        ArchError: for a network that has no meaning in the toy, with the nearest that has.
-        BundleError: for a bundle without calibration, and a conversion that does not give the network's answers.
-        ConfigError, MissingExtraError: for an unknown format, and one whose package is not installed.
-        BadInput: for a folder that is taken.
+        ArchError: for a network that cannot be deployed, with the nearest that can.
+        BundleError: for a bundle without calibration, or a conversion that gives other answers than the network.
+        ConfigError, MissingExtraError: for an unknown format, or one whose package is not installed.
+        BadInput: for a folder that is not empty.
     """
     given = bundle if isinstance(bundle, Bundle) else Bundle.load(Path(bundle))
     windows = None
     if dataset is not None:
         dataset = as_dataset(dataset)
-        windows = training_windows(given, dataset, warn) if also else None
-        # Some tell as much to a converter, which tries them one by one.
-        windows = None if windows is None else windows[:: -(-len(windows) // _TRIED)]
+        if also:
+            windows = training_windows(given, dataset, warn)
+            windows = windows[:: -(-len(windows) // _TRIED)]
         given = calibrated_on(given, dataset, warn if windows is None else silent)
     model = integer_model(given)
     given = replace(given, provenance=without_people(given.provenance))
@@ -150,11 +144,8 @@ def export(
     return emit(model, given, Path(out), extras=[converted, package])
 
 
-ENGINES = ("float", "int8", "both")
-
-
 def classifier_of(bundle: Bundle, decide: DecideSpec | None, engine: str) -> StreamReader:
-    """Build the stream classifier of a bundle; ``engine`` is one of `ENGINES`.
+    """Build the stream classifier of a bundle for one of the `ENGINES`.
 
     Raises:
         BundleError: for ``int8`` and ``both``, where the network cannot be deployed.

@@ -25,36 +25,36 @@ def silent(_: str) -> None:
     """Ignore a warning."""
 
 
-def choose_classes(dataset: Dataset, wanted: str | Sequence[str], warn: Warn = silent) -> GestureSet:
-    """Return the classes to tell apart: "shared", "all", or labels (a list, or text with commas)."""
-    if wanted == SHARED:
+def choose_classes(dataset: Dataset, choice: str | Sequence[str], warn: Warn = silent) -> GestureSet:
+    """Return the gestures to classify: "shared", "all", or labels (a list, or text with commas)."""
+    if choice == SHARED:
         gestures, left_out = shared_gestures(dataset)
         if left_out:
             reasons = "; ".join(f"{label} ({why})" for label, why in left_out.items())
             warn(f"left out of the shared gestures: {reasons}")
-    elif wanted == ALL:
-        made = {r.gesture for r in dataset.used}
-        gestures = dataset.gestures.subset([g for g in dataset.gestures.labels if g in made])
+    elif choice == ALL:
+        recorded = {r.gesture for r in dataset.used}
+        gestures = dataset.gestures.subset([g for g in dataset.gestures.labels if g in recorded])
     else:
-        labels = wanted.split(",") if isinstance(wanted, str) else wanted
+        labels = choice.split(",") if isinstance(choice, str) else choice
         gestures = dataset.gestures.subset([label.strip() for label in labels])
     if len(gestures) < 2:
         raise DatasetError(
-            f"Only {len(gestures)} gesture is left to tell apart ({', '.join(gestures.labels) or 'none'}): "
+            f"At least 2 gestures are needed, not {len(gestures)} ({', '.join(gestures.labels) or 'none'}): "
             "choose others with --classes all or --classes LABEL,LABEL."
         )
     return gestures
 
 
-def classes_for(dataset: Dataset, wanted: str | Sequence[str], context: str, warn: Warn = silent) -> GestureSet:
-    """Return the chosen classes, with one for idleness where training goes anywhere in a stream."""
-    gestures = choose_classes(dataset, wanted, warn)
+def classes_for(dataset: Dataset, choice: str | Sequence[str], context: str, warn: Warn = silent) -> GestureSet:
+    """Return the chosen gestures, with one for idleness where the context is "anywhere"."""
+    gestures = choose_classes(dataset, choice, warn)
     if context != ANYWHERE:
         return gestures
-    with_one = add_idle_gesture(gestures, dataset)
-    if added := [g.label for g in with_one.gestures if g not in gestures.gestures]:
+    with_idle = add_idle_gesture(gestures, dataset)
+    if added := [g.label for g in with_idle.gestures if g not in gestures.gestures]:
         warn(f"added a class for what happens between gestures: {added[0]}")
-    return with_one
+    return with_idle
 
 
 def windows_for(
@@ -65,7 +65,7 @@ def windows_for(
     warn: Warn = silent,
     anywhere: AnywhereSpec | None = None,
 ) -> WindowSet:
-    """Cut windows as ``arch`` needs them, with as much past as a decision sees."""
+    """Cut the windows of a network, as long as the span that a decision depends on."""
     span_s = arch.span / dataset.layout.rate_hz
     spec = replace(spec, span_s=span_s if span_s > spec.window_s else 0.0)
     if spec.context == ANYWHERE:
@@ -78,10 +78,10 @@ def windows_for(
 
 
 def outside_streams(windows: WindowSet, dataset: Dataset, people: Collection[str]) -> NDArray[np.bool_]:
-    """Return which windows lie in no stream of ``people``, (N,).
+    """Return which windows are in no stream of ``people``, (N,).
 
-    The toy at rest is nobody's and trains in every fold, but somebody may have recorded it within a session; whoever
-    is heard as a whole stream must not have given any of it.
+    Recordings of the toy at rest belong to nobody and train in every fold, but may lie in a person's session. People
+    whose whole streams are scored must not contribute any training window.
     """
     theirs = [s.id for s in dataset.streams if s.subject in people]
     return ~np.isin(windows.stream, np.array(theirs, dtype=np.str_))
@@ -92,40 +92,44 @@ WHOLE_PEOPLE = "validation-subjects"
 
 @dataclass(frozen=True)
 class TrainValidationSplit:
-    """The train/validation split of a single training, with a description in words."""
+    """The train/validation split of a single training.
+
+    ``train`` and ``watch`` are indices of training and validation windows.
+    """
 
     split: Split
     kind: str
-    said: str
+    description: str
     fold: WindowFold
     train: NDArray[np.int64]
     watch: NDArray[np.int64]
 
 
 def divide(windows: WindowSet, config: RunConfig, scored: WindowSet | None = None) -> TrainValidationSplit:
-    """Hold some people back; of fewer than three, some recordings. Nothing that is scored is trained on.
+    """Hold out some people for validation, or some recordings where there are fewer than three people.
 
-    ``watch`` and ``test`` are of ``scored``: the same recordings, cut in another way (the same when left out).
+    ``watch`` and the fold's ``test`` are indices into ``scored``: the same recordings, cut in another way (default:
+    ``windows``). No scored recording is trained on.
     """
     scored = windows if scored is None else scored
     seed = config.evaluation.seed
-    stopped = "" if config.training.patience is None else " but decided when to stop"
+    stops = "" if config.training.patience is None else " but decided when to stop"
     if config.preset == "search":
         split = parse_split("windows:holdout")
         fold = fold_windows(windows, scored, split, seed)[0]
-        said = "15 % of the windows, drawn at random: leaky, windows of one recording stand on both sides"
-        return TrainValidationSplit(split, split.text, said, fold, fold.train, fold.validation)
+        description = "15 % of the windows, drawn at random: leaky, windows of one recording are on both sides"
+        return TrainValidationSplit(split, split.text, description, fold, fold.train, fold.validation)
     people = set(windows.subject.tolist()) - {NOBODY, UNKNOWN_SUBJECT}
     if len(people) >= 3:
         split = parse_split(f"by-subject:{min(len(people), round(1 / VALIDATION_SHARE))}")
-        kind, said = WHOLE_PEOPLE, f"people who were not trained on{stopped}: "
+        kind, description = WHOLE_PEOPLE, f"people who were not trained on{stops}: "
     else:
         recordings = len(np.unique(windows.recording))
         split = parse_split(f"by-recording:{max(2, min(recordings // 2, round(1 / VALIDATION_SHARE)))}")
         kind = "validation-recordings"
-        said = f"recordings that were not trained on{stopped}; of the people who were, so flattering"
+        description = f"recordings that were not trained on{stops}; of people who were, so the scores are too high"
     fold = fold_windows(windows, scored, split, seed)[0]
     if split.apart:
-        said += ", ".join(fold.subjects)
+        description += ", ".join(fold.subjects)
     rest = np.sort(np.concatenate([fold.train, fold.validation]))
-    return TrainValidationSplit(split, kind, said, fold, rest, fold.test)
+    return TrainValidationSplit(split, kind, description, fold, rest, fold.test)

@@ -1,4 +1,4 @@
-"""Evaluations on disk, and the page that shows them."""
+"""Store evaluations in folders, and write reports of them."""
 
 from __future__ import annotations
 
@@ -23,11 +23,7 @@ from plushsense.workflow.config import RunConfig
 
 
 def check_folder(out: Path, what: str) -> None:
-    """Check that results can be written to the folder ``out``; ``what`` names them, as in "A sweep".
-
-    Raises:
-        ConfigError: where it cannot.
-    """
+    """Raise ConfigError if results cannot be written to the folder ``out``; ``what`` names them, as in "A sweep"."""
     there = next(p for p in (out.absolute(), *out.absolute().parents) if p.exists())
     if not there.is_dir():
         raise ConfigError(f"{what} cannot be written to '{out}': '{there}' is a file; give a folder.")
@@ -38,13 +34,13 @@ def check_folder(out: Path, what: str) -> None:
 def journal_of(dataset: Dataset, kind: str) -> Journal:
     """Return the journal of one kind of results in the data set's cache.
 
-    It refuses what was made with a person who was taken out since ``dataset`` was opened (`dataset.generation`).
+    Its methods raise ForgottenError if a person was removed since ``dataset`` was opened (`dataset.generation`).
     """
     return Journal(dataset.path / CACHE / kind, dataset.generation.writing)
 
 
 def machine(*more: str) -> str:
-    """Describe the processor, ``more`` and the system in plain words, without the host's name."""
+    """Describe the processor, ``more`` and the operating system, without the host's name."""
     processor = platform.processor() or platform.machine()
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
@@ -63,11 +59,11 @@ def evaluation_id(config: RunConfig, dataset: Dataset) -> str:
 
 
 def check_place(out: Path, config: RunConfig, dataset: Dataset, *, replace: bool = False) -> None:
-    """Check that an evaluation can be written to a folder, before hours of training rather than after.
+    """Check before the training that an evaluation can be written to a folder.
 
     Raises:
-        ConfigError: where ``out`` is no folder and cannot be one, holds a ``report.html`` of something else, or (not
-            with ``replace``) an evaluation of other settings or other data.
+        ConfigError: when ``out`` is not a folder, has a ``report.html`` of something else, or (without ``replace``) an
+            evaluation of other settings or data.
     """
     from plushsense.reports.page import check_page_path
 
@@ -76,21 +72,21 @@ def check_place(out: Path, config: RunConfig, dataset: Dataset, *, replace: bool
     path = out / SCORES
     if replace or not path.exists():
         return
-    held = _evaluation_table(path)
-    if held.get("id") == evaluation_id(config, dataset):
+    earlier = _evaluation_table(path)
+    if earlier.get("id") == evaluation_id(config, dataset):
         return
-    kept = held.get("dataset")
-    other = isinstance(kept, Mapping) and kept.get("hash") != dataset.hash
+    data = earlier.get("dataset")
+    other = isinstance(data, Mapping) and data.get("hash") != dataset.hash
     raise ConfigError(
-        f"'{out}' holds an evaluation of {'other data' if other else 'other settings'} "
-        f"({held.get('split')}, {held.get('title')}): choose another --out, or --force to replace it."
+        f"'{out}' contains an evaluation of {'other data' if other else 'other settings'} "
+        f"({earlier.get('split')}, {earlier.get('title')}): choose another --out, or --force to replace it."
     )
 
 
 def save_evaluation(result: Evaluation, dataset: Dataset, config: RunConfig, arch: Arch, out: Path) -> Path:
     """Write ``predictions.parquet`` and ``evaluation.json`` (scores, data set, network, settings) to a folder."""
     out.mkdir(parents=True, exist_ok=True)
-    # Never predictions beside the scores of others: who is in them is read from there when a person is to be forgotten.
+    # `forget` reads the people from the scores: never leave new predictions beside scores of other people.
     (out / SCORES).unlink(missing_ok=True)
     result.write_predictions(out / PREDICTIONS)
     content = {
@@ -111,7 +107,7 @@ def save_evaluation(result: Evaluation, dataset: Dataset, config: RunConfig, arc
 
 
 def evaluation_title(result: Evaluation, arch: Arch, config: RunConfig) -> str:
-    """Return a title that tells one evaluation from another."""
+    """Return a title that distinguishes evaluations of different settings."""
     context = f"{result.context} context"
     if result.train_context != result.context:
         context += f", trained on {result.train_context}"
@@ -120,7 +116,7 @@ def evaluation_title(result: Evaluation, arch: Arch, config: RunConfig) -> str:
 
 
 def card(arch: Arch, **more: Any) -> dict[str, Any]:
-    """Return the counts of a network for a model card and the command line."""
+    """Return the symbol and the counts of a network for a model card and the command line."""
     return {
         **arch.to_dict(),
         "parameters": arch.parameters,
@@ -144,7 +140,7 @@ def write_report(
     """Write one self-contained HTML page: data set, protocol, scores, confusions, curves, model cards.
 
     Args:
-        evaluations: results of `evaluate`, or folders (or files) where they were saved.
+        evaluations: results of `evaluate`, or the folders or files of saved ones.
         models: bundles, or their paths.
     """
     from plushsense.reports.evaluation import write_evaluation_report
@@ -162,7 +158,7 @@ def write_report(
         )
         for b in bundles
     ]
-    shown = {
+    properties = {
         "name": summary["name"],
         "layout": dataset.layout.title,
         "subjects": summary["subjects"],
@@ -179,42 +175,38 @@ def write_report(
         return write_evaluation_report(
             Path(path),
             title=title or f"PlushSense: {summary['name']}",
-            dataset=shown,
+            dataset=properties,
             evaluations=[_evaluation_table(e) for e in evaluations],
             models=cards,
             simulated=bool(summary["simulated"]),
         )
 
 
-def _evaluation_table(given: Evaluation | Mapping[str, Any] | str | os.PathLike[str]) -> dict[str, Any]:
-    if isinstance(given, Evaluation):
-        return given.to_dict()
-    if isinstance(given, Mapping):
-        table = dict(given)
+def _evaluation_table(source: Evaluation | Mapping[str, Any] | str | os.PathLike[str]) -> dict[str, Any]:
+    if isinstance(source, Evaluation):
+        return source.to_dict()
+    if isinstance(source, Mapping):
+        table = dict(source)
     else:
-        path = Path(given)
+        path = Path(source)
         path = path / SCORES if path.is_dir() else path
         try:
             table = json.loads(path.read_text(encoding="utf-8"))
+            if not isinstance(table, dict):
+                raise ValueError("no JSON object")
         except FileNotFoundError:
             raise BadInput(
-                f"There is no evaluation at '{path}': make one with  plushsense evaluate ... --out DIR"
+                f"There is no evaluation at '{path}': create one with  plushsense evaluate ... --out DIR"
             ) from None
-        except (OSError, ValueError) as cause:
-            raise BadInput(
-                f"'{path}' is not an evaluation ({cause}): give a folder that evaluate --out wrote."
-            ) from None
-        if not isinstance(table, dict):
-            raise BadInput(f"'{path}' is not an evaluation: give a folder that evaluate --out wrote.")
-    # The page has its own words for the network; the counts stand on the model card.
+        except (OSError, ValueError) as error:
+            raise BadInput(f"'{path}' is not an evaluation ({error}): give a folder written by evaluate.") from None
+    # The title names the network, and the model card has its counts.
     table.pop("model", None)
     return table
 
 
 def name_of(config: RunConfig, dataset: Dataset) -> str:
     """Return a folder name for an evaluation: readable settings, and a hash of everything else."""
-    from plushsense.workflow.reporting import evaluation_id
-
     evaluation, model = config.evaluation, config.model
     context = config.windows.context
     if evaluation.train_context not in (None, context):
