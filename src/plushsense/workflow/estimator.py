@@ -1,4 +1,4 @@
-"""A classifier of scikit-learn, for people who have arrays and know its tools and not ours."""
+"""The network as a scikit-learn classifier of arrays."""
 
 from __future__ import annotations
 
@@ -29,12 +29,16 @@ ANONYMOUS = "arrays"
 ANONYMOUS_RATE_HZ = 100.0
 
 _INT32 = np.iinfo(np.int32).max
-# Steps in one spread (standard deviation) of a channel, and steps up to its largest value, which leave room for twice
-# that value later.
+# Smallest number of steps in a channel's standard deviation, and largest number up to its peak: a later value may be
+# twice as large.
 _STEPS_IN_SPREAD = 2.0**16
 _STEPS_IN_PEAK = 2.0**29
-# What a sum's rounding leaves of a channel's spread that has none.
+# Relative standard deviation below which a channel is constant but for rounding errors.
 _CONSTANT = 1e-12
+# Windows in a batch of a prediction: a layer's output is in memory as a whole.
+_BATCH = 256
+# The settings that only the training reads.
+_TRAINING = ("preset", "epochs", "batch", "learning_rate", "random_state")
 
 
 def rows_of(X: Any) -> tuple[Any, tuple[int, int] | None]:
@@ -47,15 +51,15 @@ def rows_of(X: Any) -> tuple[Any, tuple[int, int] | None]:
     return np.reshape(np.asarray(X), (shape[0], shape[1] * shape[2])), (shape[1], shape[2])
 
 
-def shape_of(features: int, found: tuple[int, int] | None, asked: int | None) -> tuple[int, int]:
-    """Return (C, T) of the windows: their own shape, else the one given, else one channel."""
-    if asked is not None and (not isinstance(asked, int | np.integer) or asked < 1):
-        raise ArrayError(f"channels is {asked!r}: accepted are None and whole numbers from 1 up.")
-    if found is not None and asked is not None and found[0] != asked:
+def shape_of(features: int, shape: tuple[int, int] | None, given: int | None) -> tuple[int, int]:
+    """Return (C, T) of the windows from their shape, else from the given number of channels, else for one channel."""
+    if given is not None and (not isinstance(given, int | np.integer) or given < 1):
+        raise ArrayError(f"channels is {given!r}: accepted are None and whole numbers from 1 up.")
+    if shape is not None and given is not None and shape[0] != given:
         raise ArrayError(
-            f"X holds windows of {found[0]} channels, but channels or layout say {asked}: change one of them."
+            f"X has windows of {shape[0]} channels, but channels or layout say {given}: change one of them."
         )
-    channels = found[0] if found is not None else int(asked or 1)
+    channels = shape[0] if shape is not None else int(given or 1)
     if features % channels:
         raise ArrayError(f"X has n_features = {features}, which {channels} channels do not divide: give (N, C·T).")
     if features // channels < 2:
@@ -66,7 +70,7 @@ def shape_of(features: int, found: tuple[int, int] | None, asked: int | None) ->
 
 
 def people_of(groups: ArrayLike | None, n: int) -> NDArray[np.str_]:
-    """Return the person of each window; without groups each window is a person."""
+    """Return the person of each window, (N,); without groups each window is a person."""
     people = np.arange(n) if groups is None else np.asarray(groups)
     if people.shape != (n,):
         raise ArrayError(f"groups has the shape {people.shape}: expected ({n},), one a window.")
@@ -85,14 +89,14 @@ def watching_of(people: NDArray[np.str_], seed: int) -> NDArray[np.bool_]:
 def anonymous_layout(x: NDArray[Any]) -> Layout:
     """Build a layout for windows (N, C, T) without channel names.
 
-    Integers of up to 32 bits keep their value (step 1). Floats are read in steps of a power of two, at most 1/65536
-    of the channel's spread but no finer than 2⁻²⁹ of its largest value; a constant channel, from which nothing is
-    learnt, in steps as large as itself. The rate is unknown; 100 Hz stands in for it.
+    Integers of up to 32 bits have the step 1. The step of floats is a power of two, at most 1/65536 of the channel's
+    standard deviation but at least 2⁻²⁹ of its largest value; the step of a constant channel is that value. The
+    unknown rate is set to 100 Hz.
     """
-    whole = x.dtype.kind in "biu"
+    integers = x.dtype.kind in "biu"
     names = [f"channel {i}" for i in range(x.shape[1])]
     channels = tuple(
-        Channel(name, "unknown", "unknown", step=_step(x[:, i].astype(np.float64), whole))
+        Channel(name, "unknown", "unknown", step=_step(x[:, i].astype(np.float64), integers))
         for i, name in enumerate(names)
     )
     columns = (HOST_MS, DEVICE_MS, *names)
@@ -108,48 +112,47 @@ def anonymous_layout(x: NDArray[Any]) -> Layout:
     )
 
 
-def _step(values: NDArray[np.float64], whole: bool) -> float:
+def _step(values: NDArray[np.float64], integers: bool) -> float:
     peak = float(np.abs(values).max())
-    if peak == 0.0 or (whole and peak <= _INT32):
+    if peak == 0.0 or (integers and peak <= _INT32):
         return 1.0
-    # Divided first: squares of large values would not be finite.
+    # Divide first: squares of large values may overflow.
     spread = float((values / peak).std())
     finest = max(spread / _STEPS_IN_SPREAD, 1.0 / _STEPS_IN_PEAK) if spread > _CONSTANT else 1.0
     return float(2.0 ** np.floor(np.log2(max(finest * peak, 1e-300))))
 
 
 def to_integers(x: NDArray[Any], layout: Layout) -> NDArray[np.int32]:
-    """Scale windows (N, C, T) to the integers that a network of ``layout`` reads.
+    """Convert windows (N, C, T) to the integers that a network of ``layout`` reads.
 
-    With an anonymous layout, values are rounded to its steps, and what 32 bits do not hold is cut off. With a real
-    one, windows are those of `cut_windows`, integers already.
+    With an anonymous layout, values are rounded to its steps and clipped to 32 bits. With a real layout, windows must
+    be the integers of `cut_windows`.
 
     Raises:
-        ArrayError: for values that are not finite, or no integers where the layout is real.
+        ArrayError: for values that are not finite, or with a real layout not integers.
     """
     refuse_holes(x)
     if layout.name == ANONYMOUS:
         steps = np.array([c.step for c in layout.channels])
-        whole: NDArray[np.int32] = np.clip(np.rint(x / steps[:, None]), -_INT32, _INT32).astype(np.int32)
-        return whole
+        return np.asarray(np.clip(np.rint(x / steps[:, None]), -_INT32, _INT32), dtype=np.int32)
     if x.dtype.kind == "f" and (np.rint(x) != x).any():
         raise ArrayError(
-            f"X holds values that are not whole numbers, but with the layout '{layout.name}' it must hold the integers "
-            "that cut_windows gives: leave scaling to the classifier, or leave layout out."
+            f"X has values that are not whole numbers, but with the layout '{layout.name}' it must have the integers "
+            "of cut_windows: leave scaling to the classifier, or leave layout out."
         )
     if x.size and (x.max() > _INT32 or x.min() < -_INT32 - 1):
-        raise ArrayError(f"X holds values beyond 32 bits, which the layout '{layout.name}' cannot hold: check X.")
+        raise ArrayError(f"X has values beyond 32 bits, the limit of the layout '{layout.name}': check X.")
     return x.astype(np.int32)
 
 
 def refuse_holes(x: NDArray[Any]) -> None:
-    """Refuse NaN and infinity, saying where the first is."""
+    """Raise ArrayError for NaN and infinity, with the position of the first."""
     if x.dtype.kind == "f" and not np.isfinite(x).all():
         bad = ~np.isfinite(x)
         window, channel, sample = (int(i) for i in np.argwhere(bad)[0])
         raise ArrayError(
-            f"X holds NaN or infinity in {int(bad.any(axis=(1, 2)).sum())} of {len(x)} windows, first in window "
-            f"{window}, channel {channel}, sample {sample}: fill such places or leave these windows out."
+            f"X has NaN or infinity in {int(bad.any(axis=(1, 2)).sum())} of {len(x)} windows, first in window "
+            f"{window}, channel {channel}, sample {sample}: replace such values or leave these windows out."
         )
 
 
@@ -185,19 +188,19 @@ def windows_of(
 def gestures_of(classes: NDArray[Any], known: GestureSet | None = None) -> GestureSet:
     """Build a gesture for each class, in class order, with affect and family where ``known`` has the label.
 
-    Labels that a gesture set would take for one (``a`` and ``A``), or that are empty, are told apart by their number.
+    Labels that are empty, or equal in a gesture set (``a`` and ``A``), get their number as a prefix.
     """
     texts = [str(c) for c in classes.tolist()]
     plain = [plain_label(t) for t in texts]
     if "" in plain or len(set(plain)) < len(plain):
         texts = [f"class {i}: {t}" for i, t in enumerate(texts)]
-    found = [known.find(t) if known is not None else None for t in texts]
-    gestures = tuple(replace(g, label=t) if g else Gesture(t) for g, t in zip(found, texts, strict=True))
+    matches = [known.find(t) if known is not None else None for t in texts]
+    gestures = tuple(replace(g, label=t) if g else Gesture(t) for g, t in zip(matches, texts, strict=True))
     return GestureSet(known.name if known is not None else ANONYMOUS, gestures, inferred=known is None)
 
 
 def labels_table(classes: NDArray[Any]) -> dict[str, Any]:
-    """Return the labels of ``classes`` as a bundle keeps them; `labels_from` restores them with their type."""
+    """Return the labels of ``classes`` as a bundle stores them; `labels_from` restores them with their type."""
     values = classes.tolist()
     if not all(isinstance(v, str | int | float) for v in values):
         return {"labels": [str(v) for v in values], "dtype": "O"}
@@ -213,8 +216,8 @@ def labels_from(bundle: Bundle) -> NDArray[Any]:
 
 
 if TYPE_CHECKING or importlib.util.find_spec("sklearn") is None:
-    # The name must load in every install (`from plushsense import *`), so what scikit-learn would give is only
-    # declared here; making a classifier says what to install. The type checker reads the same lines.
+    # PlushClassifier must be importable without scikit-learn (`from plushsense import *`); creating one raises
+    # MissingExtraError. The type checker reads these declarations too.
     class BaseEstimator:
         def __new__(cls, *_: Any, **__: Any) -> Self:
             need("sklearn", "baselines")
@@ -233,12 +236,9 @@ if TYPE_CHECKING or importlib.util.find_spec("sklearn") is None:
 else:
     from sklearn.base import BaseEstimator, ClassifierMixin
 
-# Windows at a time: what a layer computes is in memory whole.
-_READ = 256
-
 
 class PlushClassifier(ClassifierMixin, BaseEstimator):
-    """Learns to tell windows apart: a small 1D CNN, with the manners of scikit-learn.
+    """A small 1D CNN as a scikit-learn classifier of windows.
 
         windows = ps.cut_windows(dataset)
         y = np.array(windows.labels)[windows.y]
@@ -246,36 +246,34 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
         cross_val_score(model, windows.x, y, groups=windows.subject, cv=LeaveOneGroupOut())
         model.fit(windows.x, y).save("model.plush", gestures=dataset.gestures)     # for ``plushsense live``
 
-    ``X`` is (N, C, T): N windows of C channels of T samples; or (N, C·T), as ``X.reshape(N, -1)`` makes it and
-    pipelines pass it on: one channel after the other, how many says ``channels`` (1 where neither it nor ``layout`` is
-    given). Both forms may be mixed between ``fit`` and ``predict``. Labels may be of any type that scikit-learn
-    sorts; ``predict`` gives the same type back. Sample weights are not supported, nor is ``partial_fit``.
+    ``X`` is (N, C, T), N windows of C channels of T samples, or (N, C·T) as from ``X.reshape(N, -1)``, one channel
+    after the other; ``fit`` and ``predict`` may get different forms. Labels may be of any type that scikit-learn sorts.
+    Sample weights and ``partial_fit`` are not supported.
 
-    Training needs the extra ``train`` (PyTorch); a trained or unpickled classifier predicts without it. A pickle holds
-    the network as a bundle's bytes and no object of PyTorch.
+    Training needs the extra ``train`` (PyTorch); a trained or unpickled classifier predicts without it. A pickle
+    contains the network as the bytes of a bundle, without objects of PyTorch.
 
     Args:
-        arch, filters, padding, norm: the network (see `Arch`). The padding None is the preset's: ``stream`` for
-            most, which needs T of at least the receptive field; ``mirror`` works with any T from 2.
-        preset, epochs, batch, learning_rate: the training; None keeps the preset's number.
-        channels: how many channels a row (N, C·T) holds.
-        layout: a `Layout`, or its name or path, where ``X`` holds the integers of `cut_windows`: then vectors are
-            turned in training as `train` does, and the bundle reads a toy. Without it, channels are anonymous, floats
-            are read in steps of at most 1/65536 of a channel's spread, and the bundle assumes 100 Hz.
-        random_state: a whole number gives the same weights each time; also a RandomState, or None for chance.
+        arch, filters, padding, norm: the network (see `Arch`). With padding None the preset's is used, for most
+            ``stream``, where T must be at least the receptive field; ``mirror`` works with any T from 2.
+        preset, epochs, batch, learning_rate: the training; None: the preset's number.
+        channels: number of channels in a row (N, C·T); default: that of ``layout``, else 1.
+        layout: a `Layout`, its name or its path, where ``X`` has the integers of `cut_windows`. Vectors are then
+            rotated in training as by `train`, and the bundle can read a toy. Without it, channels are anonymous (see
+            `anonymous_layout`).
+        random_state: an integer for the same weights each time, a RandomState, or None.
 
     Attributes:
         classes_: the labels in class order, (K,).
         n_features_in_: C·T.
         bundle_: the trained `Bundle`; its gestures are the classes.
-        history_: one row an epoch, as `Fitted.history`.
+        history_: one row for each epoch, as `Fitted.history`.
 
     Raises:
-        ArrayError: a ValueError, for arrays that do not fit. What scikit-learn checks itself it refuses in its own
-            words (ValueError, NotFittedError).
+        ArrayError: for arrays that do not fit; scikit-learn's own checks raise ValueError or NotFittedError.
     """
 
-    # With metadata routing on, groups reach ``fit`` unless set_fit_request says otherwise.
+    # With metadata routing, groups are passed to ``fit`` unless set_fit_request changes that.
     __metadata_request__fit = {"groups": True}  # noqa: RUF012, RUF100
 
     classes_: NDArray[Any]
@@ -317,9 +315,9 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
     def fit(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None = None) -> Self:
         """Train on the windows ``X`` with the labels ``y`` (N,).
 
-        ``groups`` (N,) names the person of each window. Under a preset that stops early (``loso``, ``paper``) 15 % of
-        the people decide when; without groups 15 % of the windows do, which is leaky. Other presets train on all of X.
-        The bundle keeps their names, as that of `train` does, so that `forget` finds it.
+        ``groups`` (N,) names the person of each window; the bundle stores the names, so that `forget` finds it. With a
+        preset that stops early (``loso``, ``paper``), 15 % of the people are held out for validation; without groups
+        15 % of the windows, which is leaky. Other presets train on all of X.
         """
         from sklearn.utils.multiclass import check_classification_targets
         from sklearn.utils.validation import validate_data
@@ -327,27 +325,22 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
         from plushsense.training.fit import fit
 
         layout = self._known_layout()
-        rows, found = rows_of(X)
+        rows, shape = rows_of(X)
         rows, labels = validate_data(self, rows, y, ensure_all_finite=False)
-        asked = self.channels
+        given = self.channels
         if layout is not None:
-            if asked not in (None, layout.n_inputs):
-                raise ArrayError(f"channels is {asked}, but the layout '{layout.name}' has {layout.n_inputs} inputs.")
-            asked = layout.n_inputs
-        channels, samples = shape_of(rows.shape[1], found, asked)
+            if given not in (None, layout.n_inputs):
+                raise ArrayError(f"channels is {given}, but the layout '{layout.name}' has {layout.n_inputs} inputs.")
+            given = layout.n_inputs
+        channels, samples = shape_of(rows.shape[1], shape, given)
         x = rows.reshape(len(rows), channels, samples)
         refuse_holes(x)
         check_classification_targets(labels)
         classes, index = np.unique(labels, return_inverse=True)
         if len(classes) < 2:
-            raise ArrayError(f"y holds one class ({classes[0]!s}) and no other: telling apart needs at least two.")
-        spec = preset(
-            self.preset,
-            epochs=_plain(self.epochs),
-            batch=_plain(self.batch),
-            learning_rate=_plain(self.learning_rate),
-            seed=_seed(self.random_state),
-        )
+            raise ArrayError(f"y has only one class ({classes[0]!s}): a classifier needs at least two.")
+        numbers = {name: _python_number(getattr(self, name)) for name in ("epochs", "batch", "learning_rate")}
+        spec = preset(self.preset, **numbers, seed=_seed(self.random_state))
         layout = layout or anonymous_layout(x)
         gestures = gestures_of(classes)
         arch = Arch.parse(
@@ -362,7 +355,7 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
         )
         if arch.span > samples:
             raise ArrayError(
-                f"X has windows of {samples} samples, but {arch.symbol} under the padding '{arch.padding}' sees "
+                f"X has windows of {samples} samples, but {arch.symbol} with padding '{arch.padding}' needs "
                 f"{arch.span}: give longer windows, a shorter network, or padding='mirror'."
             )
         people = people_of(groups, len(x))
@@ -410,18 +403,16 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
 
     def predict(self, X: ArrayLike) -> NDArray[Any]:
         """Return the most probable label of each window, (N,)."""
-        best = self._logits(X).argmax(axis=1)
-        found: NDArray[Any] = self.classes_[best]
-        return found
+        return np.asarray(self.classes_[self._logits(X).argmax(axis=1)])
 
     def to_bundle(self, gestures: GestureSet | None = None) -> Bundle:
-        """Return the trained network as a bundle, with affects and families of the labels that ``gestures`` knows."""
+        """Return the trained network as a bundle, with the affects and families of ``gestures``."""
         from sklearn.utils.validation import check_is_fitted
 
         check_is_fitted(self, "bundle_")
-        return (
-            self.bundle_ if gestures is None else replace(self.bundle_, gestures=gestures_of(self.classes_, gestures))
-        )
+        if gestures is None:
+            return self.bundle_
+        return replace(self.bundle_, gestures=gestures_of(self.classes_, gestures))
 
     def save(self, path: str | os.PathLike[str], gestures: GestureSet | None = None) -> Path:
         """Save the bundle (``*.plush``), for `load`, ``plushsense live`` and `from_bundle`."""
@@ -429,7 +420,7 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
 
     @classmethod
     def from_bundle(cls, bundle: Bundle | str | os.PathLike[str]) -> Self:
-        """Build a trained classifier from any bundle; ``X`` is then what that training read."""
+        """Build a trained classifier from a bundle; ``X`` must be as in its training."""
         bundle = bundle if isinstance(bundle, Bundle) else Bundle.load(Path(bundle))
         arch = bundle.arch
         settings: dict[str, Any] = {
@@ -440,11 +431,11 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
             "channels": arch.channels,
             "layout": None if bundle.layout.name == ANONYMOUS else bundle.layout,
         }
-        kept = bundle.provenance.get("estimator", {}).get("settings", {})
-        made = cls(**settings, **{name: kept[name] for name in _TRAINING if name in kept})
-        made.bundle_, made.classes_, made.history_ = bundle, labels_from(bundle), []
-        made.n_features_in_ = arch.channels * max(arch.window, arch.span)
-        return made
+        stored = bundle.provenance.get("estimator", {}).get("settings", {})
+        classifier = cls(**settings, **{name: stored[name] for name in _TRAINING if name in stored})
+        classifier.bundle_, classifier.classes_, classifier.history_ = bundle, labels_from(bundle), []
+        classifier.n_features_in_ = arch.channels * max(arch.window, arch.span)
+        return classifier
 
     def __getstate__(self) -> dict[str, Any]:
         state = dict(super().__getstate__())
@@ -464,27 +455,25 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
         return load_layout(self.layout if isinstance(self.layout, str) else Path(self.layout))
 
     def _settings(self) -> dict[str, Any]:
-        """Return the training settings as a bundle keeps them for `from_bundle`."""
-        kept = {name: _plain(getattr(self, name)) for name in _TRAINING}
-        return kept | {"random_state": kept["random_state"] if isinstance(kept["random_state"], int) else None}
+        """Return the training settings as a bundle stores them for `from_bundle`."""
+        stored = {name: _python_number(getattr(self, name)) for name in _TRAINING}
+        return stored | {"random_state": stored["random_state"] if isinstance(stored["random_state"], int) else None}
 
     def _logits(self, X: ArrayLike) -> NDArray[np.float64]:
         from sklearn.utils.validation import check_is_fitted, validate_data
 
         check_is_fitted(self, "bundle_")
         channels = self.bundle_.arch.channels
-        shape = (channels, self.n_features_in_ // channels)
-        rows, found = rows_of(X)
-        if found not in (None, shape):
-            raise ArrayError(f"X has the shape {np.asarray(X).shape}: expected (N, {shape[0]}, {shape[1]}), as in fit.")
+        expected = (channels, self.n_features_in_ // channels)
+        rows, shape = rows_of(X)
+        if shape not in (None, expected):
+            raise ArrayError(
+                f"X has the shape {np.asarray(X).shape}: expected (N, {expected[0]}, {expected[1]}), as in fit."
+            )
         rows = validate_data(self, rows, reset=False, ensure_all_finite=False)
-        x = to_integers(rows.reshape(len(rows), *shape), self.bundle_.layout)
+        x = to_integers(rows.reshape(len(rows), *expected), self.bundle_.layout)
         network, scaler = self.bundle_.network(), self.bundle_.scaler
-        return np.concatenate([network.forward(scaler.apply(x[at : at + _READ])) for at in range(0, len(x), _READ)])
-
-
-# The settings that only the training reads.
-_TRAINING = ("preset", "epochs", "batch", "learning_rate", "random_state")
+        return np.concatenate([network.forward(scaler.apply(x[at : at + _BATCH])) for at in range(0, len(x), _BATCH)])
 
 
 def _seed(random_state: Any) -> int:
@@ -495,6 +484,6 @@ def _seed(random_state: Any) -> int:
     return int(check_random_state(random_state).randint(np.iinfo(np.int32).max))
 
 
-def _plain(value: Any) -> Any:
-    """Convert a NumPy number to a Python number."""
+def _python_number(value: Any) -> Any:
+    """Convert a NumPy number to a Python number; return other values unchanged."""
     return value.item() if isinstance(value, np.generic) else value
