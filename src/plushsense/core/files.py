@@ -1,4 +1,4 @@
-"""Write a file or a folder whole or not at all."""
+"""Write files and folders atomically: complete or not at all."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from pathlib import Path
 from plushsense.core.errors import BadInput
 
 PART = ".part"
-"""Suffix of unfinished files. A file that a killed program left under such a name can be deleted."""
+"""Suffix of unfinished files; those of a killed program can be deleted."""
 _UNFINISHED = "-unfinished-"
 
 
 def unfinished(dest: Path) -> str:
-    """Return how the names of work folders for ``dest`` begin; they lie beside it."""
+    """Return the prefix of the names of work folders for ``dest``, which are beside it."""
     return f".{dest.resolve().name}{_UNFINISHED}"
 
 
@@ -29,17 +29,17 @@ def is_unfinished(name: str) -> bool:
 
 
 def write_file(path: Path, content: str | bytes, *, private: bool = False) -> None:
-    """Write a file in one step; see `replacing_file`. Text is written as UTF-8 with the line ends it has."""
+    """Write a file in one step (see `replacing_file`); text as UTF-8 with unchanged line ends."""
     with replacing_file(path, private=private) as part:
         part.write_bytes(content.encode("utf-8") if isinstance(content, str) else content)
 
 
 @contextlib.contextmanager
 def replacing_file(path: Path, *, private: bool = False) -> Iterator[Path]:
-    """Yield a path beside ``path`` to write to, which replaces ``path`` when the block ends without an exception.
+    """Yield a path beside ``path`` to write to; it replaces ``path`` when the block ends without an exception.
 
-    Readers see the old file or the new one, also after a loss of power and where several threads, processes or
-    machines write at once. After an exception ``path`` is as before and nothing is left beside it.
+    Readers see the old file or the new one, also after a power failure and with several writers at once. After an
+    exception ``path`` is unchanged and nothing is left beside it.
 
     Args:
         private: only the owner can read the file (mode 600, where the system has modes).
@@ -64,9 +64,9 @@ def replacing_file(path: Path, *, private: bool = False) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def syncing_folder(folder: Path) -> Iterator[Callable[[], None]]:
-    """Yield a function that flushes the names in a folder to the disk; Windows does so by itself.
+    """Yield a function that flushes the names in a folder to the disk, which Windows does by itself.
 
-    The folder is opened at the start: once a file has its name, nothing fails for want of a file descriptor.
+    The folder is opened at the start, so that no error occurs after a file has been renamed.
     """
     if os.name != "posix":
         yield lambda: None
@@ -82,7 +82,7 @@ def syncing_folder(folder: Path) -> Iterator[Callable[[], None]]:
         try:
             os.fsync(descriptor)
         except OSError as cause:
-            # A file system that cannot flush folders.
+            # Some file systems cannot flush folders.
             if cause.errno not in (errno.EINVAL, errno.ENOTSUP):
                 raise
 
@@ -95,19 +95,18 @@ def syncing_folder(folder: Path) -> Iterator[Callable[[], None]]:
 
 @contextlib.contextmanager
 def new_folder(dest: Path, error: type[BadInput], last: str = "") -> Iterator[Path]:
-    """Yield a work folder beside ``dest`` that becomes ``dest`` when the block ends, and is removed when it fails.
+    """Yield a work folder beside ``dest`` that becomes ``dest`` when the block ends, and is deleted after an exception.
 
-    The work folder's name is new each time, so no folder of the user's is touched, and what a killed run leaves does
-    no harm. An empty ``dest`` (also ``.``, or a link to an empty folder) is filled rather than replaced; the file
-    ``last`` is moved into it last.
+    The name of the work folder is new each time. An empty ``dest`` (also ``.``, or a link to an empty folder) is filled
+    rather than replaced, the file ``last`` at the end.
 
     Raises:
-        error: when ``dest`` is not empty, or the disk refuses (no permission, no space).
+        error: when ``dest`` is not empty, or cannot be written.
     """
     scratch: Path | None = None
     try:
         if dest.is_symlink() and not dest.exists():
-            raise error(f"'{dest}' is a link that leads nowhere: give a new or empty folder.")
+            raise error(f"'{dest}' is a broken link: give a new or empty folder.")
         real = dest.resolve()
         if real.exists() and (not real.is_dir() or any(real.iterdir())):
             raise error(f"'{dest}' already holds something: give a new or empty folder, nothing is overwritten.")

@@ -8,24 +8,28 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.core.errors import GestureError, nearest
-from plushsense.core.toml import builtin_names, load_table, read_named
+from plushsense.core.toml import load_table, read_named
 
 AFFECTS = ("positive", "neutral", "negative", "none")
 NOBODY = "none"
 
 
 def plain_label(label: str) -> str:
-    """Return a label as it is compared: in lower case, with ``_`` and runs of spaces as one space."""
+    """Normalise a label for comparison: lower case, with ``_`` and runs of spaces as one space."""
     return " ".join(label.replace("_", " ").split()).casefold()
 
 
 @dataclass(frozen=True)
 class Gesture:
-    """A gesture: its label, its affect ("none" where unknown) and its family of similar gestures.
+    """A gesture.
 
-    ``free_choice`` marks a label under which each person did something else; ``nobody`` one that is recorded without a
-    person (the toy at rest). An ``idle`` gesture never starts an event; an ``energetic`` one is so abrupt that
-    threshold rules may detect it before the network does.
+    Attributes:
+        affect: one of `AFFECTS`; "none" where unknown.
+        family: a name for similar gestures; default: the label.
+        free_choice: each person chose what to do.
+        nobody: recorded without a person (the toy at rest).
+        idle: never starts an event.
+        energetic: so abrupt that threshold rules may detect it before the network does.
     """
 
     label: str
@@ -39,7 +43,7 @@ class Gesture:
 
     def __post_init__(self) -> None:
         if not plain_label(self.label):
-            raise GestureError("A gesture has an empty label: give it one.")
+            raise GestureError("A gesture has an empty label: give it a label.")
         if self.affect not in AFFECTS:
             raise GestureError(
                 f"Gesture '{self.label}' has the affect '{self.affect}'; accepted are {', '.join(AFFECTS)}."
@@ -61,7 +65,7 @@ class GestureSet:
         plain = [plain_label(g.label) for g in self.gestures]
         doubled = sorted({g.label for g in self.gestures if plain.count(plain_label(g.label)) > 1})
         if doubled:
-            raise GestureError(f"Gesture set '{self.name}' holds '{doubled[0]}' twice: labels must differ.")
+            raise GestureError(f"Gesture set '{self.name}' has '{doubled[0]}' twice: labels must differ.")
 
     def __len__(self) -> int:
         return len(self.gestures)
@@ -96,7 +100,7 @@ class GestureSet:
         found = self.find(label)
         if found is None:
             raise GestureError(
-                f"'{label}' is not in the gesture set '{self.name}', which holds: {', '.join(self.labels)}."
+                f"'{label}' is not in the gesture set '{self.name}', which has: {', '.join(self.labels)}."
                 f"{nearest(label, self.labels)}"
             )
         return found
@@ -125,21 +129,16 @@ class GestureSet:
 
     @classmethod
     def infer(cls, labels: Iterable[str], name: str = "inferred") -> GestureSet:
-        """Return the set of the labels in a folder of recordings: in alphabetical order, affect unknown.
+        """Return a gesture set for the labels of recordings, in alphabetical order, with unknown affects.
 
-        Labels that differ only in case, or ``_`` against space, are one gesture; the first spelling wins.
-        ``Custom`` is the GestureRecorder's label for a gesture of free choice.
+        Labels that differ only in case, or in ``_`` and space, are one gesture in its first spelling. ``Custom`` is the
+        GestureRecorder's label for a gesture of free choice.
         """
         spellings: dict[str, str] = {}
         for label in labels:
             spellings.setdefault(plain_label(label), label)
         gestures = tuple(Gesture(s, free_choice=plain_label(s) == "custom") for s in sorted(spellings.values()))
         return cls(name, gestures, inferred=True)
-
-
-def gesture_set_names() -> tuple[str, ...]:
-    """Return the names of the built-in gesture sets."""
-    return builtin_names("gestures")
 
 
 def load_gestures(name_or_path: str | Path) -> GestureSet:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -29,8 +30,8 @@ def magnitude_limit(n: int) -> int:
 class Channel:
     """A measured quantity.
 
-    A raw value is the one that the toy sends. ``physical = (raw - offset) * scale`` in ``unit``; all later computations
-    use the integer ``round(raw / step)``. Raw values outside ``[valid_min, valid_max]`` are invalid.
+    A raw value is sent by the toy. ``physical = (raw - offset) * scale`` in ``unit``; all later computations use the
+    integer ``round(raw / step)``. Raw values outside ``[valid_min, valid_max]`` are invalid.
     """
 
     name: str
@@ -80,8 +81,9 @@ class CsvFormat:
 class Layout:
     """The channels of a toy, their order on the wire and in files, and the inputs of a network.
 
-    ``vectors`` names triples of channels that are the axes of one vector (an accelerometer), which turn with the toy.
-    ``wire`` names channels plus ``device_ms`` (the device clock) and ``delay_ms`` (since the frame before).
+    Attributes:
+        wire: names of channels, ``device_ms`` (the device clock) and ``delay_ms`` (since the frame before).
+        vectors: triples of channels that are the axes of one vector, such as an accelerometer.
     """
 
     name: str
@@ -95,60 +97,56 @@ class Layout:
     gap_ms: int = 100
     vectors: tuple[tuple[str, ...], ...] = ()
 
-    def __post_init__(self) -> None:  # noqa: C901
+    def __post_init__(self) -> None:
+        for problem in self._problems():
+            raise LayoutError(f"Layout '{self.name}': {problem}")
+
+    def _problems(self) -> Iterator[str]:
         names = [c.name for c in self.channels] + [d.name for d in self.derived]
         if len(set(names)) != len(names):
-            raise LayoutError(f"Layout '{self.name}' names a channel twice: {', '.join(names)}.")
-        if len(self.csv.header) != len(self.csv.columns):
-            raise LayoutError(
-                f"Layout '{self.name}': csv.header has {len(self.csv.header)} texts for {len(self.csv.columns)} "
-                "columns: give one for each."
-            )
+            yield f"channel names must differ: {', '.join(names)}."
+        header, columns = self.csv.header, self.csv.columns
+        if len(header) != len(columns):
+            yield f"csv.header has {len(header)} texts for {len(columns)} columns: give one for each."
         for where, used, extra in (
             ("wire", self.wire, (DEVICE_MS, DELAY_MS)),
             ("inputs", self.inputs, tuple(d.name for d in self.derived)),
-            ("csv.columns", self.csv.columns, (DEVICE_MS, DELAY_MS, HOST_MS, "label")),
+            ("csv.columns", columns, (DEVICE_MS, DELAY_MS, HOST_MS, "label")),
         ):
-            known = tuple(c.name for c in self.channels) + extra
+            known = (*self.names, *extra)
             for name in used:
                 if name not in known:
-                    raise LayoutError(
-                        f"Layout '{self.name}': {where} names '{name}'; known are {', '.join(known)}."
-                        f"{nearest(name, known)}"
-                    )
-        missing = [c.name for c in self.channels if c.name not in self.wire]
-        if missing:
-            raise LayoutError(f"Layout '{self.name}': wire does not carry {', '.join(missing)}.")
+                    yield f"{where} names '{name}'; known are {', '.join(known)}.{nearest(name, known)}"
+        if missing := [name for name in self.names if name not in self.wire]:
+            yield f"wire lacks the channels {', '.join(missing)}: add them."
         if DEVICE_MS not in self.wire and DELAY_MS not in self.wire:
-            raise LayoutError(f"Layout '{self.name}': wire carries no clock; add {DEVICE_MS} or {DELAY_MS}.")
+            yield f"wire has no clock: add {DEVICE_MS} or {DELAY_MS}."
         if not self.inputs:
-            raise LayoutError(f"Layout '{self.name}' has no inputs for a network: fill in inputs.")
+            yield "a network needs inputs: fill in inputs."
         if not 1.0 <= self.rate_hz <= 10_000.0:
-            raise LayoutError(f"Layout '{self.name}': rate_hz is {self.rate_hz}; accepted are 1 to 10000.")
+            yield f"rate_hz is {self.rate_hz}; accepted are 1 to 10000."
         for derived in self.derived:
-            if derived.kind != "magnitude":
-                raise LayoutError(
-                    f"Layout '{self.name}': derived channel '{derived.name}' is of kind '{derived.kind}'; "
-                    "accepted is magnitude."
-                )
-            if not derived.of:
-                raise LayoutError(
-                    f"Layout '{self.name}': derived channel '{derived.name}' is of no channel: fill in of."
-                )
-            limit = magnitude_limit(len(derived.of))
-            for name in derived.of:
-                at = self.index(name)
-                if max(-self.valid_min_int[at], self.valid_max_int[at]) > limit:
-                    raise LayoutError(
-                        f"Layout '{self.name}': channel '{name}' feeds '{derived.name}' but is valid from "
-                        f"{self.valid_min_int[at]} to {self.valid_max_int[at]} steps: give it valid_min and valid_max "
-                        f"within ±{limit} steps, so that the magnitude fits 32 bits."
-                    )
+            yield from self._problems_of(derived)
         for vector in self.vectors:
             if len(vector) != 3:
-                raise LayoutError(f"Layout '{self.name}': a vector has three axes, not {len(vector)}.")
+                yield f"a vector has three axes, not {len(vector)}."
             for name in vector:
                 self.index(name)
+
+    def _problems_of(self, derived: Derived) -> Iterator[str]:
+        if derived.kind != "magnitude":
+            yield f"derived channel '{derived.name}' has the kind '{derived.kind}'; accepted is magnitude."
+        if not derived.of:
+            yield f"derived channel '{derived.name}' has no source: fill in of."
+        limit = magnitude_limit(len(derived.of))
+        for name in derived.of:
+            at = self.index(name)
+            if max(-self.valid_min_int[at], self.valid_max_int[at]) > limit:
+                yield (
+                    f"channel '{name}' feeds '{derived.name}' but is valid from {self.valid_min_int[at]} to "
+                    f"{self.valid_max_int[at]} steps: give it valid_min and valid_max within ±{limit} steps, so that "
+                    "the magnitude fits 32 bits."
+                )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -157,7 +155,7 @@ class Layout:
 
     @property
     def is_labelled(self) -> bool:
-        """Return whether every row of a file carries its gesture, so that recordings are sections of streams."""
+        """Return whether every row of a file has a label, so that recordings are sections of streams."""
         return "label" in self.csv.columns
 
     @property
@@ -210,7 +208,7 @@ class Layout:
             LayoutError: for an unknown or missing key, or a value that does not fit.
         """
         given = table.get("channels")
-        # What is wrong with the channels is reported by `load_table`.
+        # `load_table` reports errors in the channels.
         names = [c.get("name") for c in given if isinstance(c, dict)] if isinstance(given, list | tuple) else []
         csv = table.get("csv", {})
         if isinstance(csv, dict):
