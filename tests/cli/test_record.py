@@ -142,7 +142,7 @@ def test_a_person_at_a_terminal(tmp_path: Path, pty_possible: None) -> None:
     press(" ")
     until("1 of 4 recorded")
     press("nmöchte nicht\r")
-    until("Noted.")
+    until("Note saved.")
     press("p")
     until("PAUSED")
     press("p\x1b[A")

@@ -9,7 +9,7 @@ import pytest
 
 from plushsense.cli.terminal import KEYS, lines
 from plushsense.recording.plan import load_protocol
-from plushsense.recording.status import RecorderStatus
+from plushsense.recording.states import RecorderStatus
 from plushsense.recording.takes import SIGNAL
 
 STEPS = load_protocol("plush-17").steps()
@@ -17,7 +17,7 @@ STATUS = RecorderStatus(
     state="idle", step=STEPS[3], steps=51, repetitions=3, next_step=STEPS[4], done=3, skipped=1, redone=0, existing="",
     countdown_s=0.0, elapsed_s=0.0, left_s=0.0, rate_hz=100.0, jitter_ms=0.5, signal="good", away=False, lost=1,
     malformed=2, garbage=3, reconnects=0, gaps=0, rows=4711, file="Back stroke 1_1795282393216_301.csv",
-    message="This recording has a hole of 5.0 s; it is kept, r makes it again.", failed="", folder="R/S01/1",
+    message="This recording has a gap of 5.0 s; it is kept, r records it again.", failed="", folder="R/S01/1",
 )  # fmt: skip
 
 
@@ -47,7 +47,7 @@ def test_narrow_lines_are_broken_not_cut() -> None:
 
 def test_a_low_screen_keeps_what_is_to_be_done_and_the_keys() -> None:
     found = " ".join(shown(79, 8))
-    for needed in (STEPS[3].gesture, "READY", "hole of 5.0 s", "SPACE start", "3 of 51 recorded"):
+    for needed in (STEPS[3].gesture, "READY", "gap of 5.0 s", "SPACE start", "3 of 51 recorded"):
         assert needed in found
 
 

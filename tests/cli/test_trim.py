@@ -15,7 +15,7 @@ from plushsense.core.recorder_csv import Frames, recording_filename, write_recor
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import MARKS
-from plushsense.dataset.people import PersonInfo, write_people
+from plushsense.dataset.store import PersonInfo, write_people
 from plushsense.dataset.trimming import decide_trims
 from plushsense.windows.cut import WindowSpec, cut_windows
 

@@ -156,7 +156,7 @@ def test_links_missing_added_and_changed_members_are_refused(folder: Path, tmp_p
         "a link": lambda i, d: [(link if i.filename == "dataset.toml" else i.filename, d)],
         "is missing": lambda i, d: [] if i.filename == "dataset.toml" else [(i.filename, d)],
         "not in the manifest": lambda i, d: [(i.filename, d), (i.filename + "2", d)],
-        "not what was saved": lambda i, d: [(i.filename, d + b" " if i.filename != MANIFEST else d)],
+        "differs from the saved file": lambda i, d: [(i.filename, d + b" " if i.filename != MANIFEST else d)],
         "holds no": lambda i, d: [] if i.filename == MANIFEST else [(i.filename, d)],
     }
     for n, (said, change) in enumerate(changes.items()):
@@ -223,10 +223,10 @@ def test_a_file_put_in_place_of_another_is_noticed(folder: Path, tmp_path: Path)
                 if info.filename != MANIFEST:
                     new.writestr(info, data if info.filename == changed else old.read(info))
             new.writestr(MANIFEST, json.dumps(manifest))
-        with pytest.raises(DatasetError, match="another data set than" if careful else "is not what was saved"):
+        with pytest.raises(DatasetError, match="another data set than" if careful else "differs from the saved file"):
             restore(target, tmp_path / "R")
         assert not (tmp_path / "R").exists()
-    with pytest.raises(DatasetError, match="is not what was saved"):
+    with pytest.raises(DatasetError, match="differs from the saved file"):
         check_backup(tmp_path / "False.zip")
 
 

@@ -93,7 +93,7 @@ def test_a_mark_reads_no_raw_file_again_and_comes_to_the_same(folder: Path, monk
 def test_a_raw_file_that_became_unreadable_is_named(folder: Path) -> None:
     (folder / "recordings" / "ana" / "Shake_1_60.csv").write_text("")
     for _ in range(2):
-        with pytest.raises(DatasetError, match="Shake_1_60.csv' can no longer be read.*bring it back"):
+        with pytest.raises(DatasetError, match="Shake_1_60.csv' can no longer be read.*restore it"):
             open_dataset(folder)
         assert list(index.rebuild_index(folder).unreadable) == ["recordings/ana/Shake_1_60.csv"]
 

@@ -47,8 +47,8 @@ def test_only_a_newline_ends_a_mark(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("line", "said"),
     [
-        ("[1]", "is no mark"),
-        ('{"recording": "a", "action": "trim"}', "lacks who: a mark says at least"),
+        ("[1]", "accepted is a table"),
+        ('{"recording": "a", "action": "trim"}', "the key who is missing"),
         ('{"recording": "a", "action": "trim", "who": "x", "start": -1}', "start is -1"),
         ('{"recording": "a", "action": "trim", "who": "x", "start": "3"}', "start is '3'"),
         ('{"recording": "a", "action": "trim", "who": "x", "stop": 2.5}', "stop is 2.5"),
@@ -125,7 +125,7 @@ def test_followed_marks_name_the_line_that_is_none(tmp_path: Path) -> None:
     with (tmp_path / MARKS).open("a") as file:
         file.write("[1]\n")
     for _ in range(2):
-        with pytest.raises(DatasetError, match="line 2 is no mark"):
+        with pytest.raises(DatasetError, match="line 2, what was given is"):
             followed.states()
 
 

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from plushsense.core.errors import DatasetError
-from plushsense.dataset.people import PEOPLE, PersonInfo, read_people, write_people
+from plushsense.dataset.store import PEOPLE, PersonInfo, read_people, write_people
 
 
 def test_people_come_back_with_columns_of_one_s_own(tmp_path: Path) -> None:
@@ -30,7 +30,7 @@ def test_a_table_from_a_spreadsheet_reads(tmp_path: Path) -> None:
         ("subject,age_group\n,child\n", "line 2 names no subject"),
         ("", "needs 'subject'"),
         ("subject,subject\nP1,P2\n", "each once"),
-        ('subject\n"P1', "no CSV file"),
+        ('subject\n"P1', "cannot be read"),
     ],
 )
 def test_what_is_no_table_of_people_is_refused(tmp_path: Path, text: str, said: str) -> None:

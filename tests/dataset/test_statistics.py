@@ -10,9 +10,8 @@ from plushsense.core.recorder_csv import Frames, recording_filename, write_recor
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks
-from plushsense.dataset.people import PersonInfo, write_people
 from plushsense.dataset.statistics import SummaryStatistics, channel_table, duration_table
-from plushsense.dataset.store import Dataset
+from plushsense.dataset.store import Dataset, PersonInfo, write_people
 
 ACCEL = load_layout("accel-3")
 ROWS = {("P1", "Wave"): [100, 200, 300], ("P2", "Wave"): [400], ("P2", "Tap"): [50]}

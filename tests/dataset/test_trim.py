@@ -23,7 +23,6 @@ from plushsense.dataset.trimming import (
     find_recordings,
     kept_rows,
     set_rows,
-    set_trim,
     suggest_trims,
     undo_trims,
 )
@@ -106,8 +105,8 @@ def test_a_confidence_nobody_reaches_marks_nothing(dataset: Dataset) -> None:
 
 def test_what_a_person_set_stays(dataset: Dataset) -> None:
     mine, old, whole, plain = _waves(suggest_trims(dataset))
-    assert set_trim(dataset, mine, 0.8, 1.5, "K", "I saw it")
-    assert set_trim(dataset, whole, None, None, "K", "nothing to trim")
+    assert set_rows(dataset, mine, *kept_rows(mine, 0.8, 1.5), "K", "I saw it")
+    assert set_rows(dataset, whole, *kept_rows(whole, None, None), "K", "nothing to trim")
     append_marks(dataset.path, [Mark(old.recording.id, "trim", "from an old version", start=7)])
     done = accept_suggestions(dataset, suggest_trims(open_dataset(dataset.path)), "bulk")
     assert done.marked == (plain.recording.id,)
@@ -120,9 +119,9 @@ def test_what_a_person_set_stays(dataset: Dataset) -> None:
 
 def test_setting_what_stands_adds_nothing_and_undo_brings_the_suggestion_back(dataset: Dataset) -> None:
     first = _waves(suggest_trims(dataset))[0]
-    assert set_trim(dataset, first, 0.8, None, "K")
+    assert set_rows(dataset, first, *kept_rows(first, 0.8, None), "K")
     standing = next(t for t in suggest_trims(dataset) if t.recording.id == first.recording.id)
-    assert not set_trim(dataset, standing, 0.8, None, "K")
+    assert not set_rows(dataset, standing, *kept_rows(standing, 0.8, None), "K")
     assert _lines(dataset) == 1
     assert undo_trims(dataset, find_recordings(dataset, "P1/*"), "K") == (first.recording.id,)
     assert undo_trims(dataset, find_recordings(dataset, "P1/*"), "K") == ()

@@ -44,7 +44,7 @@ def test_a_head_says_what_was_said(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="Whose session"):
+    with pytest.raises(ConfigError, match="The session has no person"):
         session_folder(tmp_path, SessionRequest(URL))
     assert session_folder(tmp_path, SessionRequest(URL, protocol="rest"))[0].parent.name == "none"
     with pytest.raises(DatasetError, match="no code"):

@@ -30,8 +30,7 @@ from plushsense.recording.recorder import Recorder
 from plushsense.recording.session import OpenSession
 from plushsense.recording.session_files import SessionHead, discarded_recordings, read_events
 from plushsense.recording.setup import prompt_virtual
-from plushsense.recording.states import AutoRecording
-from plushsense.recording.status import RecorderStatus
+from plushsense.recording.states import AutoRecording, RecorderStatus
 from plushsense.recording.writer import StreamFile
 
 LAYOUT = load_layout("plush-15")
@@ -118,7 +117,7 @@ def test_space_cancels_a_countdown_and_does_not_stop_too_soon(tmp_path: Path) ->
         r.space()
         assert (r.status().state, r.status().message) == (
             "recording",
-            "That was too quick for a stop: still recording.",
+            "Too early to stop: still recording.",
         )
         until(lambda: r.status().elapsed_s >= 2.0)
         r.space()
@@ -132,7 +131,7 @@ def test_redo_sets_the_last_one_aside_and_skip_brings_it_back(tmp_path: Path) ->
         r.redo("sneezed")
         assert (r.status().step.gesture, r.status().done, r.status().redone) == ("Back stroke 1", 0, 1)
         r.redo()
-        assert "no recording to make again" in r.status().message
+        assert "no recording to repeat" in r.status().message
         r.skip()
         assert (r.status().step.gesture, r.status().done, r.status().redone) == ("Head stroke 1", 1, 0)
         r.redo("sneezed")
@@ -170,7 +169,7 @@ def test_a_pause_breaks_a_recording_off_and_asks_for_it_again(tmp_path: Path) ->
         r.pause()
         status = r.status()
         assert (status.state, status.done, status.file) == ("paused", 1, first)
-        assert (status.step.gesture, "made again" in status.message) == ("Head stroke 1", True)
+        assert (status.step.gesture, "record it again" in status.message) == ("Head stroke 1", True)
         r.resume()
         assert (r.status().state, r.status().step.gesture, r.status().done) == ("idle", "Head stroke 1", 1)
         assert take(r).done == 2
@@ -211,7 +210,7 @@ def test_pause_note_and_the_end(tmp_path: Path) -> None:
     with recorder(tmp_path) as r:
         r.pause()
         r.space()
-        assert (r.status().state, r.status().message) == ("paused", "Paused: go on first (p).")
+        assert (r.status().state, r.status().message) == ("paused", "Paused: resume first (p).")
         r.resume()
         r.note("  the child\n laughs ")
         for _ in range(3):
@@ -232,7 +231,7 @@ def test_a_recording_that_nobody_stops_ends_by_itself(tmp_path: Path) -> None:
         r.wait("recording", timeout_s=20)
         r.wait("idle", timeout_s=20)
         status = r.status()
-        assert (status.done, "Nobody stopped it" in status.message) == (1, True)
+        assert (status.done, "Nobody stopped the recording" in status.message) == (1, True)
     beside = json.loads((tmp_path / status.file).with_suffix(".json").read_text())
     assert (beside["ended"], beside["auto_stopped"]) == ("longest", True)
     assert beside["device_ms"][1] - beside["device_ms"][0] == pytest.approx(2000, abs=12)
@@ -302,7 +301,7 @@ def test_unplugged_for_five_seconds_during_a_gesture(tmp_path: Path) -> None:
         with device, r:
             until(lambda: r.status().done == 1)
             status = r.status()
-        assert any("this recording has a hole" in s.message for s in seen)
+        assert any("this recording has a gap" in s.message for s in seen)
     assert (status.gaps, status.reconnects) == (1, 1)
     beside = json.loads(next(tmp_path.glob("*_*.json")).read_text())
     (gap,) = beside["gaps"]
@@ -434,9 +433,9 @@ def test_commands_from_many_threads_lose_nothing(tmp_path: Path) -> None:
 def test_a_remark_after_the_end_is_not_said_to_be_kept(tmp_path: Path) -> None:
     with recorder(tmp_path) as r:
         r.note("in time")
-        assert r.status().message == "Noted."
+        assert r.status().message == "Note saved."
     r.note("too late")
-    assert "not kept" in r.status().message
+    assert "not saved" in r.status().message
     assert [e.details["text"] for e in read_events(tmp_path) if e.what == "note"] == ["in time"]
 
 
@@ -456,7 +455,7 @@ def check_full(done: subprocess.CompletedProcess[str], out: Path) -> None:
     assert "Traceback" not in done.stderr
     (sentence,) = [line for line in done.stderr.splitlines() if line.startswith("plushsense: ")]
     assert "cannot be written any more" in sentence
-    assert "make room, and go on with the same session" in sentence
+    assert "free disk space, and continue the same session" in sentence
     said = json.loads(done.stdout)
     assert (said["finished"], "cannot be written" in said["stopped"]) == (False, True)
     folder = out / "S01" / "1"
@@ -631,4 +630,4 @@ def test_a_recording_is_saved_when_a_file_descriptor_is_free_again(tmp_path: Pat
 def test_a_session_can_be_closed_while_no_file_descriptor_is_free(tmp_path: Path) -> None:
     said = without_descriptors(tmp_path, "stays")
     assert said["done"] == 0
-    assert "close other programs, and go on with the same session" in said["failed"]
+    assert "close other programs, and continue the same session" in said["failed"]

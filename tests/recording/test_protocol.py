@@ -107,7 +107,7 @@ def test_a_label_that_no_file_can_be_called_is_refused(tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text('name = "mine"\ngestures = [{ label = "a/b" }]\n', encoding="utf-8")
     path = tmp_path / "own.toml"
     path.write_text('name = "own"\ngesture_set = "mine.toml"\n', encoding="utf-8")
-    with pytest.raises(ConfigError, match="cannot stand in a file name"):
+    with pytest.raises(ConfigError, match="cannot be part of a file name"):
         load_protocol(path)
 
 

@@ -128,7 +128,7 @@ def test_what_was_begun_is_to_be_made_again(folder: Path) -> None:
     start = SessionEvent("start", 50, {"gesture": "Hold strong", "repetition": 1, "row": 3})
     progress = opened(folder, start).progress
     assert progress.takes == {}
-    assert "is to be made again" in progress.repairs[0]
+    assert "record it again" in progress.repairs[0]
     assert [e.what for e in read_events(folder)] == ["start", "unfinished"]
     assert opened(folder).progress.repairs == []
 
@@ -221,7 +221,7 @@ def test_what_was_left_out_may_be_said_later(folder: Path) -> None:
 
 def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
     (tmp_path / "fulldatastream.csv").write_text("1, 2\n")
-    with pytest.raises(DatasetError, match="nothing is mixed"):
+    with pytest.raises(DatasetError, match="but no session"):
         OpenSession(tmp_path, HEAD)
     with pytest.raises(DatasetError, match="holds no session"):
         OpenSession(tmp_path)

@@ -26,7 +26,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     summary = simulate(out, people=2, repetitions=1, at_rest=3, progress=lambda *a: seen.append(a))
     assert seen == [(1, 3, "P01"), (2, 3, "P02"), (3, 3, "none")]
     assert summary.recordings == 2 * 17 + 3
-    assert summary.to_dict()["people"] == 2
+    assert summary.people == 2
     return out
 
 

@@ -16,7 +16,7 @@ import pytest
 
 from plushsense.core.recorder_csv import STREAM_NAME, parse_name, read_stream
 from plushsense.dataset.importing.importers import import_recordings
-from plushsense.dataset.people import PersonInfo, read_people
+from plushsense.dataset.store import PersonInfo, read_people
 from plushsense.devices.virtual.session import GESTURES
 from plushsense.recording.session_files import SESSION_LOG, read_events
 from plushsense.workflow.datasets import check_dataset

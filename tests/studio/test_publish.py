@@ -13,9 +13,9 @@ from typing import Any
 import pytest
 
 from plushsense.core.errors import DatasetError
-from plushsense.dataset.people import PEOPLE
 from plushsense.dataset.privacy.pseudonyms import is_drawn
 from plushsense.dataset.publishing.checking import VALIDATORS
+from plushsense.dataset.store import PEOPLE
 from plushsense.studio import tasks
 from plushsense.studio.app.jobs import DONE, Jobs, StudioJob
 from plushsense.studio.app.words import LANGUAGES, Words

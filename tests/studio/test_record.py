@@ -138,7 +138,7 @@ def test_redo_skip_back_pause_and_going_to_a_step(studio: Fixture, look: Fixture
     assert marked(page, "pause").inner_text() == "Break off and pause"
     marked(page, "pause").click()
     showing(page, "paused.2.2.0.0")
-    assert "made again" in marked(page, "recorder-message").inner_text()
+    assert "record it again" in marked(page, "recorder-message").inner_text()
     marked(page, "main").click()
     showing(page, "idle.2.2.0.0")
     assert len(files(tmp_path / "home")) == 2
@@ -237,7 +237,7 @@ def test_a_lost_connection_loses_nothing(studio: Fixture, look: Fixture, tmp_pat
     page = look().open(server.url + "/record")
     heard(page)
     assert showing(page, "idle.") == "idle.2.2.0.0"
-    assert "Nobody stopped it" in marked(page, "recorder-message").inner_text()
+    assert "Nobody stopped the recording" in marked(page, "recorder-message").inner_text()
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="Windows cannot stop a process for a while")

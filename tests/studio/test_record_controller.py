@@ -148,7 +148,7 @@ def test_what_is_refused_leaves_nothing(controller: RecordController, tmp_path: 
     refused: list[tuple[SessionRequest, str]] = [
         (SessionRequest(CALM, "Anna", "quick"), "no code"),
         (SessionRequest(CALM, "../S01", "quick"), "no code"),
-        (SessionRequest(CALM, "", "quick"), "Whose session"),
+        (SessionRequest(CALM, "", "quick"), "The session has no person"),
         (SessionRequest(CALM, "S01", str(outside)), "not a protocol of this studio"),
         (SessionRequest(CALM, "S01", "quick", layout=str(outside)), "not a layout of this studio"),
         (SessionRequest(CALM, "S01", "quick", words="xx"), "no wording"),

@@ -64,7 +64,7 @@ def test_a_session_that_cannot_begin(
     page = browser.open(server.url + "/record")
     for code in ("", "Anna Bērziņa", "Anna", "../../x1", "S01/2"):
         fill(page, code)
-        said(page, "Whose session" if not code else "is no code for a person")
+        said(page, "The session has no person" if not code else "is no code for a person")
         assert marked(page, "code").input_value() == code, "what was typed stays"
     assert axe(page) == []
     shots(page, "record-refused")
@@ -147,7 +147,7 @@ def test_a_toy_that_goes_away_and_comes_back(studio: Fixture, look: Fixture, tmp
     page.wait_for_timeout(1000)
     with tcp_toy(int(url.rpartition(":")[2])):
         heard(page)
-        page.get_by_text("this recording has a hole").wait_for()
+        page.get_by_text("this recording has a gap").wait_for()
         page.wait_for_timeout(300)
         page.keyboard.press("Space")
         showing(page, "idle.1.1.")

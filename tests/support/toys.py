@@ -13,10 +13,9 @@ from plushsense.core.recorder_csv import Frames, format_header, format_rows, rec
 from plushsense.dataset.about import About, Contact, Creator
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks
-from plushsense.dataset.people import PersonInfo, write_people
 from plushsense.dataset.publishing.contents import PublishOptions
 from plushsense.dataset.publishing.package import PublishResult, complete_head, publish
-from plushsense.dataset.store import Dataset, DatasetHead
+from plushsense.dataset.store import Dataset, DatasetHead, PersonInfo, write_people
 
 ACCEL = load_layout("accel-3")
 # 14 November 2023, 22:13:20 UTC.

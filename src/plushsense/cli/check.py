@@ -21,7 +21,7 @@ _DECISIONS = 20
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    from plushsense.dataset.quality.registry import CHECKS
+    from plushsense.dataset.quality.checking import CHECKS
 
     repeated: dict[str, Any] = {"action": "append", "default": []}
     add = parser.add_argument
@@ -88,7 +88,7 @@ def _limits(texts: Sequence[str]) -> dict[str, float]:
 
 def overview(result: CheckReport) -> Iterator[str]:
     """Format the findings as text: those that need a decision, then the others by severity, check and person."""
-    from plushsense.dataset.quality.registry import CHECKS
+    from plushsense.dataset.quality.checking import CHECKS
 
     people = len(result.dataset.subjects)
     excluded = f", {result.excluded} excluded" if result.excluded else ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -74,8 +75,8 @@ def run_stats(args: argparse.Namespace) -> int:
         "simulated": dataset.head.simulated,
         "recordings": len(dataset.used),
         "trimmed": trimmed,
-        "durations": [d.to_dict() for d in durations],
-        "channels": [c.to_dict() for c in channels],
+        "durations": [asdict(d) for d in durations],
+        "channels": [asdict(c) for c in channels],
     }
     simulated = " (a simulation: it says nothing about people)" if dataset.head.simulated else ""
     text = [f"{dataset.head.name}{simulated}: {len(dataset.used)} recordings, {trimmed} trimmed", ""]

@@ -19,7 +19,7 @@ from queue import SimpleQueue
 from typing import Protocol
 
 from plushsense.recording.recorder import Recorder
-from plushsense.recording.status import RecorderStatus
+from plushsense.recording.states import RecorderStatus
 
 END = "\x04"
 """The key that a source returns at its end."""

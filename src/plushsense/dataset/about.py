@@ -1,4 +1,4 @@
-"""Authors, contact and terms of a data set: the table ``[about]`` of ``dataset.toml``, which publishing needs.
+"""Authors, contact and terms of a data set: the table ``[about]`` of ``dataset.toml``, needed to publish it.
 
     [about]
     title = "Touch on a plush companion"
@@ -12,11 +12,10 @@ Every key may be left out; an older data set has no such table.
 from __future__ import annotations
 
 import re
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from plushsense.core.errors import DatasetError
-from plushsense.core.toml import load_table
 
 _EMAIL = re.compile(r"[^@\s<>]+@[^@\s<>]+\.[^@\s<>]+")
 _DOI = re.compile(r"10\.\d{4,9}/\S+")
@@ -43,7 +42,7 @@ class Creator:
 
 @dataclass(frozen=True)
 class Contact:
-    """Whom to write to about the data set."""
+    """The person who answers questions about the data set."""
 
     name: str = ""
     email: str = ""
@@ -57,11 +56,7 @@ class Contact:
 
     @classmethod
     def parse(cls, text: str) -> Contact:
-        """Read a contact of the form ``Name <mail>``.
-
-        Raises:
-            DatasetError: for another form.
-        """
+        """Read a contact of the form ``Name <mail>``; raise DatasetError for another form."""
         found = _CONTACT.fullmatch(text)
         if found is None or not found["name"] or not _EMAIL.fullmatch(found["email"]):
             raise DatasetError(
@@ -111,21 +106,8 @@ class About:
 
     def to_table(self) -> dict[str, Any]:
         """Return plain values for TOML, without those that were left out."""
-        table = {}
-        plain = About()
-        for f in fields(self):
-            if getattr(self, f.name) != getattr(plain, f.name):
-                table[f.name] = _without_blanks(asdict(self)[f.name])
-        return table
-
-    @classmethod
-    def from_table(cls, table: object, where: str) -> About:
-        """Read the table of a TOML file.
-
-        Raises:
-            DatasetError: for an unknown key, with the nearest known one, or a value that does not fit.
-        """
-        return load_table(table, cls, where, DatasetError)
+        defaults = asdict(About())
+        return {k: _without_blanks(v) for k, v in asdict(self).items() if v != defaults[k]}
 
 
 def _without_blanks(value: Any) -> Any:

@@ -1,7 +1,7 @@
-"""Backup of a data set: one zip with a manifest, verified after writing and before restoring.
+"""Back up a data set to one zip with a manifest, verified after writing and before restoring.
 
-It holds raw files, session files, marks, the people's table, evaluations and all other files, but not what can be
-rebuilt: ``cache/`` and the index. The same data set gives the same bytes.
+It holds raw files, session files, marks, the people's table, evaluations and all other files, but not ``cache/`` and
+the index, which can be rebuilt. The same data set gives the same bytes.
 """
 
 from __future__ import annotations
@@ -23,17 +23,18 @@ from plushsense.core.files import new_folder, replacing_file
 from plushsense.dataset.files import list_files
 from plushsense.dataset.importing.archives import DAMAGED, zip_entry
 from plushsense.dataset.index import open_dataset, rebuild_index
-from plushsense.dataset.store import HEAD, Dataset
+from plushsense.dataset.store import HEAD, Dataset, Progress
 
 MANIFEST = "plushsense-backup.json"
 FORMAT = "plushsense-backup"
 VERSION = 1
 _CHUNK = 1 << 20
 _LEFT_OUT = ("cache", "index", "working")
-# A manifest has about 150 bytes a file.
+# A manifest has about 150 bytes per file.
 _MANIFEST_LIMIT = 1 << 28
-
-Progress = Callable[[int, int], None]
+# Exceptions for a damaged zip, or a member of the manifest that is missing.
+_BROKEN: tuple[type[Exception], ...] = (*DAMAGED, KeyError, IndexError)
+_NO_MANIFEST: tuple[type[Exception], ...] = (*_BROKEN, TypeError, OSError, RecursionError)
 
 
 @dataclass(frozen=True)
@@ -55,47 +56,55 @@ class Backup:
 
 
 def backup(dataset: str | Path, file: str | Path, progress: Progress | None = None) -> Backup:
-    """Write a data set into one new zip file, and read it again to see that it is whole.
+    """Write a data set into one new zip file, and read it again to verify it.
 
     Args:
-        progress: called with (bytes done, bytes in all); the second half is the reading.
+        progress: called with (bytes done, bytes in all); the second half is the verification.
 
     Raises:
-        DatasetError: when ``file`` is there already or lies in the data set, a file changes meanwhile, or what was
-            written does not read back; then no file is left.
+        DatasetError: when ``file`` exists or lies in the data set, a file changes meanwhile, or the verification
+            fails; then no file is left.
     """
     folder, target = Path(dataset), Path(file)
     if target.exists() or target.is_symlink():
-        raise DatasetError(f"'{target}' is already there: a backup never replaces another; give a new name.")
+        raise DatasetError(f"'{target}' exists already: a backup never replaces another; give a new name.")
     if folder.resolve() in target.resolve().parents:
         raise DatasetError(f"'{target}' lies in the data set itself: give a place outside of '{folder}'.")
+    report = progress or (lambda done, total: None)
     source = open_dataset(folder)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        found = [c for c in list_files(folder) if c.kind not in _LEFT_OUT]
-        kept = [c.path for c in found if c.kind != "link"]
-        total = 2 * sum((folder / path).stat().st_size for path in kept)
+        listed = [f for f in list_files(folder) if f.kind not in _LEFT_OUT]
+        paths = [f.path for f in listed if f.kind != "link"]
+        total = 2 * sum((folder / path).stat().st_size for path in paths)
         done = 0
-        files = []
+        files: list[dict[str, Any]] = []
+        manifest = {
+            "format": FORMAT,
+            "version": VERSION,
+            "name": source.head.name,
+            "recordings": len(source.recordings),
+            "subjects": len(source.subjects),
+            "hash": source.hash,
+            "files": files,
+        }
         with replacing_file(target) as part:
             with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as archive:
-                for path in kept:
+                for path in paths:
                     files.append(_store(archive, folder, path))
                     done += files[-1]["bytes"]
-                    if progress is not None:
-                        progress(done, total)
-                _put(archive, MANIFEST, _manifest(source, files))
-            _verified(part, lambda n: progress(total // 2 + n, total) if progress is not None else None)
+                    report(done, total)
+                text = json.dumps(manifest, ensure_ascii=False, indent=0) + "\n"
+                archive.writestr(zip_entry(MANIFEST), text.encode("utf-8"))
+            _verify(part, lambda n: report(total // 2 + n, total))
             if target.exists():
                 raise DatasetError(f"'{target}' appeared meanwhile: a backup never replaces another; give a new name.")
     except OSError as cause:
         raise DatasetError(
-            f"The backup '{target}' cannot be made ({cause.strerror or cause}; '{cause.filename or target}'): "
+            f"The backup '{target}' cannot be written ({cause.strerror or cause}; '{cause.filename or target}'): "
             "check the path and the disk."
         ) from None
-    return _summary(
-        target, json.loads(_manifest(source, files)), tuple(c.path.as_posix() for c in found if c.kind == "link")
-    )
+    return _summary(target, manifest, tuple(f.path.as_posix() for f in listed if f.kind == "link"))
 
 
 def check_backup(file: str | Path, progress: Progress | None = None) -> Backup:
@@ -106,15 +115,15 @@ def check_backup(file: str | Path, progress: Progress | None = None) -> Backup:
     """
     path = Path(file)
     total = path.stat().st_size if path.is_file() else 0
-    manifest = _verified(path, lambda n: progress(min(n, total), total) if progress is not None else None)
+    manifest = _verify(path, lambda n: progress(min(n, total), total) if progress is not None else None)
     return _summary(path, manifest)
 
 
 def restore(file: str | Path, dest: str | Path, progress: Progress | None = None) -> Dataset:
-    """Bring a data set back into a new or empty folder; it appears whole or not at all.
+    """Restore a data set into a new or empty folder, completely or not at all.
 
     Raises:
-        DatasetError: for a damaged backup, one whose files would leave ``dest``, or a ``dest`` that holds something.
+        DatasetError: for a damaged backup, one whose files would leave ``dest``, or a ``dest`` that is not empty.
     """
     path, folder = Path(file), Path(dest)
     with _open_backup(path) as (archive, manifest):
@@ -132,27 +141,10 @@ def restore(file: str | Path, dest: str | Path, progress: Progress | None = None
             again = rebuild_index(work).dataset
             if again.hash != manifest["hash"]:
                 raise DatasetError(
-                    f"The backup '{path}' restores another data set than was saved ({len(again.recordings)} "
+                    f"The backup '{path}' restores another data set than the saved one ({len(again.recordings)} "
                     f"recordings of {manifest['recordings']}): restore it with the PlushSense that wrote it."
                 )
     return open_dataset(folder)
-
-
-def _manifest(source: Dataset, files: list[dict[str, Any]]) -> str:
-    table = {
-        "format": FORMAT,
-        "version": VERSION,
-        "name": source.head.name,
-        "recordings": len(source.recordings),
-        "subjects": len(source.subjects),
-        "hash": source.hash,
-        "files": files,
-    }
-    return json.dumps(table, ensure_ascii=False, indent=0) + "\n"
-
-
-def _put(archive: zipfile.ZipFile, name: str, text: str) -> None:
-    archive.writestr(zip_entry(name), text.encode("utf-8"))
 
 
 def _store(archive: zipfile.ZipFile, folder: Path, path: PurePosixPath) -> dict[str, Any]:
@@ -167,7 +159,7 @@ def _store(archive: zipfile.ZipFile, folder: Path, path: PurePosixPath) -> dict[
                 member.write(chunk)
         after = os.fstat(file.fileno())
     if size != before.st_size or (before.st_mtime_ns, before.st_size) != (after.st_mtime_ns, after.st_size):
-        raise DatasetError(f"'{folder / path}' changed while it was saved: make the backup when nothing is recorded.")
+        raise DatasetError(f"'{folder / path}' changed while it was saved: back up when nothing is recorded.")
     return {"path": path.as_posix(), "bytes": size, "sha256": digest.hexdigest()}
 
 
@@ -186,11 +178,7 @@ def _summary(file: Path, manifest: dict[str, Any], left_out: tuple[str, ...] = (
 
 
 def _damaged(path: Path, why: object) -> DatasetError:
-    return DatasetError(f"The backup '{path}' is damaged ({why}): take another copy of it.")
-
-
-# What the reader raises on a damaged zip, or on a member of the manifest that is missing.
-_BROKEN: tuple[type[Exception], ...] = (*DAMAGED, KeyError, IndexError)
+    return DatasetError(f"The backup '{path}' is damaged ({why}): use another copy of it.")
 
 
 @contextmanager
@@ -213,7 +201,7 @@ def _open_backup(path: Path) -> Iterator[tuple[zipfile.ZipFile, dict[str, Any]]]
             if reason := _refusal(info):
                 raise DatasetError(f"The backup '{path}' is not used: '{info.filename}' in it is {reason}.")
         if len(set(names)) != len(names):
-            raise _damaged(path, "a name stands in it twice")
+            raise _damaged(path, "it holds a name twice")
         manifest = _manifest_of(path, archive)
         listed = {entry["path"] for entry in manifest["files"]}
         if odd := sorted(listed ^ (set(names) - {MANIFEST})):
@@ -223,7 +211,7 @@ def _open_backup(path: Path) -> Iterator[tuple[zipfile.ZipFile, dict[str, Any]]]
 
 
 def _refusal(info: zipfile.ZipInfo) -> str:
-    """Return why a member must not be unpacked; "" when it may."""
+    """Return the reason why a member must not be unpacked; "" if it may."""
     name = info.filename
     parts = name.split("/")
     # zipfile cuts a name at a zero byte; ``orig_filename`` keeps it.
@@ -235,7 +223,7 @@ def _refusal(info: zipfile.ZipInfo) -> str:
     if kind not in (0, stat.S_IFREG):
         return "a link or no plain file"
     if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        return "packed as PlushSense packs nothing: damaged, or changed by another program"
+        return "compressed by a method that PlushSense does not use: damaged, or changed by another program"
     return ""
 
 
@@ -243,9 +231,9 @@ def _manifest_of(path: Path, archive: zipfile.ZipFile) -> dict[str, Any]:
     try:
         if archive.getinfo(MANIFEST).file_size > _MANIFEST_LIMIT:
             raise ValueError("its manifest is too long")
-        table = json.loads(archive.read(MANIFEST))
+        table: dict[str, Any] = json.loads(archive.read(MANIFEST))
         if table["format"] != FORMAT:
-            raise ValueError("its manifest is of something else")
+            raise ValueError("its manifest has another format")
         if table["version"] != VERSION:
             raise DatasetError(
                 f"The backup '{path}' has the version {table['version']!r}; this PlushSense reads {VERSION}."
@@ -257,15 +245,13 @@ def _manifest_of(path: Path, archive: zipfile.ZipFile) -> dict[str, Any]:
         )
         if not whole:
             raise ValueError("its manifest lacks something")
-    except (TypeError, OSError, RecursionError) as cause:
+    except _NO_MANIFEST as cause:
         raise _damaged(path, cause) from None
-    except _BROKEN as cause:
-        raise _damaged(path, cause) from None
-    return dict(table)
+    return table
 
 
 def _read(path: Path, archive: zipfile.ZipFile, entry: dict[str, Any], out: IO[bytes] | None = None) -> None:
-    """Read a member through, into ``out`` if given; it must be what the manifest says, and not a byte longer."""
+    """Read a member, into ``out`` if given, and compare it with the manifest."""
     digest = hashlib.sha256()
     size = 0
     try:
@@ -280,10 +266,10 @@ def _read(path: Path, archive: zipfile.ZipFile, entry: dict[str, Any], out: IO[b
     except _BROKEN as cause:
         raise _damaged(path, f"'{entry['path']}': {cause}") from None
     if size != entry["bytes"] or digest.hexdigest() != entry["sha256"]:
-        raise _damaged(path, f"'{entry['path']}' is not what was saved")
+        raise _damaged(path, f"'{entry['path']}' differs from the saved file")
 
 
-def _verified(path: Path, progress: Callable[[int], None]) -> dict[str, Any]:
+def _verify(path: Path, progress: Callable[[int], None]) -> dict[str, Any]:
     with _open_backup(path) as (archive, manifest):
         done = 0
         for entry in manifest["files"]:

@@ -1,4 +1,4 @@
-"""The files of a data set folder: their kind and owner, and the stamp that says whether the index is up to date."""
+"""List the files of a data set folder with kind and owner, and keep the stamp of what its index was made from."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ from typing import Any
 
 from plushsense.core.files import PART, write_file
 from plushsense.dataset.marks import MARKS
-from plushsense.dataset.people import PEOPLE
-from plushsense.dataset.store import HEAD, RECORDINGS, STREAMS
+from plushsense.dataset.store import HEAD, PEOPLE, RECORDINGS, STREAMS
 
 RECORDINGS_INDEX = "recordings.csv"
 STREAMS_INDEX = "streams.csv"
@@ -23,16 +22,17 @@ STAMP_VERSION = 2
 
 def raw_files(folder: Path) -> list[tuple[str, Path]]:
     """Return every raw file of a data set with its kind, streams or recordings; the suffix may be in any case."""
-    files = []
-    for kind in (STREAMS, RECORDINGS):
-        found = [
-            Path(place) / name
-            for place, _, names in os.walk(folder / kind)
-            for name in names
-            if name.lower().endswith(".csv")
-        ]
-        files += [(kind, path) for path in sorted(found)]
-    return files
+    return [
+        (kind, path)
+        for kind in (STREAMS, RECORDINGS)
+        for path in walk_files(folder / kind)
+        if path.name.lower().endswith(".csv")
+    ]
+
+
+def walk_files(folder: Path) -> list[Path]:
+    """Return every file below a folder in the order of the paths; folders that cannot be listed are left out."""
+    return sorted(Path(place) / name for place, _, names in os.walk(folder) for name in names)
 
 
 def sha256_of(path: Path) -> str:
@@ -45,13 +45,10 @@ def sha256_of(path: Path) -> str:
 
 def current_stamp(folder: Path) -> dict[str, Any]:
     """Return what an index is made from: raw files (name, size, time in ns), and hashes of the marks and the head."""
-    files = []
-    for _, path in raw_files(folder):
-        now = path.stat()
-        files.append([path.relative_to(folder).as_posix(), now.st_size, now.st_mtime_ns])
+    files = [(path.relative_to(folder).as_posix(), path.stat()) for _, path in raw_files(folder)]
     return {
         "format": STAMP_VERSION,
-        "files": files,
+        "files": [[name, now.st_size, now.st_mtime_ns] for name, now in files],
         "marks": sha256_of(folder / MARKS),
         "head": sha256_of(folder / HEAD),
     }
@@ -66,30 +63,30 @@ def write_stamp(folder: Path, stamp: dict[str, Any]) -> None:
     write_file(folder / STAMP, json.dumps(stamp | {"index": _index_hashes(folder)}) + "\n")
 
 
-def is_index_fresh(folder: Path) -> bool:
-    """Return whether the index in ``folder`` is complete and made from the present files."""
+def _read_stamp(folder: Path) -> dict[str, Any]:
+    """Return the stamp of the last index; empty if there is none, or it is damaged."""
     try:
         stamp = json.loads((folder / STAMP).read_text(encoding="utf-8"))
     except (FileNotFoundError, ValueError, RecursionError):
-        return False
-    return bool(stamp == current_stamp(folder) | {"index": _index_hashes(folder)})
+        return {}
+    return stamp if isinstance(stamp, dict) else {}
+
+
+def is_index_fresh(folder: Path) -> bool:
+    """Return whether the index in ``folder`` is complete and made from the present files."""
+    return _read_stamp(folder) == current_stamp(folder) | {"index": _index_hashes(folder)}
 
 
 def is_same_raw_data(folder: Path, now: dict[str, Any]) -> bool:
     """Return whether the index is complete and, except for the marks, was made from the files of the stamp ``now``."""
-    try:
-        stamp = json.loads((folder / STAMP).read_text(encoding="utf-8"))
-        return bool(stamp | {"marks": now["marks"]} == now | {"index": _index_hashes(folder)})
-    except (FileNotFoundError, ValueError, RecursionError, TypeError):
-        return False
+    return _read_stamp(folder) | {"marks": now["marks"]} == now | {"index": _index_hashes(folder)}
 
 
 def missing_files(folder: Path) -> list[str]:
     """Return the raw files of the last index that no longer exist; none when there is no stamp."""
     try:
-        listed = json.loads((folder / STAMP).read_text(encoding="utf-8"))["files"]
-        return [str(entry[0]) for entry in listed if not (folder / str(entry[0])).is_file()]
-    except (FileNotFoundError, ValueError, RecursionError, KeyError, TypeError, IndexError):
+        return [str(entry[0]) for entry in _read_stamp(folder)["files"] if not (folder / str(entry[0])).is_file()]
+    except (KeyError, TypeError, IndexError):
         return []
 
 
@@ -97,7 +94,7 @@ CACHE = "cache"
 EVALUATIONS = "evaluations"
 INDEX = (RECORDINGS_INDEX, STREAMS_INDEX, STAMP)
 
-# What the files with a fixed name are. A file of a person's that is neither raw nor JSON is "other".
+# Files with a fixed name, by kind.
 _KNOWN = {HEAD: "head", MARKS: "marks", PEOPLE: "people", **dict.fromkeys(INDEX, "index")}
 
 
@@ -105,8 +102,8 @@ _KNOWN = {HEAD: "head", MARKS: "marks", PEOPLE: "people", **dict.fromkeys(INDEX,
 class DatasetFile:
     """A file of a data set: its path in the folder, its kind and, in a person's folder, the person.
 
-    Kinds: head, marks, people, index, raw (recordings and streams), words (JSON beside these: session files), cache,
-    evaluation, working (locks, unfinished parts), other; and link for everything that is not a regular file.
+    Kinds: head, marks, people, index, raw (recordings and streams), words (JSON files beside these), cache, evaluation,
+    working (locks, unfinished parts), other; and link for everything that is not a regular file.
     """
 
     path: PurePosixPath
@@ -163,7 +160,7 @@ def person_folders(folder: Path) -> list[str]:
 
 
 def normalize_code(word: str) -> str:
-    """Return a code without case, blanks and punctuation: ``P_01`` and ``p 01`` are equal."""
+    """Return a code in lower case without blanks and punctuation: ``P_01`` and ``p 01`` are equal."""
     return "".join(c for c in word.casefold() if c.isalnum())
 
 

@@ -1,11 +1,11 @@
-"""The index of a data set: rebuilt from the raw files and the marks whenever one of them changed."""
+"""Open a data set: build its index from the raw files and the marks, again whenever one of them changed."""
 
 from __future__ import annotations
 
 import hashlib
 import itertools
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -27,23 +27,23 @@ from plushsense.dataset.files import (
     raw_files,
     write_stamp,
 )
-from plushsense.dataset.generation import Generation
 from plushsense.dataset.marks import MarkState, read_marks
+from plushsense.dataset.quality.checking import import_flags
 from plushsense.dataset.quality.findings import PARTLY_THERE
-from plushsense.dataset.quality.measurements import Examination, measured_rate_hz, usual_rows
-from plushsense.dataset.quality.registry import import_flags
+from plushsense.dataset.quality.measurements import Examination, usual_rows
 from plushsense.dataset.store import (
     RECORDINGS,
     STREAMS,
     Dataset,
     DatasetHead,
+    Generation,
+    Progress,
     RecordingInfo,
     StreamInfo,
     read_index,
     write_index,
 )
-
-Progress = Callable[[int, int], None]
+from plushsense.recording.takes import measured_rate_hz
 
 
 @dataclass
@@ -68,8 +68,7 @@ def open_dataset(path: str | Path) -> Dataset:
     On a read-only disk the index is rebuilt in memory each time it is out of date.
 
     Raises:
-        DatasetError: when the folder is missing, empty, or not a data set, or a raw file is gone or cannot be read
-            any more.
+        DatasetError: when the folder is missing, empty, or not a data set, or a raw file is missing or unreadable.
     """
     folder = Path(path)
     head = DatasetHead.read(folder)
@@ -86,7 +85,7 @@ def open_dataset(path: str | Path) -> Dataset:
         if missing := missing_files(folder):
             raise DatasetError(
                 f"'{folder}' lacks {len(missing)} raw file{'s' if len(missing) > 1 else ''} that it had "
-                f"('{missing[0]}'): bring them back, or delete {STAMP} there to go on without them."
+                f"('{missing[0]}'): restore them, or delete {STAMP} there to go on without them."
             )
         stamp = current_stamp(folder)
         # Marks change no raw file: reuse the index and apply the marks again.
@@ -102,7 +101,7 @@ def open_dataset(path: str | Path) -> Dataset:
         raise DatasetError(
             f"'{folder / file}' can no longer be read"
             f"{f', nor can {len(built.unreadable) - 1} other files' if len(built.unreadable) > 1 else ''}: "
-            f"bring it back, or take it out of the data set. {reason}"
+            f"restore it, or remove it from the data set. {reason}"
         )
     try:
         with generation.writing():
@@ -141,11 +140,7 @@ def rebuild_index(folder: Path, head: DatasetHead | None = None, progress: Progr
 
 
 def write_index_files(dataset: Dataset, stamp: dict[str, Any] | None = None) -> None:
-    """Replace the index files by what ``dataset`` holds; ``stamp`` is what was `taken` before the raw files were read.
-
-    Raises:
-        OSError: when the disk refuses.
-    """
+    """Replace the index files by those of ``dataset``; ``stamp`` is the `current_stamp` before raw files were read."""
     stamp = stamp or current_stamp(dataset.path)
     write_index(dataset.path / STREAMS_INDEX, dataset.streams, StreamInfo)
     write_index(dataset.path / RECORDINGS_INDEX, dataset.recordings, RecordingInfo)
@@ -172,14 +167,10 @@ def build_index(folder: Path, head: DatasetHead, progress: Progress | None = Non
         (streams if kind == STREAMS else recordings).append(read)
         if progress is not None:
             progress(done + 1, len(files))
-    infos = [
-        *_recordings_from_files(folder, head, recordings, streams),
-        *_recordings_from_labels(folder, head, streams),
-    ]
-    infos = apply_marks(infos, read_marks(folder))
-    infos.sort(key=lambda r: r.id)
-    found = Dataset(folder, head, infos, [_stream_info(folder, head, s) for s in streams], generation)
-    return IndexBuild(found, unreadable)
+    infos = _recordings_from_files(folder, head, recordings, streams) + _recordings_from_labels(folder, head, streams)
+    infos = sorted(apply_marks(infos, read_marks(folder)), key=lambda r: r.id)
+    stream_infos = [_stream_info(folder, head, s) for s in streams]
+    return IndexBuild(Dataset(folder, head, infos, stream_infos, generation), unreadable)
 
 
 DUPLICATE_FOLDER = "again-"
@@ -188,8 +179,8 @@ DUPLICATE_FOLDER = "again-"
 def _session(relative: Path, labelled: bool = False) -> str:
     """Return the session of a raw file from its path below ``recordings/`` or ``streams/``.
 
-    It is the folder in the person's. Without one it is 1; but streams with labels lie side by side, and each is a
-    session named after its file.
+    The session is the folder within the person's folder, or 1 if there is none. Each labelled stream without such a
+    folder is a session named after its file.
     """
     inner = relative.parts[1:-1]
     if inner and not inner[0].startswith(DUPLICATE_FOLDER):
@@ -202,7 +193,7 @@ def _stream_session(folder: Path, read: _RawFile) -> str:
 
 
 def _subject(folder_name: str, gesture: Gesture | None) -> str:
-    """Return whose a recording is: the person of its folder, or nobody if nobody makes the gesture."""
+    """Return the person of a recording: that of its folder, or nobody for a gesture that nobody makes."""
     return NOBODY if gesture is not None and gesture.nobody else folder_name
 
 
@@ -214,7 +205,7 @@ def _stream_info(folder: Path, head: DatasetHead, read: _RawFile) -> StreamInfo:
     frames = read.result.frames
     steps = np.diff(frames.device_ms)
     broken = (steps < 0) | (steps > head.layout.gap_ms)
-    flags = import_flags(Examination(frames, head.layout, None, None, stream=True))
+    flags = import_flags(Examination(frames, head.layout, stream=True))
     return StreamInfo(
         id=_stream_id(folder, read),
         subject=read.subject,
@@ -290,8 +281,8 @@ def _recordings_from_files(
             )
         if name.label not in gestures:
             gestures[name.label] = head.gestures.find(name.label)
-        found = gestures[name.label]
-        named.append((read, name, found.label if found else name.label))
+        gesture = gestures[name.label]
+        named.append((read, name, gesture.label if gesture else name.label))
     usual = usual_rows((label, len(read.result.frames)) for read, _, label in named)
     by_subject: dict[str, list[_RawFile]] = {}
     for stream in streams:
@@ -317,28 +308,36 @@ def _recordings_from_files(
             flags.append(f"{PARTLY_THERE} {rows} rows are in the session's stream")
         elif mine and found_in is None:
             flags.append("not found in the session's stream")
+        stream_id = "" if found_in is None else _stream_id(folder, found_in)
         infos.append(
             RecordingInfo(
+                **_facts(folder, read, frames, name.epoch_ms),
                 id=identity,
                 subject=_subject(read.subject, known),
                 session=session,
                 gesture=label,
-                file=read.path.relative_to(folder).as_posix(),
                 first_row=0,
-                rows=len(frames),
-                start=0,
-                stop=len(frames),
-                stream="" if found_in is None else _stream_id(folder, found_in),
+                stream=stream_id,
                 stream_row=stream_row,
-                start_ms=int(frames.device_ms[0]),
-                epoch_ms=int(frames.host_ms[0]) if frames.host_ms is not None else name.epoch_ms,
-                rate_hz=measured_rate_hz(frames),
-                excluded=False,
                 flags=tuple(flags),
-                sha256=read.sha256,
             )
         )
     return infos
+
+
+def _facts(folder: Path, read: _RawFile, frames: Frames, epoch_ms: int) -> dict[str, Any]:
+    """Return the index values of a recording that follow from its rows; ``epoch_ms`` is used without host times."""
+    return {
+        "file": read.path.relative_to(folder).as_posix(),
+        "rows": len(frames),
+        "start": 0,
+        "stop": len(frames),
+        "start_ms": int(frames.device_ms[0]),
+        "epoch_ms": int(frames.host_ms[0]) if frames.host_ms is not None else epoch_ms,
+        "rate_hz": measured_rate_hz(frames.device_ms),
+        "excluded": False,
+        "sha256": read.sha256,
+    }
 
 
 @dataclass(frozen=True)
@@ -376,29 +375,20 @@ def _recordings_from_labels(folder: Path, head: DatasetHead, streams: list[_RawF
             text = str(labels[first])
             if not plain_label(text):
                 continue
-            found = head.gestures.find(text)
-            label = found.label if found else text
+            gesture = head.gestures.find(text)
+            label = gesture.label if gesture else text
             part = frames.slice(first, last)
-            flags = import_flags(Examination(part, head.layout, None, None))
             infos.append(
                 RecordingInfo(
+                    **_facts(folder, read, part, int(part.device_ms[0])),
                     id=f"{_stream_id(folder, read)}#{number:03d} {label}",
-                    subject=_subject(read.subject, found),
+                    subject=_subject(read.subject, gesture),
                     session=_stream_session(folder, read),
                     gesture=label,
-                    file=read.path.relative_to(folder).as_posix(),
                     first_row=first,
-                    rows=last - first,
-                    start=0,
-                    stop=last - first,
                     stream=_stream_id(folder, read),
                     stream_row=first,
-                    start_ms=int(part.device_ms[0]),
-                    epoch_ms=int(part.host_ms[0]) if part.host_ms is not None else int(part.device_ms[0]),
-                    rate_hz=measured_rate_hz(part),
-                    excluded=False,
-                    flags=tuple(flags),
-                    sha256=read.sha256,
+                    flags=tuple(import_flags(Examination(part, head.layout))),
                 )
             )
     return infos
@@ -411,13 +401,7 @@ def apply_marks(infos: Iterable[RecordingInfo], marks: dict[str, MarkState]) -> 
         mark = marks.get(info.id)
         if mark is not None:
             stop = info.rows if mark.stop < 0 else min(mark.stop, info.rows)
-            values = {
-                **info.__dict__,
-                "excluded": mark.excluded,
-                "start": min(mark.start, stop),
-                "stop": stop,
-            }
-            info = RecordingInfo(**values)
+            info = replace(info, excluded=mark.excluded, start=min(mark.start, stop), stop=stop)
         out.append(info)
     return out
 

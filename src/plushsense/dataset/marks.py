@@ -14,11 +14,10 @@ from typing import Any, BinaryIO
 from filelock import FileLock
 
 from plushsense.core.errors import DatasetError, nearest
-from plushsense.core.toml import refuse_unknown
+from plushsense.core.toml import load_table
 
 MARKS = "marks.jsonl"
 BY_HAND, SUGGESTED = "hand", "suggested"
-_REQUIRED = ("recording", "action", "who")
 _LOCK_S = 30.0
 ACTIONS = ("trim", "untrim", "exclude", "include", "accept", "unaccept")
 
@@ -63,19 +62,15 @@ class MarkState:
         return bool(self.how) or (self.start, self.stop) != (0, -1)
 
 
-def _validated(mark: Mark, where: str) -> Mark:
-    """Return the mark if its values have the right type and range."""
-    for key in ("recording", "action", "who", "why", "when", "check", "how"):
-        if not isinstance(getattr(mark, key), str):
-            raise DatasetError(f"{where}: {key} is {getattr(mark, key)!r}; it must be a text.")
+def _refuse_contradictions(mark: Mark, where: str) -> None:
+    """Refuse a mark whose values do not fit each other, or are out of range."""
     if mark.action not in ACTIONS:
         raise DatasetError(
             f"{where}: unknown mark '{mark.action}': accepted are {', '.join(ACTIONS)}.{nearest(mark.action, ACTIONS)}"
         )
     for key, low in (("start", 0), ("stop", -1)):
-        value = getattr(mark, key)
-        if isinstance(value, bool) or not isinstance(value, int) or value < low:
-            raise DatasetError(f"{where}: {key} is {value!r}; it must be a whole number from {low} on.")
+        if (value := getattr(mark, key)) < low:
+            raise DatasetError(f"{where}: {key} is {value}; it must be a whole number from {low} on.")
     if bool(mark.check) != (mark.action in ("accept", "unaccept")):
         raise DatasetError(
             f"{where}: a mark '{mark.action}' with check '{mark.check}'; accept and unaccept name a check."
@@ -86,7 +81,6 @@ def _validated(mark: Mark, where: str) -> Mark:
         )
     if 0 <= mark.stop <= mark.start:
         raise DatasetError(f"{where}: rows {mark.start} to {mark.stop} keep nothing; stop must be above start, or -1.")
-    return mark
 
 
 def match_ids(pattern: str, known: Iterable[str], what: str) -> list[str]:
@@ -96,27 +90,27 @@ def match_ids(pattern: str, known: Iterable[str], what: str) -> list[str]:
         DatasetError: when it names none, with the nearest one.
     """
     ids = sorted(set(known))
-    if pattern in ids:
-        return [pattern]
-    found = [i for i in ids if fnmatchcase(i, pattern)]
-    if not found:
+    matched = [pattern] if pattern in ids else [i for i in ids if fnmatchcase(i, pattern)]
+    if not matched:
         hint = nearest(pattern, ids)
         example = f" For example '{ids[0]}', or a pattern such as 'P01/*'." if ids and not hint else ""
         raise DatasetError(f"There is no {what} '{pattern}'.{hint}{example}")
-    return found
+    return matched
 
 
 def append_marks(folder: Path, marks: Iterable[Mark]) -> None:
     """Append marks under a file lock, so that two programs can mark at once.
 
     Raises:
-        DatasetError: for a mark that cannot be, or a folder that cannot be written.
+        DatasetError: for a mark with contradictory values, or a folder that cannot be written.
     """
     lines = []
     for mark in marks:
-        table = asdict(_validated(mark, f"The mark of '{mark.recording}'"))
-        table["when"] = mark.when or datetime.now(timezone.utc).isoformat(timespec="seconds")
-        lines.append(json.dumps(table, ensure_ascii=False) + "\n")
+        _refuse_contradictions(mark, f"The mark of '{mark.recording}'")
+        when = mark.when or datetime.now(timezone.utc).isoformat(timespec="seconds")
+        lines.append(json.dumps(asdict(mark) | {"when": when}, ensure_ascii=False) + "\n")
+    if not lines:
+        return
     path = folder / MARKS
     try:
         with FileLock(folder / (MARKS + ".lock"), timeout=_LOCK_S), path.open("a+b") as file:
@@ -133,16 +127,13 @@ def append_marks(folder: Path, marks: Iterable[Mark]) -> None:
 def read_marks(folder: Path) -> dict[str, MarkState]:
     """Return the state of each marked recording.
 
-    A line that is not JSON was torn by a crash and is skipped; JSON that is not a mark is an error.
-
-    Raises:
-        DatasetError: naming the line.
+    A line that is not JSON was cut off by a crash and is skipped; JSON that is not a mark is a DatasetError.
     """
     return MarksFollower(folder).states()
 
 
 class MarksFollower:
-    """The marks of a data set, read again only as far as other programs added to them. Not thread-safe."""
+    """Follows the marks of a data set: reads only what other programs appended. Not thread-safe."""
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / MARKS
@@ -156,24 +147,18 @@ class MarksFollower:
         return self._now() != self._seen
 
     def states(self) -> dict[str, MarkState]:
-        """Return the state of each marked recording, as `read_marks`.
-
-        The dictionary is a new one if something changed, and the same one otherwise.
-
-        Raises:
-            DatasetError: naming the line.
-        """
+        """Return the state of each marked recording, as `read_marks`; a new dictionary if something changed."""
         now = self._now()
         if now == self._seen:
-            return self._given
+            return self._last_states
         if now is None:
             # The file was removed by another program.
             self._states, self._lines, self._bytes = {}, 0, 0
-            self._seen, self._given = now, {}
-            return self._given
+            self._seen, self._last_states = now, {}
+            return self._last_states
         try:
             with self._path.open("rb") as file:
-                if self._seen is None or now[0] != self._seen[0] or now[1] < self._bytes or not self._goes_on(file):
+                if not self._continues(file, now):
                     self._states, self._lines, self._bytes = {}, 0, 0
                 file.seek(self._bytes)
                 *whole, rest = file.read().split(b"\n")
@@ -188,10 +173,10 @@ class MarksFollower:
         # A line without an end may be a mark, or the beginning of one.
         self._take(rest, self._lines + 1, states)
         self._tail = whole[-1] if whole else self._tail
-        self._seen, self._given = now, states
+        self._seen, self._last_states = now, states
         return states
 
-    _given: dict[str, MarkState] = {}  # noqa: RUF012, RUF100
+    _last_states: dict[str, MarkState] = {}  # noqa: RUF012, RUF100
     _tail = b""
 
     def _now(self) -> tuple[int, int, int] | None:
@@ -203,23 +188,21 @@ class MarksFollower:
             raise DatasetError(f"'{self._path}' cannot be read: {cause.strerror or cause}.") from None
         return now.st_ino, now.st_size, now.st_mtime_ns
 
-    def _goes_on(self, file: BinaryIO) -> bool:
-        """Return whether the last line that was read is still at its place."""
+    def _continues(self, file: BinaryIO, now: tuple[int, int, int]) -> bool:
+        """Return whether the file is the one that was read, with lines appended at most."""
+        if self._seen is None or now[0] != self._seen[0] or now[1] < self._bytes:
+            return False
         file.seek(max(0, self._bytes - len(self._tail) - 1))
         return self._bytes == 0 or file.read(len(self._tail) + 1) == self._tail + b"\n"
 
     def _take(self, line: bytes, number: int, states: dict[str, MarkState]) -> None:
-        where = f"'{self._path}' line {number}"
         try:
             table: Any = json.loads(line.decode("utf-8"))
         except (ValueError, RecursionError):
             return
-        if not isinstance(table, dict):
-            raise DatasetError(f"{where} is no mark: each line is one JSON object.")
-        refuse_unknown(table, Mark.__dataclass_fields__, where, DatasetError)
-        if lacking := [key for key in _REQUIRED if key not in table]:
-            raise DatasetError(f"{where} lacks {', '.join(lacking)}: a mark says at least {', '.join(_REQUIRED)}.")
-        mark = _validated(Mark(**table), where)
+        where = f"'{self._path}' line {number}"
+        mark = load_table(table, Mark, where, DatasetError)
+        _refuse_contradictions(mark, where)
         states[mark.recording] = apply_mark(states.get(mark.recording, MarkState()), mark)
 
 

@@ -1,19 +1,18 @@
-"""Onset and offset detection: where a gesture begins and ends inside its recording, from signal activity.
+"""Detect the onset and offset of a gesture in its recording from signal activity.
 
-The recorder starts with a key and the person begins when ready, so a recording holds some rest, the gesture, and some
-rest. All steps use units of the device's own noise:
+A recording holds some rest, the gesture, and some rest. All steps use units of the device's own noise:
 
-1. each sensor's speed (change over 0.1 s, lightly smoothed), over its speed at rest; a vector's axes count as one
-   sensor. Contact sensors (capacitive, proximity) also by how far they are from the level before the touch, since
+1. activity: the speed of each sensor (change over 0.1 s, lightly smoothed) over its speed at rest; the axes of a vector
+   are one sensor. For contact sensors (capacitive, proximity) also the distance from the level before the touch, since
    a hand that holds still is no rest. The activity is that of the most active sensor.
-2. rest is what the session's stream held just before the recording (the countdown), where it is known, else the
-   quietest stretch of the recording; never much noisier than the quietest stretch.
-3. contrast = activity at its height over activity at rest. Thresholds stand at a share of the way from rest to
-   height *in decibels*, so that they fit a faint scratch and a throw alike.
+2. rest: the session's stream just before the recording (the countdown) where it is known, else the quietest stretch of
+   the recording; never much noisier than the quietest stretch.
+3. contrast: the highest activity over that at rest. Thresholds are a share of the way from rest to the highest activity
+   *in decibels*, so that they fit a faint scratch and a throw alike.
 4. from the first and last clear activity, walk outwards until it is quiet.
 
-The confidence falls with low contrast, with a begin that moves when the threshold does (a slow drift into the
-gesture), and is 0 where no begin is visible. How good it is on real recordings: docs/trim.md.
+The confidence falls with low contrast and with an onset that moves with the threshold (a slow drift into the gesture);
+it is 0 where no onset is visible. Errors on real recordings: docs/trim.md.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ _CONTACT = ("capacitive", "proximity")
 
 @dataclass(frozen=True)
 class OnsetSpec:
-    """The numbers of the method. Shares are of the way from rest to height, on a logarithmic scale.
+    """The settings of the method. Shares are of the way from rest to the highest activity, on a logarithmic scale.
 
     The walk outwards ends at ``onset_at`` and ``offset_at`` after ``quiet_s`` of quiet; activity above ``clear_at`` is
     clear. Below ``least_contrast`` there is no gesture, and activity shorter than ``least_s`` is a knock.
@@ -84,7 +83,7 @@ def suggest(frames: Frames, layout: Layout, before: Frames | None = None, spec: 
 
     Args:
         frames: the whole recording, untrimmed.
-        before: what the stream held just before, about `CONTEXT_S`; rows from before a gap are not used.
+        before: about `CONTEXT_S` of the stream just before it; rows before a gap are not used.
     """
     n = len(frames)
     nothing = Suggestion(0, n, False, False, 0.0, 0.0, 1.0, "too short")
@@ -112,10 +111,7 @@ def suggest(frames: Frames, layout: Layout, before: Frames | None = None, spec: 
     loose = [onset(spec.onset_at + d) for d in (-0.15, 0.1)], [offset(spec.offset_at + d) for d in (-0.1, 0.1)]
     spread = [period_s * (max(at, *moved) - min(at, *moved)) for at, moved in zip((start, stop), loose, strict=True)]
     trust = min(1.0, max(0.0, np.log(contrast / spec.least_contrast) / np.log(20.0 / spec.least_contrast)))
-    reasons = [
-        "it moves already at the first row" if start == 0 else "",
-        "it moves still at the last row" if stop == n else "",
-    ]
+    reasons = {"it moves already at the first row": start == 0, "it moves still at the last row": stop == n}
     return Suggestion(
         start,
         stop,
@@ -124,7 +120,7 @@ def suggest(frames: Frames, layout: Layout, before: Frames | None = None, spec: 
         round(float(trust * np.exp(-spread[0] / 0.5)), 2) if start > 0 else 0.0,
         round(float(trust * np.exp(-spread[1] / 0.5)), 2) if stop < n else 0.0,
         contrast,
-        "; ".join(filter(None, reasons)),
+        "; ".join(text for text, applies in reasons.items() if applies),
     )
 
 

@@ -1,4 +1,4 @@
-"""Statistics of a data set: durations before and after trimming, by gesture and group of people, and channel values.
+"""Compute statistics of a data set: durations by gesture and group of people, and channel values by gesture.
 
 The summary statistics of the authors' ``b_training_data_analysis.m``: mean, median, variance and range by gesture.
 """
@@ -6,16 +6,14 @@ The summary statistics of the authors' ``b_training_data_analysis.m``: mean, med
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import DatasetError, nearest
 from plushsense.core.gestures import NOBODY
-from plushsense.dataset.people import PEOPLE, PersonInfo, read_people
-from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset, RecordingInfo
+from plushsense.dataset.store import PEOPLE, UNKNOWN_SUBJECT, Dataset, PersonInfo, RecordingInfo, read_people
 
 NOT_GIVEN = "not said"
 
@@ -56,10 +54,6 @@ class Duration:
     before_rows: SummaryStatistics
     after_rows: SummaryStatistics
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
-        return asdict(self)
-
 
 def duration_table(dataset: Dataset, by: str | None = None) -> list[Duration]:
     """Return durations of the used recordings, one row per gesture and group of people.
@@ -77,7 +71,22 @@ def duration_table(dataset: Dataset, by: str | None = None) -> list[Duration]:
     for r in dataset.used:
         if r.rate_hz > 0:
             cells.setdefault((r.gesture, group(r.subject)), []).append(r)
-    return [_duration(*key, cells[key]) for key in sorted(cells, key=lambda k: (_class_order(dataset, k[0]), k))]
+    return [
+        Duration(
+            gesture,
+            group_name,
+            len(recordings),
+            len({r.subject for r in recordings} - {NOBODY, UNKNOWN_SUBJECT}),
+            sum(r.stop - r.start < r.rows for r in recordings),
+            SummaryStatistics.of([r.rows / r.rate_hz for r in recordings]),
+            SummaryStatistics.of([(r.stop - r.start) / r.rate_hz for r in recordings]),
+            SummaryStatistics.of([r.rows for r in recordings]),
+            SummaryStatistics.of([r.stop - r.start for r in recordings]),
+        )
+        for (gesture, group_name), recordings in sorted(
+            cells.items(), key=lambda cell: (_class_order(dataset, cell[0][0]), cell[0])
+        )
+    ]
 
 
 def _class_order(dataset: Dataset, gesture: str) -> int:
@@ -86,32 +95,18 @@ def _class_order(dataset: Dataset, gesture: str) -> int:
     return labels.index(gesture) if gesture in labels else len(labels)
 
 
-def _duration(gesture: str, group: str, mine: list[RecordingInfo]) -> Duration:
-    return Duration(
-        gesture,
-        group,
-        len(mine),
-        len({r.subject for r in mine} - {NOBODY, UNKNOWN_SUBJECT}),
-        sum(r.stop - r.start < r.rows for r in mine),
-        SummaryStatistics.of([r.rows / r.rate_hz for r in mine]),
-        SummaryStatistics.of([(r.stop - r.start) / r.rate_hz for r in mine]),
-        SummaryStatistics.of([r.rows for r in mine]),
-        SummaryStatistics.of([r.stop - r.start for r in mine]),
-    )
-
-
 class _Grouping:
     """Maps each person to a group by a column of subjects.csv."""
 
     def __init__(self, dataset: Dataset, by: str | None) -> None:
         self.by = by.casefold() if by else ""
         self.people = read_people(dataset.path) if self.by and self.by != "subject" else {}
-        if not self.by or self.by == "subject":
+        if self.by in ("", "subject"):
             return
         columns = {"age_group", "gender", *(key for p in self.people.values() for key in p.more)}
         if not self.people:
             raise DatasetError(
-                f"'{dataset.path}' has no {PEOPLE}, so nothing is known of the people: write one there with columns "
+                f"'{dataset.path}' has no {PEOPLE} with the people's groups: write one there with the columns "
                 "subject,age_group,gender."
             )
         if self.by not in columns:
@@ -142,10 +137,6 @@ class ChannelSummary:
     rows: int
     mean: float
     sd: float
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
-        return asdict(self)
 
 
 def channel_table(dataset: Dataset) -> list[ChannelSummary]:

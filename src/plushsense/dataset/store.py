@@ -1,12 +1,13 @@
-"""A data set folder: what is in it, and reading it.
+"""Read and write the files of a data set folder.
 
 dataset.toml                 version, name, licence, consent statement; the layout and gesture set in full
 recordings/<subject>/*.csv   raw recordings, never rewritten
 streams/<subject>/*.csv      raw session streams; a file with a label on every row is a stream too
-marks.jsonl                  trim, exclude: who and why, append-only
+marks.jsonl                  decisions about recordings, append-only (`dataset.marks`)
 recordings.csv, streams.csv  the index: rebuilt from the above, replaced atomically
-index.json                   stamp of what the index was made from: if that changed, it is rebuilt
-subjects.csv                 the people by code: age group, gender, consent reference (`dataset.people`)
+index.json                   stamp of the files that the index was made from; if they changed, it is rebuilt
+subjects.csv                 the people by code: age group, gender, consent reference; never names
+forgotten.jsonl              a line for each person who was removed, without the person
 cache/                       can be deleted
 """
 
@@ -17,28 +18,99 @@ import hashlib
 import html
 import io
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
 import tomli_w
+from filelock import FileLock, Timeout
 
-from plushsense.core.errors import DatasetError, FileFormatError
+from plushsense.core.errors import DatasetError, FileFormatError, ForgottenError
 from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import Frames, ReadResult, read_recording, read_stream
 from plushsense.core.toml import load_table, read_toml
 from plushsense.dataset.about import About
-from plushsense.dataset.generation import Generation
+from plushsense.dataset.marks import MARKS
 
 FORMAT_VERSION = 1
 HEAD = "dataset.toml"
 RECORDINGS = "recordings"
 STREAMS = "streams"
+PEOPLE = "subjects.csv"
 UNKNOWN_SUBJECT = "unknown"
+FORGOTTEN = "forgotten.jsonl"
+UNDER_WAY = "forgetting.json"
+LOCK = MARKS + ".lock"
+# Far longer than the removal of a large cache from a slow disk.
+_LOCK_S = 600.0
+_PEOPLE_COLUMNS = ("subject", "age_group", "gender", "consent")
+
+Progress = Callable[[int, int], None]
+"""Called with the work done and its total."""
+
+
+@dataclass(frozen=True)
+class Generation:
+    """The state of a data set between two removals of people, so that no result of a removed person is written.
+
+    `forget` holds the data set's lock while it removes a person, and appends a line to ``forgotten.jsonl``. Code that
+    writes results takes the same lock and compares the number of lines with that at the time the data set was opened.
+    """
+
+    folder: Path
+    removals: int
+
+    @classmethod
+    def of(cls, folder: Path) -> Generation:
+        """Return the present generation of the data set in ``folder``; read it before any of the data."""
+        try:
+            return cls(folder, (folder / FORGOTTEN).read_bytes().count(b"\n"))
+        except (FileNotFoundError, NotADirectoryError):
+            return cls(folder, 0)
+
+    def check(self) -> None:
+        """Raise ForgottenError if a person was removed since, or a removal is not finished."""
+        if self.of(self.folder) != self:
+            raise ForgottenError(
+                f"A person was removed from '{self.folder}' (plushsense forget) while this ran, so its results were "
+                "not written: run it again on the data set as it is now."
+            )
+        if (self.folder / UNDER_WAY).exists():
+            raise ForgottenError(
+                f"The removal of a person from '{self.folder}' is not finished, so nothing was written: finish  "
+                "plushsense forget  there, then run this again."
+            )
+
+    @contextmanager
+    def writing(self) -> Iterator[None]:
+        """Hold the data set's lock while something derived from it is written; do not nest.
+
+        On a read-only disk, or one without locks, only `check` is made.
+
+        Raises:
+            ForgottenError: as `check`.
+            DatasetError: when another program holds the lock for too long.
+        """
+        lock = FileLock(self.folder / LOCK, timeout=_LOCK_S)
+        try:
+            lock.acquire()
+        except Timeout:
+            raise DatasetError(
+                f"Another program has held '{self.folder / LOCK}' for {_LOCK_S / 60:.0f} minutes: end it, then run "
+                "this again."
+            ) from None
+        except (OSError, NotImplementedError):
+            pass
+        try:
+            self.check()
+            yield
+        finally:
+            lock.release()
 
 
 @dataclass(frozen=True)
@@ -48,41 +120,31 @@ class _Row:
     @classmethod
     def from_text(cls, row: dict[str, str], where: str) -> Self:
         try:
-            values: dict[str, Any] = {}
-            for f in fields(cls):
-                text = row[f.name]
-                kind = str(f.type)
-                values[f.name] = (
-                    int(text)
-                    if kind == "int"
-                    else float(text)
-                    if kind == "float"
-                    else text == "yes"
-                    if kind == "bool"
-                    else tuple(t for t in text.split(" | ") if t)
-                    if kind.startswith("tuple")
-                    else text
-                )
-            return cls(**values)
+            return cls(**{f.name: _PARSERS[str(f.type)](row[f.name]) for f in fields(cls)})
         except (KeyError, ValueError, TypeError) as cause:
             raise DatasetError(
                 f"The index '{where}' is damaged ({cause}): delete it, it is rebuilt from the recordings."
             ) from None
 
     def to_text(self) -> dict[str, str]:
-        out = {}
-        for name in self.__dataclass_fields__:
-            value = getattr(self, name)
-            out[name] = (
-                ("yes" if value else "no")
-                if isinstance(value, bool)
-                else " | ".join(value)
-                if isinstance(value, tuple)
-                else f"{value:.3f}"
-                if isinstance(value, float)
-                else str(value)
-            )
-        return out
+        return {name: _cell(value) for name, value in vars(self).items()}
+
+
+_PARSERS: dict[str, Callable[[str], Any]] = {
+    "str": str,
+    "int": int,
+    "float": float,
+    "bool": lambda text: text == "yes",
+    "tuple[str, ...]": lambda text: tuple(t for t in text.split(" | ") if t),
+}
+
+
+def _cell(value: object) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, tuple):
+        return " | ".join(value)
+    return f"{value:.3f}" if isinstance(value, float) else str(value)
 
 
 @dataclass(frozen=True)
@@ -188,19 +250,20 @@ class DatasetHead:
             raise DatasetError(f"There is no folder '{folder}': give the folder of a data set.")
         if not path.is_file():
             raise DatasetError(
-                f"'{folder}' is not a data set (it has no {HEAD}): make one with  plushsense import SRC {folder}"
+                f"'{folder}' is not a data set (it has no {HEAD}): create one with  plushsense import SRC {folder}"
             )
         table = read_toml(path, "data set", DatasetError)
         version = table.pop("format", None)
         if version != FORMAT_VERSION:
             raise DatasetError(f"'{path}' has the format {version}; this version reads {FORMAT_VERSION}.")
         file = load_table(table, _HeadFile, f"'{path}'", DatasetError)
-        layout = Layout.from_dict(file.layout, f"layout in '{path}'")
-        gestures = GestureSet.from_dict(file.gesture_set, f"gesture set in '{path}'")
-        about = About.from_table(file.about, f"[about] in '{path}'")
-        return cls(
-            file.name, layout, gestures, file.version, file.licence, file.consent, file.source, file.simulated, about
-        )
+        values = vars(file) | {
+            "layout": Layout.from_dict(file.layout, f"layout in '{path}'"),
+            "gestures": GestureSet.from_dict(file.gesture_set, f"gesture set in '{path}'"),
+            "about": load_table(file.about, About, f"[about] in '{path}'", DatasetError),
+        }
+        del values["gesture_set"]
+        return cls(**values)
 
 
 @dataclass(frozen=True)
@@ -251,8 +314,7 @@ class Dataset:
     @property
     def subjects(self) -> list[str]:
         """Codes of the people, sorted, without "none" (nobody) and "unknown"."""
-        people = {r.subject for r in self.recordings} - {NOBODY, UNKNOWN_SUBJECT}
-        return sorted(people)
+        return sorted({r.subject for r in self.recordings} - {NOBODY, UNKNOWN_SUBJECT})
 
     @property
     def used(self) -> list[RecordingInfo]:
@@ -265,8 +327,7 @@ class Dataset:
             return self.read_stream(recording.stream).slice(
                 recording.first_row + recording.start, recording.first_row + recording.stop
             )
-        frames = self._frames(read_recording, recording.file)
-        return frames.slice(recording.start, recording.stop)
+        return self._frames(read_recording, recording.file).slice(recording.start, recording.stop)
 
     def read_stream(self, stream: str) -> Frames:
         """Read the rows of one session stream and cache them, since recordings are read stream by stream."""
@@ -347,3 +408,81 @@ class Dataset:
         )
         head = "".join(f"<th>{h}</th>" for h in ("gesture", "affect", "recordings", "people", "median s"))
         return f"<p>{html.escape(repr(self))}</p><table><tr>{head}</tr>{rows}</table>"
+
+
+@dataclass(frozen=True)
+class PersonInfo:
+    """One person by code; unknown values are "", ``more`` holds columns that the user added."""
+
+    subject: str
+    age_group: str = ""
+    gender: str = ""
+    consent: str = ""
+    more: dict[str, str] = field(default_factory=dict)
+
+
+def read_people(path: Path) -> dict[str, PersonInfo]:
+    """Read the people of a file (or of the data set folder ``path``) by code; empty if there is no such file.
+
+    Raises:
+        DatasetError: for a file without a column ``subject``, a row without a code, or a code on two rows.
+    """
+    path = path / PEOPLE if path.is_dir() else path
+    people: dict[str, PersonInfo] = {}
+    try:
+        columns, rows = read_csv_rows(path, "people's file")
+    except FileNotFoundError:
+        return people
+    if "subject" not in columns or len(set(columns)) != len(columns):
+        raise DatasetError(
+            f"The people's file '{path}' has the columns {', '.join(columns) or 'nothing'}; it needs 'subject', "
+            f"accepted besides are {', '.join(_PEOPLE_COLUMNS[1:])} and others of your own, each once."
+        )
+    for line, cells in rows:
+        code = cells.pop("subject")
+        if not code or code in people:
+            problem = (
+                f"names '{code}' again: give one line per person" if code else "names no subject: fill in the code"
+            )
+            raise DatasetError(f"The people's file '{path}' line {line} {problem}.")
+        known = {key: cells.pop(key, "") for key in _PEOPLE_COLUMNS[1:]}
+        people[code] = PersonInfo(code, **known, more=cells)
+    return people
+
+
+def read_csv_rows(path: Path, what: str) -> tuple[list[str], list[tuple[int, dict[str, str]]]]:
+    """Read a CSV file that a user wrote, with ``,`` or ``;`` between the cells.
+
+    Returns:
+        The columns in lower case, and each row's line number and cells by column; missing cells are "".
+
+    Raises:
+        FileNotFoundError: when there is no such file.
+        DatasetError: for a file that cannot be read, with ``what`` as its purpose.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+        first = text.partition("\n")[0]
+        reader = csv.DictReader(io.StringIO(text), delimiter=";" if ";" in first else ",", strict=True)
+        columns = reader.fieldnames = [c.strip().casefold() for c in reader.fieldnames or ()]
+        rows = []
+        for row in reader:
+            cells = {k: (v or "").strip() for k, v in row.items() if isinstance(k, str) and not isinstance(v, list)}
+            rows.append((reader.line_num, cells))
+    except FileNotFoundError:
+        raise
+    except (OSError, UnicodeDecodeError, csv.Error) as cause:
+        raise DatasetError(f"The {what} '{path}' cannot be read ({cause}): give a CSV file in UTF-8.") from None
+    return columns, rows
+
+
+def write_people(folder: Path, people: Iterable[PersonInfo]) -> None:
+    """Replace the people's file of the data set in ``folder``, sorted by code."""
+    listed = sorted(people, key=lambda p: p.subject)
+    more = list(dict.fromkeys(key for p in listed for key in p.more))
+    out = io.StringIO()
+    writer = csv.DictWriter(out, [*_PEOPLE_COLUMNS, *more], lineterminator="\n", restval="")
+    writer.writeheader()
+    for p in listed:
+        writer.writerow(p.more | {key: getattr(p, key) for key in _PEOPLE_COLUMNS})
+    write_file(folder / PEOPLE, out.getvalue())

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,7 +23,7 @@ from plushsense.dataset.index import as_dataset
 from plushsense.dataset.marks import BY_HAND, SUGGESTED, Mark, MarkState, append_marks, match_ids, read_marks
 from plushsense.dataset.onset import CONTEXT_S, Suggestion, suggest
 from plushsense.dataset.quality.checking import author_name
-from plushsense.dataset.store import Dataset, RecordingInfo
+from plushsense.dataset.store import Dataset, Progress, RecordingInfo
 
 STATES = ("none", "suggested", "accepted", "adjusted")
 
@@ -32,9 +32,7 @@ STATES = ("none", "suggested", "accepted", "adjusted")
 class Trim:
     """Suggested trim and state of one recording.
 
-    ``seconds`` (rows + 1,) is the device time since the first row, at each row and at the end; resets are skipped.
-    ``state``: "none" (nothing to suggest, no mark), "suggested", "accepted" (a suggestion was), "adjusted" (a person
-    set it).
+    ``seconds`` (rows + 1,) are `row_times_s`.
     """
 
     recording: RecordingInfo
@@ -44,7 +42,7 @@ class Trim:
 
     @property
     def state(self) -> str:
-        """The state, one of `STATES`."""
+        """One of `STATES`: "accepted" is a suggestion that was marked, "adjusted" a mark that a person set."""
         if self.mark_state.trimmed:
             return "accepted" if self.mark_state.how == SUGGESTED else "adjusted"
         return "suggested" if self.suggestion.onset_visible else "none"
@@ -90,7 +88,7 @@ class Trim:
 
 @dataclass(frozen=True)
 class AcceptedTrims:
-    """Ids of recordings by what accepting did: marked, already so, no visible onset (or too unsure), set by hand."""
+    """Ids of recordings by what accepting did: marked, marked already, no visible or sure onset, set by hand."""
 
     marked: tuple[str, ...] = ()
     already: tuple[str, ...] = ()
@@ -99,14 +97,9 @@ class AcceptedTrims:
 
 
 def suggest_trims(
-    dataset: Dataset,
-    recordings: Iterable[RecordingInfo] | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    dataset: Dataset, recordings: Iterable[RecordingInfo] | None = None, progress: Progress | None = None
 ) -> list[Trim]:
-    """Return the suggestion and the state of each recording, in the order of the index.
-
-    Args:
-        recordings: which; by default those that no mark excludes.
+    """Return the suggestion and the state of each recording; by default of all that no mark excludes.
 
     Raises:
         DatasetError: for a data set whose recordings are cut from labels, which need no trimming.
@@ -117,9 +110,9 @@ def suggest_trims(
             f"'{dataset.layout.name}'), so there is no reaction time to trim: trim data sets of single recordings."
         )
     chosen = list(dataset.used if recordings is None else recordings)
-    standing = read_marks(dataset.path)
+    marks = read_marks(dataset.path)
     nobody = {g.label for g in dataset.gestures.gestures if g.nobody}
-    found = {}
+    trims = {}
     # Sorted by stream, since the data set caches the last one.
     for done, info in enumerate(sorted(chosen, key=lambda r: (r.stream, r.id)), 1):
         frames = dataset.read(replace(info, start=0, stop=info.rows))
@@ -127,10 +120,10 @@ def suggest_trims(
             suggestion = Suggestion(0, info.rows, False, False, 0.0, 0.0, 1.0, "rest: all of it is the gesture")
         else:
             suggestion = suggest(frames, dataset.layout, _before(dataset, info))
-        found[info.id] = Trim(info, suggestion, standing.get(info.id, MarkState()), row_times_s(frames))
+        trims[info.id] = Trim(info, suggestion, marks.get(info.id, MarkState()), row_times_s(frames))
         if progress is not None:
             progress(done, len(chosen))
-    return [found[info.id] for info in chosen]
+    return [trims[info.id] for info in chosen]
 
 
 def _before(dataset: Dataset, info: RecordingInfo) -> Frames | None:
@@ -149,11 +142,7 @@ def row_times_s(frames: Frames) -> NDArray[np.float64]:
 
 
 def find_recordings(dataset: Dataset, pattern: str) -> list[RecordingInfo]:
-    """Return the recordings that an id or a pattern with ``*`` and ``?`` matches.
-
-    Raises:
-        DatasetError: when it names none.
-    """
+    """Return the recordings that an id or a pattern with ``*`` and ``?`` matches; DatasetError if there is none."""
     ids = {r.id: r for r in dataset.recordings}
     return [ids[identity] for identity in match_ids(pattern, ids, "recording")]
 
@@ -178,7 +167,7 @@ def accept_suggestions(
         else:
             end = stop if stop < info.rows else -1
             marks.append(Mark(info.id, "trim", who, why, start=start, stop=end, how=SUGGESTED))
-    _append(dataset, marks)
+    append_marks(dataset.path, marks)
     return AcceptedTrims(tuple(m.recording for m in marks), tuple(already), tuple(not_visible), tuple(by_hand))
 
 
@@ -204,18 +193,11 @@ def kept_rows(trim: Trim, start_s: float | None, stop_s: float | None) -> tuple[
     return start, stop
 
 
-def set_trim(
-    dataset: Dataset, trim: Trim, start_s: float | None, stop_s: float | None, who: str, why: str = ""
-) -> bool:
-    """Mark `kept_rows` of a recording as set by hand; returns False if that was in force already."""
-    return set_rows(dataset, trim, *kept_rows(trim, start_s, stop_s), who, why)
-
-
 def set_rows(dataset: Dataset, trim: Trim, start: int, stop: int, who: str, why: str = "") -> bool:
-    """Mark rows ``start`` to ``stop`` of a recording as set by hand; returns False if that was in force already.
+    """Mark rows ``start`` to ``stop`` of a recording as set by hand; return False if that is the present mark.
 
     Raises:
-        DatasetError: for rows that are not there, or none.
+        DatasetError: for rows that do not exist, or none.
     """
     info = trim.recording
     if not 0 <= start < stop <= info.rows:
@@ -223,30 +205,22 @@ def set_rows(dataset: Dataset, trim: Trim, start: int, stop: int, who: str, why:
     if trim.state == "adjusted" and trim.current_rows() == (start, stop):
         return False
     end = stop if stop < info.rows else -1
-    _append(dataset, [Mark(info.id, "trim", who, why, start=start, stop=end, how=BY_HAND)])
+    append_marks(dataset.path, [Mark(info.id, "trim", who, why, start=start, stop=end, how=BY_HAND)])
     return True
 
 
 def refresh_trims(dataset: Dataset, trims: Iterable[Trim]) -> list[Trim]:
     """Return the same suggestions with the present marks."""
-    standing = read_marks(dataset.path)
-    return [replace(t, mark_state=standing.get(t.recording.id, MarkState())) for t in trims]
+    marks = read_marks(dataset.path)
+    return [replace(t, mark_state=marks.get(t.recording.id, MarkState())) for t in trims]
 
 
 def undo_trims(dataset: Dataset, recordings: Sequence[RecordingInfo], who: str, why: str = "") -> tuple[str, ...]:
-    """Undo the trim of recordings, accepted or set by hand; returns the ids of those that had one."""
-    standing = read_marks(dataset.path)
-    marked = [r.id for r in recordings if standing.get(r.id, MarkState()).trimmed]
-    _append(dataset, [Mark(identity, "untrim", who, why) for identity in marked])
-    return tuple(marked)
-
-
-def _append(dataset: Dataset, marks: list[Mark]) -> None:
-    if marks:
-        append_marks(dataset.path, marks)
-
-
-Kept = tuple[str, float | None, float | None]
+    """Undo the trim of recordings, accepted or set by hand; return the ids of those that had one."""
+    marks = read_marks(dataset.path)
+    trimmed = tuple(r.id for r in recordings if marks.get(r.id, MarkState()).trimmed)
+    append_marks(dataset.path, [Mark(identity, "untrim", who, why) for identity in trimmed])
+    return trimmed
 
 
 @dataclass(frozen=True)
@@ -276,33 +250,33 @@ def decide_trims(
     only: str = "*",
     accept: Sequence[str] = (),
     above: float | None = None,
-    keep: Sequence[Kept] = (),
+    keep: Sequence[tuple[str, float | None, float | None]] = (),
     undo: Sequence[str] = (),
     offset: bool = False,
     who: str | None = None,
     why: str = "",
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> TrimResult:
-    """Suggest trims and mark decisions, if any are given; without one nothing is marked.
+    """Suggest trims, and mark the given decisions.
 
     Args:
-        only: an id or a pattern of the recordings to look at; by default all that no mark excludes.
-        accept: ids or patterns of those whose suggestion is taken. ``above``: the least confidence, 0 to 1; without
-            ``accept``, of all that are looked at.
-        keep: (id, from, to) in seconds, None for the edge, as set by hand.
-        undo: ids or patterns whose mark is taken back.
-        offset: whether a suggested end is taken too.
+        only: an id or a pattern of the recordings; by default all that no mark excludes.
+        accept: ids or patterns of recordings whose suggestion is accepted.
+        above: the least confidence to accept, 0 to 1; without ``accept``, for all recordings of ``only``.
+        keep: (id, from, to) in seconds to set by hand, None for the edge.
+        undo: ids or patterns whose trim is undone.
+        offset: whether to accept suggested ends, too.
         who: by default the login name.
 
     Raises:
-        ConfigError: for a confidence that is none, or a ``keep`` of several recordings.
-        DatasetError: for names that are not there, and times outside a recording. Then nothing is marked.
+        ConfigError: for a confidence out of range, or a ``keep`` of several recordings; nothing is marked then.
+        DatasetError: for unknown recordings, or times outside a recording; nothing is marked then.
     """
     if above is not None and not 0.0 <= above <= 1.0:
         raise ConfigError(f"Accepting above {above:g}: a confidence from 0 to 1 is accepted.")
     dataset = as_dataset(dataset)
     chosen = dataset.used if only == "*" else find_recordings(dataset, only)
-    found = {t.recording.id: t for t in suggest_trims(dataset, chosen, progress)}
+    listed = {t.recording.id: t for t in suggest_trims(dataset, chosen, progress)}
     undone = {r.id: r for pattern in undo for r in find_recordings(dataset, pattern)}
     by_name = {r.id: r for pattern in accept for r in find_recordings(dataset, pattern)}
     to_keep = []
@@ -311,19 +285,16 @@ def decide_trims(
         if others:
             raise ConfigError(f"One recording is set at a time, and '{identity}' names {1 + len(others)}: give an id.")
         to_keep.append((info, start_s, stop_s))
-    more = [r for r in [*by_name.values(), *(i for i, _, _ in to_keep)] if r.id not in found]
-    every = found | {t.recording.id: t for t in suggest_trims(dataset, more)}
-    for info, start_s, stop_s in to_keep:
-        kept_rows(every[info.id], start_s, stop_s)
+    more = [r for r in [*by_name.values(), *(i for i, _, _ in to_keep)] if r.id not in listed]
+    every = listed | {t.recording.id: t for t in suggest_trims(dataset, more)}
+    rows = [(every[info.id], *kept_rows(every[info.id], start_s, stop_s)) for info, start_s, stop_s in to_keep]
     accepting = bool(by_name) or above is not None
     name = author_name(who) if accepting or undone or to_keep else ""
     # All arguments are valid; from here on marks are written.
-    taken_back = undo_trims(dataset, list(undone.values()), name, why)
-    adjusted = tuple(
-        info.id for info, start_s, stop_s in to_keep if set_trim(dataset, every[info.id], start_s, stop_s, name, why)
-    )
+    undone_ids = undo_trims(dataset, list(undone.values()), name, why)
+    adjusted = tuple(t.recording.id for t, start, stop in rows if set_rows(dataset, t, start, stop, name, why))
     accepted = AcceptedTrims()
     if accepting:
-        again = refresh_trims(dataset, [every[identity] for identity in (by_name or found)])
+        again = refresh_trims(dataset, [every[identity] for identity in (by_name or listed)])
         accepted = accept_suggestions(dataset, again, name, why, above=above or 0.0, offset=offset)
-    return TrimResult(dataset, tuple(refresh_trims(dataset, found.values())), accepted, adjusted, taken_back)
+    return TrimResult(dataset, tuple(refresh_trims(dataset, listed.values())), accepted, adjusted, undone_ids)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.core.errors import ConfigError, nearest
-from plushsense.core.gestures import GestureSet, load_gestures, plain_label
+from plushsense.core.gestures import load_gestures, plain_label
 from plushsense.core.recorder_csv import parse_name, recording_filename
 from plushsense.core.toml import builtin_names, load_table, read_named
 
@@ -76,7 +76,7 @@ class Protocol:
         return tuple(Step(n, g, r, self.prompts[g]) for n, (g, r) in enumerate(pairs))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values, ready for JSON, from which `from_dict` builds the same protocol without other files."""
+        """Return plain values for JSON, from which `from_dict` builds the same protocol without other files."""
         return asdict(self) | {"gestures": list(self.gestures), "nobody": list(self.nobody)}
 
     @classmethod
@@ -111,21 +111,7 @@ class Protocol:
                 f"The {where}: shortest_s is {file.shortest_s:g} and longest_s {file.longest_s:g}; "
                 "the shortest must be below the longest."
             )
-        gestures, prompts, nobody, chosen = _resolved(file, where, words or file.words or DEFAULT, beside)
-        return cls(
-            name=file.name,
-            title=file.title or file.name,
-            gesture_set=file.gesture_set,
-            gestures=gestures,
-            prompts=prompts,
-            repetitions=file.repetitions,
-            order=file.order,
-            countdown_s=file.countdown_s,
-            shortest_s=file.shortest_s,
-            longest_s=file.longest_s,
-            words=chosen,
-            nobody=nobody,
-        )
+        return cls(**vars(file) | _resolved(file, where, words or file.words or DEFAULT, beside))
 
 
 @dataclass(frozen=True)
@@ -146,17 +132,17 @@ class _ProtocolFile:
     nobody: tuple[str, ...] | None = None
 
 
-def _resolved(
-    file: _ProtocolFile, where: str, words: str, beside: Path | None
-) -> tuple[tuple[str, ...], dict[str, str], tuple[str, ...], str]:
-    """Return the gestures in order, the prompt of each, those recorded without a person, and the wording."""
+def _resolved(file: _ProtocolFile, where: str, words: str, beside: Path | None) -> dict[str, Any]:
+    """Return the values that depend on the gesture set and the wording."""
+    title = file.title or file.name
     given, labels = file.prompts, file.gestures or ()
     if file.nobody is not None and labels and all(isinstance(given.get(label), str) for label in labels):
-        # From `to_dict`: the file of the gesture set may be gone.
-        return labels, {label: str(given[label]) for label in labels}, file.nobody, words
-    gesture_set = _gesture_set(file.gesture_set, beside)
-    found = [gesture_set.get(label) for label in labels] or [g for g in gesture_set.gestures if not g.nobody]
-    if len({g.label for g in found}) < len(found) or not found or file.gestures == ():
+        # From `to_dict`: the file of the gesture set may no longer exist.
+        return {"title": title, "prompts": {label: given[label] for label in labels}, "words": words}
+    own = beside / file.gesture_set if beside is not None and file.gesture_set.endswith(".toml") else None
+    gesture_set = load_gestures(own if own is not None and own.is_file() else file.gesture_set)
+    gestures = [gesture_set.get(label) for label in labels] or [g for g in gesture_set.gestures if not g.nobody]
+    if len({g.label for g in gestures}) < len(gestures) or not gestures or file.gestures == ():
         raise ConfigError(f"The {where} must name every gesture once, and at least one: see its gestures.")
     wordings = {DEFAULT, *(w for text in given.values() if isinstance(text, Mapping) for w in text)}
     if words not in wordings:
@@ -165,7 +151,7 @@ def _resolved(
         )
     prompts = {}
     texts = {gesture_set.get(label).label: text for label, text in given.items()}
-    for gesture in found:
+    for gesture in gestures:
         text = texts.get(gesture.label, {})
         if isinstance(text, Mapping):
             text = text.get(words) or text.get(DEFAULT) or gesture.description or gesture.label
@@ -174,17 +160,12 @@ def _resolved(
         named = parse_name(recording_filename(gesture.label, 0, 0))
         if named is None or plain_label(named.label) != plain_label(gesture.label):
             raise ConfigError(
-                f"The {where}: '{gesture.label}' cannot stand in a file name; "
-                'take a label without  \\ / : * ? " < > | ( )  and without a point at its end.'
+                f"The {where}: '{gesture.label}' cannot be part of a file name; "
+                'choose a label without  \\ / : * ? " < > | ( )  and without a point at its end.'
             )
         prompts[gesture.label] = text.strip()
-    return tuple(prompts), prompts, tuple(g.label for g in found if g.nobody), words
-
-
-def _gesture_set(name: str, beside: Path | None) -> GestureSet:
-    if beside is not None and name.endswith(".toml") and (beside / name).is_file():
-        return load_gestures(beside / name)
-    return load_gestures(name)
+    nobody = tuple(g.label for g in gestures if g.nobody)
+    return {"title": title, "gestures": tuple(prompts), "prompts": prompts, "nobody": nobody, "words": words}
 
 
 def protocol_names() -> tuple[str, ...]:

@@ -13,8 +13,7 @@ from plushsense.core.recorder_csv import STREAM_NAME
 from plushsense.devices.base import Device
 from plushsense.recording.session import OpenSession
 from plushsense.recording.session_files import SessionHead
-from plushsense.recording.states import RecordingMachine, key_of, write_error
-from plushsense.recording.status import RecorderState, StepResult
+from plushsense.recording.states import RecorderState, RecordingMachine, StepResult, key_of, write_error
 from plushsense.recording.writer import BackgroundWriter, StreamFile
 
 
@@ -131,11 +130,11 @@ class Recorder(RecordingMachine):
                 self._cancel("The countdown was cancelled.")
             elif self._state == "recording" and self._take is not None:
                 if max(self._passed_s(), self._wall_s()) < self.protocol.shortest_s:
-                    self._show_message("That was too quick for a stop: still recording.")
+                    self._show_message("Too early to stop: still recording.")
                 else:
                     self._stop("space")
             elif self._state == "paused":
-                self._show_message("Paused: go on first (p).")
+                self._show_message("Paused: resume first (p).")
 
     def redo(self, why: str = "") -> None:
         """Repeat the last recording, or the current one; the existing file is kept as discarded."""
@@ -143,16 +142,16 @@ class Recorder(RecordingMachine):
             if self._state == "countdown":
                 self._cancel("The countdown was cancelled.")
             elif self._state == "recording":
-                self._abandon("redo", "Broken off: it is to be made again.")
+                self._abandon("redo", "Stopped: record it again.")
             elif self._state in ("idle", "paused", "finished"):
                 key = self._plan.last
                 if key is None:
-                    self._show_message("There is no recording to make again: go back to it (b).")
+                    self._show_message("There is no recording to repeat: go back to it (b).")
                     return
                 file = self._plan.discard(key)
                 more = {"why": why} if why else {}
                 self._log("redo", file=file, gesture=key[0], repetition=key[1], **more)
-                self._ready(f"'{key[0]}', {key[1]}, is to be made again; skip (s) keeps it after all.")
+                self._ready(f"'{key[0]}', {key[1]}, is to be recorded again; skip (s) keeps the earlier recording.")
 
     def skip(self) -> None:
         """Skip this step; a recording that was to be repeated is kept."""
@@ -160,7 +159,7 @@ class Recorder(RecordingMachine):
             if self._state == "countdown":
                 self._cancel("")
             if self._state == "recording":
-                self._show_message("Recording: space stops it, r breaks it off.")
+                self._show_message("Recording: space stops it, r discards it.")
             elif self._state in ("idle", "paused"):
                 key = key_of(self._plan.step)
                 message = ""
@@ -179,12 +178,12 @@ class Recorder(RecordingMachine):
             if self._state == "countdown":
                 self._cancel("")
             if self._state == "recording":
-                self._show_message("Recording: space stops it, r breaks it off.")
+                self._show_message("Recording: space stops it, r discards it.")
             elif self._state in ("idle", "paused", "finished"):
                 self._plan.at = min(max(0, number), len(self._plan.steps) - 1)
                 self._log_step("go")
                 there = key_of(self._plan.step) in self._plan.takes
-                self._ready("This one is recorded: space makes it again, s goes on." if there else "")
+                self._ready("This step is recorded: space records it again, s goes on." if there else "")
 
     def back(self) -> None:
         """Go one step back."""
@@ -204,7 +203,7 @@ class Recorder(RecordingMachine):
                 return
             self._paused = True
             if self._state == "recording":
-                self._abandon("pause", "The pause broke this recording off: it is to be made again.")
+                self._abandon("pause", "The pause stopped this recording: record it again.")
             else:
                 self._enter("paused", "")
             self._log("pause")
@@ -222,10 +221,10 @@ class Recorder(RecordingMachine):
         text = " ".join(text.split())
         with self._notifying():
             if text and (self._closing or self._state == "stopped"):
-                self._show_message("The session has ended: this remark is not kept.")
+                self._show_message("The session has ended: this note is not saved.")
             elif text:
                 self._log_step("note", text=text, file=self._plan.last_file)
-                self._show_message("Noted.")
+                self._show_message("Note saved.")
 
     def show_message(self, text: str) -> None:
         """Show a sentence on every display."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import os
 import re
@@ -61,12 +62,12 @@ def check_subject(code: str) -> str:
     Raises:
         DatasetError: for two words, a word without a digit, or more than 16 characters.
     """
-    plain = re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,15}", code, re.ASCII)
-    bare = len(code) > 2 and not re.search(r"\d", code) and code != NOBODY
-    if plain is None or bare or _RESERVED.fullmatch(code):
+    valid = re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,15}", code, re.ASCII)
+    is_word = len(code) > 2 and not re.search(r"\d", code) and code != NOBODY
+    if valid is None or is_word or _RESERVED.fullmatch(code):
         raise DatasetError(
             f"'{code}' is no code for a person: give a short one with a number in it, such as S01, never a name "
-            "(at most 16 letters and digits; who S01 is stays on paper, away from the recordings)."
+            "(at most 16 letters and digits; keep the name that belongs to S01 on paper, away from the recordings)."
         )
     return code
 
@@ -85,14 +86,11 @@ def session_names(person: Path) -> list[str]:
 
     Numeric names are sorted by number, since the clock of a computer without a clock battery may be wrong.
     """
-    found = []
-    for folder in sorted(person.iterdir()) if person.is_dir() else ():
-        head = SessionHead.read(folder) if (folder / SESSION_HEAD).is_file() else None
-        if head is not None:
-            found.append((head.started_ms, folder.name))
-    if all(name.isdigit() for _, name in found):
-        return sorted((name for _, name in found), key=int)
-    return [name for _, name in sorted(found)]
+    folders = sorted(person.iterdir()) if person.is_dir() else []
+    heads = [(head.started_ms, f.name) for f in folders if f.is_dir() and (head := SessionHead.read(f)) is not None]
+    if all(name.isdigit() for _, name in heads):
+        return sorted((name for _, name in heads), key=int)
+    return [name for _, name in sorted(heads)]
 
 
 def is_finished(folder: Path) -> bool:
@@ -114,10 +112,7 @@ def next_session(person: Path) -> str:
 def new_session(person: Path) -> str:
     """Return an unused number for a new session."""
     taken = {p.name for p in person.iterdir()} if person.is_dir() else set()
-    number = 1
-    while str(number) in taken:
-        number += 1
-    return str(number)
+    return next(str(number) for number in itertools.count(1) if str(number) not in taken)
 
 
 class OpenSession:
@@ -145,7 +140,7 @@ class OpenSession:
             self._lock.acquire()
         except Timeout:
             raise DatasetError(
-                f"Another program is recording the session '{folder}': go on there, or close it first."
+                f"Another program is recording the session '{folder}': continue there, or close it first."
             ) from None
         except (OSError, NotImplementedError) as cause:
             raise DatasetError(_refused(folder, cause)) from None
@@ -174,25 +169,16 @@ class OpenSession:
             others = [p.name for p in self.folder.iterdir() if p.name != LOCK and not p.name.endswith(PART)]
             if others:
                 raise DatasetError(
-                    f"'{self.folder}' holds '{others[0]}' but no session: nothing is mixed, take another --session."
+                    f"'{self.folder}' holds '{others[0]}' but no session: give another --session or an empty folder."
                 )
             given.write(self.folder)
             return given
-        if given is None:
-            return known
-        return self._joined(known, given)
+        return known if given is None else self._joined(known, given)
 
     def _joined(self, known: SessionHead, given: SessionHead) -> SessionHead:
         """Return the stored head, completed by what only the new one states; refuse contradictions."""
         added: dict[str, Any] = {}
-        for key, option in (
-            ("subject", "--subject"),
-            ("layout", "--layout"),
-            ("protocol", "--protocol"),
-            ("age_group", "--age-group"),
-            ("gender", "--gender"),
-            ("consent", "--consent"),
-        ):
+        for key in ("subject", "layout", "protocol", "age_group", "gender", "consent"):
             old, new = getattr(known, key), getattr(given, key)
             old_json, new_json = json.loads(json.dumps([old, new]))
             if old_json == new_json or not new:
@@ -202,7 +188,7 @@ class OpenSession:
                 differs = f"{names[0]!r}, not {names[1]!r}" if names[0] != names[1] else "another one of that name"
                 raise DatasetError(
                     f"The session '{self.folder}' was begun with the {key.replace('_', ' ')} {differs}: "
-                    f"leave {option} as it was, or begin a new session (--new)."
+                    f"leave --{key.replace('_', '-')} as it was, or begin a new session (--new)."
                 )
             added[key] = new
         if given.simulated and not known.simulated:
@@ -260,7 +246,7 @@ def _repair(folder: Path, layout: Layout, log: LogFile) -> SessionProgress:
             path.unlink()
     if started is not None and started not in progress.takes:
         log.write([_event("unfinished", gesture=started[0], repetition=started[1])])
-        progress.repairs.append(f"'{started[0]}', {started[1]}, was broken off: it is to be made again")
+        progress.repairs.append(f"'{started[0]}', {started[1]}, was interrupted: record it again")
     return progress
 
 
@@ -296,8 +282,8 @@ def replay_log(folder: Path, progress: SessionProgress) -> tuple[Key | None, dic
             if progress.takes.get(of[file]) == file:
                 del progress.takes[of[file]]
         elif event.what == "keep" and file in of:
-            if file in (aside := progress.discarded.get(of[file], [])):
-                aside.remove(file)
+            if file in (discarded := progress.discarded.get(of[file], [])):
+                discarded.remove(file)
             progress.takes[of[file]] = file
         elif event.what == "skip" and key is not None:
             progress.skipped.add(key)
@@ -327,7 +313,7 @@ def _repair_stream(path: Path, layout: Layout, progress: SessionProgress, log: L
             log.write([_event("mended", file=path.name, how="torn last line cut off", bytes=size - whole, text=kept)])
             file.truncate(whole)
             os.fsync(file.fileno())
-            progress.repairs.append(f"the last line of {path.name} was torn and is cut off ({size - whole} bytes)")
+            progress.repairs.append(f"the incomplete last line of {path.name} was removed ({size - whole} bytes)")
 
 
 def _host_ms(line: bytes, layout: Layout) -> int:
@@ -339,7 +325,7 @@ def _host_ms(line: bytes, layout: Layout) -> int:
 
 
 def _repair_takes(folder: Path, progress: SessionProgress, log: LogFile, made: dict[str, Key]) -> None:
-    """Check every recording: add one that the log does not know, rename one that is incomplete."""
+    """Check every recording: add one that the log lacks, rename one that is incomplete."""
     known = {file: key for key, file in progress.takes.items()}
     known |= {file: key for key, files in progress.discarded.items() for file in files}
     for path in sorted(folder.glob("*.csv"), key=lambda p: (n.epoch_ms if (n := parse_name(p.name)) else 0, p.name)):
@@ -351,14 +337,14 @@ def _repair_takes(folder: Path, progress: SessionProgress, log: LogFile, made: d
         if not data.endswith(b"\n") or data.count(b"\n") != name.rows + 1:
             os.replace(path, path.with_name(path.name + TORN))
             log.write([_event("mended", file=path.name, how=f"not whole: renamed to end in {TORN}")])
-            progress.repairs.append(f"'{path.name}' is not whole: it is to be made again")
+            progress.repairs.append(f"'{path.name}' is incomplete: record it again")
             if key is not None and progress.takes.get(key) == path.name:
                 del progress.takes[key]
             continue
         if key is not None:
             continue
         if path.name in made:
-            # It was gone, was repeated, and is back: the newer one is used.
+            # It was missing, was recorded again, and is back: the newer one is used.
             key = made[path.name]
             log.write([_event("redo", file=path.name, gesture=key[0], repetition=key[1], why="made again")])
             progress.discarded.setdefault(key, []).insert(0, path.name)
@@ -380,7 +366,7 @@ def _repair_takes(folder: Path, progress: SessionProgress, log: LogFile, made: d
     for key, file in list(progress.takes.items()):
         if not (folder / file).exists():
             log.write([_event("mended", file=file, how="the recording is gone", gesture=key[0], repetition=key[1])])
-            progress.repairs.append(f"'{file}' is gone: it is to be made again")
+            progress.repairs.append(f"'{file}' is missing: record it again")
             del progress.takes[key]
 
 

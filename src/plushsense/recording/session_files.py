@@ -46,24 +46,20 @@ class SessionHead:
     simulated: bool = False
 
     def write(self, folder: Path) -> None:
-        """Write the head to ``folder``, whole or not at all."""
+        """Write the head to ``folder``, completely or not at all."""
         text = json.dumps({"format": FORMAT_VERSION} | asdict(self), ensure_ascii=False, indent=1) + "\n"
         write_file(folder / SESSION_HEAD, text)
 
     @classmethod
     def read(cls, folder: Path) -> SessionHead | None:
-        """Read the head of the session in ``folder``; return None where there is none.
-
-        Raises:
-            DatasetError: for a head that is damaged or of another format.
-        """
+        """Read the head of the session in ``folder``; None if there is none, DatasetError if it is damaged."""
         path = folder / SESSION_HEAD
         try:
             table = json.loads(path.read_text(encoding="utf-8"))
         except (FileNotFoundError, NotADirectoryError):
             return None
         except (OSError, ValueError, RecursionError) as cause:
-            raise DatasetError(f"'{path}' cannot be read ({cause}): bring it back from a copy.") from None
+            raise DatasetError(f"'{path}' cannot be read ({cause}): restore it from a copy.") from None
         if not isinstance(table, dict) or table.pop("format", None) != FORMAT_VERSION:
             raise DatasetError(f"'{path}' is no session head of format {FORMAT_VERSION}: check which version wrote it.")
         return load_table(table, cls, f"'{path}'", DatasetError)

@@ -1,7 +1,4 @@
-"""Prepare a recording session: check a request and derive folder, layout and session head from it.
-
-The terminal and the studio say it in their own ways; what follows is the same.
-"""
+"""Prepare a recording session for the terminal and the studio: derive folder, layout and head from a request."""
 
 from __future__ import annotations
 
@@ -18,17 +15,13 @@ from plushsense.recording.plan import load_protocol
 from plushsense.recording.recorder import Recorder
 from plushsense.recording.session import check_session, check_subject, new_session, next_session
 from plushsense.recording.session_files import SessionHead
-from plushsense.recording.status import RecorderStatus
+from plushsense.recording.states import RecorderStatus
 
 _SIMULATED = "virtual"
 
 
 def open_toy(url: str, layout: Layout | str | None = None) -> Device:
-    """Open a toy by its URL; a toy that goes away later is waited for and the gap is recorded.
-
-    Raises:
-        ConfigError, LayoutError, DeviceError: as `plushsense.devices.opening.open_device`.
-    """
+    """Open a toy by its URL as `open_device`; when it is disconnected later, wait for it and record the gap."""
     return open_device(url, layout, reconnect=True)
 
 
@@ -112,18 +105,18 @@ def session_folder(
     """Return the session's folder in ``out``, and its head if it exists already.
 
     Args:
-        session: its name; None: the person's last one when it is unfinished, else a number.
-        new: begin another one in any case.
+        session: its name; None: the person's last session if it is unfinished, else a new number.
+        new: always begin a new session.
 
     Raises:
-        ConfigError: without a subject, or when a session of this name is there and a new one is request.
-        DatasetError: for a code or name that cannot be.
+        ConfigError: without a subject, or when a new session was requested and one of this name exists.
+        DatasetError: for an invalid code or name.
     """
     subject = request.subject
     if not subject and request.protocol and load_protocol(request.protocol).needs_nobody:
         subject = NOBODY
     if not subject:
-        raise ConfigError("Whose session is it? Give --subject with the person's code, such as S01.")
+        raise ConfigError("The session has no person: give --subject with the person's code, such as S01.")
     person = out / check_subject(subject)
     if session is not None:
         name = check_session(session)
@@ -131,7 +124,7 @@ def session_folder(
         name = new_session(person) if new else next_session(person)
     known = SessionHead.read(person / name)
     if known is not None and new:
-        raise ConfigError(f"The session '{person / name}' is there: leave --new off, or give another --session.")
+        raise ConfigError(f"The session '{person / name}' exists: leave --new off, or give another --session.")
     return person / name, known
 
 
@@ -146,13 +139,13 @@ def session_head(request: SessionRequest, folder: Path, fresh: bool, layout: Lay
     """Return the head of the requested session; settings left out for a continued session are empty.
 
     Args:
-        fresh: whether the session begins now.
+        fresh: whether the session is new.
         layout: the open toy's.
         software: the program that records.
     """
     named = request.protocol or (PROTOCOL if fresh else "")
     if not named and request.words:
-        raise ConfigError("--words goes with --protocol: a session that goes on keeps the words it began with.")
+        raise ConfigError("--words goes with --protocol: a continued session keeps the wording it began with.")
     protocol = load_protocol(named, request.words or None) if named else None
     return SessionHead(
         subject=folder.parent.name,

@@ -1,13 +1,12 @@
 """Simulate recording sessions with the virtual toy, with the files of the authors' recorder.
 
-One folder a person, with ``<label>_<epoch ms>_<rows>.csv`` for each recording and ``fulldatastream.csv`` for the whole
+Each person's folder holds ``<label>_<epoch ms>_<rows>.csv`` for each recording and ``fulldatastream.csv`` for the whole
 session, which ends with some handling that is no gesture; recordings of the toy at rest are in the folder ``none``.
-A score on these says nothing about a real toy.
+A score on these recordings says nothing about a real toy.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -29,7 +28,7 @@ from plushsense.core.recorder_csv import (
     recording_filename,
 )
 from plushsense.devices.virtual.motions import AT_REST
-from plushsense.devices.virtual.session import GESTURES, Episode, GestureMark, VirtualSession
+from plushsense.devices.virtual.session import GESTURES, Episode, VirtualSession
 from plushsense.devices.virtual.stream import channel_columns
 from plushsense.devices.virtual.world import WORLD, World, draw_person
 
@@ -54,10 +53,6 @@ class SimulationSummary:
     lost: int
     seed: int
 
-    def to_dict(self) -> dict[str, str | int]:
-        """Return plain values, ready for JSON."""
-        return dataclasses.asdict(self)
-
 
 @dataclass(frozen=True)
 class _Take:
@@ -77,24 +72,23 @@ def _session(
     episodes = [session.idle(2.0)]
     episodes += [session.perform(label, repetitions) for label in gestures]
     episodes.append(session.idle(2.0))
-    marks: list[GestureMark] = [m for e in episodes for m in e.marks]
     number = 0 if who is None else who + 1
     order = 40 if who is None else who
     rng = np.random.default_rng([seed, number, 0xF11E])
-    frames, row_of, lost = _taken_in(episodes, START_MS + order * 86_400_000, True, layout, world, rng)
+    frames, row_of, lost = _receive(episodes, START_MS + order * 86_400_000, True, layout, world, rng)
     if who is not None:
         # With its own random generator, so that the recordings do not depend on it.
         handling = [e for _ in range(HANDLED) for e in (session.handle(), session.idle(2.0))]
         after = int(frames.host_ms[-1]) if frames.host_ms is not None else 0
-        more, _, more_lost = _taken_in(
-            handling, after, False, layout, world, np.random.default_rng([seed, number, 0xA4D])
-        )
+        own_rng = np.random.default_rng([seed, number, 0xA4D])
+        more, _, more_lost = _receive(handling, after, False, layout, world, own_rng)
         frames, lost = _joined(frames, more), lost + more_lost
+    marks = [m for e in episodes for m in e.marks]
     cuts = [(m.label, int(row_of[m.record_start]), int(row_of[m.record_stop])) for m in marks]
     return _Take(frames, cuts, lost)
 
 
-def _taken_in(
+def _receive(
     episodes: Sequence[Episode], host_ms: int, first: bool, layout: Layout, world: World, rng: np.random.Generator
 ) -> tuple[Frames, NDArray[np.int64], int]:
     """Return the frames received from ``host_ms`` on, the frame of each sent row and of the end, and the number lost.
@@ -122,13 +116,13 @@ def _joined(one: Frames, other: Frames) -> Frames:
 
 
 def _arrival(device_ms: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
-    """Return the host times of frames, from 0: with a small clock drift and delays of 0 to 6 ms."""
+    """Return the host times of frames from 0, with a small clock drift and delays of 0 to 6 ms."""
     passed = (device_ms - device_ms[0]) * (1.0 + 4e-5 * rng.standard_normal())
     return np.maximum.accumulate(np.rint(passed + 6.0 * rng.random(len(passed))).astype(np.int64))
 
 
 def _write(folder: Path, take: _Take, layout: Layout) -> int:
-    """Write the stream and the recordings of one session; returns the rows of the recordings."""
+    """Write the stream and the recordings of one session; return the rows of the recordings."""
     folder.mkdir(parents=True, exist_ok=True)
     rows = 0
     host = take.frames.host_ms
@@ -163,13 +157,13 @@ def simulate(
         people, repetitions: the size.
         seed: the same seed writes the same files.
         progress: called with sessions done, sessions in all, and the folder just written.
-        at_rest: recordings of nobody; by default gestures × repetitions, as in the paper.
+        at_rest: number of recordings without a person; by default gestures × repetitions, as in the paper.
         gestures: a subset of the 17, in class order.
-        layout: whose columns are written: plush-15, plush-14 or accel-3.
+        layout: the layout of the files: plush-15, plush-14 or accel-3.
 
     Raises:
-        ConfigError: for a size or gesture that cannot be.
-        DatasetError: when the folder holds something already.
+        ConfigError: for a size out of range or an unknown gesture.
+        DatasetError: when the folder is not empty.
     """
     labels = tuple(gestures) if gestures is not None else GESTURES
     unknown = [label for label in labels if label not in GESTURES]

@@ -1,9 +1,9 @@
 """The state machine of a recording session, driven by commands and by the toy's frames.
 
 `plushsense.recording.recorder` adds the commands. One thread reads the toy's frames, the threads of the background
-writer write them; none waits for another. All times of a session run on the toy's own clock, so that a virtual toy at
-twenty times the speed counts down in a twentieth of the time, and a toy that is unplugged during the countdown does
-not start an empty recording.
+writer write them; none waits for another. All durations of a session are measured by the toy's own clock, so that a
+virtual toy at twenty times the speed counts down in a twentieth of the time, and a toy that is unplugged during the
+countdown does not start an empty recording.
 """
 
 from __future__ import annotations
@@ -13,16 +13,90 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from plushsense.core.errors import DatasetError, PlushSenseError
 from plushsense.devices.base import Counters, Device, Frame, now_ms
 from plushsense.recording.plan import Step
 from plushsense.recording.session import Key, OpenSession, SessionProgress
 from plushsense.recording.session_files import SessionEvent
-from plushsense.recording.status import RecorderState, RecorderStatus
 from plushsense.recording.takes import AWAY_S, Ended, FrameReceiver, RecordingTake, gap_entry, sidecar
 from plushsense.recording.writer import BackgroundWriter, lacks_descriptor, save_take, to_frames
+
+RecorderState = Literal["idle", "countdown", "recording", "saving", "paused", "finished", "stopped"]
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """The state of one planned recording.
+
+    ``file`` is the recording in use ("" when there is none yet), ``discarded`` the number of discarded files.
+    """
+
+    step: Step
+    file: str
+    skipped: bool
+    discarded: int
+
+
+@dataclass(frozen=True)
+class RecorderStatus:
+    """A snapshot of a session.
+
+    Attributes:
+        state: current state; "finished": all steps are recorded or skipped; "stopped": no more data come or can be
+            written (``failed`` is the reason when the disk is the cause, else ``message``).
+        step: the current step; ``next_step``: the one after it.
+        done, skipped, steps: numbers of steps; ``redone``: number of discarded files.
+        existing: the file of this step if it is recorded already.
+        countdown_s: time left; ``elapsed_s`` of this recording; ``left_s`` until it ends automatically.
+        rate_hz, jitter_ms, signal: signal quality of the last seconds (see `plushsense.recording.takes.SIGNAL`).
+        away: whether the toy is disconnected.
+        frames, lost, malformed, garbage, reconnects, gaps: numbers since this program began.
+        rows: rows of the session's stream.
+        file: the last finished recording.
+        bad_share: share of the last seconds' lines that were lost, malformed or out of range, 0 to 1.
+    """
+
+    state: RecorderState
+    step: Step
+    steps: int
+    repetitions: int
+    next_step: Step | None
+    done: int
+    skipped: int
+    redone: int
+    existing: str
+    countdown_s: float
+    elapsed_s: float
+    left_s: float
+    rate_hz: float
+    jitter_ms: float
+    signal: str
+    away: bool
+    lost: int
+    malformed: int
+    garbage: int
+    reconnects: int
+    gaps: int
+    rows: int
+    file: str
+    message: str
+    failed: str
+    folder: str
+    frames: int = 0
+    bad_share: float = 0.0
+
+    @property
+    def bad_share_total(self) -> float:
+        """Share of all lines since this program began that were lost, malformed or out of range, 0 to 1."""
+        bad = self.lost + self.malformed + self.garbage
+        return bad / max(1, self.frames + bad)
+
+    @property
+    def seen(self) -> str:
+        """An identifier of what is displayed: a command given to another display is outdated."""
+        return f"{self.state}.{self.step.number}.{self.done}.{self.skipped}.{self.redone}"
 
 
 def store_take(
@@ -44,33 +118,32 @@ def store_take(
     """
     layout, step = session.layout, take.step
     frames = to_frames(take.frames, layout.n_channels)
-    beside = sidecar(take, frames, layout, session.head, counters, ended, saved_ms=saved_ms, **more)
-    path = save_take(session.folder, frames, layout, step.gesture, saved_ms, beside)
+    metadata = sidecar(take, frames, layout, session.head, counters, ended, saved_ms=saved_ms, **more)
+    path = save_take(session.folder, frames, layout, step.gesture, saved_ms, metadata)
     key = {"gesture": step.gesture, "repetition": step.repetition}
-    says = {"rows": len(frames), "lost": take.lost, "gaps": len(take.gaps), "ended": ended}
-    events = [SessionEvent("take", saved_ms, {"file": path.name} | key | says)]
+    result = {"rows": len(frames), "lost": take.lost, "gaps": len(take.gaps), "ended": ended}
+    events = [SessionEvent("take", saved_ms, {"file": path.name} | key | result)]
     if earlier:
         events.append(SessionEvent("redo", saved_ms, {"file": earlier} | key))
     session.log.write(events)
     message = ""
     if ended == "longest":
         longest_s = session.protocol.longest_s
-        message = f"Nobody stopped it: it ended by itself after {longest_s:g} s; r makes it again."
+        message = f"Nobody stopped the recording: it ended after {longest_s:g} s; r records it again."
     elif take.gaps:
         longest = max(gap["missing_ms"] for gap in take.gaps) / 1000.0
-        what = f"has a hole of {longest:.1f} s" if longest >= 0.05 else "has a jump in the toy's clock"
-        message = f"This recording {what}; it is kept, r makes it again."
+        what = f"has a gap of {longest:.1f} s" if longest >= 0.05 else "has a jump in the toy's clock"
+        message = f"This recording {what}; it is kept, r records it again."
     return path.name, message
 
 
 def write_error(session: OpenSession, recordings: int, cause: Exception) -> DatasetError:
     """Return the error with which a session stops that cannot be written any more."""
     why = getattr(cause, "strerror", None) or cause
-    remedy = "close other programs" if lacks_descriptor(cause) else "make room"
+    remedy = "close other programs" if lacks_descriptor(cause) else "free disk space"
     return DatasetError(
-        f"'{session.folder}' cannot be written any more ({why}): the session has stopped. "
-        f"What was recorded until then is kept ({recordings} recordings); "
-        f"{remedy}, and go on with the same session."
+        f"'{session.folder}' cannot be written any more ({why}): the session has stopped, with {recordings} recordings "
+        f"saved; {remedy}, and continue the same session."
     )
 
 
@@ -105,7 +178,7 @@ class PlanProgress:
 
     @property
     def last(self) -> Key | None:
-        """The step of the last recording in use; None when there is none, or it is to be made again."""
+        """The step of the last recording in use; None when there is none, or it is to be recorded again."""
         return self._last if self._last in self.takes else None
 
     @property
@@ -133,7 +206,7 @@ class PlanProgress:
         return left is not None
 
     def discard(self, key: Key) -> str:
-        """Discard the recording of a step, so that it is to be made again; return its file."""
+        """Discard the recording of a step, so that it is recorded again; return its file."""
         file = self.takes.pop(key)
         self.discarded.setdefault(key, []).append(file)
         self.at = next(s.number for s in self.steps if key_of(s) == key)
@@ -218,9 +291,8 @@ class RecordingMachine:
     def status(self) -> RecorderStatus:
         """Return a snapshot of the session."""
         with self._changed:
-            plan = self._plan
+            plan, receiver = self._plan, self._receiver
             counters = self.device.counters
-            quality = self._receiver.quality()
             passed = self._passed_s()
             counting, running = self._state == "countdown", self._state == "recording"
             return RecorderStatus(
@@ -236,22 +308,19 @@ class RecordingMachine:
                 countdown_s=max(0.0, self.protocol.countdown_s - passed) if counting else 0.0,
                 elapsed_s=max(passed, self._wall_s()) if running else 0.0,
                 left_s=max(0.0, self.protocol.longest_s - passed) if running else 0.0,
-                rate_hz=quality.rate_hz,
-                jitter_ms=quality.jitter_ms,
-                signal=quality.signal,
-                away=self._receiver.away,
-                lost=self._receiver.lost,
+                **vars(receiver.quality()),
+                away=receiver.away,
+                lost=receiver.lost,
                 malformed=counters.malformed,
                 garbage=counters.garbage,
                 reconnects=counters.reconnects,
-                gaps=len(self._receiver.gaps),
-                rows=self._receiver.rows,
+                gaps=len(receiver.gaps),
+                rows=receiver.rows,
                 file=plan.last_file,
                 message=self._message,
                 failed=self._failed,
                 folder=str(self.session.folder),
                 frames=counters.frames,
-                bad_share=quality.bad_share,
             )
 
     # State changes (with the lock) ----------------------------------------------------------------------------
@@ -377,7 +446,7 @@ class RecordingMachine:
         except PlushSenseError as cause:
             over = str(cause)
         except Exception as cause:  # noqa: BLE001, RUF100
-            over = f"Reading the toy failed ({type(cause).__name__}: {cause}): what came until then is kept."
+            over = f"Reading the toy failed ({type(cause).__name__}: {cause}): all frames until then are kept."
         with self._notifying():
             if self._closing:
                 return
@@ -420,11 +489,11 @@ class RecordingMachine:
         if self._take is not None:
             self._take.gaps.append(gap | {"after_row": len(self._take.frames)})
         if gap["missing_ms"] >= 1000.0 * AWAY_S:
-            message = f"The toy was away for {gap['missing_ms'] / 1000.0:.1f} s"
+            message = f"The toy was disconnected for {gap['missing_ms'] / 1000.0:.1f} s"
             if self._state == "countdown":
                 self._cancel(f"{message}: press space again.")
             elif self._state == "recording":
-                self._show_message(f"{message}: this recording has a hole; r makes it again.")
+                self._show_message(f"{message}: this recording has a gap; r records it again.")
             else:
                 self._show_message(f"{message}.")
 

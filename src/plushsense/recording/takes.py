@@ -93,7 +93,7 @@ class SignalMonitor:
 
 Ended = Literal["space", "auto", "longest", "toy", "cut"]
 """Why a recording ended: the space bar, automatic recording (--auto), the protocol's longest_s, the end of the toy's
-data, or ("cut") it was cut out of a longer stream afterwards."""
+data, or "cut": it was cut from a longer stream afterwards."""
 
 
 @dataclass
@@ -129,10 +129,10 @@ def gap_entry(rows: int, last: Frame, now: Frame | None, missing_ms: float, reas
 
 
 def measured_rate_hz(device_ms: Any) -> float:
-    """Return the frames per second by the toy's clock, without gaps; 0 when it is unknown."""
+    """Return the frames per second by the toy's clock, without gaps and resets; 0 when it is unknown."""
     steps = np.diff(device_ms)
     even = steps[(steps >= 0) & (steps <= 1000)]
-    return round(1000.0 * len(even) / float(even.sum()), 2) if even.sum() > 0 else 0.0
+    return 1000.0 * len(even) / float(even.sum()) if even.sum() > 0 else 0.0
 
 
 def sidecar(
@@ -161,7 +161,7 @@ def sidecar(
         "stream_row": take.row,
         "device_ms": [int(frames.device_ms[0]), int(frames.device_ms[-1])],
         "host_ms": [int(frames.host_ms[0]), int(frames.host_ms[-1])],
-        "rate_hz": measured_rate_hz(frames.device_ms),
+        "rate_hz": round(measured_rate_hz(frames.device_ms), 2),
         "lost": take.lost,
         "malformed": counters.malformed - take.before.malformed,
         "garbage": int(outside.any(axis=1).sum()),
@@ -177,7 +177,7 @@ def sidecar(
 
 
 AWAY_S = 1.0
-"""A toy that sends nothing for this long is disconnected; the user is informed."""
+"""A toy that sends nothing for this long counts as disconnected."""
 
 JUMP_MS = 1000
 """A toy's clock that advances by this much more than the elapsed time was misread or set: the step is not counted."""

@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import Frames
-from plushsense.dataset.quality.checking import CheckReport
+from plushsense.dataset.quality.checking import CHECKS, CheckReport
 from plushsense.dataset.quality.findings import SEVERITIES, Finding
 from plushsense.dataset.quality.measurements import NEVER_STOPPED_FACTOR, duration_s, summarize
-from plushsense.dataset.quality.registry import CHECKS
 from plushsense.dataset.store import Dataset, RecordingInfo
 from plushsense.reports import quality_figures as figures
 from plushsense.reports.figures import png

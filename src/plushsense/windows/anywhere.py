@@ -1,24 +1,25 @@
-"""Windows cut anywhere in a session's stream: what a network hears at work, beginnings, ends and idleness included.
+"""Cut windows anywhere in a session's stream, as a network reads it in use: with onsets, ends and idle time.
 
-A *position* is a sample of the stream at which a network might have to answer; its window is what really came before.
-Positions lie every ``every_s`` along the streams of the data set. What a position is called:
+A *position* is a sample of the stream at which a network might have to answer; its window ends there. Positions lie
+every ``every_s`` along the streams of the data set. The label of a position is
 
-- a gesture, from ``onset_s`` after the beginning of its recording (trim marks count) to ``after_s`` after its end;
-- idle, where no recording is, and no end of one within the last ``settle_s``; and in recordings of an idle gesture;
-- nothing, and left out: just after a beginning, just after an end, in recordings that are not used (excluded, of a
-  gesture that is not a class, not stopped in time), and where two recordings claim it.
+- a gesture, from ``onset_s`` after the beginning of its recording (after trimming) to ``after_s`` after its end;
+- idle, where there is no recording, and no end of one within the last ``settle_s``, and in recordings of an idle
+  gesture;
+- nothing, so that it is left out: just after a beginning or an end, in recordings that are not used (excluded, of a
+  gesture that is not a class, not stopped in time), and where two recordings overlap.
 
-People also practise between recordings, and that must not pass for idleness: of the unmarked positions of a stream,
-the liveliest ``busy_share`` is left out, by how much the signals moved in the last second, without a look at labels.
-Of what remains as many are taken, evenly, as make idle windows ``idle_share`` of all.
+People also practise between recordings, which is not idle time: of the unmarked positions of a stream, the
+``busy_share`` with the most movement in the last second is left out. Of the others, as many are taken, evenly, as make
+``idle_share`` of all windows.
 
-A recording that no stream holds (or whose stream gives no position of it) is cut as `plushsense.windows.cut` does, and
-marked. A session with such a recording gives no idle positions: somewhere in its stream may be that gesture.
+A recording that is in no stream (or has no position there) is cut as by `plushsense.windows.cut`, and marked. A session
+with such a recording gives no idle positions, since its stream may contain that gesture.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -26,7 +27,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.gestures import Gesture, GestureSet
-from plushsense.dataset.store import Dataset, RecordingInfo, StreamInfo
+from plushsense.dataset.store import Dataset, Progress, RecordingInfo, StreamInfo
 from plushsense.windows.clock import Segment, resample
 from plushsense.windows.cut import (
     ANYWHERE,
@@ -46,10 +47,7 @@ NOTHING, FREE = -1, -2
 
 @dataclass(frozen=True)
 class AnywhereSpec:
-    """Settings of the positions of a stream to train on, in seconds and shares.
-
-    The rules stand in the module's docstring.
-    """
+    """Settings of the positions of a stream to train on, in seconds and shares; see the docstring of the module."""
 
     every_s: float = 0.4
     onset_s: float = 0.3
@@ -68,15 +66,12 @@ class AnywhereSpec:
             raise ConfigError(f"idle_share is {self.idle_share:g}: accepted is 0 up to, not including, 1.")
         if self.settle_s < self.after_s:
             raise ConfigError(
-                f"settle_s is {self.settle_s:g} and after_s {self.after_s:g}: what is still the gesture cannot be idle."
+                f"settle_s is {self.settle_s:g} and after_s {self.after_s:g}: settle_s must not be below after_s."
             )
 
 
 def add_idle_gesture(gestures: GestureSet, dataset: Dataset) -> GestureSet:
-    """Return the gesture set with an idle class added, where a stream can show idleness and the set has none.
-
-    Runs of labels fill their streams: nothing is unmarked there, and nothing is added.
-    """
+    """Return the gesture set with an idle class added, if it has none and the streams have unmarked rows."""
     if any(g.idle for g in gestures.gestures) or dataset.layout.is_labelled:
         return gestures
     if not any(r.stream_row >= 0 for r in dataset.used):
@@ -90,7 +85,7 @@ def add_idle_gesture(gestures: GestureSet, dataset: Dataset) -> GestureSet:
     if gestures.find(IDLE_LABEL) is not None:
         raise DatasetError(
             f"The gesture '{IDLE_LABEL}' of '{dataset.head.name}' is not marked as idle: "
-            "say  idle = true  in its gesture set, or name it otherwise."
+            "set  idle = true  in its gesture set, or rename it."
         )
     return GestureSet(gestures.name, (*gestures.gestures, idle), gestures.inferred)
 
@@ -109,33 +104,25 @@ class _Place:
         return WindowCut(self.x[self.at - reach : self.at], ANYWHERE, rows)
 
 
-@dataclass(frozen=True, eq=False)
-class _Found:
-    """Positions of a stream: those in recordings, with the recording, and unmarked ones that may pass for idle."""
-
-    held: list[tuple[RecordingInfo, _Place]]
-    free: list[_Place]
-
-
 def cut_anywhere(
     dataset: Dataset,
     spec: WindowSpec,
     gestures: GestureSet,
     anywhere: AnywhereSpec | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> WindowSet:
     """Cut windows at positions along the streams of ``dataset``, for training.
 
     Args:
-        gestures: the classes (see `with_idle`). Without an idle one, no position outside a recording is taken.
+        gestures: the classes (see `add_idle_gesture`). Without an idle one, only positions in recordings are taken.
         progress: called with (streams done, streams in all).
 
     Returns:
         Windows whose ``context`` is "anywhere" ("loop" and "inside" for recordings without a stream). Idle windows
-        of a stream count as one recording of the stream's person; no window reaches over a break of the clock.
+        of a stream count as one recording of the stream's person; no window spans a break of the clock.
 
     Raises:
-        DatasetError: when no window comes out.
+        DatasetError: when there is no window.
     """
     anywhere = anywhere or AnywhereSpec()
     layout = dataset.layout
@@ -146,12 +133,12 @@ def cut_anywhere(
     moving, resting = list[tuple[RecordingInfo, _Place]](), list[tuple[RecordingInfo, _Place]]()
     free: list[tuple[RecordingInfo, _Place]] = []
     for done, stream in enumerate(dataset.streams):
-        found = _positions(dataset, stream, used, reach, anywhere)
-        for recording, place in found.held:
+        in_recordings, unmarked = _positions(dataset, stream, used, reach, anywhere)
+        for recording, place in in_recordings:
             (resting if gestures.get(recording.gesture).idle else moving).append((recording, place))
         if idle is not None and (stream.subject, stream.session) not in adrift:
             nobody = _unmarked(stream, idle)
-            free += [(nobody, place) for place in found.free]
+            free += [(nobody, place) for place in unmarked]
         if progress is not None:
             progress(done + 1, len(dataset.streams))
     reached = {r.id for r, _ in (*moving, *resting)}
@@ -190,8 +177,8 @@ def _unmarked(stream: StreamInfo, idle: Gesture) -> RecordingInfo:
 
 def _positions(
     dataset: Dataset, stream: StreamInfo, used: Sequence[RecordingInfo], reach: int, spec: AnywhereSpec
-) -> _Found:
-    """Return the positions of one stream with their labels."""
+) -> tuple[list[tuple[RecordingInfo, _Place]], list[_Place]]:
+    """Return the positions of a stream in recordings, with the recording, and the unmarked ones to use as idle."""
     mine = [r for r in used if r.stream == stream.id and r.stream_row >= 0]
     chosen = {r.id for r in mine}
     barred = [r for r in dataset.recordings if r.stream == stream.id and r.stream_row >= 0 and r.id not in chosen]
@@ -213,7 +200,7 @@ def _positions(
                 free.append(_Place(x, segment, at))
                 lively.append(float(moved[at - 1]))
     kept = np.sort(np.argsort(lively, kind="stable")[: len(free) - round(spec.busy_share * len(free))])
-    return _Found(held, [free[at] for at in kept.tolist()])
+    return held, [free[at] for at in kept.tolist()]
 
 
 def position_labels(

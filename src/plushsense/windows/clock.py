@@ -84,8 +84,7 @@ class SampleClock:
     def push(self, device_ms: int, values: Sequence[int]) -> list[NDArray[np.int64]]:
         """Return the samples, each (C,) int64, that this frame completes.
 
-        ``restarted`` then says whether the frame began a new segment: what remembers the past must be reset before it
-        reads these samples.
+        ``restarted`` is then whether the frame began a new segment: reset any state before it reads these samples.
         """
         return [np.array(row, dtype=np.int64) for row in self.rows(device_ms, values)]
 

@@ -1,21 +1,20 @@
-"""Windows: equal stretches of even samples that know their recording, their person and what their past is.
+"""Cut recordings into windows: equal stretches of even samples with their recording, person and context.
 
 A recording of at least one window gives full windows every ``step_s`` from its start ("inside"). A shorter one gives
-one window, and where the rest of it comes from is the ``context``:
+one window, whose remaining samples depend on the ``context``:
 
-- ``stream``: what the session's stream held before (the recording is located in it). Where there is no stream, or
-  too little of it, the recording is looped, and the window says so.
-- ``loop``: the recording repeated from its start, as the paper does (never zero-padded).
+- ``stream``: the rows of the session's stream before the recording. Where there is no stream, or too little of it, the
+  recording is looped, and the window is marked so.
+- ``loop``: the recording repeated from its start, as in the paper (never zero-padded).
 
-To train for work in a stream there is a third one, ``anywhere``: see ``windows/anywhere``, which cuts it.
+To train for continuous recognition there is a third context, ``anywhere`` (``windows/anywhere``).
 
-A recording many times longer than its gesture usually is was not stopped in time: what its rows show is not known, so
-it is left out, and named.
+A recording many times longer than its gesture usually is was not stopped in time; it is left out and listed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -24,8 +23,8 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, DatasetError, nearest
 from plushsense.core.gestures import GestureSet
-from plushsense.dataset.quality.measurements import NEVER_STOPPED_FACTOR
-from plushsense.dataset.store import RECORDINGS, Dataset, RecordingInfo
+from plushsense.dataset.quality.measurements import NEVER_STOPPED_FACTOR, usual_rows
+from plushsense.dataset.store import RECORDINGS, Dataset, Progress, RecordingInfo
 from plushsense.windows.clock import Segment, resample
 from plushsense.windows.features import network_inputs
 
@@ -63,14 +62,11 @@ class WindowSpec:
 
 
 def whole_gestures(windowing: Mapping[str, Any]) -> WindowSpec:
-    """Return the window settings of a bundle (its ``windowing``).
-
-    Where it was trained anywhere, or on arrays, those of whole gestures with their real past.
-    """
-    given = {field.name: windowing[field.name] for field in fields(WindowSpec) if field.name in windowing}
-    if given.get("context") not in CONTEXTS:
-        given["context"] = "stream"
-    return WindowSpec(**given)
+    """Return the window settings of a bundle's ``windowing``; with the context "stream" if it is another one."""
+    values = {field.name: windowing[field.name] for field in fields(WindowSpec) if field.name in windowing}
+    if values.get("context") not in CONTEXTS:
+        values["context"] = "stream"
+    return WindowSpec(**values)
 
 
 @dataclass(frozen=True)
@@ -149,9 +145,9 @@ def from_recording(segments: list[Segment], dataset: Dataset, window: int, step:
 def _from_stream(
     segments: list[Segment], first: int, last: int, window: int, reach: int, step: int, dataset: Dataset
 ) -> list[WindowCut]:
-    """Cut rows ``first`` to ``last`` of a stream with their real past; return nothing where the past is too short.
+    """Cut rows ``first`` to ``last`` of a stream with the samples before; return none where these are too few.
 
-    Where a gap or a clock reset divides the recording, its end is cut as usual, and full windows of the parts before.
+    If a gap or a clock reset divides the recording, the parts before it give full windows only.
     """
     cuts: list[WindowCut] = []
     for segment in (s for s in segments if s.first_row < last and first < s.last_row):
@@ -174,16 +170,16 @@ def cut_windows(
     dataset: Dataset,
     spec: WindowSpec | None = None,
     gestures: GestureSet | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> WindowSet:
     """Cut the used recordings of ``dataset`` into windows.
 
     Args:
-        gestures: the classes, in order; recordings of other gestures are left out. Default: all of the data set.
+        gestures: the classes, in order, by default all of the data set; recordings of other gestures are left out.
         progress: called with (recordings done, recordings in all).
 
     Raises:
-        DatasetError: when no window comes out.
+        DatasetError: when there is no window.
     """
     spec = spec or WindowSpec()
     gestures = gestures or dataset.gestures
@@ -199,19 +195,19 @@ def cut_windows(
     cuts: list[tuple[RecordingInfo, WindowCut]] = []
     stream_id, segments = "", list[Segment]()
     for done, recording in enumerate(recordings):
-        mine: list[WindowCut] = []
+        own: list[WindowCut] = []
         if spec.context == "stream" and recording.stream_row >= 0:
             if recording.stream != stream_id:
                 stream_id = recording.stream
                 segments = resample(dataset.read_stream(stream_id), layout)
             first = recording.stream_row + recording.start
             last = first + recording.stop - recording.start
-            mine = _from_stream(segments, first, last, window, reach, step, dataset)
-        if not mine:
-            mine = from_recording(resample(dataset.read(recording), layout), dataset, reach, step)
-        if not mine:
+            own = _from_stream(segments, first, last, window, reach, step, dataset)
+        if not own:
+            own = from_recording(resample(dataset.read(recording), layout), dataset, reach, step)
+        if not own:
             left_out.append(f"{recording.id}: no valid sample")
-        cuts += [(recording, c) for c in mine]
+        cuts += [(recording, c) for c in own]
         if progress is not None:
             progress(done + 1, len(recordings))
     if not cuts:
@@ -224,10 +220,7 @@ def cut_windows(
 
 def drop_long_recordings(recordings: list[RecordingInfo], spec: WindowSpec) -> tuple[list[RecordingInfo], list[str]]:
     """Split recordings into those to cut and descriptions of those that were not stopped in time."""
-    durations: dict[str, list[int]] = {}
-    for r in recordings:
-        durations.setdefault(r.gesture, []).append(r.stop - r.start)
-    usual = {gesture: float(np.median(rows)) for gesture, rows in durations.items()}
+    usual = usual_rows((r.gesture, r.stop - r.start) for r in recordings)
     kept, left_out = [], []
     for r in recordings:
         own_file = r.file.startswith(f"{RECORDINGS}/")
@@ -246,7 +239,7 @@ def recordings_in_time(recordings: list[RecordingInfo], spec: WindowSpec | None 
 def assemble(cuts: list[tuple[RecordingInfo, WindowCut]], gestures: GestureSet, dataset: Dataset) -> WindowSet:
     ids = tuple(sorted({r.id for r, _ in cuts}))
     number = {identity: i for i, identity in enumerate(ids)}
-    # Layouts see to it that every input fits 32 bits.
+    # Layouts ensure that every input fits 32 bits.
     x = np.stack([c.x.astype(np.int32).T for _, c in cuts])
     order = np.array([number[r.id] for r, _ in cuts], dtype=np.int64)
     by_recording = np.argsort(order, kind="stable")
@@ -280,10 +273,10 @@ def assemble(cuts: list[tuple[RecordingInfo, WindowCut]], gestures: GestureSet, 
 
 
 def shared_gestures(dataset: Dataset, share: float = 0.9) -> tuple[GestureSet, dict[str, str]]:
-    """Return the gestures that at least ``share`` of the people made and that are not free choice, and why each
-    other is not.
+    """Return the gestures for models of all people, and the reason why each other gesture is left out.
 
-    Gestures that are recorded without a person stay in.
+    These are gestures that at least ``share`` of the people made and that are not free choice, and those that are
+    recorded without a person.
     """
     people = dataset.subjects
     kept, left_out = [], {}

@@ -1,4 +1,4 @@
-"""Inputs of a network: derived channels in integers, the scaling to floats, and statistics of windows.
+"""Compute the inputs of a network: derived channels in integers, scaling to floats, and statistics of windows.
 
 The order is fixed: raw integers → even samples → derived channels, all in integers → per-channel offset and scale.
 """

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,10 +16,9 @@ from plushsense.core.errors import ConfigError
 from plushsense.core.gestures import NOBODY
 from plushsense.core.version import __version__
 from plushsense.dataset.files import CACHE
-from plushsense.dataset.generation import Generation
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import as_dataset
-from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
+from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset, Generation
 from plushsense.deploy.quantize import (
     QUANTIZE_VERSION,
     Ranges,
@@ -412,7 +411,7 @@ def simulate(
         seed=seed,
         progress=lambda at, total, _: report("recording", at, total),
     )
-    summary: dict[str, Any] = dict(done.to_dict())
+    summary: dict[str, Any] = asdict(done)
     if dataset is not None:
         import_simulation(out, dataset, report)
         summary["dataset"] = str(dataset)

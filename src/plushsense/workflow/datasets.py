@@ -27,9 +27,9 @@ from plushsense.dataset.publishing.package import (
     save_head,
 )
 from plushsense.dataset.quality import checking
-from plushsense.dataset.quality.checking import CheckReport, Progress, check
+from plushsense.dataset.quality.checking import CheckReport, check
 from plushsense.dataset.quality.findings import CheckLimits
-from plushsense.dataset.store import Dataset, DatasetHead
+from plushsense.dataset.store import Dataset, DatasetHead, Progress
 from plushsense.evaluation.reidentification import reidentify, report, verdict
 from plushsense.models.bundle import Bundle
 
@@ -86,7 +86,7 @@ def check_dataset(
     """Check every recording and stream of a data set.
 
     Args:
-        only: names of checks (`plushsense.dataset.quality.registry.CHECKS`); default: all.
+        only: names of checks (`plushsense.dataset.quality.checking.CHECKS`); default: all.
         limits: limits that differ from the defaults, e.g. ``{"duration": 0.5}``.
         progress: called with (files done, total).
 

@@ -17,7 +17,7 @@ from plushsense.dataset.importing import importers as adding
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks
-from plushsense.dataset.people import PersonInfo, read_people, write_people
+from plushsense.dataset.store import PersonInfo, read_people, write_people
 from plushsense.recording.session_files import SessionEvent
 
 Writer = Callable[..., Path]
@@ -75,7 +75,7 @@ def test_what_cannot_be_added_is_refused(tmp_path: Path, session_writer: Writer)
     before = raw(tmp_path / "DS")
     with pytest.raises(DatasetError, match="already holds something"):
         import_recordings(tmp_path / "src", tmp_path / "DS", layout="accel-3")
-    with pytest.raises(DatasetError, match="has the layout 'accel-3', and 'plush-15' was asked for"):
+    with pytest.raises(DatasetError, match="has the layout 'accel-3', not 'plush-15'"):
         import_recordings(tmp_path / "src", tmp_path / "DS", layout="plush-15", add_to=True)
     session_writer(tmp_path / "out")
     with pytest.raises(DatasetError, match="'plush-15', but that of the data set is 'accel-3'"):
@@ -151,7 +151,7 @@ def test_a_take_made_again_later_is_set_aside_once(tmp_path: Path, session_write
 def test_two_imports_at_once(tmp_path: Path) -> None:
     put(tmp_path / "src" / "ana", "Shake", 1)
     import_recordings(tmp_path / "src", tmp_path / "DS", layout="accel-3")
-    with adding._workplace(tmp_path / "DS"), pytest.raises(DatasetError, match="Another import is adding"):
+    with adding._locked_work_folder(tmp_path / "DS"), pytest.raises(DatasetError, match="Another import is adding"):
         import_recordings(tmp_path / "src", tmp_path / "DS", add_to=True)
 
 
@@ -168,15 +168,16 @@ def test_gestures_that_are_new_keep_their_affect(tmp_path: Path, session_writer:
     assert json.loads(json.dumps(done.to_dict()))["added"] == {"recordings": 1, "streams": 1}
 
 
-def test_what_the_recorder_says_anew_is_marked_anew() -> None:
+def test_what_the_recorder_says_anew_is_marked_anew(tmp_path: Path) -> None:
     aside = {"a": "sneezed", "b": "sneezed", "c": "", "d": "", "e": "sneezed", "f": ""}
-    decided = {
-        "b": ("exclude", "recorder"),
-        "c": ("exclude", "recorder"),
-        "d": ("exclude", "me"),
-        "e": ("include", "me"),
-    }
-    said = [(m.recording, m.action, m.who) for m in adding._new_marks(aside, decided)]
+    decided = [
+        ("b", "exclude", "recorder"),
+        ("c", "exclude", "recorder"),
+        ("d", "exclude", "me"),
+        ("e", "include", "me"),
+    ]
+    append_marks(tmp_path, [Mark(*one) for one in decided])
+    said = [(m.recording, m.action, m.who) for m in adding._new_marks(tmp_path, aside)]
     assert said == [("a", "exclude", "recorder"), ("c", "include", "recorder")]
 
 

@@ -142,7 +142,7 @@ def test_a_mapping_of_files_that_are_not_there_is_said(tmp_path: Path) -> None:
     put(tmp_path / "src" / "x", "Shake", 1)
     (tmp_path / "map.csv").write_text("file,subject\nShake_1001_60.csv,ana\nShake_9_9.csv,ana\n")
     done = import_recordings(tmp_path / "src", tmp_path / "DS", layout="accel-3", subjects=tmp_path / "map.csv")
-    assert done.to_dict()["warnings"][0] == "files that the mapping names are not there (1): 'Shake_9_9.csv'"
+    assert done.to_dict()["warnings"][0] == "files that the mapping names do not exist (1): 'Shake_9_9.csv'"
 
 
 def test_upper_case_suffixes_and_odd_files_are_accounted_for(tmp_path: Path) -> None:

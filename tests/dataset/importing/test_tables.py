@@ -75,10 +75,10 @@ def test_a_pause_a_clock_that_runs_back_and_a_recording_column(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("name", "factor", "said"),
     [
-        ("time", 10, "taken for ms"),
-        ("timestamp", 0.01, "taken for s"),
-        ("t", 10_000, "taken for us"),
-        ("time", 10_000_000, "taken for ns"),
+        ("time", 10, "read as ms"),
+        ("timestamp", 0.01, "read as s"),
+        ("t", 10_000, "read as us"),
+        ("time", 10_000_000, "read as ns"),
         ("time_s", 0.01, ""),
         ("Arduino Timestamp (ms)", 10, ""),
     ],

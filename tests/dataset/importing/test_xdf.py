@@ -106,7 +106,7 @@ def test_files_in_folders_have_the_folders_person(tmp_path: Path, xdf_writer: Wr
     assert [(r.subject, r.session) for r in done.dataset.recordings] == [("ana", "one"), ("ana", "two"), ("ben", "1")]
     assert [e["file"] for e in done.rejected] == ["ana/bad.xdf"]
     alone = tmp_path / "src" / "ana" / "one.xdf"
-    with pytest.raises(FileFormatError, match="whose 'one.xdf' is, is not said"):
+    with pytest.raises(FileFormatError, match="the person of 'one.xdf' is not known"):
         import_recordings(alone, tmp_path / "DS2", layout="accel-3")
     (tmp_path / "map.csv").write_text("file,subject\none.xdf,S1\n")
     done = import_recordings(alone, tmp_path / "DS2", layout="accel-3", subjects=tmp_path / "map.csv")
@@ -123,7 +123,7 @@ def test_what_is_odd_is_said(tmp_path: Path, xdf_writer: Writer, xdf_stream: Any
     done = import_recordings(path, tmp_path / "DS", layout="accel-3", gestures="plush-18")
     text = "\n".join(done.notes)
     assert "1 samples without a number" in text
-    assert "'x', 'y', 'z': the values are small fractions of what layout 'accel-3' counts in" in text
+    assert "'x', 'y', 'z': the values are small fractions of the step of layout 'accel-3'" in text
     assert "1 markers name no gesture and begin no recording: 'sneezed'" in text
     assert done.gestures == ["Hold strong", "Tail pull"]
     path.write_bytes(whole[:-120])
@@ -184,7 +184,7 @@ def test_who_is_in_the_name_or_the_folder() -> None:
 def test_columns_by_label_by_header_and_by_place() -> None:
     assert match_columns(ACCEL, ["Arduino Timestamp (ms)", "Z", "Y", "X"], 4) == ([3, 2, 1], 0)
     assert match_columns(PLUSH, ["?"] * 15, 15) == (list(range(13)), 13)
-    assert match_columns(ACCEL, ["x", "y", "q"], 3) == "its labels name z not once"
+    assert match_columns(ACCEL, ["x", "y", "q"], 3) == "its labels do not name z exactly once"
     assert match_columns(ACCEL, [], 4)[0:2] != ([0, 1, 2], None), "device_ms comes first on this layout's wire"
 
 

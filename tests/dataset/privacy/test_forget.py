@@ -15,9 +15,9 @@ from plushsense.dataset import index
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import MARKS, Mark, append_marks, read_marks
-from plushsense.dataset.people import read_people
 from plushsense.dataset.privacy import forget as room
 from plushsense.dataset.privacy.forget import FORGOTTEN, UNDER_WAY, RemovalRecord, forget, plan_removal, read_removals
+from plushsense.dataset.store import read_people
 
 ACCEL = load_layout("accel-3")
 INDEX = {"recordings.csv", "streams.csv", "index.json"}
@@ -87,13 +87,13 @@ def test_stopped_between_the_last_line_and_the_end_it_is_buried_once(
 def test_who_comes_into_a_set_that_people_were_taken_out_of_is_named(folder: Path, tmp_path: Path) -> None:
     def told() -> list[str]:
         done = import_recordings(tmp_path / "src", folder, add_to=True)
-        return [w for w in done.to_dict()["warnings"] if "forgotten" in w]
+        return [w for w in done.to_dict()["warnings"] if "were removed" in w]
 
     (folder / "cache").mkdir(exist_ok=True)
     assert told() == []
     forget(folder, "P1")
     (said,) = told()
-    assert "P1 just came in" in said
+    assert "P1 were added now" in said
     assert "plushsense forget" in said
     assert told() == [], "only who is new"
 

@@ -17,9 +17,8 @@ from plushsense.core.recorder_csv import Frames, format_rows, write_recording
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import MARKS, Mark, append_marks, read_marks
-from plushsense.dataset.people import read_people
 from plushsense.dataset.privacy.pseudonymise import PseudonymisationResult, pseudonymise
-from plushsense.dataset.store import Dataset, RecordingInfo
+from plushsense.dataset.store import Dataset, RecordingInfo, read_people
 from plushsense.recording.session_files import SessionHead, read_events
 from plushsense.recording.simulate import simulate
 from plushsense.windows.cut import WindowSpec, cut_windows
@@ -167,7 +166,7 @@ def test_no_name_code_address_or_date_is_left(folder: Path, tmp_path: Path) -> N
     assert "photo of Ana.txt" in said
     assert "torn" in said
     assert re.search(r"replaced by 'S\w{4}' \(1×\)", said)
-    assert "notes in free words were kept" in said
+    assert "notes in free text were kept" in said
     assert "Ana" not in said.replace("photo of Ana.txt", "")
 
 
@@ -212,7 +211,7 @@ def test_session_files_people_and_marks_go_along(folder: Path, tmp_path: Path) -
     assert f"{code} pulled the cable" in {m["why"] for m in lines}
     quiet = pseudonymise(folder, tmp_path / "OUT2", key=done.key, drop_notes=True)
     assert {json.loads(m)["why"] for m in (tmp_path / "OUT2" / "marks.jsonl").read_text().splitlines()} == {""}
-    assert not any("free words" in f["message"] for f in quiet.findings)
+    assert not any("free text" in f["message"] for f in quiet.findings)
 
 
 def test_a_session_named_in_words_is_said_and_like_findings_are_one(folder: Path, tmp_path: Path) -> None:
@@ -254,7 +253,7 @@ def test_the_key_is_added_to_and_a_person_keeps_the_code(folder: Path, tmp_path:
 
 def test_a_key_beside_the_data_or_of_something_else_is_refused(folder: Path, tmp_path: Path) -> None:
     for place in (folder / "key.csv", tmp_path / "OUT" / "key.csv", folder / "cache" / "k" / "key.csv"):
-        with pytest.raises(DatasetError, match="keep it elsewhere"):
+        with pytest.raises(DatasetError, match="choose a place outside"):
             pseudonymise(folder, tmp_path / "OUT", key=place)
     with pytest.raises(DatasetError, match="outside of it"):
         pseudonymise(folder, folder / "OUT", key=tmp_path / "k.csv")

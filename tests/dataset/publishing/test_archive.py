@@ -45,7 +45,7 @@ def test_an_entry_that_would_leave_is_refused(tmp_path: Path, name: str) -> None
     bad = tmp_path / "bad.zip"
     with zipfile.ZipFile(bad, "w") as archive:
         archive.writestr(zipfile.ZipInfo(name), "x")
-    with pytest.raises(DatasetError, match="which no package has"), open_package(bad):
+    with pytest.raises(DatasetError, match="is refused"), open_package(bad):
         pass
     assert [p.name for p in tmp_path.iterdir()] == ["bad.zip"]
 
@@ -55,14 +55,14 @@ def test_a_link_and_a_damaged_zip_are_refused(tmp_path: Path) -> None:
     link.external_attr = 0o120777 << 16
     with zipfile.ZipFile(tmp_path / "link.zip", "w") as archive:
         archive.writestr(link, "/etc/passwd")
-    with pytest.raises(DatasetError, match="which no package has"), open_package(tmp_path / "link.zip"):
+    with pytest.raises(DatasetError, match="is refused"), open_package(tmp_path / "link.zip"):
         pass
     write_zip(package(tmp_path / "P"), tmp_path / "p.zip", "n")
     data = bytearray((tmp_path / "p.zip").read_bytes())
     at = data.find(b"csv") + 5
     data[at] ^= 0xFF
     (tmp_path / "broken.zip").write_bytes(bytes(data))
-    with pytest.raises(DatasetError, match="damaged zip"), open_package(tmp_path / "broken.zip"):
+    with pytest.raises(DatasetError, match="it is damaged"), open_package(tmp_path / "broken.zip"):
         pass
 
 
@@ -70,7 +70,10 @@ def test_an_entry_that_hides_another_or_swells_is_refused(tmp_path: Path) -> Non
     write_zip(package(tmp_path / "P"), tmp_path / "p.zip", "n")
     with zipfile.ZipFile(tmp_path / "p.zip", "a") as archive, pytest.warns(UserWarning, match="Duplicate"):
         archive.writestr("n/z.txt", "another")
-    with pytest.raises(DatasetError, match=r"'n/z.txt' twice"), open_package(tmp_path / "p.zip"):
+    with (
+        pytest.raises(DatasetError, match="another member has the same name"),
+        open_package(tmp_path / "p.zip"),
+    ):
         pass
     with zipfile.ZipFile(tmp_path / "bomb.zip", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("n/z.txt", bytes(20_000_000))

@@ -76,7 +76,7 @@ def test_nothing_leaves_that_should_not(source: Dataset, package: PublishResult)
 
 def test_names_of_what_is_left_out_are_told(package: PublishResult) -> None:
     text = (package.folder / "README.md").read_text(encoding="utf-8")
-    assert "Left out: 1 excluded recording. Their rows still stand in the session's stream." in text
+    assert "Left out: 1 excluded recording. Their rows are still in the session's stream." in text
     assert "Trimmed: 1 recording;" in text
     assert "Left out: 3 columns of the people's table." in text
     assert "**not looked at**" in text

@@ -26,10 +26,9 @@ from plushsense.core.recorder_csv import (
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks
-from plushsense.dataset.quality.checking import CheckReport, check
+from plushsense.dataset.quality.checking import CHECKS, Check, CheckReport, check
 from plushsense.dataset.quality.findings import CheckLimits, Issue
 from plushsense.dataset.quality.measurements import Examination
-from plushsense.dataset.quality.registry import CHECKS, Check
 from plushsense.dataset.store import Dataset
 from plushsense.recording.simulate import simulate
 

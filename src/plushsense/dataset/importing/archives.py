@@ -1,7 +1,7 @@
-"""Zip archives: unpacking foreign ones safely, and entries of our own that do not depend on the disk.
+"""Unpack zip archives of unknown origin safely, and make reproducible entries for our own.
 
-Every member is unpacked or refused with a reason. Refused are links, devices, paths that leave the folder, names that
-are ambiguous or reserved on some file system, encrypted or damaged members, and those with an extreme expansion ratio.
+Every member is unpacked or refused with a reason: links, devices, paths that leave the folder, names that are ambiguous
+or reserved on some file system, encrypted or damaged members, and extreme expansion ratios are refused.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.dataset.importing.build import DEVICE_NAME
 
 _CHUNK = 1 << 20
-# The earliest time that a zip can say.
+# The earliest time that a zip can store.
 _WHEN = (1980, 1, 1, 0, 0, 0)
 _DEEPEST = 30
 _LONGEST_NAME = 200
@@ -38,12 +38,12 @@ DAMAGED: tuple[type[Exception], ...] = (
     struct.error,
     ValueError,
 )
-"""What the reader of zips raises on bytes that are no zip, or a damaged one."""
+"""Exceptions of zipfile for bytes that are no zip, or a damaged one."""
 try:
     import lzma
 
     DAMAGED = (*DAMAGED, lzma.LZMAError)
-except ImportError:  # A Python that was built without it refuses such members by itself.
+except ImportError:  # A Python that was built without lzma refuses such members itself.
     pass
 
 
@@ -125,7 +125,7 @@ def unpack_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, target: Path,
                 out.write(chunk)
     except BaseException as cause:
         target.unlink(missing_ok=True)
-        # The unpacker of bzip2 says so of damaged bytes; what the disk refuses has a number.
+        # bzip2 raises OSError for damaged bytes, without a number, unlike the disk.
         if isinstance(cause, OSError) and cause.errno is None:
             raise zipfile.BadZipFile(str(cause)) from None
         raise
@@ -133,7 +133,7 @@ def unpack_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, target: Path,
 
 
 def unpack(path: Path, folder: Path, limits: UnpackLimits | None = None) -> list[tuple[str, str]]:
-    """Unpack the zip ``path`` into the empty ``folder``; returns the refused members with the reason.
+    """Unpack the zip ``path`` into the empty ``folder``; return the refused members with the reason.
 
     Raises:
         DatasetError: for a file that is no zip, or one that holds more files or bytes than ``limits`` allow.
@@ -144,7 +144,7 @@ def unpack(path: Path, folder: Path, limits: UnpackLimits | None = None) -> list
     try:
         archive = zipfile.ZipFile(path)
     except DAMAGED as cause:
-        raise DatasetError(f"'{path}' is no zip, or a damaged one ({_message(cause)}): get it once more.") from None
+        raise DatasetError(f"'{path}' is no zip, or a damaged one ({_message(cause)}): get another copy.") from None
     with archive:
         members = [m for m in archive.infolist() if not m.filename.endswith("/")]
         total = sum(m.file_size for m in members)

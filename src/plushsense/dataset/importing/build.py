@@ -1,4 +1,4 @@
-"""From a search to a data set: copying files, reading them, people, marks, and where each file went."""
+"""Create a data set from the files of a source: copy and read them, and account for each."""
 
 from __future__ import annotations
 
@@ -14,10 +14,19 @@ from plushsense.core.files import new_folder
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.recorder_csv import STREAM_NAME, parse_name
 from plushsense.dataset.importing.sources import COMPANIONS, LEFT_OUT, SourceFile, SourceScan
-from plushsense.dataset.index import DUPLICATE_FOLDER, IndexBuild, Progress, apply_marks, build_index, write_index_files
+from plushsense.dataset.index import DUPLICATE_FOLDER, IndexBuild, apply_marks, build_index, write_index_files
 from plushsense.dataset.marks import Mark, append_marks, read_marks
-from plushsense.dataset.people import PersonInfo, write_people
-from plushsense.dataset.store import HEAD, RECORDINGS, STREAMS, UNKNOWN_SUBJECT, Dataset, DatasetHead
+from plushsense.dataset.store import (
+    HEAD,
+    RECORDINGS,
+    STREAMS,
+    UNKNOWN_SUBJECT,
+    Dataset,
+    DatasetHead,
+    PersonInfo,
+    Progress,
+    write_people,
+)
 from plushsense.recording.session_files import SESSION_LOG
 
 TWICE = "the same file was already imported"
@@ -85,7 +94,7 @@ class Copier:
         self.work = work
         self.there = there
         self.grown: set[str] = set()
-        """Paths below the data set of files that are there, shorter."""
+        """Paths below the data set of existing files that are replaced by longer ones."""
         self.taken = dict(taken or {})
         self.contents = dict(contents or {})
         self.copied: dict[Path, str] = {}
@@ -96,15 +105,14 @@ class Copier:
         """Sources of the companions of each copied file."""
 
     def copy(self, found: SourceFile) -> str:
-        """Copy one file and return "", or why it was not copied; companions come after the file that they belong to."""
+        """Copy one file and return "", or the reason why not; companions come after the file that they belong to."""
         try:
             raw = found.source.read_bytes()
         except OSError as cause:
             return f"cannot be read: {cause.strerror or cause}"
         content = hashlib.sha256(raw).hexdigest()
-        there = self.contents.get((found.kind, content))
-        if there is not None:
-            self.already[found.source] = there
+        if (existing := self.contents.get((found.kind, content))) is not None:
+            self.already[found.source] = existing
             return ""
         folder = self._folder(found)
         if folder is None:
@@ -112,16 +120,16 @@ class Copier:
         companion = found.kind == COMPANIONS
         name = found.source.name
         place, again = folder, 1
-        while (key := _key(f"{place}/{name}", companion)) in self.taken:
+        while (key := key_of(f"{place}/{name}", companion=companion)) in self.taken:
             if self.taken[key] == content:
                 if companion or self.contents:
                     self.already[found.source] = f"{place}/{name}"
                     return ""
                 return TWICE
-            if (longer := self._goes_on(f"{place}/{name}", raw)) is not None:
-                if not longer:
-                    self.already[found.source] = f"{place}/{name}"
-                    return ""
+            if (longer := self._continues(f"{place}/{name}", raw)) is False:
+                self.already[found.source] = f"{place}/{name}"
+                return ""
+            if longer:
                 self.grown.add(f"{place}/{name}")
                 break
             again += 1
@@ -135,10 +143,10 @@ class Copier:
             self.companions.setdefault(self.copied.get(found.beside, ""), []).append(found.source)
         return ""
 
-    def _goes_on(self, file: str, raw: bytes) -> bool | None:
-        """Return True if ``raw`` continues an append-only file that exists, False if the existing one is longer.
+    def _continues(self, file: str, raw: bytes) -> bool | None:
+        """Return True if ``raw`` continues an existing append-only file, False if the existing file continues ``raw``.
 
-        None if neither begins with the other. An incomplete last line is ignored, since the recorder completes it.
+        None if neither is the case. An incomplete last line is ignored, since the recorder completes it.
         """
         if self.there is None or file.rpartition("/")[2] not in APPENDED or file in self.grown:
             return None
@@ -155,23 +163,18 @@ class Copier:
         if found.beside is not None:
             main = self.copied.get(found.beside) or self.already.get(found.beside)
             return None if main is None else main.rpartition("/")[0]
-        kind = STREAMS if found.kind == COMPANIONS else found.kind
-        folder = f"{kind}/{folder_name(found.subject)}"
+        folder = f"{STREAMS if found.kind == COMPANIONS else found.kind}/{folder_name(found.subject)}"
         return f"{folder}/{session_folder(found.session)}" if found.session else folder
-
-
-def _key(path: str, companion: bool) -> str:
-    folder, _, name = path.casefold().rpartition("/")
-    return f"{folder}/{name}/" if companion else f"{folder}/{name.rpartition('.')[0]}"
 
 
 def key_of(path: str, *, companion: bool) -> str:
     """Return the key in `Copier.taken` of a file by its path below the data set."""
-    return _key(path, companion)
+    folder, _, name = path.casefold().rpartition("/")
+    return f"{folder}/{name}/" if companion else f"{folder}/{name.rpartition('.')[0]}"
 
 
 RECORDER = "recorder"
-SIMULATED = "these recordings are of the virtual toy: scores on them say nothing about a real one"
+SIMULATED = "these recordings are of the virtual toy: scores on them say nothing about a real toy"
 NO_PEOPLE = (
     "the folders are gestures, so the people are not known: splits by subject are not possible; "
     "import again with --subjects map.csv (columns file,subject) if a mapping exists"
@@ -204,17 +207,8 @@ class ImportSummary:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
-        return {
-            "recordings": self.recordings,
-            "subjects": self.subjects,
-            "gestures": self.gestures,
-            "streams": self.streams,
-            "rejected": self.rejected,
-            "left_out": self.left_out,
-            "companions": self.companions,
-            "excluded": self.excluded,
-            "added": self.added,
-            "already_there": self.already_there,
+        hidden = ("dataset", "notes", "warnings", "seconds")
+        return {key: value for key, value in vars(self).items() if key not in hidden} | {
             "warnings": self.notes + self.warnings,
             "seconds": round(self.seconds, 2),
             "hash": self.dataset.hash,
@@ -253,8 +247,7 @@ class ImportedFiles:
             self.reject(self._origin[file], reason)
             self._remove(file)
             for source in self.copier.companions.pop(file, ()):
-                companion = self.copier.copied.get(source)
-                if companion is not None:
+                if (companion := self.copier.copied.get(source)) is not None:
                     self.reject(self._origin[companion], ORPHAN.format(Path(file).name))
                     self._remove(companion)
 
@@ -307,30 +300,26 @@ def merge_people(
     there: Mapping[str, PersonInfo], sessions: Iterable[PersonInfo], file: Mapping[str, PersonInfo], subjects: set[str]
 ) -> tuple[list[PersonInfo], list[str]]:
     """Merge the people's table of the data set with the sessions (fill gaps) and the user's file (override)."""
+    keys = ("age_group", "gender", "consent")
     people, notes = dict(there), []
     for info in sessions:
         code = folder_name(info.subject)
-        was = people.get(code)
         if code == NOBODY:
             continue
-        if was is None:
-            people[code] = replace(info, subject=code)
-            continue
-        for key in ("age_group", "gender", "consent"):
-            now, then = getattr(info, key), getattr(was, key)
-            if now and then and now != then:
-                notes.append(f"the {key.replace('_', ' ')} of '{code}' is kept as '{then}'; a session says '{now}'")
-            elif now and not then:
-                was = replace(was, **{key: now})
-        people[code] = was
-    strangers = []
-    for code, info in file.items():
-        if folder_name(code) not in subjects:
-            strangers.append(code)
-            continue
-        was = people.get(folder_name(code), PersonInfo(folder_name(code)))
-        own = {key: getattr(info, key) or getattr(was, key) for key in ("age_group", "gender", "consent")}
-        people[folder_name(code)] = PersonInfo(folder_name(code), **own, more=was.more | info.more)
+        known = people.get(code, PersonInfo(code))
+        for key in keys:
+            new, old = getattr(info, key), getattr(known, key)
+            if new and old and new != old:
+                notes.append(f"the {key.replace('_', ' ')} of '{code}' is kept as '{old}'; a session says '{new}'")
+        values = {key: getattr(known, key) or getattr(info, key) for key in keys}
+        people[code] = replace(known, **values, more=info.more | known.more)
+    strangers = [code for code in file if folder_name(code) not in subjects]
+    for info in file.values():
+        code = folder_name(info.subject)
+        if code in subjects:
+            known = people.get(code, PersonInfo(code))
+            values = {key: getattr(info, key) or getattr(known, key) for key in keys}
+            people[code] = PersonInfo(code, **values, more=known.more | info.more)
     if strangers:
         notes.append(
             f"people of the people's file who are not in the data set were left out ({len(strangers)}): "
@@ -351,7 +340,7 @@ def create_dataset(
     """Create the data set ``dest`` from a search, completely or not at all.
 
     Raises:
-        DatasetError: when nothing can be read, or ``dest`` holds something already.
+        DatasetError: when nothing can be read, or ``dest`` is not empty.
     """
     with new_folder(dest, DatasetError, last=HEAD) as work:
         account = ImportedFiles(search, Copier(work))
@@ -392,13 +381,9 @@ def read_copied(account: ImportedFiles, head: DatasetHead, progress: Progress | 
 
 def summarize_import(dataset: Dataset, account: ImportedFiles, notes: list[str], new: set[str]) -> ImportSummary:
     """Return the summary of an import that added the files ``new``."""
-    notes_of_import = [SIMULATED] if dataset.head.simulated else []
-    notes_of_import += notes
-    if any(r.subject == UNKNOWN_SUBJECT for r in dataset.recordings):
-        notes_of_import.append(NO_PEOPLE)
-    flagged = [(s.id, s.flags) for s in dataset.streams if s.file in new]
-    flagged += [(r.id, r.flags) for r in dataset.recordings if r.file in new]
+    unknown = any(r.subject == UNKNOWN_SUBJECT for r in dataset.recordings)
     mine = [r for r in dataset.recordings if r.file in new]
+    flagged = [s for s in dataset.streams if s.file in new] + mine
     return ImportSummary(
         dataset,
         len(dataset.recordings),
@@ -406,9 +391,9 @@ def summarize_import(dataset: Dataset, account: ImportedFiles, notes: list[str],
         sorted({r.gesture for r in dataset.recordings}),
         len(dataset.streams),
         account.rejected,
-        [f"{recording_id}: {flag}" for recording_id, flags in flagged for flag in flags],
+        [f"{info.id}: {flag}" for info in flagged for flag in info.flags],
         0.0,
-        notes_of_import,
+        [*([SIMULATED] if dataset.head.simulated else ()), *notes, *([NO_PEOPLE] if unknown else ())],
         left_out=account.left_out,
         companions=account.count(COMPANIONS),
         excluded=sum(r.excluded for r in mine),

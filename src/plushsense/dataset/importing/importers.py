@@ -1,6 +1,6 @@
-"""Importing recordings into a new or existing data set: raw files are copied unchanged, each is accounted for.
+"""Import recordings into a new or existing data set: raw files are copied unchanged, and each is accounted for.
 
-A file format is one function that scans a file and one line in ``FORMATS``; a folder layout is one function in
+A file format is a function that scans a file and a line in ``FORMATS``; a structure of folders is a function in
 `importing.sources`.
 """
 
@@ -12,7 +12,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -23,7 +23,7 @@ from plushsense.core.files import write_file
 from plushsense.core.gestures import GestureSet, load_gestures
 from plushsense.core.layouts import Layout, layout_names, load_layout
 from plushsense.core.recorder_csv import SIMULATION_MARK, parse_name
-from plushsense.dataset.files import sha256_of
+from plushsense.dataset.files import CACHE, sha256_of, walk_files
 from plushsense.dataset.importing.archives import UnpackLimits, unpack
 from plushsense.dataset.importing.build import (
     RECORDER,
@@ -55,17 +55,24 @@ from plushsense.dataset.importing.sources import (
 )
 from plushsense.dataset.importing.tables import STREAM_ROLE, check_roles, read_table
 from plushsense.dataset.importing.xdf import person_and_session, read_xdf
-from plushsense.dataset.index import Progress, open_dataset, rebuild_index
+from plushsense.dataset.index import open_dataset, rebuild_index
 from plushsense.dataset.marks import MARKS, Mark, append_marks
-from plushsense.dataset.people import PersonInfo, read_people, write_people
 from plushsense.dataset.privacy.forget import read_removals
-from plushsense.dataset.store import HEAD, RECORDINGS, STREAMS, Dataset, DatasetHead
-
-CACHE = "cache"
+from plushsense.dataset.store import (
+    HEAD,
+    RECORDINGS,
+    STREAMS,
+    Dataset,
+    DatasetHead,
+    PersonInfo,
+    Progress,
+    read_people,
+    write_people,
+)
 
 
 @contextmanager
-def _workplace(dest: Path) -> Iterator[Path]:
+def _locked_work_folder(dest: Path) -> Iterator[Path]:
     """Create a work folder on the data set's disk, locked for one import; leftovers of a killed import are removed."""
     cache = dest / CACHE
     cache.mkdir(exist_ok=True)
@@ -79,7 +86,7 @@ def _workplace(dest: Path) -> Iterator[Path]:
             finally:
                 shutil.rmtree(work, ignore_errors=True)
     except Timeout:
-        raise DatasetError(f"Another import is adding to '{dest}' just now: wait for it to end.") from None
+        raise DatasetError(f"Another import is adding to '{dest}' now: wait until it ends.") from None
 
 
 def _copier(dataset: Dataset, work: Path) -> Copier:
@@ -92,38 +99,29 @@ def _copier(dataset: Dataset, work: Path) -> Copier:
             if info.file.startswith(f"{kind}/"):
                 taken[key_of(info.file, companion=False)] = info.sha256
                 contents[(kind, info.sha256)] = info.file
-    for kind in (RECORDINGS, STREAMS):
-        for place, _, names in os.walk(dataset.path / kind):
-            for name in names:
-                path = Path(place) / name
-                file = path.relative_to(dataset.path).as_posix()
-                if not name.lower().endswith(".csv"):
-                    taken[key_of(file, companion=True)] = sha256_of(path)
+    for path in (*walk_files(dataset.path / RECORDINGS), *walk_files(dataset.path / STREAMS)):
+        if path.suffix.lower() != ".csv":
+            taken[key_of(path.relative_to(dataset.path).as_posix(), companion=True)] = sha256_of(path)
     return Copier(work, taken, contents, dataset.path)
 
 
-def _last_use_marks(folder: Path) -> dict[str, tuple[str, str]]:
-    """Return the last exclude or include mark of each recording, and who made it."""
-    decided: dict[str, tuple[str, str]] = {}
-    try:
-        lines = (folder / MARKS).read_bytes().split(b"\n")
-    except FileNotFoundError:
-        return decided
-    for line in lines:
+def _new_marks(folder: Path, set_aside: Mapping[str, str]) -> list[Mark]:
+    """Return marks for what the recorder decided since; decisions of people stay.
+
+    Args:
+        set_aside: the reason why the recorder discarded a recording by its id, "" if it did not.
+    """
+    last: dict[str, tuple[str, str]] = {}
+    for line in (folder / MARKS).read_bytes().split(b"\n") if (folder / MARKS).is_file() else ():
         try:
             mark = json.loads(line)
             if mark["action"] in ("exclude", "include"):
-                decided[str(mark["recording"])] = (mark["action"], mark["who"])
+                last[str(mark["recording"])] = (mark["action"], mark["who"])
         except (ValueError, TypeError, KeyError, RecursionError):
             continue
-    return decided
-
-
-def _new_marks(aside: Mapping[str, str], decided: Mapping[str, tuple[str, str]]) -> list[Mark]:
-    """Return marks for what the recorder decided since; decisions of people stay."""
     marks = []
-    for recording, why in aside.items():
-        action, who = decided.get(recording, ("include", RECORDER))
+    for recording, why in set_aside.items():
+        action, who = last.get(recording, ("include", RECORDER))
         new_action = "exclude" if why else "include"
         if who == RECORDER and action != new_action:
             marks.append(Mark(recording, new_action, RECORDER, why or "kept after all"))
@@ -133,9 +131,9 @@ def _new_marks(aside: Mapping[str, str], decided: Mapping[str, tuple[str, str]])
 def refuse_mixture(dataset: Dataset, search: SourceScan) -> None:
     """Refuse to mix recordings of the virtual toy with real ones."""
     if dataset.head.simulated != search.simulated:
-        mine, theirs = ("real", "virtual") if search.simulated else ("virtual", "real")
+        kinds = ("real", "virtual") if search.simulated else ("virtual", "real")
         raise DatasetError(
-            f"'{dataset.path}' holds recordings of a {mine} toy and the source those of a {theirs} one: "
+            f"'{dataset.path}' holds recordings of a {kinds[0]} toy and the source those of a {kinds[1]} one: "
             "keep them apart."
         )
 
@@ -152,7 +150,7 @@ def add_to_dataset(
     Raises:
         DatasetError: when the data set cannot be opened or written, or another import is at work.
     """
-    with _workplace(dest) as work:
+    with _locked_work_folder(dest) as work:
         dataset = open_dataset(dest)
         refuse_mixture(dataset, search)
         copier = _copier(dataset, work)
@@ -175,9 +173,8 @@ def add_to_dataset(
         new = set(account.kept)
         if head.gestures != dataset.head.gestures:
             write_file(dest / HEAD, head.to_toml())
-        marks = _new_marks(account.set_aside_reasons(), _last_use_marks(dest))
-        if marks:
-            append_marks(dest, marks)
+        marks = _new_marks(dest, account.set_aside_reasons())
+        append_marks(dest, marks)
         if {p.subject: p for p in listed} != there:
             write_people(dest, listed)
         # Companions first, so that an existing recording always has its sidecar.
@@ -185,7 +182,7 @@ def add_to_dataset(
             target = dest / file
             target.parent.mkdir(parents=True, exist_ok=True)
             if target.exists() and file not in copier.grown:
-                raise DatasetError(f"'{target}' appeared while adding: nothing is overwritten, so run it once more.")
+                raise DatasetError(f"'{target}' appeared during the import and is not overwritten: import again.")
             os.replace(work / file, target)
         rebuilt = rebuild_index(dest, head).dataset if new or marks else open_dataset(dest)
     come = sorted(set(rebuilt.subjects) - set(dataset.subjects))
@@ -193,14 +190,14 @@ def add_to_dataset(
 
 
 def _returning_people_warning(dest: Path, come: list[str]) -> list[str]:
-    """Return a warning if people are added to a data set from which people were removed: it may be the same person."""
+    """Return a warning if people are added to a data set from which people were removed, as they may be the same."""
     gone = read_removals(dest)
     if not come or not gone:
         return []
     days = ", ".join(dict.fromkeys(g.day for g in gone))
     return [
-        f"people were forgotten here ({len(gone)}; {days}), and {', '.join(come[:5])} just came in"
-        f"{f' with {len(come) - 5} more' if len(come) > 5 else ''}: whoever should not be here, take out again with  "
+        f"people were removed from this data set ({len(gone)}; {days}), and {', '.join(come[:5])}"
+        f"{f' and {len(come) - 5} more' if len(come) > 5 else ''} were added now: remove a person again with  "
         f"plushsense forget {dest} CODE"
     ]
 
@@ -217,29 +214,25 @@ SHOWN = 5
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """Options of an import; ``layout``, ``gestures`` and ``mapping`` (file to person) may be unknown.
+    """Options of an import; ``layout``, ``gestures`` and ``mapping`` (file to person) may be None.
 
     ``layout_origin`` names the source of the layout in messages; ``columns`` maps roles to column names; ``new_folder``
-    makes a new folder for what has to be unpacked or converted.
+    makes a folder for unpacked or converted files.
     """
 
     layout: Layout | None
     gestures: GestureSet | None
     mapping: Mapping[str, str] | None
     new_folder: Callable[[str], Path]
-    layout_origin: str = "the layout that was asked for"
+    layout_origin: str = "the given layout"
     columns: Mapping[str, str] = field(default_factory=dict)
     limits: UnpackLimits = field(default_factory=UnpackLimits)
 
     def known_layout(self, found: Layout | None = None) -> Layout:
-        """Return the layout that was requested or found.
-
-        Raises:
-            ConfigError: when there is none.
-        """
+        """Return the layout that was found or requested; raise ConfigError if there is none."""
         if (layout := found or self.layout) is None:
             raise ConfigError(
-                f"--layout is needed, for only sessions of plushsense record say what theirs is: accepted are "
+                f"--layout is needed, since only sessions of plushsense record name theirs: accepted are "
                 f"{', '.join(layout_names())}, or a TOML file of your own."
             )
         return layout
@@ -252,19 +245,18 @@ class ImportOptions:
 
 
 def scan_folder(source: Path, options: ImportOptions, *, around: Path | None = None) -> SourceScan:
-    """Search a folder: sessions of our recorder, XDF files, and recordings by the shape of the folders.
+    """Search a folder: sessions of our recorder, XDF files, and recordings by the structure of the folders.
 
     ``around`` is the folder in which to search for the mark of a simulation, by default ``source``.
     """
-    files = source_files(source)
-    simulated = is_simulation(around or source, files)
-    files, refused = split_regular_files(f for f in files if f.name != SIMULATION_MARK)
+    all_files = source_files(source)
+    simulated = is_simulation(around or source, all_files)
+    files, refused = split_regular_files(f for f in all_files if f.name != SIMULATION_MARK)
     sessions = read_sessions(files)
     layout = options.known_layout(common_layout(sessions, options.layout, options.layout_origin))
     gestures = options.known_gestures(layout)
     in_session = [f for f in files if sessions and session_of(f, sessions) is not None]
     rest = sorted(set(files) - set(in_session)) if in_session else files
-    convertible = [f for f in rest if f.suffix.lower() == ".xdf"]
     plain = [f for f in rest if f.suffix.lower() != ".xdf"]
     mapping = None if options.mapping is None else dict(options.mapping)
     shape = "labelled-rows" if layout.is_labelled else "gesture-recorder"
@@ -276,24 +268,27 @@ def scan_folder(source: Path, options: ImportOptions, *, around: Path | None = N
     found = [replace(f, origin=printable_path(f.source.relative_to(source))) for f in found]
     people, notes = people_of(sessions)
     search = SourceScan(layout, gestures, shape if rest else "sessions", found, people, notes=notes)
-    for file in convertible:
+    for file in (f for f in rest if f.suffix.lower() == ".xdf"):
         name = printable_path(file.relative_to(source))
         person = None if file.parent == around else file.parent.resolve().name
         if mapping is not None:
             person = mapping.get(name, mapping.get(file.name))
         try:
-            _xdf(file, name, person, layout, gestures, options, search)
+            _add_xdf(file, name, person, options, search)
         except FileFormatError as cause:
             search.found.append(SourceFile(file, "", origin=name, reason=str(cause)))
     if mapping is not None:
-        search.notes += _unused(mapping, source, rest)
+        present = {name for f in rest for name in (f.name, f.relative_to(source).as_posix())}
+        if missing := [name for name in mapping if name not in present]:
+            listed = ", ".join(f"'{m}'" for m in missing[:SHOWN]) + (", …" if len(missing) > SHOWN else "")
+            search.notes.append(f"files that the mapping names do not exist ({len(missing)}): {listed}")
     search.simulated = simulated or any(not isinstance(h, str) and h.simulated for h in sessions.values())
     return search
 
 
 def scan_zip(path: Path, options: ImportOptions) -> SourceScan:
     """Search a zip, unpacked beside the new data set."""
-    # Recordings at the top belong to the person named by the folder, as if the user had unpacked the zip.
+    # As if the user had unpacked it: recordings at the top belong to the person named by the folder.
     folder = options.new_folder("unpacked") / folder_name(path.stem)
     folder.mkdir()
     refused = unpack(path, folder, options.limits)
@@ -306,52 +301,46 @@ def scan_zip(path: Path, options: ImportOptions) -> SourceScan:
 
 def scan_xdf(path: Path, options: ImportOptions) -> SourceScan:
     """Search one XDF file."""
-    layout = options.known_layout()
-    gestures = options.known_gestures(layout)
-    search = SourceScan(layout, gestures, "xdf", [], simulated=is_simulation(path.resolve().parent, []))
-    _xdf(path, path.name, (options.mapping or {}).get(path.name), layout, gestures, options, search)
+    search = _scan_of_file(path, "xdf", options)
+    _add_xdf(path, path.name, (options.mapping or {}).get(path.name), options, search)
     return search
 
 
-def _xdf(
-    path: Path,
-    name: str,
-    person: str | None,
-    layout: Layout,
-    gestures: GestureSet | None,
-    options: ImportOptions,
-    search: SourceScan,
-) -> None:
+def _scan_of_file(path: Path, shape: str, options: ImportOptions) -> SourceScan:
+    layout = options.known_layout()
+    simulated = is_simulation(path.resolve().parent, [])
+    return SourceScan(layout, options.known_gestures(layout), shape, [], simulated=simulated)
+
+
+def _add_xdf(path: Path, name: str, person: str | None, options: ImportOptions, search: SourceScan) -> None:
+    """Convert an XDF file, and add its recordings and notes to ``search``."""
     subject, session = person_and_session(path, person)
     if options.mapping is not None:
         subject = person
     if subject is None:
         raise FileFormatError(
-            f"whose '{name}' is, is not said: name the person with --subjects map.csv (file,subject), or call the file "
-            "sub-<code>_ses-<session>.xdf as LabRecorder does"
+            f"the person of '{name}' is not known: name the person with --subjects map.csv (file,subject), or call the "
+            "file sub-<code>_ses-<session>.xdf as LabRecorder does"
         )
     folder = options.new_folder("converted") / "xdf"
-    _take(
-        read_xdf(path, name, folder, subject, session, layout, gestures, options.columns.get(STREAM_ROLE, "")), search
-    )
+    stream = options.columns.get(STREAM_ROLE, "")
+    _add(read_xdf(path, name, folder, subject, session, search.layout, search.gestures, stream), search)
 
 
 def scan_table(path: Path, options: ImportOptions) -> SourceScan:
     """Search one table with a row per sample."""
     if parse_name(path.name) is not None:
         raise DatasetError(f"'{path}' is one recording: give the folder that holds the people's folders.")
-    layout = options.known_layout()
-    check_roles(options.columns, layout)
-    search = SourceScan(
-        layout, options.known_gestures(layout), "table", [], simulated=is_simulation(path.resolve().parent, [])
-    )
+    check_roles(options.columns, options.known_layout())
+    search = _scan_of_file(path, "table", options)
     person = (options.mapping or {}).get(path.name)
-    _take(read_table(path, path.name, options.new_folder("converted"), person, layout, options.columns), search)
+    _add(read_table(path, path.name, options.new_folder("converted"), person, search.layout, options.columns), search)
     return search
 
 
-def _take(laid_out: Iterable[SourceFile | str], search: SourceScan) -> None:
-    for entry in laid_out:
+def _add(entries: Iterable[SourceFile | str], search: SourceScan) -> None:
+    """Add files and notes to ``search``."""
+    for entry in entries:
         if isinstance(entry, str):
             search.notes.append(entry)
         else:
@@ -366,32 +355,19 @@ FORMATS: dict[str, Callable[[Path, ImportOptions], SourceScan]] = {
 }
 
 
-def _unused(mapping: dict[str, str], source: Path, files: Iterable[Path]) -> list[str]:
-    """Return a warning if the mapping names files that do not exist."""
-    there = {name for f in files for name in (f.name, f.relative_to(source).as_posix())}
-    missing = [name for name in mapping if name not in there]
-    if not missing:
-        return []
-    listed = ", ".join(f"'{m}'" for m in missing[:SHOWN]) + (", …" if len(missing) > SHOWN else "")
-    return [f"files that the mapping names are not there ({len(missing)}): {listed}"]
-
-
 @contextmanager
-def _workplaces(dest: Path) -> Iterator[Callable[[str], Path]]:
-    """Yield a function that creates folders for unpacked and converted files; all are removed at the end."""
-    made: list[Path] = []
+def _temporary_folders(dest: Path) -> Iterator[Callable[[str], Path]]:
+    """Yield a function that creates folders beside ``dest`` for unpacked and converted files; remove all at the end."""
+    with ExitStack() as stack:
 
-    def make_one(what: str) -> Path:
-        real = dest.resolve()
-        place = next(p for p in real.parents if p.is_dir())
-        made.append(Path(tempfile.mkdtemp(prefix=f".{real.name}-{what}-", dir=place)))
-        return made[-1]
+        def create(what: str) -> Path:
+            real = dest.resolve()
+            place = next(p for p in real.parents if p.is_dir())
+            folder = Path(tempfile.mkdtemp(prefix=f".{real.name}-{what}-", dir=place))
+            stack.callback(shutil.rmtree, folder, ignore_errors=True)
+            return folder
 
-    try:
-        yield make_one
-    finally:
-        for folder in made:
-            shutil.rmtree(folder, ignore_errors=True)
+        yield create
 
 
 def scan_source(source: Path, options: ImportOptions) -> SourceScan:
@@ -402,19 +378,19 @@ def scan_source(source: Path, options: ImportOptions) -> SourceScan:
     """
     try:
         if source.is_dir():
-            if strange := sorted(set(options.columns) - {STREAM_ROLE}):
-                raise ConfigError(f"--column {strange[0]}=… is for a table; '{source}' is a folder.")
+            if unused := sorted(set(options.columns) - {STREAM_ROLE}):
+                raise ConfigError(f"--column {unused[0]}=… is for a table; '{source}' is a folder.")
             search = scan_folder(source, options)
         elif source.is_file():
             if source.suffix.lower() not in FORMATS:
                 raise DatasetError(
-                    f"'{source}' is of no kind that can be imported: give a folder, or a file that ends in "
+                    f"'{source}' is no file that can be imported: give a folder, or a file that ends in "
                     f"{', '.join(FORMATS)}."
                 )
             search = FORMATS[source.suffix.lower()](source, options)
         else:
             raise DatasetError(
-                f"There is no folder '{source}', nor such a file: give what the recorder wrote, or a file that ends in "
+                f"There is no folder or file '{source}': give the recorder's folder, or a file that ends in "
                 f"{', '.join(FORMATS)}."
             )
     except OSError as cause:
@@ -424,9 +400,9 @@ def scan_source(source: Path, options: ImportOptions) -> SourceScan:
     if not any(f.kind in ("recordings", "streams") for f in search.found):
         first = next((f" The first: '{f.origin}': {f.reason.rstrip('.')}." for f in search.found if f.reason), "")
         raise DatasetError(
-            f"'{source}' holds no recording: expected <label>_<epoch ms>_<rows>.csv in a folder a person"
+            f"'{source}' holds no recording: expected <label>_<epoch ms>_<rows>.csv in a folder per person"
             f"{' (or CSVs with a label column)' if search.shape == 'labelled-rows' else ''}; "
-            f"found {len(search.found)} others.{first}"
+            f"found {len(search.found)} other files.{first}"
         )
     return search
 
@@ -451,23 +427,23 @@ def import_recordings(
     """Create a data set at ``dest`` from recordings, or add them to an existing one.
 
     Args:
-        source: a folder as a recorder left it (sessions, a folder a person, a folder a label), a zip of one, an XDF
-            file, or one table (.csv, .parquet).
-        dest: the new data set; it must not exist yet, or be empty. With ``add_to`` the data set to add to.
-        layout: the sensor layout, by name, path or as it is; sessions of our recorder and ``add_to`` need none.
+        source: a folder that a recorder wrote (sessions, a folder per person or per label), a zip of one, an XDF file,
+            or one table (.csv, .parquet).
+        dest: the new data set, which must not exist or be empty; with ``add_to`` the data set to add to.
+        layout: the sensor layout or its name or path; not needed for sessions of our recorder, and with ``add_to``.
         gestures: the gesture set; by default ``plush-18`` for plush layouts, else inferred from the labels.
         subjects: "folder" (the folder is the person) or the path of a mapping file ``file,subject``.
-        simulated: these are recordings of the virtual toy; found out by itself where `plushsense simulate` wrote them.
+        simulated: the virtual toy made the recordings; detected in folders that `plushsense simulate` wrote.
         progress: called with (files done, files in all).
-        people: the path of a people's table, see `dataset.people`.
-        columns: which column of a table is what (``{"label": "activity"}``), or which ``stream`` of an XDF file.
-        limits: how much a zip may unpack to.
+        people: the path of a people's table, see `dataset.store.read_people`.
+        columns: the column of a table by role (``{"label": "activity"}``), or the ``stream`` of an XDF file.
+        limits: limits of unpacking a zip.
 
     Returns:
         The summary; every source file is imported, imported with a warning, left out or rejected with a reason.
 
     Raises:
-        DatasetError: when there is nothing to import, or ``dest`` holds something already.
+        DatasetError: when there is nothing to import, or ``dest`` is not empty.
     """
     began = time.perf_counter()
     source, dest = Path(source), Path(dest)
@@ -479,54 +455,49 @@ def import_recordings(
         raise DatasetError(f"There is no people's file '{people}': check the path.")
     people_info = {} if people is None else read_people(Path(people))
     if source.is_dir() and dest.resolve() != source.resolve() and dest.resolve().is_relative_to(source.resolve()):
-        raise ConfigError(f"'{dest}' lies in '{source}', which is only read: give a place outside it for the data set.")
+        raise ConfigError(f"'{dest}' lies in '{source}', which is only read: give a folder outside of it.")
     head = None
     if add_to:
         head = DatasetHead.read(dest)
         if given is not None and given.to_dict() != head.layout.to_dict():
             raise DatasetError(
-                f"'{dest}' has the layout '{head.layout.name}', and '{given.name}' was asked for: a data set has one "
-                "layout, so leave --layout out or make another data set."
+                f"'{dest}' has the layout '{head.layout.name}', not '{given.name}': a data set has one layout, so "
+                "leave --layout out or create another data set."
             )
         if name or licence or consent:
             raise ConfigError("--add keeps the name, licence and consent statement of the data set: leave them out.")
     # An inferred set does not tell which markers of an XDF file are gestures.
     known = gestures if head is None or head.gestures.inferred else head.gestures
-    with _workplaces(dest) as workplace:
+    with _temporary_folders(dest) as new_folder:
         options = ImportOptions(
             given if head is None else head.layout,
             known,
             mapping,
-            workplace,
-            "the layout that was asked for" if head is None else "that of the data set",
+            new_folder,
+            "the given layout" if head is None else "that of the data set",
             columns or {},
             limits or UnpackLimits(),
         )
         search = scan_source(source, options)
         search.simulated = search.simulated or simulated
         if head is None:
-            done = create_dataset(
-                source, dest, search, _new_head(source, search, name, licence, consent), people_info, progress
+            new_head = DatasetHead(
+                name=name or (source.resolve().name if source.is_dir() else source.stem),
+                layout=search.layout,
+                gestures=search.gestures or GestureSet("inferred", (), inferred=True),
+                licence=licence,
+                consent=consent,
+                source=search.shape,
+                simulated=search.simulated,
             )
+            done = create_dataset(source, dest, search, new_head, people_info, progress)
         else:
             try:
                 done = add_to_dataset(dest, search, gestures, people_info, progress)
             except OSError as cause:
                 raise DatasetError(
                     f"'{dest}' cannot be added to ({cause.strerror or cause}, {cause.filename}): it is as valid as "
-                    "before; check the disk and run it once more."
+                    "before; check the disk and import again."
                 ) from None
     done.seconds = time.perf_counter() - began
     return done
-
-
-def _new_head(source: Path, search: SourceScan, name: str | None, licence: str, consent: str) -> DatasetHead:
-    return DatasetHead(
-        name=name or (source.resolve().name if source.is_dir() else source.stem),
-        layout=search.layout,
-        gestures=search.gestures or GestureSet("inferred", (), inferred=True),
-        licence=licence,
-        consent=consent,
-        source=search.shape,
-        simulated=search.simulated,
-    )

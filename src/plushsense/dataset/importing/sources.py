@@ -1,4 +1,4 @@
-"""Finding recordings in a source folder: the kind of each file, its person and session.
+"""Find the recordings in a source folder: kind, person and session of each file.
 
 Three folder layouts are read: sessions of our own recorder, folders of the GestureRecorder (by person, or by label
 after the authors' anonymising step), and folders of CSVs with a label on every row. Outside a session, the nearest
@@ -7,10 +7,10 @@ folder names the person.
 
 from __future__ import annotations
 
-import csv
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from plushsense.core.errors import BadInput, DatasetError
@@ -18,8 +18,7 @@ from plushsense.core.gestures import NOBODY, GestureSet, plain_label
 from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import SIMULATION_MARK, STREAM_NAME, parse_name
 from plushsense.core.toml import read_toml
-from plushsense.dataset.people import PersonInfo
-from plushsense.dataset.store import HEAD, RECORDINGS, STREAMS, UNKNOWN_SUBJECT
+from plushsense.dataset.store import HEAD, RECORDINGS, STREAMS, UNKNOWN_SUBJECT, PersonInfo, read_csv_rows
 from plushsense.recording.session_files import SESSION_HEAD, SESSION_LOG, SIDECAR, SessionHead, discarded_recordings
 
 COMPANIONS = "companions"
@@ -35,9 +34,8 @@ class SourceFile:
     """A source file and where it goes.
 
     ``kind`` is recordings, streams, companions (copied beside another file, never read), left out (not needed), or ""
-    for a refused file with its ``reason``. ``origin`` is its name in messages, by default the path below the source.
-    ``beside`` is the file that a companion belongs to; without one it goes to its session's stream. ``set_aside`` is
-    why the recorder excluded the recording.
+    for a refused file with its ``reason``. ``origin`` is its name in messages. ``beside`` is the file that a companion
+    belongs to, by default its session's stream. ``set_aside`` is the reason why the recorder discarded the recording.
     """
 
     source: Path
@@ -64,7 +62,7 @@ class SourceScan:
 
 
 def printable_path(path: Path) -> str:
-    """Return a path as printable text; characters that are not, or that would act on a terminal, are escaped."""
+    """Return a path as text; characters that are not printable, or that would act on a terminal, are escaped."""
     text = os.fsencode(path).decode("utf-8", "backslashreplace").replace(os.sep, "/")
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
@@ -73,7 +71,7 @@ def source_files(source: Path) -> list[Path]:
     """Return every file below ``source`` in name order, and every link to a folder.
 
     Raises:
-        DatasetError: when a data set is in there, which would be taken in again.
+        DatasetError: when it contains a data set, which would be imported again.
         OSError: when a folder cannot be listed.
     """
 
@@ -90,13 +88,13 @@ def source_files(source: Path) -> list[Path]:
                 if here == source
                 else f"'{here}' in '{source}' is a data set already: give the recorder's folder, or move it away first"
             )
-            raise DatasetError(f"{what}; importing it again would mix its own copies with its people.")
+            raise DatasetError(f"{what}; importing it again would mix its copies of files with its people.")
         files += [here / name for name in sorted(names + [f for f in folders if (here / f).is_symlink()])]
     return files
 
 
 def is_simulation(source: Path, files: Iterable[Path]) -> bool:
-    """Return whether the virtual toy made ``files``: its mark, or a simulated data set, is there or above."""
+    """Return whether the virtual toy made ``files``: its mark, or a simulated data set, is in or above the folder."""
     if any(f.name == SIMULATION_MARK for f in files):
         return True
     for place in (source.resolve(), *source.resolve().parents):
@@ -110,57 +108,57 @@ def is_simulation(source: Path, files: Iterable[Path]) -> bool:
     return False
 
 
-def _not_a_file(path: Path) -> SourceFile | None:
-    if path.is_symlink():
-        return SourceFile(path, "", reason="a symbolic link is not followed")
-    if not path.is_file():
-        return SourceFile(path, "", reason="not a regular file")
-    if path.name.startswith("._"):
-        return SourceFile(path, "", reason="what macOS leaves beside a file, no recording")
-    try:
-        path.name.encode("utf-8")
-    except UnicodeEncodeError:
-        return SourceFile(path, "", reason="its name is not UTF-8: rename it")
-    if any(c < " " or c == "\x7f" for c in path.name):
-        return SourceFile(path, "", reason="its name holds a control character: rename it")
-    return None
-
-
 def split_regular_files(files: Iterable[Path]) -> tuple[list[Path], list[SourceFile]]:
     """Split files into those that can be read and those refused: links, devices, names that are not text."""
     good, refused = [], []
     for path in files:
-        odd = _not_a_file(path)
-        if odd is None:
-            good.append(path)
+        if reason := _refusal(path):
+            refused.append(SourceFile(path, "", reason=reason))
         else:
-            refused.append(odd)
+            good.append(path)
     return good, refused
+
+
+def _refusal(path: Path) -> str:
+    """Return why a file is refused by its kind or name; "" if it is not."""
+    if path.is_symlink():
+        return "a symbolic link is not followed"
+    if not path.is_file():
+        return "not a regular file"
+    if path.name.startswith("._"):
+        return "metadata of macOS, no recording"
+    try:
+        path.name.encode("utf-8")
+    except UnicodeEncodeError:
+        return "its name is not UTF-8: rename it"
+    if any(c < " " or c == "\x7f" for c in path.name):
+        return "its name holds a control character: rename it"
+    return ""
 
 
 def _is_by_label(source: Path, files: Iterable[Path]) -> bool:
     """Return whether folders are gestures, not people: every recording's label is its folder's name."""
     named = [(path, name) for path in files if (name := parse_name(path.name)) is not None]
-    inside = [(path, name) for path, name in named if path.parent != source] or named
-    return bool(inside) and all(plain_label(n.label) == plain_label(p.parent.resolve().name) for p, n in inside)
+    named = [(path, name) for path, name in named if path.parent != source] or named
+    return bool(named) and all(plain_label(n.label) == plain_label(p.parent.resolve().name) for p, n in named)
 
 
 def _nobodys_folders(files: Iterable[Path], gestures: GestureSet | None) -> set[Path]:
     """Return the folders in which every recording is of a gesture that nobody makes (the toy at rest)."""
-    by_folder: dict[Path, bool] = {}
+    with_nobody: set[Path] = set()
+    with_people: set[Path] = set()
     for path in files:
         name = parse_name(path.name)
         if name is not None and gestures is not None:
             gesture = gestures.find(name.label)
-            nobody = gesture is not None and gesture.nobody
-            by_folder[path.parent] = by_folder.get(path.parent, True) and nobody
-    return {folder for folder, nobody in by_folder.items() if nobody}
+            (with_nobody if gesture is not None and gesture.nobody else with_people).add(path.parent)
+    return with_nobody - with_people
 
 
 def _refuse_unclear_people(source: Path, found: Iterable[SourceFile], *, nested: bool) -> None:
-    """Refuse folders that leave open who the person is, so that people are neither merged nor split.
+    """Refuse folders that do not identify the person, so that people are neither merged nor split.
 
-    With ``nested`` a folder of recordings inside another one is unclear too.
+    With ``nested``, also refuse a folder of recordings inside another one.
     """
     folders: dict[str, Path] = {}
     for f in found:
@@ -169,15 +167,13 @@ def _refuse_unclear_people(source: Path, found: Iterable[SourceFile], *, nested:
         other = folders.setdefault(f.subject.casefold(), f.source.parent)
         if other != f.source.parent:
             a, b = (p.relative_to(source).as_posix() for p in (other, f.source.parent))
-            raise DatasetError(
-                f"Who the person is is not clear: '{a}' and '{b}' in '{source}' have the same name: {_ASK}."
-            )
+            raise DatasetError(f"The person is not clear: '{a}' and '{b}' in '{source}' have the same name: {_ASK}.")
     places = set(folders.values())
     for place in sorted(places) if nested else ():
         above = next((p for p in place.parents if p in places), None)
         if above is not None:
             raise DatasetError(
-                f"Who the person is is not clear: '{place}' lies in '{above}', both hold recordings: {_ASK}."
+                f"The person is not clear: '{place}' lies in '{above}', and both hold recordings: {_ASK}."
             )
 
 
@@ -232,17 +228,13 @@ def classify_labelled_rows(
         if path.suffix.lower() != ".csv":
             yield SourceFile(path, "", reason="not a CSV file")
         elif subject is None:
-            reason = (
-                "not in the folder of a person" if subjects is None else "not named in the mapping file of --subjects"
-            )
-            yield SourceFile(path, "", reason=reason)
+            where = "in the folder of a person" if subjects is None else "named in the mapping file of --subjects"
+            yield SourceFile(path, "", reason=f"not {where}")
         else:
             yield SourceFile(path, STREAMS, subject)
 
 
-Classifier = Callable[[Path, list[Path], dict[str, str] | None, GestureSet | None], Iterator[SourceFile]]
-
-CLASSIFIERS: dict[str, Classifier] = {
+CLASSIFIERS: dict[str, Callable[[Path, list[Path], dict[str, str] | None, GestureSet | None], Iterator[SourceFile]]] = {
     "gesture-recorder": classify_gesture_recorder,
     "labelled-rows": classify_labelled_rows,
 }
@@ -254,7 +246,7 @@ def classify_files(
     """Classify ``files`` (regular ones); each is returned once.
 
     Raises:
-        DatasetError: when the folders leave open who the person is.
+        DatasetError: when the folders do not identify the person.
     """
     found = list(CLASSIFIERS[shape](source, files, subjects, gestures))
     if subjects is None:
@@ -266,31 +258,23 @@ def read_mapping(path: Path) -> dict[str, str]:
     """Read a mapping from file name to person, a CSV with the columns ``file`` and ``subject``."""
     mapping: dict[str, str] = {}
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            sample = file.readline()
-            file.seek(0)
-            reader = csv.DictReader(file, delimiter=";" if ";" in sample else ",")
-            columns = [c.strip().casefold() for c in reader.fieldnames or ()]
-            if columns[:2] != ["file", "subject"]:
-                raise DatasetError(
-                    f"The mapping file '{path}' begins with the columns {', '.join(columns) or 'nothing'}; "
-                    "it needs  file,subject"
-                )
-            reader.fieldnames = columns
-            for row in reader:
-                name = (row["file"] or "").strip().replace("\\", "/")
-                subject = (row["subject"] or "").strip()
-                if not name or not subject:
-                    raise DatasetError(
-                        f"The mapping file '{path}' line {reader.line_num} names no {'subject' if name else 'file'}: "
-                        "each line is  file,subject"
-                    )
-                if mapping.setdefault(name, subject) != subject:
-                    raise DatasetError(
-                        f"The mapping file '{path}' gives '{name}' to '{mapping[name]}' and '{subject}'."
-                    )
-    except (OSError, UnicodeDecodeError, csv.Error) as cause:
-        raise DatasetError(f"The mapping file '{path}' cannot be read: {cause}.") from None
+        columns, rows = read_csv_rows(path, "mapping file")
+    except FileNotFoundError:
+        raise DatasetError(f"There is no mapping file '{path}': check the path.") from None
+    if columns[:2] != ["file", "subject"]:
+        raise DatasetError(
+            f"The mapping file '{path}' begins with the columns {', '.join(columns) or 'nothing'}; it needs "
+            "file,subject"
+        )
+    for line, cells in rows:
+        name, subject = cells["file"].replace("\\", "/"), cells["subject"]
+        if not name or not subject:
+            raise DatasetError(
+                f"The mapping file '{path}' line {line} names no {'subject' if name else 'file'}: each line is  "
+                "file,subject"
+            )
+        if mapping.setdefault(name, subject) != subject:
+            raise DatasetError(f"The mapping file '{path}' gives '{name}' to '{mapping[name]}' and '{subject}'.")
     return mapping
 
 
@@ -298,7 +282,7 @@ def read_mapping(path: Path) -> dict[str, str]:
 LEFT_OVER = {
     ".part": "not finished when the recorder stopped; its rows are in the session's stream",
     ".new": "not finished when the recorder stopped; its rows are in the session's stream",
-    ".torn": "damaged by a crash and set aside by the recorder; its rows are in the session's stream",
+    ".torn": "damaged by a crash and renamed by the recorder; its rows are in the session's stream",
     ".lock": "a lock of the recorder",
 }
 
@@ -372,7 +356,7 @@ def classify_session_files(sessions: Sessions, files: Iterable[Path]) -> Iterato
 
 def _find(place: Path, head: SessionHead, files: list[Path]) -> Iterator[SourceFile]:
     try:
-        aside = discarded_recordings(place)
+        discarded = discarded_recordings(place)
     except (BadInput, OverflowError, RecursionError) as cause:
         # Only the log states which takes were repeated.
         yield from (SourceFile(path, "", reason=f"its {SESSION_LOG} cannot be used: {cause}") for path in files)
@@ -380,31 +364,24 @@ def _find(place: Path, head: SessionHead, files: list[Path]) -> Iterator[SourceF
     stream = place / STREAM_NAME
     mains = {p.with_suffix("").as_posix(): p for p in files if p == stream or parse_name(p.name) is not None}
     for path in files:
-
-        def found(
-            kind: str, reason: str = "", beside: Path | None = None, why: str = "", path: Path = path
-        ) -> SourceFile:
-            return SourceFile(
-                path, kind, head.subject, reason, head.session or place.name, beside=beside, set_aside=why
-            )
-
+        of_session = partial(SourceFile, path, subject=head.subject, session=head.session or place.name)
         name = path.name
         if path == stream:
-            yield found(STREAMS)
+            yield of_session(STREAMS)
         elif parse_name(name) is not None:
-            yield found(RECORDINGS, why=aside.get(name, ""))
+            yield of_session(RECORDINGS, set_aside=discarded.get(name, ""))
         elif path.parent == place and name in (SESSION_HEAD, SESSION_LOG):
-            yield found(COMPANIONS, beside=stream if stream in files else None)
+            yield of_session(COMPANIONS, beside=stream if stream in files else None)
         elif path.suffix in LEFT_OVER:
-            yield found(LEFT_OUT, LEFT_OVER[path.suffix])
+            yield of_session(LEFT_OUT, reason=LEFT_OVER[path.suffix])
         elif name.endswith(SIDECAR):
             main = mains.get(path.with_suffix("").as_posix())
             if main is None:
-                yield found(LEFT_OUT, "the sidecar of a recording that is not there")
+                yield of_session(LEFT_OUT, reason="the sidecar of a recording that is missing")
             else:
-                yield found(COMPANIONS, beside=main)
+                yield of_session(COMPANIONS, beside=main)
         else:
-            yield found("", "no file of a session: expected are recordings, their sidecars, the stream and the log")
+            yield of_session("", reason="no file of a session: expected are recordings, sidecars, stream and log")
 
 
 def people_of(sessions: Sessions) -> tuple[list[PersonInfo], list[str]]:
@@ -415,15 +392,14 @@ def people_of(sessions: Sessions) -> tuple[list[PersonInfo], list[str]]:
     for head in heads:
         values = {key: _plain(getattr(head, key)) for key in ("age_group", "gender", "consent")}
         before = people.get(head.subject)
-        if before is not None:
-            for key, value in values.items():
-                was = getattr(before, key)
-                if was and value and was != value:
-                    notes.append(
-                        f"the sessions of '{head.subject}' differ in {key.replace('_', ' ')} ('{was}', '{value}'): "
-                        "the latest is kept"
-                    )
-                values[key] = value or was
+        for key, value in values.items() if before is not None else ():
+            earlier = getattr(before, key)
+            if earlier and value and earlier != value:
+                notes.append(
+                    f"the sessions of '{head.subject}' differ in {key.replace('_', ' ')} ('{earlier}', '{value}'): "
+                    "the latest is kept"
+                )
+            values[key] = value or earlier
         people[head.subject] = PersonInfo(head.subject, values["age_group"], values["gender"], values["consent"])
     return list(people.values()), notes
 

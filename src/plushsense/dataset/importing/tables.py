@@ -1,15 +1,13 @@
-"""Import of one table with a row per sample: ``subject, [session], [recording], label, time`` and the channels.
+"""Import a table with a row per sample: ``subject, [session], [recording], label, time`` and the channels.
 
-Rows are taken person by person and session by session, in the order of the file. A recording is a run of rows with one
-label (and one ``recording``, where there is such a column); without that column it also ends where the time runs back
-or pauses for more than a second. Rows without a label belong to no recording; a session
-with such rows is also kept as a stream.
+Rows are read by person and session, in the order of the file. A recording is a run of rows with one label (and one
+``recording``, if there is such a column); without that column it also ends where the time runs backwards or pauses for
+more than a second. Rows without a label belong to no recording; a session with such rows is also written as a stream.
 """
 
 from __future__ import annotations
 
 import csv
-import hashlib
 import itertools
 import json
 from array import array
@@ -34,6 +32,7 @@ from plushsense.core.recorder_csv import (
     recording_filename,
     write_recording,
 )
+from plushsense.dataset.files import sha256_of
 from plushsense.dataset.importing.sources import COMPANIONS, SourceFile
 from plushsense.dataset.store import RECORDINGS, STREAMS
 
@@ -55,51 +54,39 @@ class LabelledSegment:
 
 @dataclass(frozen=True)
 class ConvertedSource:
-    """The file that recordings were converted from, and what ``origin.json`` states of it."""
+    """The file that recordings were converted from; ``more`` are further values of ``origin.json``."""
 
     path: Path
     display_name: str
     more: dict[str, Any]
 
     @cached_property
-    def sha256(self) -> str:
-        """SHA-256 of the file."""
-        with self.path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-
-    def to_json(self) -> str:
-        """Return the text of ``origin.json``."""
-        table = {"source": self.display_name, "sha256": self.sha256} | self.more
+    def text(self) -> str:
+        """The text of ``origin.json``."""
+        table = {"source": self.display_name, "sha256": sha256_of(self.path)} | self.more
         return json.dumps(table, ensure_ascii=False, indent=1) + "\n"
 
 
 def whole_steps(values: NDArray[np.float64], layout: Layout) -> tuple[NDArray[np.int64], str]:
     """Round values (T, C) to integer steps of the layout; also returns a warning if the steps are too coarse."""
-    steps = np.array([c.step for c in layout.channels])
-    scaled = values / steps
+    scaled = values / np.array([c.step for c in layout.channels])
     rounded = np.round(scaled)
-    if not len(values):
-        return rounded.astype(np.int64), ""
-    between = np.mean(np.abs(scaled - rounded) > _BETWEEN, axis=0) > 0.1
-    coarse = between & (np.std(scaled, axis=0) < _FEW_STEPS)
-    odd = [f"'{n}'" for n, is_odd in zip(layout.names, coarse, strict=True) if is_odd]
-    warning = (
-        f"{', '.join(odd)}: the values are small fractions of what layout '{layout.name}' counts in and were rounded "
-        "to it: give a layout with a smaller step"
-        if odd
-        else ""
-    )
+    warning = ""
+    if len(values):
+        between = np.mean(np.abs(scaled - rounded) > _BETWEEN, axis=0) > 0.1
+        coarse = between & (np.std(scaled, axis=0) < _FEW_STEPS)
+        if names := ", ".join(f"'{n}'" for n, is_coarse in zip(layout.names, coarse, strict=True) if is_coarse):
+            warning = (
+                f"{names}: the values are small fractions of the step of layout '{layout.name}' and were rounded to "
+                "it: give a layout with a smaller step"
+            )
     return np.clip(rounded, -LARGEST, LARGEST).astype(np.int64), warning
 
 
 def usable_rows(*columns: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return rows (T,) in which every value of every column is a number that a file can hold."""
-    good = np.ones(len(columns[0]), dtype=bool)
-    for column in columns:
-        # NaN compares as false.
-        fits = np.abs(column) < LARGEST
-        good &= fits.all(axis=1) if fits.ndim == 2 else fits
-    return good
+    # NaN compares as false.
+    return np.asarray(np.all(np.abs(np.column_stack(columns)) < LARGEST, axis=1))
 
 
 def write_session(
@@ -121,10 +108,10 @@ def write_session(
     where = f"{original.display_name}: {subject}{f', session {session}' if session else ''}"
     main: Path | None = None
     if layout.is_labelled:
-        apart = layout.csv.separator.strip() or " "
-        written = [" ".join(cut.label.replace(apart, "_").split()) for cut in cuts]
-        labels = np.full(len(frames), "", dtype=f"<U{max(map(len, written), default=1)}")
-        for cut, label in zip(cuts, written, strict=True):
+        separator = layout.csv.separator.strip() or " "
+        cells = [" ".join(cut.label.replace(separator, "_").split()) for cut in cuts]
+        labels = np.full(len(frames), "", dtype=f"<U{max(map(len, cells), default=1)}")
+        for cut, label in zip(cuts, cells, strict=True):
             labels[cut.start : cut.stop] = label
         frames = Frames(frames.values, frames.device_ms, frames.host_ms, labels)
         with_stream, cuts = True, ()
@@ -151,7 +138,7 @@ def write_session(
         write_recording(path, frames.slice(cut.start, cut.stop), layout)
         yield SourceFile(path, RECORDINGS, subject, session=session, origin=name)
     about = folder / ORIGIN
-    about.write_text(original.to_json(), encoding="utf-8", newline="\n")
+    about.write_text(original.text, encoding="utf-8", newline="\n")
     yield SourceFile(about, COMPANIONS, subject, session=session, origin=f"{where}, {ORIGIN}", beside=main)
 
 
@@ -179,7 +166,7 @@ class ImportedColumns:
     numbers: dict[str, NDArray[np.float64]]
     malformed: int = 0
     in_ms: bool = False
-    """The time is of a type that knows its unit, already in milliseconds."""
+    """Whether the time column had a type with a unit, so that the numbers are milliseconds."""
 
 
 def check_roles(columns: Mapping[str, str], layout: Layout) -> None:
@@ -191,10 +178,10 @@ def check_roles(columns: Mapping[str, str], layout: Layout) -> None:
 
 
 def choose_columns(there: list[str], layout: Layout, given: Mapping[str, str], display_name: str) -> dict[str, str]:
-    """Assign columns of ``there`` to roles and channels.
+    """Return the column of ``there`` for each role and channel.
 
     Raises:
-        FileFormatError: for a column that is missing, or there twice.
+        FileFormatError: for a missing column, or two of one name.
     """
     plain = [name.strip().casefold() for name in there]
     candidates: dict[str, tuple[str, ...]] = dict(ROLES)
@@ -257,7 +244,7 @@ def read_csv(path: Path, display_name: str, layout: Layout, given: Mapping[str, 
 
 def _number(text: str) -> float:
     try:
-        # Python alone takes 1_000 for a number.
+        # Only Python reads 1_000 as a number.
         return float(text) if "_" not in text else float("nan")
     except ValueError:
         return float("nan")
@@ -278,7 +265,11 @@ def read_parquet(path: Path, display_name: str, layout: Layout, given: Mapping[s
         nested = next((n for n in table.columns if table[n].dtype.is_nested()), None)
         if nested is not None:
             raise FileFormatError(f"'{display_name}' has more than one value in a cell of column '{nested}'")
-        texts = {r: _parquet_texts(pl, table[n]) for r, n in names.items() if r in _TEXTS}
+        texts = {
+            r: [text.strip() for text in table[n].cast(pl.String).fill_null("").to_list()]
+            for r, n in names.items()
+            if r in _TEXTS
+        }
         numbers = {r: _parquet_numbers(pl, table[n]) for r, n in names.items() if r not in _TEXTS}
         in_ms = table[names["time"]].dtype.is_temporal()
     except FileFormatError:
@@ -292,10 +283,6 @@ def read_parquet(path: Path, display_name: str, layout: Layout, given: Mapping[s
     return ImportedColumns(names, texts, numbers, in_ms=in_ms)
 
 
-def _parquet_texts(pl: Any, column: Any) -> list[str]:
-    return [text.strip() for text in column.cast(pl.String).fill_null("").to_list()]
-
-
 def _parquet_numbers(pl: Any, column: Any) -> NDArray[np.float64]:
     if column.dtype.is_temporal():
         microseconds = column.dt.total_microseconds() if column.dtype == pl.Duration else column.dt.epoch("us")
@@ -307,7 +294,7 @@ def _parquet_numbers(pl: Any, column: Any) -> NDArray[np.float64]:
 def milliseconds(name: str, times: NDArray[np.float64], rate_hz: float) -> tuple[float, str]:
     """Return milliseconds per unit of the time column, and a note if its name does not state the unit.
 
-    The unit is then the one that matches the layout's rate best; units differ by a factor of a thousand.
+    Then it is the unit that matches the layout's rate best.
     """
     plain = name.strip().casefold().rstrip(")")
     for unit, factor in _UNITS.items():
@@ -316,10 +303,10 @@ def milliseconds(name: str, times: NDArray[np.float64], rate_hz: float) -> tuple
     steps = np.diff(times[:100_000])
     forward = steps[np.isfinite(steps) & (steps > 0)]
     if not len(forward):
-        return 1.0, f"column '{name}' is taken for milliseconds"
+        return 1.0, f"column '{name}' is read as milliseconds"
     step = float(np.median(forward))
     unit = min(_UNITS, key=lambda u: abs(np.log(step * _UNITS[u] * rate_hz / 1000.0)))
-    return _UNITS[unit], f"column '{name}' is taken for {unit}, as the rate of {rate_hz:g} Hz suggests"
+    return _UNITS[unit], f"column '{name}' is read as {unit}, as the rate of {rate_hz:g} Hz suggests"
 
 
 def _codes(texts: Iterable[str]) -> tuple[NDArray[np.int64], list[str]]:
@@ -329,13 +316,10 @@ def _codes(texts: Iterable[str]) -> tuple[NDArray[np.int64], list[str]]:
     return np.array(numbers, dtype=np.int64), list(known)
 
 
-READERS = {".csv": read_csv, ".parquet": read_parquet}
-
-
 def read_table(
     path: Path, display_name: str, folder: Path, subject: str | None, layout: Layout, given: Mapping[str, str]
 ) -> Iterator[SourceFile | str]:
-    """Write a table's recordings into the new ``folder``; yields the files, and warnings.
+    """Write a table's recordings into the new ``folder``; yield the files, and warnings.
 
     ``subject`` is the person if the table has no such column.
 
@@ -343,7 +327,8 @@ def read_table(
         FileFormatError: for a table that cannot be read, or lacks a column.
         MissingExtraError: for Parquet without polars.
     """
-    columns = READERS[path.suffix.lower()](path, display_name, layout, given)
+    read = read_parquet if path.suffix.lower() == ".parquet" else read_csv
+    columns = read(path, display_name, layout, given)
     if "subject" not in columns.names and subject is None:
         raise FileFormatError(
             f"'{display_name}' has no column 'subject': name the right one with --column subject=NAME, or the person "
@@ -378,7 +363,7 @@ def read_table(
     values, note = whole_steps(raw[good], layout)
     if note:
         yield f"{display_name}: {note}"
-    whole = Frames(values, np.round(device[good]).astype(np.int64), np.round(host[good]).astype(np.int64))
+    device_ms, host_ms = (np.round(clock[good]).astype(np.int64) for clock in (device, host))
     people, sessions, labels, takes = people[good], sessions[good], labels[good], takes[good]
     named = np.array([bool(plain_label(n)) and len(n) <= LONGEST_LABEL for n in label_names], dtype=bool)
     group = people * len(session_names) + sessions
@@ -387,7 +372,7 @@ def read_table(
     original = ConvertedSource(path, display_name, {"columns": columns.names})
     for number, (first, last) in enumerate(itertools.pairwise(edges)):
         mine = order[first:last]
-        frames = Frames(whole.values[mine], whole.device_ms[mine], host_ms=_rows(whole.host_ms, mine))
+        frames = Frames(values[mine], device_ms[mine], host_ms[mine])
         new = (np.diff(labels[mine]) != 0) | (np.diff(takes[mine]) != 0)
         if "recording" not in columns.names:
             steps = np.diff(frames.device_ms)
@@ -405,7 +390,3 @@ def read_table(
             original,
             with_stream=not labelled.all(),
         )
-
-
-def _rows(column: NDArray[np.int64] | None, rows: NDArray[np.int64]) -> NDArray[np.int64] | None:
-    return None if column is None else column[rows]

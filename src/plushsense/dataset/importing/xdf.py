@@ -1,7 +1,7 @@
-"""Import of XDF files (LabRecorder): the stream that fits the layout, cut into recordings by markers.
+"""Import XDF files (LabRecorder): the stream that fits the layout, cut into recordings by markers.
 
-A marker that names a gesture begins a recording; the next marker, whatever it says, ends it (``end`` and ``stop`` do
-only that), and so does the end of the stream. ``start Tail pull``, ``Tail pull/begin``, ``end Tail pull`` and the like
+A marker that names a gesture begins a recording; any next marker, or the end of the stream, ends it (``end`` and
+``stop`` do only that). ``start Tail pull``, ``Tail pull/begin``, ``end Tail pull`` and the like
 are understood. Without a gesture set every marker but ``end`` and ``stop`` is a gesture.
 """
 
@@ -142,44 +142,30 @@ def complete_chunks(path: Path) -> tuple[int, int]:
 
 
 def _sample_bytes(header: bytes) -> int:
-    """Return the least bytes of a sample of a stream by its header: time stamp flag and values."""
+    """Return the minimum size of a sample by the header of its stream: time stamp flag and values."""
     count = re.search(rb"<channel_count>\s*(\d{1,6})\s*</", header)
     kind = re.search(rb"<channel_format>\s*(\w+)\s*</", header)
     size = _SIZES.get(kind[1].decode("ascii", "replace")) if kind else None
     if count is None or size is None:
-        raise FileFormatError("a stream's header says no channels")
+        raise FileFormatError("a stream's header names no channels")
     return 1 + int(count[1]) * size
 
 
-class _FirstBytes(io.RawIOBase):
+class _FirstBytes(io.FileIO):
     """The first bytes of a file, as if it ended there."""
 
     def __init__(self, path: Path, length: int):
-        self._file = path.open("rb", buffering=0)
-        self._left = length
+        super().__init__(path)
         self._length = length
-
-    def readable(self) -> bool:
-        return True
-
-    def seekable(self) -> bool:
-        return True
-
-    def tell(self) -> int:
-        return self._file.tell()
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
         if whence == os.SEEK_END:
             offset, whence = offset + self._length, os.SEEK_SET
-        return self._file.seek(offset, whence)
+        return super().seek(offset, whence)
 
     def readinto(self, buffer: Any) -> int:
-        left = max(0, self._length - self._file.tell())
-        return self._file.readinto(memoryview(buffer)[:left])
-
-    def close(self) -> None:
-        self._file.close()
-        super().close()
+        left = max(0, self._length - self.tell())
+        return super().readinto(memoryview(buffer)[:left]) or 0
 
 
 def _load(path: Path, length: int) -> list[dict[str, Any]]:
@@ -222,7 +208,7 @@ def match_columns(layout: Layout, labels: list[str], width: int) -> tuple[list[i
     if set(keys) & set(layout.names):
         missing = [n for n in layout.names if keys.count(n) != 1]
         if missing:
-            return f"its labels name {', '.join(missing)} not once"
+            return f"its labels do not name {', '.join(missing)} exactly once"
         return [keys.index(n) for n in layout.names], keys.index(DEVICE_MS) if DEVICE_MS in keys else None
     if width == layout.n_channels:
         return list(range(width)), None
@@ -266,7 +252,7 @@ def read_xdf(
     gestures: GestureSet | None,
     stream_name: str = "",
 ) -> Iterator[SourceFile | str]:
-    """Write the recordings of an XDF file into the new ``folder``; yields the files, and warnings.
+    """Write the recordings of an XDF file into the new ``folder``; yield the files, and warnings.
 
     ``stream_name`` selects one of several streams that fit the layout.
 
@@ -277,7 +263,7 @@ def read_xdf(
     good, size = complete_chunks(path)
     streams = _load(path, good)
     if good < size:
-        yield f"{display_name}: cut off or damaged from byte {good} of {size} on; what was before is taken"
+        yield f"{display_name}: cut off or damaged from byte {good} of {size} on; the bytes before are used"
     texts = [s for s in streams if _text(s, "channel_format") == "string"]
     fitting, others = [], []
     for stream in streams:
@@ -290,7 +276,7 @@ def read_xdf(
         elif not len(stream["time_stamps"]):
             others.append((name, "it is empty"))
         elif stream_name and name != stream_name:
-            others.append((name, f"the stream '{stream_name}' was asked for"))
+            others.append((name, f"the stream '{stream_name}' was selected"))
         else:
             fitting.append((stream, name, *columns))
     if len(fitting) != 1:
@@ -309,7 +295,7 @@ def read_xdf(
         listed = ", ".join(f"'{u[:40]}'" for u in dict.fromkeys(unknown[:20]))
         notes.append(f"{len(unknown)} markers name no gesture and begin no recording: {listed}")
     if not cuts:
-        notes.append("no marker names a gesture: only the stream is taken")
+        notes.append("no marker names a gesture: only the stream is imported")
     yield from (f"{display_name}: {note}" for note in notes)
     if not len(frames):
         raise FileFormatError(f"the stream '{name}' has no sample with a number in every channel")

@@ -1,4 +1,4 @@
-"""Pseudonymising: a copy of a data set with random codes and shifted dates; the key stays outside.
+"""Copy a data set with random codes and shifted dates; the key stays outside of the copy.
 
 Sensor values stay the same byte for byte. `pseudonyms` shifts the dates in the rows, `redaction` rewrites texts, and
 `find_traces` searches the result for remains of the originals. Caches, evaluations and unknown files are not copied.
@@ -7,7 +7,7 @@ Sensor values stay the same byte for byte. `pseudonyms` shifts the dates in the 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -22,9 +22,8 @@ from plushsense.core.gestures import NOBODY
 from plushsense.core.layouts import DEVICE_MS, HOST_MS, Layout
 from plushsense.core.recorder_csv import ReadResult, parse_name, read_recording, read_stream
 from plushsense.dataset.files import STAMP, DatasetFile, list_files, match_code, person_folders
-from plushsense.dataset.index import DUPLICATE_FOLDER, Progress, build_index, open_dataset, write_index_files
+from plushsense.dataset.index import DUPLICATE_FOLDER, build_index, open_dataset, write_index_files
 from plushsense.dataset.marks import MARKS
-from plushsense.dataset.people import PEOPLE, read_people, write_people
 from plushsense.dataset.privacy.pseudonyms import (
     KEPT,
     Pseudonym,
@@ -46,9 +45,20 @@ from plushsense.dataset.privacy.redaction import (
     redact_json,
     redact_marks,
     redact_people,
-    subjects_in,
+    subject_in,
 )
-from plushsense.dataset.store import HEAD, RECORDINGS, STREAMS, Dataset, DatasetHead, RecordingInfo
+from plushsense.dataset.store import (
+    HEAD,
+    PEOPLE,
+    RECORDINGS,
+    STREAMS,
+    Dataset,
+    DatasetHead,
+    Progress,
+    RecordingInfo,
+    read_people,
+    write_people,
+)
 
 NAME = "[name]"
 _SAME = "the same content as "
@@ -57,10 +67,7 @@ _SHOWN = 5
 
 @dataclass
 class PseudonymisationResult:
-    """Result of pseudonymising.
-
-    ``findings`` are for a person to read: {file, line, message}, files by their new names.
-    """
+    """Result of pseudonymising; ``findings`` are for a person to review: {file, line, message}, with new file names."""
 
     dataset: Dataset
     files: int
@@ -95,14 +102,14 @@ def pseudonymise(
     """Create a pseudonymised copy of a data set at ``out``; the original is not changed.
 
     Args:
-        key: the key file ``original,code,shift_s``, outside of both data sets. One that is there is added to, so that
-            a person keeps the code of an earlier run.
-        words: more that may not be left anywhere, such as first names; each becomes ``[name]``.
-        drop_notes: leave out what people wrote freely (notes, the reasons of marks).
-        progress: called with (raw files done, in all).
+        key: the key file ``original,code,shift_s``, outside of both data sets. An existing one is extended, so that a
+            person keeps the code of an earlier run.
+        words: more words to replace everywhere by ``[name]``, such as first names.
+        drop_notes: leave out free text (notes, the reasons of marks).
+        progress: called with (raw files done, raw files in all).
 
     Raises:
-        DatasetError: for a key or an ``out`` in a wrong place, and when the last look still finds an old code or time;
+        DatasetError: for a key or an ``out`` in a wrong place, or when the result still contains an old code or time;
             then nothing is left at ``out``.
     """
     folder, dest, key = Path(dataset), Path(out), Path(key)
@@ -111,7 +118,7 @@ def pseudonymise(
     try:
         key.parent.mkdir(parents=True, exist_ok=True)
         with FileLock(key.with_name(key.name + ".lock")):
-            return _Pseudonymisation(folder, source, key, tuple(words), drop_notes, progress).run(dest)
+            return _Pseudonymisation(source, key, words, drop_notes, progress).run(dest)
     except OSError as cause:
         raise DatasetError(
             f"'{cause.filename or folder}' cannot be used ({cause.strerror or cause}): check the path and the disk."
@@ -127,8 +134,8 @@ def _refuse_places(folder: Path, dest: Path, key: Path) -> None:
     inside = next((p for p in secret.parents if p in (real, target) or (p / HEAD).is_file()), None)
     if inside is not None:
         raise DatasetError(
-            f"The key file '{key}' would lie in the data set '{inside}': whoever gets the data would get the key too; "
-            "keep it elsewhere."
+            f"The key file '{key}' would lie in the data set '{inside}', so that everybody who gets the data gets the "
+            "key: choose a place outside."
         )
 
 
@@ -137,15 +144,15 @@ class _Pseudonymisation:
 
     def __init__(
         self,
-        folder: Path,
         source: Dataset,
         key: Path,
-        words: tuple[str, ...],
+        words: Iterable[str],
         drop_notes: bool,
         progress: Progress | None,
     ) -> None:
-        self.folder, self.source, self.key, self.progress = folder, source, key, progress
-        self.found = ReviewNotes()
+        folder = self.folder = source.path
+        self.source, self.key, self.progress = source, key, progress
+        self.notes = ReviewNotes()
         files = list_files(folder)
         self.table = read_people(folder)
         self.people = person_folders(folder)
@@ -159,21 +166,20 @@ class _Pseudonymisation:
                 continue
             person = self._pseudonym(content.person) if content.person else None
             for _, value in read_lines(folder / content.path):
-                for alias in subjects_in(value):
-                    if person is not None and alias not in KEPT and person.original not in KEPT:
-                        instead.setdefault(alias, person.code)
+                alias = subject_in(value)
+                if alias and person is not None and alias not in KEPT and person.original not in KEPT:
+                    instead.setdefault(alias, person.code)
                 for login in logins_in(value):
-                    role = roles.setdefault(login.casefold(), f"person-{len(roles) + 1}")
-                    instead.setdefault(login, role)
+                    instead.setdefault(login, roles.setdefault(login.casefold(), f"person-{len(roles) + 1}"))
         self.names = NamePatterns(instead)
         self._rewordings = {
-            p.original: Redactor(self.names, roles, p.code, p.shift_ms, self.found, drop_notes)
+            p.original: Redactor(self.names, roles, p.code, p.shift_ms, self.notes, drop_notes)
             for p in self.codes.values()
         }
         # Write in the order of the codes, so that times on the disk do not reveal the old order.
         self.files = sorted(files, key=lambda c: (self._pseudonym(c.person).code if c.person else "", c.path))
         if self.names.too_short:
-            self.found.add("", f"too short to be looked for in texts: {_listed(self.names.too_short)}; read the notes")
+            self.notes.add("", f"too short to be searched in texts: {_listed(self.names.too_short)}; read the notes")
 
     def _pseudonym(self, person: str) -> Pseudonym:
         return self.codes.get(person) or self.codes[match_code(person, self.people) or NOBODY]
@@ -193,22 +199,23 @@ class _Pseudonymisation:
             old = [p for p in self.people if p not in KEPT]
             for file, what in find_traces(work, old, self.names, times):
                 raise DatasetError(
-                    f"'{file}' would still hold '{what}': nothing was made. Where that is a gesture's label or another "
-                    "word of the data, rename the person or the gesture first; a file that should not be there, remove."
+                    f"'{file}' would still hold '{what}': nothing was written. If that is a gesture's label or another "
+                    "word of the data, rename the person or the gesture first; if the file does not belong there, "
+                    "remove it."
                 )
             files = len(list_files(work))
             write_key(self.key, self.codes)
-        if self.found.prose:
-            self.found.add("", f"{self.found.prose} notes in free words were kept: names are replaced, but read them")
+        if self.notes.prose:
+            self.notes.add("", f"{self.notes.prose} notes in free text were kept: names are replaced, but read them")
         words = sorted({s for new in self.moved.values() for s in PurePosixPath(new).parts[2:-1] if _in_words(s)})
         if words:
-            self.found.add(
+            self.notes.add(
                 "",
-                f"names of sessions that are words stay as they are: {_listed(words)}; where one tells who somebody "
-                "is, put that word into --words",
+                f"names of sessions that are words stay as they are: {_listed(words)}; if one identifies a person, add "
+                "it to --words",
             )
         result = Dataset(dest, made.head, made.recordings, made.streams)
-        return PseudonymisationResult(result, files, self.found.merged(), self.key)
+        return PseudonymisationResult(result, files, self.notes.merged(), self.key)
 
     def _raw_files(self, work: Path) -> NDArray[np.int64]:
         """Rewrite the raw files, each verified against its original; returns every time found in them."""
@@ -225,11 +232,11 @@ class _Pseudonymisation:
             target = work / new
             target.parent.mkdir(parents=True, exist_ok=True)
             target.write_bytes(shifted_rows(old.read_bytes(), self.source.layout, clocks, shift_ms, old))
-            times += _clocks(before, clocks).values()
+            times += clocks.values()
             if not _same(before, reader(target, self.source.layout), clocks, shift_ms):
                 raise DatasetError(
-                    f"The times in '{content.path}' cannot be moved without changing something else: nothing was made; "
-                    "exclude the file or report it."
+                    f"The times in '{content.path}' cannot be shifted without changing something else: nothing was "
+                    "written; exclude the file or report it."
                 )
             if self.progress is not None:
                 self.progress(done, len(raw))
@@ -249,7 +256,7 @@ class _Pseudonymisation:
         for content in self.files:
             path = self.folder / content.path
             if content.path.name == ORIGIN:
-                self.found.add("", f"'{ORIGIN}' of a converted file was left out: it names the file that it came from")
+                self.notes.add("", f"'{ORIGIN}' of a converted file was left out: it names the file that it came from")
             elif content.kind == "words" and content.person:
                 new = self._place(content)
                 text = redact_json(path, new.as_posix(), self._words(content.person))
@@ -257,7 +264,7 @@ class _Pseudonymisation:
                     (work / new).parent.mkdir(parents=True, exist_ok=True)
                     (work / new).write_text(text, encoding="utf-8", newline="\n")
             elif content.kind == "marks":
-                text = redact_marks(path, self._words_of_id, self._renamed, self.found)
+                text = redact_marks(path, self._words_of_id, self._renamed, self.notes)
                 (work / MARKS).write_text(text, encoding="utf-8", newline="\n")
             elif content.kind == "people":
                 write_people(work, redact_people(self.table.values(), self._words, PEOPLE))
@@ -266,7 +273,7 @@ class _Pseudonymisation:
             elif content.kind in ("other", "link", "words"):
                 left.append(content.path.as_posix())
         if left:
-            self.found.add("", f"not taken along, nobody knows what is in them: {_listed(left)}")
+            self.notes.add("", f"not copied, since their contents are not known: {_listed(left)}")
 
     def _words_of_id(self, identity: str) -> Redactor | None:
         if not identity:
@@ -293,33 +300,23 @@ class _Pseudonymisation:
         new = {r.id: r for r in made.recordings}
         wrong = sorted(old.keys() ^ new.keys()) or [i for i in old if not self._agrees(old[i], new[i])]
         if wrong or len(made.streams) != len(self.source.streams):
-            raise DatasetError(f"The new data set would not say the same as the old one ({_listed(wrong)}): report it.")
+            raise DatasetError(f"The new data set would differ from the old one ({_listed(wrong)}): report it.")
         across = [r for r in self.source.recordings for f in r.flags if f.startswith(_SAME)]
         lost = [r for r in across if not any(f.startswith(_SAME) for f in new[self._renamed(r.id)].flags)]
         if lost:
-            self.found.add(
+            self.notes.add(
                 "",
-                f"{len(lost)} recordings have the same content as one of another person; with their dates moved apart "
-                "that can no longer be seen: look into it in the original",
+                f"{len(lost)} recordings have the same content as one of another person, which their different shifts "
+                "of time now hide: check them in the original",
             )
 
     def _agrees(self, old: RecordingInfo, new: RecordingInfo) -> bool:
         def facts(r: RecordingInfo) -> tuple[Any, ...]:
             flags = [re.sub(r"\d{12,}", "", f) for f in r.flags if not f.startswith(_SAME)]
-            return (
-                r.gesture,
-                r.first_row,
-                r.rows,
-                r.start,
-                r.stop,
-                r.stream_row,
-                r.excluded,
-                round(r.rate_hz, 3),
-                flags,
-            )
+            keys = ("gesture", "first_row", "rows", "start", "stop", "stream_row", "excluded")
+            return *(getattr(r, key) for key in keys), round(r.rate_hz, 3), flags
 
-        stream = self._renamed(old.stream)
-        return facts(old) == facts(new) and new.stream == stream
+        return facts(old) == facts(new) and new.stream == self._renamed(old.stream)
 
 
 def _in_words(session: str) -> bool:
@@ -332,25 +329,18 @@ def _in_words(session: str) -> bool:
 
 def _listed(names: Iterable[str]) -> str:
     listed = list(names)
-    return ", ".join(f"'{n}'" for n in listed[:_SHOWN]) + (
-        f" and {len(listed) - _SHOWN} more" if len(listed) > _SHOWN else ""
-    )
+    more = f" and {len(listed) - _SHOWN} more" if len(listed) > _SHOWN else ""
+    return ", ".join(f"'{n}'" for n in listed[:_SHOWN]) + more
 
 
-def _clocks(read: ReadResult, columns: Iterable[str]) -> dict[str, NDArray[np.int64]]:
-    held = {HOST_MS: read.frames.host_ms, DEVICE_MS: read.frames.device_ms}
-    return {c: column for c in columns if (column := held[c]) is not None}
+def _dated_columns(read: ReadResult, layout: Layout) -> dict[str, NDArray[np.int64]]:
+    """Return the time columns of a file that hold dates, by name."""
+    device_ms = None if read.integrated or DEVICE_MS not in layout.csv.columns else read.frames.device_ms
+    columns = {HOST_MS: read.frames.host_ms, DEVICE_MS: device_ms}
+    return {name: column for name, column in columns.items() if column is not None and holds_dates(column)}
 
 
-def _dated_columns(read: ReadResult, layout: Layout) -> tuple[str, ...]:
-    """Return the time columns of a file that hold dates."""
-    frames = read.frames
-    own = DEVICE_MS in layout.csv.columns and not read.integrated
-    held = ((HOST_MS, frames.host_ms), (DEVICE_MS, frames.device_ms if own else None))
-    return tuple(name for name, column in held if column is not None and holds_dates(column))
-
-
-def _same(before: ReadResult, after: ReadResult, columns: tuple[str, ...], shift_ms: int) -> bool:
+def _same(before: ReadResult, after: ReadResult, columns: Collection[str], shift_ms: int) -> bool:
     """Return whether two readings differ only in the shifted dates."""
     a, b = before.frames, after.frames
     if len(a) != len(b) or before.warnings != after.warnings or not np.array_equal(a.values, b.values):
@@ -363,7 +353,7 @@ def _same(before: ReadResult, after: ReadResult, columns: tuple[str, ...], shift
         if old is None or new is None:
             continue
         moved = np.where(old >= 10**11, old + shift_ms, old) if name in columns else old
-        # Other values in a column of dates are fragments of dates and became zeros.
+        # Other values in a column of dates are fragments of dates, which became zeros.
         if not np.array_equal(moved[old >= 10**11], new[old >= 10**11]):
             return False
         if name not in columns and not np.array_equal(old, new):
@@ -388,10 +378,11 @@ def _words(data: bytes) -> str:
 def find_traces(
     folder: Path, originals: Iterable[str], names: NamePatterns, times: NDArray[np.int64]
 ) -> Iterator[tuple[str, str]]:
-    """Find what is left of the originals, each as (file, text).
+    """Find remains of the originals, each as (file, text).
 
     Args:
-        originals: the old codes, which no folder of a person may bear; names: what no file may hold.
+        originals: the old codes, which must not be folders of people.
+        names: the words that no file may contain.
         times: every time of the original files, in ms since 1970.
     """
     old = set(originals)

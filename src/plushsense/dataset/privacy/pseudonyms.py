@@ -1,6 +1,6 @@
-"""Pseudonyms: the key file, and shifting dates in numbers, in text and in the time columns of raw files.
+"""Keep the key file of pseudonyms, and shift dates in numbers, in text and in the time columns of raw files.
 
-A number is a date if it is milliseconds since 1970 and after 1990; the counter of a toy since it was switched on never
+A number is a date if, as milliseconds since 1970, it is after 1990; the counter of a toy since it was switched on never
 reaches that.
 """
 
@@ -10,7 +10,7 @@ import csv
 import io
 import re
 import secrets
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from decimal import Decimal, InvalidOperation
@@ -188,13 +188,12 @@ def shifted_rows(data: bytes, layout: Layout, columns: Collection[str], shift_ms
             return b"".join([*out, text[done:]])
         tokens = list(_TOKEN.finditer(text))
         whole = len(tokens) == len(keys) or (keys[-1] == "label" and len(tokens) > len(keys))
-        out, done = [], 0
-        for i, token in enumerate(tokens):
-            change: Callable[[bytes, int], bytes] | None = _cell if i in at else None if whole else _stray
-            if change is not None:
-                out += [text[done : token.start()], change(token.group(), shift_ms)]
-                done = token.end()
-        return b"".join([*out, text[done:]])
+        # From the right, so that the places of the other cells stay.
+        for i, token in reversed([*enumerate(tokens)]):
+            if i in at or not whole:
+                change = _cell if i in at else _stray
+                text = text[: token.start()] + change(token.group(), shift_ms) + text[token.end() :]
+        return text
 
     return data[:start] + _LINE.sub(line, data[start:])
 
@@ -239,17 +238,19 @@ def read_key(path: Path) -> dict[str, Pseudonym]:
     except FileNotFoundError:
         return {}
     except (OSError, UnicodeDecodeError, csv.Error) as cause:
-        raise DatasetError(f"The key file '{path}' cannot be read ({cause}): bring it back from a copy.") from None
+        raise DatasetError(f"The key file '{path}' cannot be read ({cause}): restore it from a copy.") from None
     if not rows or rows[0] != COLUMNS:
         raise DatasetError(
-            f"'{path}' is no key file (it does not begin with {','.join(COLUMNS)}): name a file that is not there yet, "
-            "or the key of an earlier run; nothing is overwritten."
+            f"'{path}' is no key file (it does not begin with {','.join(COLUMNS)}): name a new file, or the key of an "
+            "earlier run; nothing is overwritten."
         )
     key: dict[str, Pseudonym] = {}
     codes: set[str] = set()
     for number, row in enumerate(rows[1:], 2):
         if len(row) != 3 or not row[0] or not row[1] or not row[2].lstrip("-").isdigit():
-            raise DatasetError(f"The key file '{path}' line {number} is no  {','.join(COLUMNS)}: bring it back whole.")
+            raise DatasetError(
+                f"The key file '{path}' line {number} is no  {','.join(COLUMNS)}: restore it from a copy."
+            )
         if row[0] in key or (row[1].casefold() in codes):
             raise DatasetError(f"The key file '{path}' line {number} names '{row[0]}' or its code twice.")
         codes.add(row[1].casefold())

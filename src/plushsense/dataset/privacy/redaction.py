@@ -1,4 +1,4 @@
-"""Redaction of texts: names, codes, dates, logins and addresses in session files, marks, people and the head.
+"""Redact texts: names, codes, dates, logins and addresses in session files, marks, people and the head.
 
 Codes and names are replaced, dates shifted, logins become roles, and addresses of toys and computers are dropped.
 """
@@ -10,7 +10,8 @@ import re
 import unicodedata
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +20,8 @@ import tomli_w
 from plushsense.core.errors import DatasetError
 from plushsense.core.toml import read_toml
 from plushsense.dataset.files import normalize_code
-from plushsense.dataset.people import PersonInfo
 from plushsense.dataset.privacy.pseudonyms import FIRST_MS, shifted_number, shifted_text
-from plushsense.dataset.store import HEAD
+from plushsense.dataset.store import HEAD, PersonInfo
 
 _BEFORE, _AFTER = r"(?<![^\W_])", r"(?![^\W_])"
 _PIECES = re.compile(r"[^\W\d_]+|\d+")
@@ -55,7 +55,7 @@ def _pattern(word: str) -> str:
 class NamePatterns:
     """Words to search for and their replacements: whole words, in any case, with ``_``, ``-`` or blanks inside.
 
-    Words that are too short to be looked for (`searchable`) are in ``too_short``.
+    Words that are too short for that (`is_searchable`) are in ``too_short``.
     """
 
     def __init__(self, instead: Mapping[str, str]) -> None:
@@ -93,7 +93,7 @@ def without_addresses(text: str) -> str:
 
 ON_FILE = "on file"
 ORIGIN = "origin.json"
-"""What the importer writes of a file that it converted: the name that somebody gave it, and its hash."""
+"""File of the importer with the name and hash of the file that it converted."""
 _MENDED = "mended"
 LOGINS = frozenset({"who", "by", "user", "author", "leader", "operator", "recorded_by"})
 _SUBJECT, _CONSENT = "subject", "consent"
@@ -170,22 +170,20 @@ class Redactor:
             return [self.value(v, key, where) for v in value]
         if isinstance(value, str):
             return self._string(value, key.casefold(), where)
-        if isinstance(value, bool) or value is None:
-            return value
-        if isinstance(value, int | float):
+        if isinstance(value, int | float) and not isinstance(value, bool):
             return self._number(value, key.casefold())
         return value
 
     def _string(self, value: str, key: str, where: tuple[str, int]) -> str:
+        if not value:
+            return value
         if key in LOGINS:
             return self.role(value)
-        if key == _SUBJECT:
-            return self.code if value else value
-        if key == _CONSENT:
-            return ON_FILE if value else value
+        if key in (_SUBJECT, _CONSENT):
+            return self.code if key == _SUBJECT else ON_FILE
         if key in _PLACES:
             return without_addresses(value) if "://" in value else ""
-        if key in PROSE and value:
+        if key in PROSE:
             if self.drop_notes:
                 return ""
             self.findings.prose += 1
@@ -211,10 +209,10 @@ def logins_in(value: Any, key: str = "") -> Iterator[str]:
         yield value
 
 
-def subjects_in(value: Any) -> Iterator[str]:
-    """Yield the name of the person in a session's head."""
-    if isinstance(value, dict) and isinstance(value.get(_SUBJECT), str) and value[_SUBJECT]:
-        yield value[_SUBJECT]
+def subject_in(value: Any) -> str:
+    """Return the person in a session's head; "" if there is none."""
+    subject = value.get(_SUBJECT) if isinstance(value, dict) else None
+    return subject if isinstance(subject, str) else ""
 
 
 def read_lines(path: Path) -> Iterator[tuple[int, Any]]:
@@ -271,29 +269,23 @@ def redact_people(people: Iterable[PersonInfo], words_of: Callable[[str], Redact
     """Yield the people's table with codes; a consent reference becomes "on file", since it leads to a signed name."""
     for person in people:
         words = words_of(person.subject)
-        more = {key: words.text(value, (file, 0)) for key, value in person.more.items()}
-        yield replace(
-            person,
-            subject=words.code,
-            age_group=words.text(person.age_group, (file, 0)),
-            gender=words.text(person.gender, (file, 0)),
-            consent=ON_FILE if person.consent else "",
-            more=more,
-        )
+        redact = partial(words.text, where=(file, 0))
+        more = {key: redact(value) for key, value in person.more.items()}
+        consent = ON_FILE if person.consent else ""
+        yield PersonInfo(words.code, redact(person.age_group), redact(person.gender), consent, more)
 
 
 def redact_head(folder: Path, words: Redactor) -> str:
     """Return the redacted ``dataset.toml``; layout and gesture set stay as they are."""
     table = read_toml(folder / HEAD, "data set", DatasetError)
-    kept = ("layout", "gesture_set", "format")
-    out = {key: value if key in kept else _texts(value, words) for key, value in table.items()}
-    return tomli_w.dumps(out)
+    unchanged = ("layout", "gesture_set", "format")
+    return tomli_w.dumps({k: v if k in unchanged else _redact_texts(v, words) for k, v in table.items()})
 
 
-def _texts(value: Any, words: Redactor) -> Any:
-    """Redact a value of the head: its authors are meant to be named, so only people's codes and dates change."""
+def _redact_texts(value: Any, words: Redactor) -> Any:
+    """Redact a value of the head; its authors stay, so that only people's codes and dates change."""
     if isinstance(value, dict):
-        return {key: _texts(v, words) for key, v in value.items()}
+        return {key: _redact_texts(v, words) for key, v in value.items()}
     if isinstance(value, list):
-        return [_texts(v, words) for v in value]
+        return [_redact_texts(v, words) for v in value]
     return words.text(value, (HEAD, 0)) if isinstance(value, str) else value

@@ -1,8 +1,8 @@
-"""Validation of a package: every validator reads every file, without network access.
+"""Validate a package: every validator reads every file, without network access.
 
-checksums    every file is there, unchanged, and no other
+checksums    every file exists and is unchanged, and there are no others
 data         the recordings are readable, the tables agree with them, and nothing private is included
-times        no unshifted time is left
+times        every time is shifted
 metadata     title, version, licence and day are the same in every metadata file
 croissant    mlcroissant accepts the metadata and loads back, bit for bit, what the files hold
 frictionless frictionless accepts the descriptor and every cell has the type that its schema says
@@ -30,106 +30,23 @@ from plushsense.core.recorder_csv import SIMULATION_MARK, parse_name, read_strea
 from plushsense.dataset.files import sha256_of
 from plushsense.dataset.index import IndexBuild, build_index
 from plushsense.dataset.marks import MARKS
-from plushsense.dataset.people import PEOPLE, read_people
 from plushsense.dataset.publishing.contents import LATEST_MS, WALL_CLOCK_MS, PackageContents
 from plushsense.dataset.publishing.croissant import (
     CROISSANT_CONFORMS_TO,
     CROISSANT_FILE,
-    ReportProblem,
     compare_records,
 )
 from plushsense.dataset.publishing.description import CHECKSUMS, DATA, Description, find_licence
 from plushsense.dataset.publishing.metadata import CRATE_FILE, DATACITE_FILE, DATACITE_XML_FILE, DATAPACKAGE_FILE
 from plushsense.dataset.publishing.tables import build_tables, list_package_files, open_package, read_checksums
-from plushsense.dataset.store import Dataset, DatasetHead
+from plushsense.dataset.store import PEOPLE, DatasetHead, read_people
 
 # The wording of findings may differ between versions.
 _NOT_COMPARED = ("flags",)
 
 
-def compare_tables(root: Path, dataset: Dataset, report: ReportProblem) -> None:
-    """Compare every cell of the tables with the data folder."""
-    contents = PackageContents(dataset, read_people(dataset.path), {}, ())
-    for table, expected in build_tables(contents):
-        with (root / table.file).open(encoding="utf-8", newline="") as file:
-            have = _keyed(file, table.key)
-        want = _keyed(io.StringIO(expected), table.key)
-        for key in want.keys() - have.keys():
-            report(table.file, f"'{key}' is in the data but not in the table")
-        for key, row in have.items():
-            if key not in want:
-                report(table.file, f"'{key}' is in the table but not in the data")
-                continue
-            for column in [*want[key], *(c for c in row if c not in want[key])]:
-                value, due = row.get(column), want[key].get(column)
-                if value != due and column not in _NOT_COMPARED:
-                    report(table.file, f"'{key}' has {column} {value!r}; the data say {due!r}")
-
-
 def _keyed(file: Any, key: str) -> dict[str, dict[str, str]]:
     return {row.get(key) or "": row for row in csv.DictReader(file)}
-
-
-def find_private(dataset: Dataset, report: ReportProblem) -> None:
-    """Find private data: who marked, when and why, and references of consent forms."""
-    if any(p.consent for p in read_people(dataset.path).values()):
-        report(f"{DATA}/{PEOPLE}", "holds references of consent forms, which do not leave")
-    path = dataset.path / MARKS
-    for number, line in enumerate(path.read_bytes().splitlines() if path.is_file() else (), 1):
-        try:
-            mark = json.loads(line)
-            private = [key for key in ("who", "why", "when") if mark.get(key)]
-        except (ValueError, AttributeError):
-            report(f"{DATA}/{MARKS}", f"line {number} is no mark")
-            continue
-        if private:
-            report(f"{DATA}/{MARKS}", f"line {number} says {' and '.join(private)} of a mark, which does not leave")
-
-
-def compare_metadata(root: Path, dataset: Dataset, load: Callable[[str], Any], report: ReportProblem) -> int:
-    """Compare title, version, licence and day in every metadata file with ``dataset.toml`` and each other.
-
-    Returns:
-        How many statements were compared.
-    """
-    head = dataset.head
-    d = Description(dataset, find_licence(head.licence), head.about, head.consent, "", ())
-    croissant, package, cited = (load(f) for f in (CROISSANT_FILE, DATAPACKAGE_FILE, DATACITE_FILE))
-    crate = next((e for e in _get(load(CRATE_FILE), "@graph") or () if _get(e, "@id") == "./"), None)
-    day = _get(cited, "dates", 0, "date")
-    statements_by_file = {
-        CROISSANT_FILE: {
-            "title": (_get(croissant, "name"), d.title),
-            "version": (_get(croissant, "version"), d.version),
-            "licence": (_get(croissant, "license"), d.licence.url),
-            "day": (_get(croissant, "datePublished"), day),
-        },
-        DATAPACKAGE_FILE: {
-            "title": (_get(package, "title"), d.title),
-            "version": (_get(package, "version"), d.version),
-            "licence": (_get(package, "licenses", 0, "name"), d.licence.spdx),
-            "day": (_get(package, "created"), f"{day}T00:00:00Z"),
-        },
-        CRATE_FILE: {
-            "title": (_get(crate, "name"), d.title),
-            "version": (_get(crate, "version"), d.version),
-            "licence": (_get(crate, "license", "@id"), d.licence.url),
-            "day": (_get(crate, "datePublished"), day),
-        },
-        DATACITE_FILE: {
-            "title": (_get(cited, "titles", 0, "title"), d.title),
-            "version": (_get(cited, "version"), d.version),
-            "licence": (_get(cited, "rightsList", 0, "rightsIdentifier"), d.licence.spdx),
-        },
-    }
-    for file, statements in statements_by_file.items():
-        for what, (value, due) in statements.items():
-            if value != due:
-                report(file, f"its {what} is {value!r}; {DATA}/dataset.toml and the others say {due!r}")
-    if (root / SIMULATION_MARK).is_file() != d.simulated:
-        report(SIMULATION_MARK, f"{'is missing, though' if d.simulated else 'is there, but'} {DATA}/dataset.toml says "
-            f"simulated = {str(d.simulated).lower()}")  # fmt: skip
-    return sum(map(len, statements_by_file.values())) + 1
 
 
 def _get(table: Any, *path: str | int) -> Any:
@@ -182,18 +99,18 @@ class ValidationResult:
 
 @dataclass
 class PackageView:
-    """The package under validation; slow results are cached."""
+    """The package under validation, with the problems that the present validator found; slow results are cached."""
 
     root: Path
     thorough: bool = False
     packed: bool = False
-    found: list[tuple[str, str]] = field(default_factory=list)
+    problems: list[tuple[str, str]] = field(default_factory=list)
     looked_at: str = ""
 
     def report(self, file: str, problem: str) -> None:
-        """Note a problem; only the first `SHOWN` are kept."""
-        if len(self.found) < SHOWN:
-            self.found.append((file, problem))
+        """Add a problem, up to `SHOWN`."""
+        if len(self.problems) < SHOWN:
+            self.problems.append((file, problem))
 
     def load(self, file: str) -> Any:
         """Read a JSON file of the package; None, and a problem, if it is unreadable."""
@@ -214,7 +131,7 @@ class PackageView:
         return build_index(self.root / DATA, DatasetHead.read(self.root / DATA))
 
     def is_own(self, path: str) -> bool:
-        """Return whether PlushSense may have added a file to the data folder since; not in a zip."""
+        """Return whether PlushSense may have added a file by opening the data folder; not in a zip."""
         return not self.packed and _OWN.fullmatch(path) is not None
 
     def is_local(self, path: object) -> bool:
@@ -231,7 +148,7 @@ def validate_package(
     """Validate a package, a folder or a zip.
 
     Args:
-        thorough: also the slow ones read every row of the streams, not only the first thousand of each.
+        thorough: let the slow validators read every row of the streams, not only the first thousand of each.
 
     Raises:
         DatasetError: for what is no package.
@@ -244,17 +161,14 @@ def validate_package(
 def check_folder(
     root: Path, *, thorough: bool = False, packed: bool = False, progress: StageProgress | None = None
 ) -> ValidationResult:
-    """Validate the folder of a package.
-
-    ``packed``: it was unpacked from a zip, which nobody has opened as a data set.
-    """
+    """Validate the folder of a package; ``packed``: it was unpacked from a zip."""
     checked = ValidationResult()
     package = PackageView(root, thorough, packed)
     for number, (name, validator) in enumerate(VALIDATORS.items()):
         if progress is not None:
             progress(f"validating: {name}", number, len(VALIDATORS))
         began = time.perf_counter()
-        package.found, package.looked_at = [], ""
+        package.problems, package.looked_at = [], ""
         try:
             validator(package)
         except MissingExtraError:
@@ -263,12 +177,12 @@ def check_folder(
             package.report("", str(cause))
         except Exception as cause:  # noqa: BLE001, RUF100
             package.report("", f"the validator gave up: {type(cause).__name__}: {_short(cause)}")
-        checked.problems += [Problem(name, file, problem) for file, problem in package.found]
+        checked.problems += [Problem(name, file, problem) for file, problem in package.problems]
         checked.validators.append(
             {
                 "validator": name,
                 "looked_at": package.looked_at,
-                "problems": len(package.found),
+                "problems": len(package.problems),
                 "seconds": round(time.perf_counter() - began, 2),
             }
         )
@@ -300,17 +214,91 @@ def _checksums(p: PackageView) -> None:
 
 
 def _data(p: PackageView) -> None:
-    for file, reason in p.built.unreadable.items():
-        p.report(f"{DATA}/{file}", reason)
+    for path, reason in p.built.unreadable.items():
+        p.report(f"{DATA}/{path}", reason)
     dataset = p.built.dataset
-    compare_tables(p.root, dataset, p.report)
-    find_private(dataset, p.report)
+    contents = PackageContents(dataset, read_people(dataset.path), {}, ())
+    for table, expected in build_tables(contents):
+        with (p.root / table.file).open(encoding="utf-8", newline="") as file:
+            rows = _keyed(file, table.key)
+        due_rows = _keyed(io.StringIO(expected), table.key)
+        for key in due_rows.keys() - rows.keys():
+            p.report(table.file, f"'{key}' is in the data but not in the table")
+        for key, row in rows.items():
+            if key not in due_rows:
+                p.report(table.file, f"'{key}' is in the table but not in the data")
+                continue
+            for column in dict.fromkeys((*due_rows[key], *row)):
+                value, due = row.get(column), due_rows[key].get(column)
+                if value != due and column not in _NOT_COMPARED:
+                    p.report(table.file, f"'{key}' has {column} {value!r}; the data say {due!r}")
+    _report_private(p)
     p.looked_at = f"{len(dataset.recordings)} recordings, {len(dataset.streams)} streams"
 
 
+def _report_private(p: PackageView) -> None:
+    """Report private data: author, time and reason of marks, and references of consent forms."""
+    folder = p.root / DATA
+    if any(person.consent for person in read_people(folder).values()):
+        p.report(f"{DATA}/{PEOPLE}", "holds references of consent forms, which must not be published")
+    path = folder / MARKS
+    for number, line in enumerate(path.read_bytes().splitlines() if path.is_file() else (), 1):
+        try:
+            mark = json.loads(line)
+            private = [key for key in ("who", "why", "when") if mark.get(key)]
+        except (ValueError, AttributeError):
+            p.report(f"{DATA}/{MARKS}", f"line {number} is no mark")
+            continue
+        if private:
+            p.report(f"{DATA}/{MARKS}", f"line {number} holds {' and '.join(private)}, which must not be published")
+
+
+_STATEMENTS: dict[str, dict[str, tuple[str | int, ...]]] = {
+    CROISSANT_FILE: {"title": ("name",), "version": ("version",), "licence": ("license",), "day": ("datePublished",)},
+    DATAPACKAGE_FILE: {
+        "title": ("title",),
+        "version": ("version",),
+        "licence": ("licenses", 0, "name"),
+        "day": ("created",),
+    },
+    CRATE_FILE: {
+        "title": ("name",),
+        "version": ("version",),
+        "licence": ("license", "@id"),
+        "day": ("datePublished",),
+    },
+    DATACITE_FILE: {
+        "title": ("titles", 0, "title"),
+        "version": ("version",),
+        "licence": ("rightsList", 0, "rightsIdentifier"),
+    },
+}
+
+
 def _metadata(p: PackageView) -> None:
-    compared = compare_metadata(p.root, p.built.dataset, p.load, p.report)
-    p.looked_at = f"{compared} statements"
+    """Compare title, version, licence and day in every metadata file with ``dataset.toml`` and each other."""
+    dataset = p.built.dataset
+    head = dataset.head
+    d = Description(dataset, find_licence(head.licence), head.about, head.consent, "", ())
+    documents = {file: p.load(file) for file in _STATEMENTS}
+    graph = _get(documents[CRATE_FILE], "@graph") or ()
+    documents[CRATE_FILE] = next((e for e in graph if _get(e, "@id") == "./"), None)
+    day = _get(documents[DATACITE_FILE], "dates", 0, "date")
+    for file, statements in _STATEMENTS.items():
+        by_url = file in (CROISSANT_FILE, CRATE_FILE)
+        expected = {
+            "title": d.title,
+            "version": d.version,
+            "licence": d.licence.url if by_url else d.licence.spdx,
+            "day": day if by_url else f"{day}T00:00:00Z",
+        }
+        for key, path in statements.items():
+            if (value := _get(documents[file], *path)) != expected[key]:
+                p.report(file, f"its {key} is {value!r}; {DATA}/dataset.toml and the others say {expected[key]!r}")
+    if (p.root / SIMULATION_MARK).is_file() != d.simulated:
+        state = "is missing, though" if d.simulated else "exists, but"
+        p.report(SIMULATION_MARK, f"{state} {DATA}/dataset.toml says simulated = {str(d.simulated).lower()}")
+    p.looked_at = f"{sum(map(len, _STATEMENTS.values())) + 1} statements"
 
 
 def _times(p: PackageView) -> None:
@@ -318,7 +306,7 @@ def _times(p: PackageView) -> None:
     for path in p.sums:
         name = parse_name(path) if path.startswith(f"{DATA}/") else None
         if name is not None and name.epoch_ms >= LATEST_MS:
-            p.report(path, f"its name holds the time {name.epoch_ms}, which is not shifted")
+            p.report(path, f"its name contains the time {name.epoch_ms}, which is not shifted")
     for file in sorted({r.file for r in dataset.recordings} | {s.file for s in dataset.streams}):
         frames = read_stream(dataset.path / file, dataset.layout).frames
         if frames.host_ms is not None and int(frames.host_ms.max()) >= LATEST_MS:
@@ -344,7 +332,7 @@ def _croissant(p: PackageView) -> None:
             p.report(CROISSANT_FILE, f"'{entry.get('@id')}' lies at {place!r}, which is no path of the package")
         elif "sha256" in entry and p.sums.get(place) != entry["sha256"]:
             p.report(str(place), "has another SHA-256 than croissant.json says")
-    if p.found:
+    if p.problems:
         return
     mlcroissant = need("mlcroissant", EXTRA)
     need("absl.logging", EXTRA).set_verbosity("error")
@@ -365,7 +353,7 @@ def _frictionless(p: PackageView) -> None:
                 p.report(
                     DATAPACKAGE_FILE, f"a resource has the {key} {resource.get(key)!r}: a path of the package only"
                 )
-    if p.found:
+    if p.problems:
         return
     frictionless = need("frictionless", EXTRA)
     package = frictionless.Package(str(p.root / DATAPACKAGE_FILE))
@@ -428,15 +416,14 @@ def _datacite(p: PackageView) -> None:
     for error in sorted(schema.validator.iter_errors(document), key=lambda e: list(map(str, e.absolute_path))):
         where = "/".join(map(str, error.absolute_path))
         p.report(DATACITE_FILE, f"{f'{where}: ' if where else ''}{error.message[:300]}")
-    if not p.found:
+    if not p.problems:
         xml = (p.root / DATACITE_XML_FILE).read_text(encoding="utf-8")
         if xml != schema.tostring(document):
             p.report(DATACITE_XML_FILE, f"does not say what {DATACITE_FILE} says")
     p.looked_at = "schema 4.5"
 
 
-Validator = Callable[[PackageView], None]
-VALIDATORS: dict[str, Validator] = {
+VALIDATORS: dict[str, Callable[[PackageView], None]] = {
     "checksums": _checksums,
     "data": _data,
     "times": _times,

@@ -1,4 +1,4 @@
-"""The published data set: raw files rewritten with shifted times and plain columns, and nothing private.
+"""Write the published data set: raw files with shifted times and plain columns, and nothing private.
 
 Raw files are rewritten with the layout's column keys, one separator and shifted times, so that no sidecar, header note
 or malformed line of the original is included. Sessions are numbered, since their names may be dates; marks lose who,
@@ -11,7 +11,6 @@ import hmac
 import json
 import re
 import secrets
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -31,10 +30,22 @@ from plushsense.core.recorder_csv import (
     recording_filename,
 )
 from plushsense.dataset.index import DUPLICATE_FOLDER, build_index
-from plushsense.dataset.marks import MARKS, Mark, read_marks
-from plushsense.dataset.people import PEOPLE, PersonInfo, read_people, write_people
+from plushsense.dataset.marks import MARKS, Mark, MarkState, read_marks
 from plushsense.dataset.publishing.description import DATA
-from plushsense.dataset.store import HEAD, RECORDINGS, STREAMS, Dataset, DatasetHead, RecordingInfo, StreamInfo
+from plushsense.dataset.store import (
+    HEAD,
+    PEOPLE,
+    RECORDINGS,
+    STREAMS,
+    Dataset,
+    DatasetHead,
+    PersonInfo,
+    Progress,
+    RecordingInfo,
+    StreamInfo,
+    read_people,
+    write_people,
+)
 
 YEAR_2000_MS = 946_684_800_000
 _SPREAD_MS = 366 * 86_400_000
@@ -93,7 +104,6 @@ def shift_of(subject: str, firsts: list[int], device: bool, key: bytes) -> Shift
     return Shift(min(near, default=0), YEAR_2000_MS + drawn, device)
 
 
-Progress = Callable[[int, int], None]
 PUBLIC_COLUMNS = ("age_group", "gender")
 # Codes that pandas would read as a number or a missing value.
 _NOT_A_CODE = re.compile(r"[-+]?[\d.]+(e\d+)?|na|n/a|null|none|nan|inf(inity)?|true|false", re.IGNORECASE)
@@ -164,15 +174,14 @@ class _ContentsWriter:
         self.taken: set[str] = set()
 
     def run(self) -> PackageContents:
-        total = len(self.kept) * (not self.labelled) + len(self.streams)
-        done = 0
+        infos: list[StreamInfo | RecordingInfo] = [*self.streams, *([] if self.labelled else self.kept)]
         files: dict[str, str] = {}
-        for stream in self.streams:
-            files[stream.file] = self._write_stream(stream)
-            self.progress(done := done + 1, total)
-        for recording in [] if self.labelled else self.kept:
-            files[recording.file] = self._write_recording(recording)
-            self.progress(done := done + 1, total)
+        for done, info in enumerate(infos, 1):
+            if isinstance(info, StreamInfo):
+                files[info.file] = self._write_stream(info)
+            else:
+                files[info.file] = self._write_recording(info)
+            self.progress(done, len(infos))
         people = self._write_people()
         ids = {r.id: self._id(r, files) for r in self.kept}
         self._write_marks(ids)
@@ -182,9 +191,7 @@ class _ContentsWriter:
         origin = {ids[r.id]: r for r in self.kept}
         if built.unreadable or published.keys() != origin.keys():
             odd = next(iter([*built.unreadable, *(published.keys() ^ origin.keys())]))
-            raise DatasetError(
-                f"The package would not hold what the data set holds: '{odd}' differs. Please report it."
-            )
+            raise DatasetError(f"The package would differ from the data set in '{odd}'. Please report it.")
         for identity, before in origin.items():
             after = published[identity]
             for key in ("gesture", "rows", "first_row", "start", "stop", "excluded"):
@@ -193,7 +200,7 @@ class _ContentsWriter:
                         f"'{identity}' would be published with another {key}: {getattr(after, key)!r} instead of "
                         f"{getattr(before, key)!r}. Please report it."
                     )
-        self._say_what_was_left_out(built.dataset, origin)
+        self._note_changes(built.dataset, origin)
         return PackageContents(built.dataset, people, origin, tuple(self.notes))
 
     def _write_stream(self, stream: StreamInfo) -> str:
@@ -242,7 +249,7 @@ class _ContentsWriter:
             and (frames.labels is None or np.array_equal(back.frames.labels, frames.labels))  # type: ignore[arg-type]
         )
         if not same:
-            raise DatasetError(f"'{target}' would not be read back as it was recorded. Please report it.")
+            raise DatasetError(f"'{target}' would differ from the recording when it is read. Please report it.")
 
     def _free(self, path: str) -> str:
         """Return a path below the data folder that no other file has, also on file systems that ignore case."""
@@ -259,8 +266,7 @@ class _ContentsWriter:
 
     def _id(self, recording: RecordingInfo, files: dict[str, str]) -> str:
         target = Path(files[recording.file])
-        kind = STREAMS if self.labelled else RECORDINGS
-        identity = target.relative_to(kind).with_suffix("").as_posix()
+        identity = target.relative_to(target.parts[0]).with_suffix("").as_posix()
         return identity if not self.labelled else f"{identity}#{recording.id.rpartition('#')[2]}"
 
     @property
@@ -276,7 +282,7 @@ class _ContentsWriter:
             lacking += sum(read_recording(folder / r.file, layout).frames.host_ms is None for r in self.kept)
         if lacking:
             self.notes.append(
-                f"Left out: the computer's clock, since {_count(lacking, 'file')} lacked it; the toy's clock stays."
+                f"Left out: the computer's clock, since {_count(lacking, 'file')} lacked it; the toy's clock is kept."
             )
         return lacking == 0
 
@@ -315,27 +321,24 @@ class _ContentsWriter:
                     f"{PEOPLE} has no column '{column}' to publish; besides {', '.join(PUBLIC_COLUMNS)} it has "
                     f"{', '.join(sorted(columns)) or 'none'}."
                 )
-        people = {}
-        for code, public in self.codes.items():
-            if code in known:
-                p = known[code]
-                more = {c: p.more.get(c, "") for c in self.options.columns}
-                people[public] = PersonInfo(public, p.age_group, p.gender, "", more)
+        people = {
+            public: PersonInfo(public, p.age_group, p.gender, "", {c: p.more.get(c, "") for c in self.options.columns})
+            for code, public in self.codes.items()
+            if (p := known.get(code)) is not None
+        }
         if people:
             write_people(self.folder, people.values())
-        left = sorted(columns - set(self.options.columns)) + ["consent"] * any(p.consent for p in known.values())
-        if left:
+        left_out = len(columns - set(self.options.columns)) + any(p.consent for p in known.values())
+        if left_out:
             # Only the number, since the name of a column may be private too.
-            self.notes.append(f"Left out: {_count(len(left), 'column')} of the people's table.")
+            self.notes.append(f"Left out: {_count(left_out, 'column')} of the people's table.")
         return people
 
     def _write_marks(self, ids: dict[str, str]) -> None:
-        standing = read_marks(self.source.path)
+        states = read_marks(self.source.path)
         marks = []
         for recording in self.kept:
-            mark = standing.get(recording.id)
-            if mark is None:
-                continue
+            mark = states.get(recording.id, MarkState())
             identity = ids[recording.id]
             if (mark.start, mark.stop) != (0, -1):
                 marks.append(Mark(identity, "trim", "", start=mark.start, stop=mark.stop))
@@ -346,10 +349,10 @@ class _ContentsWriter:
             lines = "".join(json.dumps(asdict(mark), ensure_ascii=False) + "\n" for mark in marks)
             (self.folder / MARKS).write_text(lines, encoding="utf-8", newline="\n")
 
-    def _say_what_was_left_out(self, published: Dataset, origin: dict[str, RecordingInfo]) -> None:
+    def _note_changes(self, published: Dataset, origin: dict[str, RecordingInfo]) -> None:
         out = [r for r in self.source.recordings if r.excluded]
         if out and not self.options.excluded and not self.labelled:
-            still = " Their rows still stand in the session's stream." if self.streams else ""
+            still = " Their rows are still in the session's stream." if self.streams else ""
             self.notes.append(f"Left out: {_count(len(out), 'excluded recording')}.{still}")
         elif out:
             self.notes.append(f"In the package, but marked as excluded: {_count(len(out), 'recording')}.")
@@ -367,13 +370,9 @@ class _ContentsWriter:
                 "a P in front."
             )
         if self.streams and published.recordings and not self.labelled:
-            lost = sum(o.stream_row >= 0 and n.stream_row < 0 for n, o in _pairs(published, origin))
+            lost = sum(origin[r.id].stream_row >= 0 and r.stream_row < 0 for r in published.recordings)
             if lost:
                 self.notes.append(f"No longer found in their stream: {_count(lost, 'recording')}.")
-
-
-def _pairs(published: Dataset, origin: dict[str, RecordingInfo]) -> list[tuple[RecordingInfo, RecordingInfo]]:
-    return [(r, origin[r.id]) for r in published.recordings]
 
 
 def _count(n: int, what: str) -> str:

@@ -1,6 +1,6 @@
-"""Croissant metadata of a package (``croissant.json``), and comparing what mlcroissant loads with the files.
+"""Write the Croissant metadata of a package (``croissant.json``), and compare what mlcroissant loads with the files.
 
-Every value is compared: tables with their text, rows of recordings and streams with what PlushSense's own reader reads.
+Every value is compared: tables with their text, rows of recordings and streams with those that PlushSense reads.
 """
 
 from __future__ import annotations
@@ -8,7 +8,9 @@ from __future__ import annotations
 import csv
 import glob
 import itertools
+import json
 from collections.abc import Callable, Iterable
+from importlib import resources
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -31,54 +33,11 @@ from plushsense.dataset.publishing.description import (
 from plushsense.dataset.store import Dataset
 
 CROISSANT_FILE = "croissant.json"
+CONTEXT = "croissant_context.json"
 CROISSANT_CONFORMS_TO = "http://mlcommons.org/croissant/1.1"
 FILE_FIELD = "file"
 
 _TYPES = {INTEGER: "cr:Int64", NUMBER: "cr:Float64", TEXT: "sc:Text", YES_NO: "sc:Boolean"}
-# The context of the specification, written out so that readers need not fetch it.
-_CONTEXT: dict[str, Any] = {
-    "@language": "en",
-    "@vocab": "https://schema.org/",
-    "arrayShape": "cr:arrayShape",
-    "citeAs": "cr:citeAs",
-    "column": "cr:column",
-    "conformsTo": "dct:conformsTo",
-    "containedIn": "cr:containedIn",
-    "cr": "http://mlcommons.org/croissant/",
-    "rai": "http://mlcommons.org/croissant/RAI/",
-    "data": {"@id": "cr:data", "@type": "@json"},
-    "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
-    "dct": "http://purl.org/dc/terms/",
-    "description": {"@container": "@language"},
-    "equivalentProperty": "cr:equivalentProperty",
-    "examples": {"@id": "cr:examples", "@type": "@json"},
-    "extract": "cr:extract",
-    "field": "cr:field",
-    "fileProperty": "cr:fileProperty",
-    "fileObject": "cr:fileObject",
-    "fileSet": "cr:fileSet",
-    "format": "cr:format",
-    "includes": "cr:includes",
-    "isArray": "cr:isArray",
-    "isLiveDataset": "cr:isLiveDataset",
-    "jsonPath": "cr:jsonPath",
-    "key": "cr:key",
-    "md5": "cr:md5",
-    "name": {"@container": "@language"},
-    "parentField": "cr:parentField",
-    "path": "cr:path",
-    "recordSet": "cr:recordSet",
-    "references": "cr:references",
-    "regex": "cr:regex",
-    "repeated": "cr:repeated",
-    "replace": "cr:replace",
-    "samplingRate": "cr:samplingRate",
-    "sc": "https://schema.org/",
-    "separator": "cr:separator",
-    "source": "cr:source",
-    "subField": "cr:subField",
-    "transform": "cr:transform",
-}
 
 
 def croissant(d: Description) -> dict[str, Any]:
@@ -86,7 +45,8 @@ def croissant(d: Description) -> dict[str, Any]:
     files = {f.path: f for f in d.files}
     people = [_creator(c.name, c.orcid, c.affiliation) for c in d.creators]
     document: dict[str, Any] = {
-        "@context": _CONTEXT,
+        # Written out, so that readers need not fetch it.
+        "@context": json.loads(resources.files("plushsense.dataset.publishing").joinpath(CONTEXT).read_text("utf-8")),
         "@type": "sc:Dataset",
         "name": d.title,
         "description": d.text,
@@ -128,20 +88,12 @@ def _source_id(table: PackageTable) -> str:
 
 
 def _distribution(table: PackageTable, files: dict[str, FileEntry]) -> dict[str, Any]:
+    described = {"@id": _source_id(table), "name": _source_id(table), "description": table.text}
     if not table.file:
-        return {
-            "@type": "cr:FileSet",
-            "@id": _source_id(table),
-            "name": _source_id(table),
-            "description": table.text,
-            "encodingFormat": "text/csv",
-            "includes": table.glob,
-        }
+        return {"@type": "cr:FileSet"} | described | {"encodingFormat": "text/csv", "includes": table.glob}
     return {
         "@type": "cr:FileObject",
-        "@id": _source_id(table),
-        "name": table.file,
-        "description": table.text,
+        **described,
         "contentUrl": table.file,
         "contentSize": f"{files[table.file].bytes} B",
         "encodingFormat": "text/csv",
@@ -195,22 +147,21 @@ def compare_records(
 
     Args:
         stream_rows: of each stream only so many rows, from its beginning; None: all.
-        say: called with a file and what is wrong there.
+        report: called with a file and its problem.
     """
     path = str(root / CROISSANT_FILE)
     loaded = mlcroissant.Dataset(path)
     by_id = {node.uuid: node for node in loaded.metadata.distribution}
     compared = {}
-    seen: set[str] = set()
+    loaded_files: set[str] = set()
     for record_set in loaded.metadata.record_sets:
         name = record_set.uuid
         source = by_id[next(f.source.uuid for f in record_set.fields)]
         if type(source).__name__ == "FileObject":
             compared[name] = _table(name, loaded.records(name), root / source.content_url, report)
-            seen.add(source.content_url)
             continue
         files = _files(dataset, name)
-        seen |= {file for file, _ in files}
+        loaded_files |= {file for file, _ in files}
         if stream_rows is None or name == "samples":
             compared[name] = _rows(name, loaded.records(name), files, dataset, None, report)
             continue
@@ -221,16 +172,14 @@ def compare_records(
             records = itertools.islice(iter(loaded.records(name)), stream_rows)
             compared[name] += _rows(name, records, [file], dataset, stream_rows, report)
     expected = {f for name in ("samples", "stream-samples") for f, _ in _files(dataset, name)}
-    for absent in sorted(expected - seen):
+    for absent in sorted(expected - loaded_files):
         report(absent, "is in no record set of croissant.json")
     return compared
 
 
 def _files(dataset: Dataset, name: str) -> list[tuple[str, Path]]:
-    if name == "samples":
-        files = {r.file for r in dataset.recordings} - {s.file for s in dataset.streams}
-    else:
-        files = {s.file for s in dataset.streams}
+    streams = {s.file for s in dataset.streams}
+    files = {r.file for r in dataset.recordings} - streams if name == "samples" else streams
     return [(f"{DATA}/{file}", dataset.path / file) for file in sorted(files)]
 
 
@@ -241,16 +190,17 @@ def _table(name: str, records: Iterable[dict[str, Any]], path: Path, report: Rep
     for number, record in enumerate(records, 1):
         if number > len(rows):
             continue
+        problem = ""
         for key, value in record.items():
             column = key.rpartition("/")[2]
             text = rows[number - 1].get(column)
             if text is None or not _same(value, text):
-                report(
-                    path.name, f"row {number} has {column} {text!r}; as a record of '{name}' it is {_plain(value)!r}"
-                )
-                return number
-        if len(record) != len(rows[0]):
-            report(path.name, f"has {len(rows[0])} columns; a record of '{name}' has {len(record)}")
+                problem = f"row {number} has {column} {text!r}; as a record of '{name}' it is {_plain(value)!r}"
+                break
+        if not problem and len(record) != len(rows[0]):
+            problem = f"has {len(rows[0])} columns; a record of '{name}' has {len(record)}"
+        if problem:
+            report(path.name, problem)
             return number
     if number != len(rows):
         report(path.name, f"holds {len(rows)} rows; '{name}' loads {number} records")
@@ -284,12 +234,12 @@ def _rows(
     report: ReportProblem,
 ) -> int:
     """Compare the rows of recordings or streams file by file, in any order of files."""
-    waiting = dict(files)
+    remaining = dict(files)
     compared = 0
     key = f"{name}/{FILE_FIELD}"
     for value, group in itertools.groupby(records, key=lambda record: record[key]):
         file = str(_plain(value))
-        place = waiting.pop(file, None)
+        place = remaining.pop(file, None)
         rows = list(group)
         compared += len(rows)
         if place is None:
@@ -298,7 +248,7 @@ def _rows(
         problem = _difference(rows, name, read_stream(place, dataset.layout).frames, dataset, limit)
         if problem:
             report(file, problem)
-    for file in waiting:
+    for file in remaining:
         report(file, f"'{name}' does not load it")
     return compared
 
@@ -311,15 +261,12 @@ def _difference(
     n = len(frames) if limit is None else min(limit, len(frames))
     if len(rows) != n:
         return f"'{name}' loads {len(rows)} of its {n} rows"
-    expected: dict[str, Any] = {DEVICE_MS: frames.device_ms}
-    if frames.host_ms is not None:
-        expected[HOST_MS] = frames.host_ms
-    if frames.labels is not None:
-        expected["label"] = frames.labels
-    for at, channel in enumerate(layout.channels):
-        expected[channel.name] = frames.values[:, at]
+    clocks = {DEVICE_MS: frames.device_ms, HOST_MS: frames.host_ms, "label": frames.labels}
+    expected: dict[str, Any] = clocks | dict(zip(layout.names, frames.values.T, strict=True))
     steps = {c.name: c.step for c in layout.channels}
     for column, values in expected.items():
+        if values is None:
+            continue
         key = f"{name}/{column}"
         if key not in rows[0]:
             return f"'{name}' has no field '{column}'"
@@ -331,7 +278,7 @@ def _difference(
         elif steps.get(column, 1.0) == 1.0:
             same = np.array_equal(np.array(loaded, dtype=np.int64), values[:n])
         else:
-            same = np.array_equal(np.round(np.array(loaded) / steps[column]).astype(np.int64), values[:n])
+            same = np.array_equal(np.round(np.array(loaded) / steps[column]), values[:n])
         if not same:
             return f"'{name}' loads other values of {column} than the file holds"
     return None

@@ -1,15 +1,20 @@
-"""Description of a package, the one source of all its metadata files."""
+"""Describe a package: the one source of its metadata files and of its texts, from the templates beside this file."""
 
 from __future__ import annotations
 
+import re
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from plushsense.core.errors import DatasetError, nearest
 from plushsense.core.layouts import DEVICE_MS, HOST_MS, Channel, Layout
+from plushsense.core.templates import fill_text
 from plushsense.dataset.about import About, Creator
 from plushsense.dataset.files import sha256_of
-from plushsense.dataset.store import Dataset
+from plushsense.dataset.store import RECORDINGS, STREAMS, Dataset
 
 
 @dataclass(frozen=True)
@@ -20,7 +25,7 @@ class Licence:
     title: str
     url: str
     travels: bool = False
-    """Whether its text must lie beside every copy."""
+    """Whether every copy must include its text."""
 
 
 _CC = "https://creativecommons.org/licenses"
@@ -66,11 +71,6 @@ INTEGER, NUMBER, TEXT, YES_NO = "integer", "number", "string", "boolean"
 SIMULATION = "SIMULATION: recordings of a virtual toy. Nobody touched anything; they say nothing about a real toy."
 
 DATA = "data"
-RECORDINGS_TABLE = "recordings.csv"
-STREAMS_TABLE = "streams.csv"
-SUBJECTS_TABLE = "subjects.csv"
-GESTURES_TABLE = "gestures.csv"
-CHANNELS_TABLE = "channels.csv"
 CHECKSUMS = "checksums.sha256"
 
 
@@ -84,7 +84,7 @@ class TableColumn:
     unit: str = ""
     valid: tuple[float, float] | None = None
     refers: str = ""
-    """``table.column`` that its values stand in."""
+    """``table.column`` that its values refer to."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ class Description:
     published: str
     tables: tuple[PackageTable, ...]
     notes: tuple[str, ...] = ()
-    """What was left out or changed on the way, one sentence each."""
+    """Notes on what was left out or changed, one sentence each."""
     files: tuple[FileEntry, ...] = field(default=())
 
     @property
@@ -206,47 +206,111 @@ def file_entry(root: Path, path: Path, text: str) -> FileEntry:
     return FileEntry(relative, path.stat().st_size, sha256_of(path), _MEDIA.get(path.suffix, "text/plain"), text)
 
 
-def sample_columns(layout: Layout, labelled: bool) -> tuple[TableColumn, ...]:
+def sample_columns(layout: Layout) -> tuple[TableColumn, ...]:
     """Return the columns of a recording's or stream's file, in file order."""
-    columns = []
-    for key in layout.csv.columns:
-        if key == HOST_MS:
-            columns.append(
-                TableColumn(
-                    key, INTEGER, "time at which the computer took the row in; shifted, the date is fictitious", "ms"
-                )
-            )
-        elif key == DEVICE_MS:
-            columns.append(
-                TableColumn(
-                    key, INTEGER, "the toy's clock: the truth for rate, gaps and losses; a fall is a restart", "ms"
-                )
-            )
-        elif key == "label":
-            if labelled:
-                columns.append(TableColumn(key, TEXT, "gesture at this row"))
-        else:
-            columns.append(channel_column(layout.channels[layout.index(key)]))
-    return tuple(columns)
+    others = {
+        HOST_MS: TableColumn(
+            HOST_MS, INTEGER, "time at which the computer received the row; shifted, the date is fictitious", "ms"
+        ),
+        DEVICE_MS: TableColumn(
+            DEVICE_MS, INTEGER, "the toy's clock: the truth for rate, gaps and losses; a fall is a restart", "ms"
+        ),
+        "label": TableColumn("label", TEXT, "gesture at this row"),
+    }
+    return tuple(others.get(key) or _channel_column(layout.channels[layout.index(key)]) for key in layout.csv.columns)
 
 
-def channel_column(channel: Channel) -> TableColumn:
+def _channel_column(channel: Channel) -> TableColumn:
     """Return a measured channel as a column."""
-    physical = (
-        ""
-        if channel.offset == 0.0 and channel.scale == 1.0
-        else f"; physical value = (raw - {channel.offset:g}) * {channel.scale:g} {channel.unit}"
-    )
-    step = "" if channel.step == 1.0 else f"; in steps of {channel.step:g}"
-    valid = f"valid from {_plain(channel.valid_min)} to {_plain(channel.valid_max)}"
-    return TableColumn(
-        channel.name,
-        INTEGER if channel.step == 1.0 else NUMBER,
-        f"{channel.kind}, raw reading{physical}{step}; {valid}, what is outside is kept as it was read",
-        channel.unit,
-        (channel.valid_min, channel.valid_max),
+    text = f"{channel.kind}, raw reading"
+    if (channel.offset, channel.scale) != (0.0, 1.0):
+        text += f"; physical value = (raw - {channel.offset:g}) * {channel.scale:g} {channel.unit}"
+    if channel.step != 1.0:
+        text += f"; in steps of {channel.step:g}"
+    limits = (channel.valid_min, channel.valid_max)
+    low, high = (int(v) if v == int(v) else v for v in limits)
+    text += f"; valid from {low} to {high}, values outside are kept as they were read"
+    return TableColumn(channel.name, INTEGER if channel.step == 1.0 else NUMBER, text, channel.unit, limits)
+
+
+README = "README.md"
+LICENCE = "LICENSE.txt"
+REIDENTIFICATION = "reidentification.md"
+REIDENTIFICATION_JSON = "reidentification.json"
+
+Rows = Sequence[tuple[str, ...]]
+
+
+def fill_template(template: str, d: Description, **values: Any) -> str:
+    """Fill a template of this folder."""
+    return fill_text("plushsense.dataset.publishing", template, d=d, SIMULATION=SIMULATION, **values)
+
+
+def readme(d: Description, reidentification: str | None) -> str:
+    """Return the README in Markdown; ``reidentification`` is the report's short form, None if it was left out."""
+    samples = next(t for t in d.tables if t.files)
+    return fill_template(
+        "README.md.j2",
+        d,
+        facts=_facts(d),
+        files=_files(d, reidentification is not None),
+        columns=[(f"`{c.name}`", c.unit, c.text) for c in samples.columns],
+        gestures=_gestures(d),
+        findings=_findings(d),
+        reidentification=reidentification,
+        samples=samples,
+        sample_folder=f"{DATA}/{STREAMS if d.dataset.layout.is_labelled else RECORDINGS}",
+        DATA=DATA,
+        REIDENTIFICATION=REIDENTIFICATION,
     )
 
 
-def _plain(value: float) -> str:
-    return str(int(value)) if value == int(value) else str(value)
+def _facts(d: Description) -> Rows:
+    data = d.dataset
+    seconds = sum(s.seconds for s in data.streams)
+    duration = f"{seconds / 3600:.1f} h" if seconds >= 3600 else f"{seconds / 60:.1f} min"
+    return [
+        ("version", f"{d.version}, {d.published}"),
+        ("made by", "; ".join(c.name for c in d.creators)),
+        ("people", str(len(data.subjects))),
+        ("recordings", str(len(data.recordings))),
+        ("gestures", f"{d.gestures_made}, of {len(data.gestures)} in the set"),
+        ("session streams", f"{len(data.streams)}, {duration}" if data.streams else "none"),
+        ("sensors", f"{data.layout.title}: {data.layout.n_channels} channels, nominally {data.layout.rate_hz:g} Hz"),
+    ]
+
+
+def _files(d: Description, reidentification: bool) -> Rows:
+    rows = [(f"`{t.file or t.glob}`", t.text + (f", {len(t.files)} files" if t.files else "")) for t in d.tables]
+    return [
+        *rows,
+        (f"`{DATA}/`", "a PlushSense data set: the recordings with layout, gesture set and marks"),
+        ("`croissant.json`", "metadata for machine learning (Croissant 1.1)"),
+        ("`datapackage.json`, `schemas/`", "metadata of the tables (Frictionless)"),
+        ("`ro-crate-metadata.json`", "metadata of the files (RO-Crate 1.1)"),
+        ("`datacite.json`, `datacite.xml`", "metadata for a DOI (DataCite 4.5)"),
+        *([(f"`{REIDENTIFICATION}`, `.json`", "whether people can be recognised")] if reidentification else []),
+        ("`checksums.sha256`", "of all files; check with  `sha256sum -c checksums.sha256`"),
+    ]
+
+
+def _gestures(d: Description) -> Rows:
+    rows = []
+    for g in d.dataset.gestures.gestures:
+        mine = [r for r in d.dataset.recordings if r.gesture == g.label]
+        free = " (free choice: everybody did something else)" if g.free_choice else ""
+        rows.append((g.label + free, g.affect, g.family, str(len(mine)), str(len({r.subject for r in mine}))))
+    return rows
+
+
+def _findings(d: Description) -> Rows:
+    counts: Counter[str] = Counter()
+    for flags in [r.flags for r in d.dataset.recordings] + [s.flags for s in d.dataset.streams]:
+        counts.update({_kind(flag) for flag in flags})
+    return [(kind, str(n)) for kind, n in counts.most_common()]
+
+
+def _kind(flag: str) -> str:
+    """Return a finding without its numbers and names, so that similar ones are counted together."""
+    flag = re.sub(r"(the same content as) .*", r"\1 another", flag)
+    return re.sub(r"\d[\d.]*", "n", flag.split(" (")[0]).replace("lines", "line").replace("gaps", "gap")

@@ -1,8 +1,7 @@
-"""Publishing a data set as a package: refused if something is missing, written completely, then validated."""
+"""Publish a data set as a package: refuse incomplete descriptions, write all files, then validate them."""
 
 from __future__ import annotations
 
-import json
 import re
 import time
 from collections import Counter
@@ -16,12 +15,22 @@ from plushsense.core.files import new_folder, write_file
 from plushsense.core.gestures import NOBODY
 from plushsense.core.recorder_csv import SIMULATION_MARK
 from plushsense.dataset.about import Contact
-from plushsense.dataset.people import PersonInfo
-from plushsense.dataset.publishing.bids import write_bids
 from plushsense.dataset.publishing.checking import StageProgress, ValidationResult, check_folder
 from plushsense.dataset.publishing.contents import PublishOptions, write_contents
 from plushsense.dataset.publishing.croissant import CROISSANT_FILE, croissant
-from plushsense.dataset.publishing.description import CHECKSUMS, SIMULATION, Description, file_entry, find_licence
+from plushsense.dataset.publishing.description import (
+    CHECKSUMS,
+    LICENCE,
+    README,
+    REIDENTIFICATION,
+    REIDENTIFICATION_JSON,
+    SIMULATION,
+    Description,
+    file_entry,
+    fill_template,
+    find_licence,
+    readme,
+)
 from plushsense.dataset.publishing.metadata import (
     CRATE_FILE,
     DATACITE_FILE,
@@ -31,17 +40,12 @@ from plushsense.dataset.publishing.metadata import (
     datacite,
     datapackage,
     schemas,
-)
-from plushsense.dataset.publishing.readme import (
-    LICENCE,
-    README,
-    REIDENTIFICATION,
-    REIDENTIFICATION_JSON,
-    licence_note,
-    readme,
+    write_bids,
+    write_json,
+    write_text,
 )
 from plushsense.dataset.publishing.tables import list_package_files, write_checksums, write_tables, write_zip
-from plushsense.dataset.store import HEAD, UNKNOWN_SUBJECT, Dataset, DatasetHead
+from plushsense.dataset.store import HEAD, UNKNOWN_SUBJECT, Dataset, DatasetHead, PersonInfo
 
 EXTRA = "publish"
 # In smaller groups, age group and gender alone may identify a person.
@@ -100,27 +104,24 @@ class PublishResult:
 def complete_head(
     head: DatasetHead, where: Path, licence: str = "", contact: str = "", consent: str = ""
 ) -> DatasetHead:
-    """Return the head with the given values; refuse it while licence, contact or consent statement is missing.
+    """Return the head with the given values.
 
     Raises:
-        DatasetError: naming the lines to add to dataset.toml, or what of it cannot be used.
+        DatasetError: without a licence, contact or consent statement, or for an invalid value.
     """
     about = replace(head.about, contact=Contact.parse(contact)) if contact else head.about
     head = replace(head, about=about, licence=licence or head.licence, consent=consent.strip() or head.consent)
-    lines, flags = [], []
-    if not head.licence:
-        lines.append('licence = "CC-BY-4.0"')
-        flags.append("--licence CC-BY-4.0")
-    if not head.consent.strip():
-        lines.append('consent = "what the people agreed to"')
-        flags.append('--consent "what the people agreed to"')
-    if not head.about.contact:
-        lines.append('in a table [about]  contact = { name = "Your Name", email = "you@example.org" }')
-        flags.append('--contact "Your Name <you@example.org>"')
-    if lines:
+    contact_line = 'in a table [about]  contact = { name = "Your Name", email = "you@example.org" }'
+    hints = [
+        (head.licence, 'licence = "CC-BY-4.0"', "--licence CC-BY-4.0"),
+        (head.consent.strip(), 'consent = "what the people agreed to"', '--consent "what the people agreed to"'),
+        (head.about.contact, contact_line, '--contact "Your Name <you@example.org>"'),
+    ]
+    if missing := [(line, flag) for value, line, flag in hints if not value]:
+        lines, flags = zip(*missing, strict=True)
         raise DatasetError(
             f"'{where}' cannot be published without licence, contact and consent statement: set in '{where / HEAD}'  "
-            f"{'  and  '.join(lines)}  or say  {' '.join(flags)}"
+            f"{'  and  '.join(lines)}  or give  {' '.join(flags)}"
         )
     if not _VERSION.fullmatch(head.version):
         raise DatasetError(
@@ -135,11 +136,7 @@ def save_head(dataset: Dataset, head: DatasetHead) -> None:
 
 
 def require_validators() -> None:
-    """Check that the validators are installed before any work is done.
-
-    Raises:
-        MissingExtraError: with the install command.
-    """
+    """Raise MissingExtraError if a validator is not installed."""
     for module in ("mlcroissant", "frictionless", "rocrate", "datacite", "jinja2"):
         need(module, EXTRA)
 
@@ -148,7 +145,7 @@ def check_output_folder(dataset: Dataset, out: Path) -> Path:
     """Check the target folder and return the path of the zip beside it.
 
     Raises:
-        DatasetError: when something is there already, or ``out`` lies in the data set.
+        DatasetError: when it is not empty, the zip exists, or ``out`` lies in the data set.
     """
     real = out.resolve()
     target = real.with_name(real.name + ".zip")
@@ -177,13 +174,13 @@ def publish(
 
     Args:
         head: a `complete_head`.
-        reidentification: None leaves the report out, which the README then says.
-        published: the day it is published, ISO; today by default.
-        thorough: let the slow validators read every row of the streams too.
+        reidentification: None leaves the report out, which the README then states.
+        published: the day of publication, ISO; today by default.
+        thorough: as `validate_package`.
         progress: called with the name of the stage, the work done and its total.
 
     Raises:
-        DatasetError: when ``out`` or its zip is there already, or the data set cannot be published.
+        DatasetError: as `check_output_folder`, or when the data set cannot be published.
         MissingExtraError: without the validators.
     """
     began = time.perf_counter()
@@ -224,31 +221,31 @@ def publish(
 
 
 def _write_texts(work: Path, d: Description, source: Dataset, found: Reidentification | None) -> None:
-    _text(work / README, readme(d, found.short if found else None))
+    write_text(work / README, readme(d, found.short if found else None))
     own = next((source.path / name for name in _LICENCE_FILES if (source.path / name).is_file()), None)
-    text = own.read_text(encoding="utf-8", errors="replace") if own else licence_note(d)
-    _text(work / LICENCE, text)
+    text = own.read_text(encoding="utf-8", errors="replace") if own else fill_template("LICENSE.txt.j2", d)
+    write_text(work / LICENCE, text)
     if d.simulated:
-        _text(work / SIMULATION_MARK, f"{SIMULATION}\n")
+        write_text(work / SIMULATION_MARK, f"{SIMULATION}\n")
     if found is not None:
         banner = f"**{SIMULATION}**\n\n" if d.simulated else ""
-        _text(work / REIDENTIFICATION, banner + found.report)
-        _json(work / REIDENTIFICATION_JSON, found.figures)
+        write_text(work / REIDENTIFICATION, banner + found.report)
+        write_json(work / REIDENTIFICATION_JSON, found.figures)
 
 
 def _write_metadata(work: Path, d: Description) -> None:
     """Write the metadata files, each of which lists those before it; the checksums cover all."""
     for path, schema in schemas(d).items():
         (work / path).parent.mkdir(exist_ok=True)
-        _json(work / path, schema)
+        write_json(work / path, schema)
     d = _with_files(work, d)
-    _json(work / CROISSANT_FILE, croissant(d))
-    _json(work / DATAPACKAGE_FILE, datapackage(d))
+    write_json(work / CROISSANT_FILE, croissant(d))
+    write_json(work / DATAPACKAGE_FILE, datapackage(d))
     cited = datacite(d)
-    _json(work / DATACITE_FILE, cited)
+    write_json(work / DATACITE_FILE, cited)
     xml = need("datacite.schema45", EXTRA).tostring(cited)
-    _text(work / DATACITE_XML_FILE, xml)
-    _json(work / CRATE_FILE, crate(_with_files(work, d)))
+    write_text(work / DATACITE_XML_FILE, xml)
+    write_json(work / CRATE_FILE, crate(_with_files(work, d)))
     write_checksums(work)
 
 
@@ -269,36 +266,26 @@ def _warnings(source: Dataset, d: Description, people: dict[str, PersonInfo]) ->
     rare = sum(n for n in groups.values() if n < FEWEST_ALIKE)
     if rare:
         warnings.append(
-            f"{rare} people are of an age group and gender that fewer than {FEWEST_ALIKE} people share, so these alone "
-            "may tell who they are: use coarser groups in subjects.csv"
+            f"{rare} people have an age group and gender that fewer than {FEWEST_ALIKE} people share, which alone may "
+            "identify them: use coarser groups in subjects.csv"
         )
-    spoken = [s for s in d.dataset.subjects if not any(c.isdigit() for c in s)]
-    if spoken:
+    without_digit = [s for s in d.dataset.subjects if not any(c.isdigit() for c in s)]
+    if without_digit:
         warnings.append(
-            f"subject codes are published as they are, and {len(spoken)} hold no digit ('{spoken[0]}'): if they are "
-            "names, pseudonymise the data set first"
+            f"subject codes are published as they are, and {len(without_digit)} hold no digit ('{without_digit[0]}'): "
+            "if they are names, pseudonymise the data set first"
         )
     if d.licence.travels and not any((source.path / name).is_file() for name in _LICENCE_FILES):
-        warnings.append(
-            f"{d.licence.spdx} asks that its text lies beside every copy: put it into the data set as LICENSE.txt"
-        )
+        warnings.append(f"{d.licence.spdx} requires its text in every copy: put it into the data set as LICENSE.txt")
     if not d.about.title:
         warnings.append(
-            f"the title is the data set's name, '{source.head.name}', often that of the folder that was imported: it "
-            "is published, so look at it, or set title in [about] in dataset.toml"
+            f"the published title is the data set's name, '{source.head.name}', often that of the imported folder: "
+            "check it, or set title in [about] in dataset.toml"
         )
     if not d.about.creators:
         warnings.append("nobody is named as creator, so the contact is: add creators to [about] in dataset.toml")
     if any(r.subject == UNKNOWN_SUBJECT for r in d.dataset.recordings):
-        warnings.append("the people of some recordings are not known, so they share one shift of time")
+        warnings.append("the people of some recordings are not known, so they share one time shift")
     if not {r.subject for r in d.dataset.recordings} - {NOBODY, UNKNOWN_SUBJECT}:
         warnings.append("no recording has a known person")
     return warnings
-
-
-def _json(path: Path, table: dict[str, Any]) -> None:
-    _text(path, json.dumps(table, ensure_ascii=False, indent=1) + "\n")
-
-
-def _text(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8", newline="\n")

@@ -1,110 +1,60 @@
-"""Files of a package: the CSV tables beside the data, checksums, and packing and unpacking its zip."""
+"""Write the files of a package: the CSV tables beside the data (``tables.toml``), checksums, and the zip."""
 
 from __future__ import annotations
 
 import csv
 import io
-import os
 import re
+import tomllib
 import zipfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path, PurePosixPath
+from dataclasses import replace
+from importlib import resources
+from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from plushsense.core.errors import DatasetError
 from plushsense.core.files import replacing_file
 from plushsense.core.gestures import NOBODY
-from plushsense.dataset.files import sha256_of
-from plushsense.dataset.importing.archives import DAMAGED, UnpackLimits, refusal, unpack_member, zip_entry
+from plushsense.core.toml import load_table
+from plushsense.dataset.files import sha256_of, walk_files
+from plushsense.dataset.importing.archives import UnpackLimits, unpack, zip_entry
 from plushsense.dataset.publishing.contents import PackageContents
 from plushsense.dataset.publishing.description import (
-    CHANNELS_TABLE,
     CHECKSUMS,
     DATA,
-    GESTURES_TABLE,
-    INTEGER,
-    NUMBER,
-    RECORDINGS_TABLE,
-    STREAMS_TABLE,
-    SUBJECTS_TABLE,
     TEXT,
-    YES_NO,
     PackageTable,
     TableColumn,
     sample_columns,
 )
-from plushsense.dataset.store import RECORDINGS, STREAMS, UNKNOWN_SUBJECT, Dataset
+from plushsense.dataset.store import RECORDINGS, STREAMS, UNKNOWN_SUBJECT, Dataset, PersonInfo
 
-Row = tuple[object, ...]
-
-_SUBJECT = TableColumn("subject", TEXT, "code of the person; none: nobody touched the toy; unknown: not known who")
-_RECORDINGS = (
-    TableColumn("id", TEXT, "the recording"),
-    TableColumn("subject", TEXT, "who made it", refers="subjects.subject"),
-    TableColumn("session", TEXT, "the person's session"),
-    TableColumn("gesture", TEXT, "what was done", refers="gestures.gesture"),
-    TableColumn("affect", TEXT, "what the gesture carries: positive, neutral, negative, or none where nobody said"),
-    TableColumn("file", TEXT, "the file, from the root of the package"),
-    TableColumn("first_row", INTEGER, "row of the file at which it begins, from 0", "row"),
-    TableColumn("rows", INTEGER, "how many rows it has", "row"),
-    TableColumn("start", INTEGER, "first row, counted from first_row, that remains after trimming", "row"),
-    TableColumn("stop", INTEGER, "row before which the trimmed recording ends", "row"),
-    TableColumn("excluded", YES_NO, "whether it is not to be used"),
-    TableColumn("stream", TEXT, "file of the session's stream in which it stands; empty: not found in one"),
-    TableColumn("stream_row", INTEGER, "row of that stream at which it begins, from 0", "row"),
-    TableColumn("seconds", NUMBER, "how long it takes by the toy's clock, gaps and restarts left out", "s"),
-    TableColumn("rate_hz", NUMBER, "measured rate", "Hz"),
-    TableColumn("flags", TEXT, "what the checks at the door found, parted by |"),
-    TableColumn("sha256", TEXT, "SHA-256 of the file"),
-)
-_STREAMS = (
-    TableColumn("file", TEXT, "the file, from the root of the package"),
-    TableColumn("subject", TEXT, "whose session it is", refers="subjects.subject"),
-    TableColumn("session", TEXT, "the person's session"),
-    TableColumn("rows", INTEGER, "how many rows it has", "row"),
-    TableColumn("seconds", NUMBER, "how long it takes by the toy's clock, gaps and restarts left out", "s"),
-    TableColumn("restarts", INTEGER, "how often the clock fell or left a gap"),
-    TableColumn("flags", TEXT, "what the checks at the door found, parted by |"),
-    TableColumn("sha256", TEXT, "SHA-256 of the file"),
-)
-_GESTURES = (
-    TableColumn("class", INTEGER, "class index, from 0"),
-    TableColumn("gesture", TEXT, "its label"),
-    TableColumn("affect", TEXT, "what it carries: positive, neutral, negative, or none where nobody said"),
-    TableColumn("family", TEXT, "its family of look-alikes"),
-    TableColumn("free_choice", YES_NO, "whether everybody did something else under this label"),
-    TableColumn("recordings", INTEGER, "how many recordings there are"),
-    TableColumn("people", INTEGER, "by how many people"),
-    TableColumn("description", TEXT, "how it is made"),
-)
-_CHANNELS = (
-    TableColumn("channel", TEXT, "its name: the column of recordings and streams"),
-    TableColumn("kind", TEXT, "what it measures"),
-    TableColumn("unit", TEXT, "unit of the physical value"),
-    TableColumn("offset", NUMBER, "physical value = (raw - offset) * scale"),
-    TableColumn("scale", NUMBER, "see offset"),
-    TableColumn("step", NUMBER, "smallest difference of raw values"),
-    TableColumn("valid_min", NUMBER, "smallest valid raw value; what is below is sensor garbage"),
-    TableColumn("valid_max", NUMBER, "largest valid raw value; what is above is sensor garbage"),
-)
+Row = Mapping[str, object]
 
 
 def build_tables(contents: PackageContents) -> list[tuple[PackageTable, str]]:
     """Return the tables beside the data, and the text of each."""
     d = contents.dataset
-    people = _people_columns(contents)
-    made = [
-        (PackageTable("recordings", "one line a recording", _RECORDINGS, RECORDINGS_TABLE, key="id"), _recordings(d)),
-        (PackageTable("subjects", "one line a person", people, SUBJECTS_TABLE, key="subject"), _people(contents)),
-        (PackageTable("gestures", "one line a gesture", _GESTURES, GESTURES_TABLE, key="gesture"), _gestures(d)),
-        (PackageTable("channels", "one line a channel", _CHANNELS, CHANNELS_TABLE, key="channel"), _channels(d)),
-    ]
-    if d.streams:
-        made.append(
-            (PackageTable("streams", "one line a session's stream", _STREAMS, STREAMS_TABLE, key="file"), _streams(d))
-        )
-    return [(table, _text(table, rows)) for table, rows in made]
+    rows = {
+        "recordings": _recordings(d),
+        "subjects": _people(contents),
+        "gestures": _gestures(d),
+        "channels": _channels(d),
+        **({"streams": _streams(d)} if d.streams else {}),
+    }
+    text = resources.files("plushsense.dataset.publishing").joinpath("tables.toml").read_text("utf-8")
+    known = tomllib.loads(text)
+    made = []
+    for name, its_rows in rows.items():
+        table = load_table(known[name] | {"name": name}, PackageTable, "tables.toml", DatasetError)
+        if name == "subjects":
+            more = dict.fromkeys(key for p in contents.people.values() for key in p.more)
+            own = tuple(TableColumn(key, TEXT, "as given by those who recorded") for key in more)
+            table = replace(table, columns=(*table.columns[:3], *own, *table.columns[3:]))
+        made.append((table, _text(table, its_rows)))
+    return made
 
 
 def write_tables(root: Path, contents: PackageContents) -> tuple[PackageTable, ...]:
@@ -114,22 +64,14 @@ def write_tables(root: Path, contents: PackageContents) -> tuple[PackageTable, .
     for table, text in build_tables(contents):
         (root / table.file).write_text(text, encoding="utf-8", newline="\n")
         made.append(table)
-    labelled = d.layout.is_labelled
-    columns = sample_columns(d.layout, labelled)
-    if not labelled:
+    columns = sample_columns(d.layout)
+    if not d.layout.is_labelled:
         files = tuple(sorted({f"{DATA}/{r.file}" for r in d.recordings}))
-        made.append(
-            PackageTable(
-                "samples",
-                "the rows of every recording, all files one after the other",
-                columns,
-                files=files,
-                glob=f"{DATA}/{RECORDINGS}/**/*.csv",
-            )
-        )
+        text = "the rows of every recording, all files one after the other"
+        made.append(PackageTable("samples", text, columns, files=files, glob=f"{DATA}/{RECORDINGS}/**/*.csv"))
     if d.streams:
         files = tuple(sorted(f"{DATA}/{s.file}" for s in d.streams))
-        text = "the rows of every session's stream, what lay between the gestures included"
+        text = "the rows of every session's stream, including those between the gestures"
         made.append(PackageTable("stream-samples", text, columns, files=files, glob=f"{DATA}/{STREAMS}/**/*.csv"))
     return tuple(made)
 
@@ -139,96 +81,76 @@ def _text(table: PackageTable, rows: Iterable[Row]) -> str:
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow([c.name for c in table.columns])
     for row in rows:
-        writer.writerow([_cell(value) for value in row])
+        writer.writerow([_cell(row[c.name]) for c in table.columns])
     return out.getvalue()
 
 
 def _cell(value: object) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
+    if isinstance(value, tuple):
+        return " | ".join(value)
     return "" if value is None else f"{value:.3f}" if isinstance(value, float) else str(value)
 
 
 def _recordings(d: Dataset) -> Iterable[Row]:
     files = {s.id: f"{DATA}/{s.file}" for s in d.streams}
     for r in d.recordings:
-        found = r.stream_row >= 0 and r.stream in files
+        located = r.stream_row >= 0 and r.stream in files
         gesture = d.gestures.find(r.gesture)
-        yield (
-            r.id,
-            r.subject,
-            r.session,
-            r.gesture,
-            gesture.affect if gesture else "none",
-            f"{DATA}/{r.file}",
-            r.first_row,
-            r.rows,
-            r.start,
-            r.stop,
-            r.excluded,
-            files[r.stream] if found else "",
-            r.stream_row if found else None,
-            (r.rows - 1) / r.rate_hz if r.rate_hz > 0 else None,
-            r.rate_hz,
-            " | ".join(r.flags),
-            r.sha256,
-        )
+        yield vars(r) | {
+            "affect": gesture.affect if gesture else "none",
+            "file": f"{DATA}/{r.file}",
+            "stream": files[r.stream] if located else "",
+            "stream_row": r.stream_row if located else None,
+            "seconds": (r.rows - 1) / r.rate_hz if r.rate_hz > 0 else None,
+        }
 
 
 def _streams(d: Dataset) -> Iterable[Row]:
     for s in d.streams:
-        yield f"{DATA}/{s.file}", s.subject, s.session, s.rows, s.seconds, s.restarts, " | ".join(s.flags), s.sha256
-
-
-def _people_columns(contents: PackageContents) -> tuple[TableColumn, ...]:
-    more = dict.fromkeys(key for p in contents.people.values() for key in p.more)
-    return (
-        _SUBJECT,
-        TableColumn("age_group", TEXT, "as given; empty: not said"),
-        TableColumn("gender", TEXT, "as given; empty: not said"),
-        *(TableColumn(key, TEXT, "as given by those who recorded") for key in more),
-        TableColumn("recordings", INTEGER, "how many recordings there are"),
-        TableColumn("sessions", INTEGER, "in how many sessions"),
-    )
+        yield vars(s) | {"file": f"{DATA}/{s.file}"}
 
 
 def _people(contents: PackageContents) -> Iterable[Row]:
     d = contents.dataset
-    more = list(dict.fromkeys(key for p in contents.people.values() for key in p.more))
+    more = dict.fromkeys((key for p in contents.people.values() for key in p.more), "")
     # "none" and "unknown" are listed too, so that every reference resolves.
     for code in sorted({r.subject for r in d.recordings} | {s.subject for s in d.streams}):
         mine = [r for r in d.recordings if r.subject == code]
-        person = contents.people.get(code)
-        groups = (person.age_group, person.gender) if person else ("", "")
-        own = [person.more.get(key, "") if person else "" for key in more]
-        yield code, *groups, *own, len(mine), len({r.session for r in mine})
+        person = contents.people.get(code, PersonInfo(code))
+        counts = {"recordings": len(mine), "sessions": len({r.session for r in mine})}
+        yield more | person.more | vars(person) | {"subject": code} | counts
 
 
 def _gestures(d: Dataset) -> Iterable[Row]:
-    for index, g in enumerate(d.gestures.gestures):
-        mine = [r for r in d.recordings if r.gesture == g.label]
-        people = {r.subject for r in mine} - {NOBODY, UNKNOWN_SUBJECT}
-        yield index, g.label, g.affect, g.family, g.free_choice, len(mine), len(people), g.description
     # Labels outside the gesture set are listed too, so that every reference resolves.
-    for label in sorted({r.gesture for r in d.recordings} - set(d.gestures.labels)):
+    known = {g.label: vars(g) for g in d.gestures.gestures}
+    unknown = {"affect": "none", "free_choice": False, "description": "not in the gesture set"}
+    for label in (*known, *sorted({r.gesture for r in d.recordings} - set(known))):
         mine = [r for r in d.recordings if r.gesture == label]
-        yield None, label, "none", label, False, len(mine), len({r.subject for r in mine}), "not in the gesture set"
+        yield known.get(label, unknown | {"family": label}) | {
+            "class": d.gestures.labels.index(label) if label in known else None,
+            "gesture": label,
+            "recordings": len(mine),
+            "people": len({r.subject for r in mine} - ({NOBODY, UNKNOWN_SUBJECT} if label in known else set())),
+        }
 
 
 def _channels(d: Dataset) -> Iterable[Row]:
     for c in d.layout.channels:
-        yield c.name, c.kind, c.unit, *(repr(v) for v in (c.offset, c.scale, c.step, c.valid_min, c.valid_max))
+        # In full, not rounded to three digits.
+        numbers = {key: repr(getattr(c, key)) for key in ("offset", "scale", "step", "valid_min", "valid_max")}
+        yield vars(c) | {"channel": c.name} | numbers
 
 
 _LINE = re.compile(r"(?P<sha>[0-9a-f]{64}) [ *](?P<path>.+)")
 _LIMITS = UnpackLimits(total_bytes=64 * 2**30)
-_BROKEN: tuple[type[Exception], ...] = (*DAMAGED, OSError)
 
 
 def list_package_files(root: Path) -> list[Path]:
     """Return every file below a folder, in the order of their paths."""
-    found = [Path(place) / name for place, _, names in os.walk(root) for name in names]
-    return sorted(found, key=lambda p: p.relative_to(root).as_posix())
+    return sorted(walk_files(root), key=lambda p: p.relative_to(root).as_posix())
 
 
 def write_checksums(root: Path) -> int:
@@ -243,11 +165,7 @@ def write_checksums(root: Path) -> int:
 
 
 def read_checksums(root: Path) -> dict[str, str]:
-    """Read the checksums by path.
-
-    Raises:
-        DatasetError: for a missing or damaged file.
-    """
+    """Read the checksums by path; raise DatasetError for a missing or damaged file."""
     path = root / CHECKSUMS
     try:
         text = path.read_text(encoding="utf-8")
@@ -255,10 +173,9 @@ def read_checksums(root: Path) -> dict[str, str]:
         raise DatasetError(f"'{path}' cannot be read ({cause}).") from None
     sums = {}
     for number, line in enumerate(text.splitlines(), 1):
-        found = _LINE.fullmatch(line)
-        if found is None:
+        if (match := _LINE.fullmatch(line)) is None:
             raise DatasetError(f"'{path}' line {number} is no checksum and path.")
-        sums[found["path"]] = found["sha"]
+        sums[match["path"]] = match["sha"]
     return sums
 
 
@@ -291,26 +208,11 @@ def open_package(package: Path) -> Iterator[Path]:
     with TemporaryDirectory(prefix="plushsense-package-") as scratch:
         target = Path(scratch).resolve()
         try:
-            with zipfile.ZipFile(package) as archive:
-                members = [info for info in archive.infolist() if not info.is_dir()]
-                if sum(info.file_size for info in members) > _LIMITS.total_bytes:
-                    raise DatasetError(f"'{package}' would unpack to more than {_LIMITS.total_bytes // 2**30} GiB.")
-                for info in members:
-                    _unpack(archive, info, target, package)
-        except _BROKEN as cause:
-            raise DatasetError(f"'{package}' is a damaged zip ({cause}): fetch it again.") from None
+            refused = unpack(package, target, _LIMITS)
+        except OSError as cause:
+            raise DatasetError(f"'{package}' cannot be unpacked: {cause.strerror or cause}.") from None
+        if refused:
+            name, reason = refused[0]
+            raise DatasetError(f"'{package}' is not used, since its entry '{name}' is refused: {reason}.")
         inside = list(target.iterdir())
         yield inside[0] if len(inside) == 1 and inside[0].is_dir() else target
-
-
-def _unpack(archive: zipfile.ZipFile, info: zipfile.ZipInfo, target: Path, package: Path) -> None:
-    """Unpack one entry; a refused entry refuses the whole package."""
-    name = PurePosixPath(info.filename.replace("\\", "/"))
-    outside = name.is_absolute() or ".." in name.parts or ":" in info.filename
-    if reason := "it would be written outside" if outside else refusal(info, _LIMITS):
-        raise DatasetError(
-            f"'{package}' holds the entry '{info.filename}', which no package has: not unpacked ({reason})."
-        )
-    if (path := target.joinpath(*name.parts)).exists():
-        raise DatasetError(f"'{package}' holds the entry '{info.filename}' twice: not unpacked.")
-    unpack_member(archive, info, path, _LIMITS.total_bytes)

@@ -1,1 +1,1 @@
-"""Quality checks of recordings: each check is one function and one line in `registry.CHECKS`."""
+"""Quality checks of recordings: each check is a function and a line in `checking.CHECKS`."""

@@ -1,4 +1,4 @@
-"""Checking a whole data set, and the marks that accept findings or exclude recordings."""
+"""Run the quality checks over a data set, and make the marks that accept findings or exclude recordings."""
 
 from __future__ import annotations
 
@@ -6,18 +6,94 @@ import getpass
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from plushsense.core.errors import ConfigError, DatasetError, nearest
 from plushsense.core.recorder_csv import Frames, ReadResult, parse_name, read_recording, read_stream
 from plushsense.dataset.marks import Mark, match_ids, read_marks
-from plushsense.dataset.quality.findings import SEVERITIES, CheckLimits, Finding, Issue
+from plushsense.dataset.quality import comparisons, recordings
+from plushsense.dataset.quality.findings import SEVERITIES, CheckLimits, Finding, Issue, Severity
 from plushsense.dataset.quality.measurements import DatasetSummary, Examination, RecordingSummary, summarize, usual_rows
-from plushsense.dataset.quality.registry import CHECKS
-from plushsense.dataset.store import Dataset, RecordingInfo, StreamInfo
+from plushsense.dataset.store import Dataset, Progress, RecordingInfo, StreamInfo
 
-Progress = Callable[[int, int], None]
+
+@dataclass(frozen=True)
+class Check:
+    """A quality check.
+
+    ``run`` is a function of `recordings`, which examines one recording or stream at a time, or of `comparisons`, which
+    compares all of them. ``scope`` lists the subjects of its findings: recording, stream, subject, dataset. With
+    ``at_import`` it also runs at every import, and its messages become flags of the index. ``stream_action`` replaces
+    ``action`` for a stream.
+    """
+
+    run: Callable[[Any], Iterator[Issue]]
+    scope: tuple[str, ...]
+    severity: Severity
+    action: str
+    at_import: bool = False
+    stream_action: str = ""
+
+    @property
+    def compares(self) -> bool:
+        """Whether the check compares all recordings."""
+        return self.run.__module__ == comparisons.__name__
+
+
+_R, _S, _P, _D = "recording", "stream", "subject", "dataset"
+_LOOK = "look at its plot; trim or exclude it, or accept"
+_TO_ONE = "trim it to one gesture, or exclude it"
+_SENSOR = "check the sensor; exclude it if the gesture is hit"
+_RADIO = "check cable and radio; exclude it if the gesture is hit"
+_RESTART = "nothing: readers restart there"
+_LEFT_OUT = "nothing: that line is left out"
+
+CHECKS: dict[str, Check] = {
+    "never-stopped": Check(recordings.never_stopped, (_R,), "error", "trim it to the gesture, or exclude it", True),
+    "duration": Check(comparisons.duration, (_R,), "warning", _LOOK),
+    "no-onset": Check(comparisons.no_onset, (_R,), "warning", "look whether the gesture was made; exclude it if not"),
+    "several-gestures": Check(comparisons.several_gestures, (_R,), "warning", _TO_ONE),
+    "clock-reset": Check(
+        recordings.clock_reset, (_R, _S), "error", "trim it to one side, or exclude it", True, _RESTART
+    ),
+    "gaps": Check(recordings.gaps, (_R, _S), "warning", "exclude it if the gesture is hit, or accept", True, _RESTART),
+    "lost-frames": Check(recordings.lost_frames, (_R, _S), "warning", _RADIO),
+    "rate": Check(recordings.rate, (_R, _S), "warning", "check firmware and layout; training resamples it", True),
+    "jitter": Check(recordings.jitter, (_R, _S), "info", "nothing: the clock rule evens it out"),
+    "resumed": Check(recordings.resumed, (_S,), "warning", _RESTART, True),
+    "cut-line": Check(recordings.cut_line, (_S,), "info", _LEFT_OUT),
+    "malformed": Check(recordings.malformed, (_R, _S), "info", _LEFT_OUT),
+    "rows": Check(recordings.rows_against_name, (_R,), "warning", "compare with the original file, or accept", True),
+    "garbage": Check(recordings.garbage, (_R, _S), "warning", _SENSOR, True),
+    "blank-rows": Check(recordings.blank_rows, (_R, _S), "warning", _SENSOR),
+    "spikes": Check(recordings.spikes, (_R,), "warning", _SENSOR),
+    "flat": Check(comparisons.flat, (_R, _S, _D), "error", "check the sensor's cable; exclude what it spoiled"),
+    "stuck": Check(comparisons.stuck, (_R, _S), "warning", _SENSOR),
+    "saturated": Check(comparisons.saturated, (_R,), "warning", "widen the sensor's range, or accept strong touch"),
+    "drift": Check(comparisons.drift, (_S, _P), "warning", "let the toy calibrate again between gestures"),
+    "duplicate": Check(comparisons.duplicate, (_R, _S), "error", "exclude one of the two"),
+    "overlap": Check(comparisons.overlap, (_R,), "warning", "trim or exclude one of the two"),
+    "not-in-stream": Check(comparisons.not_in_stream, (_R,), "warning", "check that the stream is this session's"),
+    "missing": Check(comparisons.missing, (_P,), "warning", "record it if the person is still there, or accept"),
+    "label": Check(comparisons.unknown_label, (_D,), "warning", "give a gesture set that has it, or rename the files"),
+    "class-balance": Check(comparisons.class_balance, (_D,), "info", "weight the classes, or leave odd ones out"),
+    "subject-balance": Check(comparisons.subject_balance, (_D,), "info", "weight the people, or record more"),
+}
+
+
+def import_flags(examined: Examination) -> list[str]:
+    """Return the messages of the import checks about one recording or stream, without those of severity info."""
+    scope = _S if examined.stream else _R
+    return [
+        issue.message
+        for check in CHECKS.values()
+        if check.at_import and not check.compares and scope in check.scope
+        for issue in check.run(examined)
+        if (issue.severity or check.severity) != "info"
+    ]
+
+
 # A finding that concerns this share of the recordings is reported once, for the data set.
 _NEARLY_ALL = 0.8
 _MANY = 10
@@ -68,7 +144,7 @@ class CheckReport:
             "excluded": self.excluded,
             "undecided": len(self.undecided),
             "counts": self.counts(),
-            "findings": [f.to_dict() for f in self.findings],
+            "findings": [asdict(f) for f in self.findings],
             "checks": list(self.checks),
             "seconds": round(self.seconds, 2),
             "simulated": self.dataset.head.simulated,
@@ -76,7 +152,7 @@ class CheckReport:
 
 
 def known_checks(only: Iterable[str]) -> tuple[str, ...]:
-    """Return the checks named in ``only``, all if it is empty; raises ConfigError for an unknown name."""
+    """Return the checks named in ``only``, all if it is empty; raise ConfigError for an unknown name."""
     names = tuple(dict.fromkeys(only))
     for name in names:
         if name not in CHECKS:
@@ -95,11 +171,11 @@ def check(
 
     Args:
         only: names of checks; all by default.
-        limits: from where on something is worth saying.
+        limits: the limits above which something is reported.
         progress: called with (files done, files in all).
 
     Raises:
-        ConfigError: for a check that is not known.
+        ConfigError: for an unknown check.
         FileFormatError: for a raw file that can no longer be read.
     """
     began = time.perf_counter()
@@ -107,61 +183,62 @@ def check(
     limits = limits or CheckLimits()
     used = dataset.used
     usual = usual_rows((r.gesture, r.stop - r.start) for r in used)
-    found: list[Finding] = []
-    recordings: list[RecordingSummary] = []
+    findings: list[Finding] = []
+    summaries: list[RecordingSummary] = []
     streams: list[RecordingSummary] = []
-
-    def look(examined: Examination, info: RecordingInfo | StreamInfo) -> None:
-        scope = "stream" if examined.stream else "recording"
-        for name in checks:
-            examine = CHECKS[name].examine
-            if examine is not None and scope in CHECKS[name].scope:
-                found.extend(_finding(one, name, info) for one in examine(examined))
-        (streams if examined.stream else recordings).append(summarize(info, examined.frames, dataset.layout))
-
     for info, result, frames in _read(dataset, used, progress):
-        if isinstance(info, StreamInfo):
-            bad = result.malformed - result.cut
-            whole = Examination(frames, dataset.layout, None, None, limits, malformed=bad, cut=result.cut, stream=True)
-            look(whole, info)
+        examined = _examination(dataset, info, result, frames, usual, limits)
+        if not len(examined.frames) and not examined.stream:
             continue
-        own_file = not info.file.startswith("streams/")
-        named = parse_name(info.file.rsplit("/", 1)[-1]) if own_file else None
-        examined = Examination(
-            frames.slice(info.start, info.stop),
-            dataset.layout,
-            named.rows if named else None,
-            usual[info.gesture] if own_file else None,
-            limits,
-            first_row=info.start,
-            rows_in_file=len(frames),
-            malformed=result.malformed if own_file else 0,
-        )
-        if len(examined.frames):
-            look(examined, info)
-    compared = DatasetSummary(dataset, recordings, streams, limits)
-    by_id: dict[str, RecordingInfo | StreamInfo] = {s.id: s for s in dataset.streams}
-    by_id |= {r.id: r for r in used}
+        scope = _S if examined.stream else _R
+        for name in checks:
+            if not CHECKS[name].compares and scope in CHECKS[name].scope:
+                findings += [_finding(issue, name, info) for issue in CHECKS[name].run(examined)]
+        (streams if examined.stream else summaries).append(summarize(info, examined.frames, dataset.layout))
+    compared = DatasetSummary(dataset, summaries, streams, limits)
+    by_id: dict[str, RecordingInfo | StreamInfo] = {s.id: s for s in dataset.streams} | {r.id: r for r in used}
     for name in checks:
-        check_all = CHECKS[name].compare
-        if check_all is not None:
-            found.extend(_finding(one, name, by_id.get(one.about)) for one in check_all(compared))
-    found = list(_merge_common(found, len(recordings)))
+        if CHECKS[name].compares:
+            findings += [_finding(issue, name, by_id.get(issue.about)) for issue in CHECKS[name].run(compared)]
     marks = read_marks(dataset.path)
-    found = [
-        replace(f, accepted=True) if (m := marks.get(f.about)) is not None and f.check in m.accepted else f
-        for f in found
-    ]
-    order = {name: i for i, name in enumerate(CHECKS)}
-    found.sort(key=lambda f: (SEVERITIES.index(f.severity), order[f.check], f.about))
-    return CheckReport(
-        dataset,
-        tuple(found),
-        len(recordings),
-        len(dataset.recordings) - len(used),
-        checks,
+    order = list(CHECKS)
+    findings = sorted(
+        (
+            replace(f, accepted=f.about in marks and f.check in marks[f.about].accepted)
+            for f in _merge_common(findings, len(summaries))
+        ),
+        key=lambda f: (SEVERITIES.index(f.severity), order.index(f.check), f.about),
+    )
+    excluded = len(dataset.recordings) - len(used)
+    seconds = time.perf_counter() - began
+    return CheckReport(dataset, tuple(findings), len(summaries), excluded, checks, limits, seconds)
+
+
+def _examination(
+    dataset: Dataset,
+    info: RecordingInfo | StreamInfo,
+    result: ReadResult,
+    frames: Frames,
+    usual: dict[str, float],
+    limits: CheckLimits,
+) -> Examination:
+    """Return what the checks of one recording or stream need; ``usual`` are the usual rows by gesture."""
+    if isinstance(info, StreamInfo):
+        malformed = result.malformed - result.cut
+        return Examination(
+            frames, dataset.layout, limits=limits, malformed=malformed, cut=bool(result.cut), stream=True
+        )
+    own_file = not info.file.startswith("streams/")
+    named = parse_name(info.file.rsplit("/", 1)[-1]) if own_file else None
+    return Examination(
+        frames.slice(info.start, info.stop),
+        dataset.layout,
+        named.rows if named else None,
+        usual[info.gesture] if own_file else None,
         limits,
-        time.perf_counter() - began,
+        first_row=info.start,
+        rows_in_file=len(frames),
+        malformed=result.malformed if own_file else 0,
     )
 
 
@@ -169,35 +246,23 @@ def _read(
     dataset: Dataset, used: Sequence[RecordingInfo], progress: Progress | None
 ) -> Iterator[tuple[RecordingInfo | StreamInfo, ReadResult, Frames]]:
     """Read every raw file once: streams with the recordings that are part of them, and the recordings' own files."""
-    inside: dict[str, list[RecordingInfo]] = {}
-    own = []
-    for r in used:
-        if r.file.startswith("streams/"):
-            inside.setdefault(r.file, []).append(r)
-        else:
-            own.append(r)
-    total, done = len(dataset.streams) + len(own), 0
-    for s in dataset.streams:
-        result = read_stream(dataset.path / s.file, dataset.layout)
-        yield s, result, result.frames
-        for r in inside.get(s.file, ()):
-            yield r, result, result.frames.slice(r.first_row, r.first_row + r.rows)
-        done += 1
+    own = [r for r in used if not r.file.startswith("streams/")]
+    infos: list[StreamInfo | RecordingInfo] = [*dataset.streams, *own]
+    for done, info in enumerate(infos, 1):
+        read = read_stream if isinstance(info, StreamInfo) else read_recording
+        result = read(dataset.path / info.file, dataset.layout)
+        yield info, result, result.frames
+        if isinstance(info, StreamInfo):
+            for r in (r for r in used if r.file == info.file):
+                yield r, result, result.frames.slice(r.first_row, r.first_row + r.rows)
         if progress is not None:
-            progress(done, total)
-    for r in own:
-        result = read_recording(dataset.path / r.file, dataset.layout)
-        yield r, result, result.frames
-        done += 1
-        if progress is not None:
-            progress(done, total)
+            progress(done, len(infos))
 
 
 def _finding(issue: Issue, name: str, info: RecordingInfo | StreamInfo | None) -> Finding:
     check = CHECKS[name]
-    recording = info.id if isinstance(info, RecordingInfo) else ""
     return Finding(
-        recording=recording,
+        recording=info.id if isinstance(info, RecordingInfo) else "",
         stream=info.id if isinstance(info, StreamInfo) else "",
         subject=info.subject if info is not None else issue.about,
         gesture=info.gesture if isinstance(info, RecordingInfo) else "",
@@ -210,63 +275,50 @@ def _finding(issue: Issue, name: str, info: RecordingInfo | StreamInfo | None) -
     )
 
 
-def _merge_common(found: list[Finding], recordings: int) -> Iterator[Finding]:
+def _merge_common(findings: list[Finding], recordings: int) -> Iterator[Finding]:
     """Merge the findings of a check that concerns nearly every recording into one of the data set."""
-    concerned = Counter(f.check for f in {(f.check, f.recording): f for f in found if f.recording}.values())
+    concerned = Counter(check for check, _ in {(f.check, f.recording) for f in findings if f.recording})
     common = {c for c, n in concerned.items() if n >= _MANY and n > _NEARLY_ALL * recordings}
-    for f in found:
-        if f.check not in common or not (f.recording or f.stream):
-            yield f
-    for c in sorted(common):
-        first = next(f for f in found if f.check == c and f.recording)
-        worst = min((f.severity for f in found if f.check == c), key=SEVERITIES.index)
+    yield from (f for f in findings if f.check not in common or not (f.recording or f.stream))
+    for check in sorted(common):
+        first = next(f for f in findings if f.check == check and f.recording)
         yield Finding(
-            "",
-            "",
-            "",
-            "",
-            c,
-            worst,
-            f"so in {concerned[c]} of {recordings} recordings, for instance {first.recording}: {first.message}",
-            first.action,
+            check=check,
+            severity=min((f.severity for f in findings if f.check == check), key=SEVERITIES.index),
+            message=f"so in {concerned[check]} of {recordings} recordings, for instance {first.recording}: "
+            f"{first.message}",
+            action=first.action,
         )
 
 
 def author_name(who: str | None) -> str:
-    """Return who decides: the name given, else the login name.
+    """Return the name of the person who decides: ``who``, else the login name.
 
     Raises:
-        ConfigError: where nobody is logged in by name.
+        ConfigError: when there is no login name.
     """
-    if who:
-        return who
     try:
-        return getpass.getuser()
+        return who or getpass.getuser()
     except (OSError, KeyError, ImportError):
-        raise ConfigError("Nobody is logged in by name here: say who decides with --who NAME.") from None
+        raise ConfigError("This computer gives no login name: name the person who decides with --who NAME.") from None
 
 
 def exclusions(
     dataset: Dataset, exclude: Sequence[str] = (), include: Sequence[str] = (), *, who: str, why: str
 ) -> list[Mark]:
     """Return marks that exclude or include recordings; patterns match ids."""
-    marks = []
-    used, out = {r.id for r in dataset.used}, {r.id for r in dataset.recordings if r.excluded}
-    for pattern in exclude:
-        ids = match_ids(pattern, used | out, "recording")
-        marks += [Mark(i, "exclude", who, why) for i in ids if i in used]
-    for pattern in include:
-        ids = match_ids(pattern, used | out, "recording")
-        marks += [Mark(i, "include", who, why) for i in ids if i in out]
-    return marks
+    excluded = {r.id: r.excluded for r in dataset.recordings}
+    return [
+        Mark(identity, action, who, why)
+        for action, patterns in (("exclude", exclude), ("include", include))
+        for pattern in patterns
+        for identity in match_ids(pattern, excluded, "recording")
+        if excluded[identity] == (action == "include")
+    ]
 
 
 def parse_acceptance(text: str) -> tuple[str, str]:
-    """Split ``CHECK:PATTERN``; without a pattern it refers to the whole data set.
-
-    Raises:
-        ConfigError: for a check that is not known.
-    """
+    """Split ``CHECK:PATTERN``; without a pattern it refers to the whole data set. An unknown check is a ConfigError."""
     check, _, pattern = text.partition(":")
     known_checks([check])
     return check, pattern
@@ -278,36 +330,29 @@ def acceptances(checked: CheckReport, accept: Sequence[str], *, who: str, why: s
     Only present findings can be accepted, so that a later fault is not hidden.
 
     Raises:
-        DatasetError: when the check found nothing there.
+        DatasetError: when the check has no such finding.
     """
     marks = []
     for entry in accept:
         check, pattern = parse_acceptance(entry)
-        found = {f.about: f for f in checked.findings_of(check)}
-        if not found:
+        present = {f.about: f for f in checked.findings_of(check)}
+        if not present:
             raise DatasetError(f"The check '{check}' found nothing, so there is nothing to accept.")
-        ids = [""] if not pattern and "" in found else match_ids(pattern, found, f"finding of '{check}' about")
-        marks += [Mark(i, "accept", who, why, check=check) for i in ids if not found[i].accepted]
+        ids = [""] if not pattern and "" in present else match_ids(pattern, present, f"finding of '{check}' about")
+        marks += [Mark(i, "accept", who, why, check=check) for i in ids if not present[i].accepted]
     return marks
 
 
 def withdrawals(dataset: Dataset, unaccept: Sequence[str], *, who: str, why: str) -> list[Mark]:
-    """Return marks that undo acceptances.
-
-    Raises:
-        DatasetError: when none of the kind stands.
-    """
+    """Return marks that undo acceptances; raise DatasetError when no such finding is accepted."""
     marks = []
     standing = read_marks(dataset.path)
     for entry in unaccept:
         check, pattern = parse_acceptance(entry)
         accepted = [i for i, mark in standing.items() if check in mark.accepted]
         if not accepted:
-            raise DatasetError(f"Nothing that '{check}' found was accepted, so there is nothing to take back.")
-        ids = (
-            [""]
-            if not pattern and "" in accepted
-            else match_ids(pattern, accepted, f"accepted finding of '{check}' on")
-        )
+            raise DatasetError(f"No finding of '{check}' is accepted, so there is nothing to withdraw.")
+        all_of_it = not pattern and "" in accepted
+        ids = [""] if all_of_it else match_ids(pattern, accepted, f"accepted finding of '{check}' on")
         marks += [Mark(i, "unaccept", who, why, check=check) for i in ids]
     return marks

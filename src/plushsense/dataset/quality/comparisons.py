@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
@@ -29,17 +29,19 @@ _SEVERAL_USUAL = 0.2
 _SESSION_S = 60.0
 _PLAIN = 0.25
 _GENTLE = 0.5
-_TOLD_S = 0.3
+_SHORTEST_S = 0.3
 _RAIL = 0.99
 _ALIKE = 3
 _OFTEN = 0.04
+_OVERLAP = 0.1
+_MADE_BY = 0.9
+_AGREE = 0.6
 
 
 def usual_seconds(group: list[RecordingSummary]) -> float:
     """Return the mean duration (as in the paper) of the recordings that were stopped.
 
-    One recording of three minutes among gestures of two seconds would raise the mean until half of the good ones
-    are outliers.
+    A single recording of three minutes among gestures of two seconds would make outliers of half of the good ones.
     """
     seconds = np.array([o.seconds for o in group])
     return float(seconds[seconds <= NEVER_STOPPED_FACTOR * np.median(seconds)].mean())
@@ -50,12 +52,20 @@ def never_stopped(o: RecordingSummary, group: list[RecordingSummary]) -> bool:
     return o.seconds > NEVER_STOPPED_FACTOR * float(np.median([g.seconds for g in group]))
 
 
-def _is_cut_by_the_file(o: RecordingSummary, whole: DatasetSummary) -> bool:
+def _by_subject(group: Iterable[RecordingSummary], values: Iterable[float]) -> dict[str, list[float]]:
+    """Group the values of recordings by person."""
+    grouped: dict[str, list[float]] = {}
+    for o, value in zip(group, values, strict=True):
+        grouped.setdefault(o.info.subject, []).append(value)
+    return grouped
+
+
+def _is_cut_by_the_file(o: RecordingSummary, w: DatasetSummary) -> bool:
     """Return whether a run of equal labels touches an end of its file, so that its duration is not the person's."""
     info = o.info
-    if not isinstance(info, RecordingInfo) or whole.dataset.layout.csv.columns[-1] != "label":
+    if not isinstance(info, RecordingInfo) or w.dataset.layout.csv.columns[-1] != "label":
         return False
-    rows = next((s.info.rows for s in whole.streams if s.info.id == info.stream), None)
+    rows = next((s.info.rows for s in w.streams if s.info.id == info.stream), None)
     return info.first_row == 0 or info.first_row + info.rows == rows
 
 
@@ -66,24 +76,18 @@ def duration(w: DatasetSummary) -> Iterator[Issue]:
         if len(group) < _ENOUGH:
             continue
         mean = usual_seconds(group)
-        own: dict[str, list[float]] = {}
-        for o in group:
-            own.setdefault(o.info.subject, []).append(o.seconds)
+        own = _by_subject(group, [o.seconds for o in group])
         for o in group:
             off = o.seconds / mean - 1 if mean else 0.0
             if abs(off) <= share or never_stopped(o, group):
                 continue
-            # A person who always takes longer has a tempo, not a fault.
-            mine = float(np.median(own[o.info.subject]))
-            habit = len(own[o.info.subject]) >= 3 and abs(o.seconds / mine - 1) <= share if mine else False
+            # A person who always takes longer than others is no fault of the recording.
+            median = float(np.median(own[o.info.subject]))
+            habit = bool(median) and len(own[o.info.subject]) >= 3 and abs(o.seconds / median - 1) <= share
+            others = "as this person's others do (their median " if habit else "this person's median is "
             yield Issue(
                 f"lasts {o.seconds:.2f} s, {abs(off) * 100:.0f} % {'more' if off > 0 else 'less'} than the mean of its "
-                f"gesture ({mean:.2f} s)"
-                + (
-                    f", as this person's others do (their median {mine:.2f} s)"
-                    if habit
-                    else f"; this person's median is {mine:.2f} s"
-                ),
+                f"gesture ({mean:.2f} s){',' if habit else ';'} {others}{median:.2f} s{')' if habit else ''}",
                 about=o.info.id,
                 severity="info" if habit else None,
             )
@@ -206,7 +210,7 @@ def drift(w: DatasetSummary) -> Iterator[Issue]:
 
 
 def _baselines(w: DatasetSummary) -> Iterator[tuple[str, np.ndarray, str, float]]:
-    """Return for each session the baselines in order of time, (K, C): of its stream, else of its recordings."""
+    """Yield the name, baselines (K, C) in order of time, subject of findings and duration of each session."""
     streamed = set()
     for o in w.streams:
         if o.lows is not None:
@@ -215,11 +219,11 @@ def _baselines(w: DatasetSummary) -> Iterator[tuple[str, np.ndarray, str, float]
     sessions: dict[tuple[str, str], list[RecordingSummary]] = {}
     for o in w.recordings:
         sessions.setdefault((o.info.subject, o.info.session), []).append(o)
-    for (subject, session), outlines in sessions.items():
+    for (subject, session), group in sessions.items():
         if (subject, session) not in streamed:
-            outlines.sort(key=lambda o: o.info.epoch_ms if isinstance(o.info, RecordingInfo) else 0)
-            passed = [o.info.epoch_ms for o in (outlines[0], outlines[-1]) if isinstance(o.info, RecordingInfo)]
-            yield f"session {session}", np.array([o.low for o in outlines]), subject, (passed[1] - passed[0]) / 1000
+            timed = sorted((o.info.epoch_ms, i) for i, o in enumerate(group) if isinstance(o.info, RecordingInfo))
+            lows = np.array([group[i].low for _, i in timed])
+            yield f"session {session}", lows, subject, (timed[-1][0] - timed[0][0]) / 1000
 
 
 def no_onset(w: DatasetSummary) -> Iterator[Issue]:
@@ -232,18 +236,16 @@ def no_onset(w: DatasetSummary) -> Iterator[Issue]:
         # A gesture that many people make without moving has no onset.
         if usual < 2 * _SOMETHING or np.percentile(peaks, 20) < _PLAIN * usual:
             continue
-        own: dict[str, list[float]] = {}
+        own = _by_subject(group, peaks.tolist())
         for o, peak in zip(group, peaks, strict=True):
-            own.setdefault(o.info.subject, []).append(float(peak))
-        for o, peak in zip(group, peaks, strict=True):
-            # A person who is always gentle has a style, not a fault, provided the activity is above rest.
+            # A person who is always gentle is no fault of the recording, provided the activity is above rest.
             mine = own[o.info.subject]
             if len(mine) >= 3 and peak > max(0.5 * float(np.median(mine)), _GENTLE * w.limits.onset * usual):
                 continue
             if (
                 peak < w.limits.onset * usual
                 and not _is_cut_by_the_file(o, w)
-                and o.seconds >= _TOLD_S
+                and o.seconds >= _SHORTEST_S
                 and not never_stopped(o, group)
             ):
                 yield Issue(
@@ -276,15 +278,14 @@ def several_gestures(w: DatasetSummary) -> Iterator[Issue]:
     for group in w.groups.values():
         if len(group) < _ENOUGH:
             continue
-        found = []
+        parts_of = []
         for o in group:
             block_s = o.hop * o.period_ms / 1000
-            found.append(bursts(w.activity(o), max(1, round(w.limits.quiet_s / block_s))))
-        counts = np.array([len(f) for f in found])
+            parts_of.append(bursts(w.activity(o), max(1, round(w.limits.quiet_s / block_s))))
         # If many recordings have several parts, the gesture has.
-        if np.mean(counts > 1) > _SEVERAL_USUAL:
+        if np.mean([len(parts) > 1 for parts in parts_of]) > _SEVERAL_USUAL:
             continue
-        for o, parts in zip(group, found, strict=True):
+        for o, parts in zip(group, parts_of, strict=True):
             if len(parts) > 1:
                 rows = tuple((a * o.hop + o.first_row, b * o.hop + o.first_row) for a, b in parts)
                 still = max((b[0] - a[1]) * o.period_ms / 1000 for a, b in itertools.pairwise(rows))
@@ -294,11 +295,6 @@ def several_gestures(w: DatasetSummary) -> Iterator[Issue]:
                     rows,
                     about=o.info.id,
                 )
-
-
-_OVERLAP = 0.1
-_MADE_BY = 0.9
-_AGREE = 0.6
 
 
 def duplicate(w: DatasetSummary) -> Iterator[Issue]:
@@ -374,10 +370,16 @@ def missing(w: DatasetSummary) -> Iterator[Issue]:
         yield Issue(f"{subject} has {', '.join(listed[:6])}{more}", about=subject)
 
 
-def _odd(counts: dict[str, int], factor: float) -> tuple[float, list[str]]:
+def _balance(counts: dict[str, int], what: str, factor: float) -> Iterator[Issue]:
+    """Find names whose count is far from the median."""
     usual = float(np.median(list(counts.values()))) if counts else 0.0
     odd = [f"{name} {n}" for name, n in counts.items() if usual and (n * factor < usual or n > factor * usual)]
-    return usual, odd
+    if odd:
+        yield Issue(
+            f"{len(odd)} of {len(counts)} {what} have far fewer or more recordings than the median ({usual:.0f}): "
+            + ", ".join(odd[:8])
+            + (", …" if len(odd) > 8 else "")
+        )
 
 
 def class_balance(w: DatasetSummary) -> Iterator[Issue]:
@@ -387,24 +389,11 @@ def class_balance(w: DatasetSummary) -> Iterator[Issue]:
             counts.pop(gesture.label, None)
         elif not w.dataset.gestures.inferred:
             counts.setdefault(gesture.label, 0)
-    usual, odd = _odd(counts, w.limits.balance)
-    if odd:
-        yield Issue(
-            f"{len(odd)} of {len(counts)} gestures have far fewer or more recordings than the median ({usual:.0f}): "
-            + ", ".join(odd[:8])
-            + (", …" if len(odd) > 8 else "")
-        )
+    yield from _balance(counts, "gestures", w.limits.balance)
 
 
 def subject_balance(w: DatasetSummary) -> Iterator[Issue]:
-    counts = {subject: c.total() for subject, c in _people(w).items()}
-    usual, odd = _odd(counts, w.limits.balance)
-    if odd:
-        yield Issue(
-            f"{len(odd)} of {len(counts)} people have far fewer or more recordings than the median ({usual:.0f}): "
-            + ", ".join(odd[:8])
-            + (", …" if len(odd) > 8 else "")
-        )
+    yield from _balance({subject: c.total() for subject, c in _people(w).items()}, "people", w.limits.balance)
 
 
 def not_in_stream(w: DatasetSummary) -> Iterator[Issue]:

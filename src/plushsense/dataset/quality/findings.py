@@ -1,16 +1,16 @@
-"""Findings of the checks, and the limits that decide when something is reported."""
+"""Findings of the quality checks, and the limits above which they are reported."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
-from typing import Any, Literal, Self
+from dataclasses import dataclass, fields, replace
+from typing import Literal, Self
 
 from plushsense.core.errors import ConfigError, nearest
 
 Severity = Literal["info", "warning", "error"]
 PARTLY_THERE = "only its first"
-"""Beginning of the index's flag for a recording whose end is not in the stream."""
+"""Start of the index's flag for a recording whose end is not in the stream."""
 
 # Most urgent first. An error needs a decision: until it is accepted, or the recording excluded, the check fails.
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "info")
@@ -29,13 +29,13 @@ class CheckLimits:
     gap_ms: float = 50.0
     """Time without a frame; where frames come slower than 20 a second, 2.5 periods."""
     long_gap_ms: float = 1000.0
-    """A gap in a recording that asks for a decision."""
+    """A gap in a recording that needs a decision."""
     pause_s: float = 60.0
     """A stream that stood still this long goes on afterwards as another session."""
     lost: float = 0.02
     """Share of frames that the device clock misses."""
     garbage: float = 0.2
-    """Share of rows with an invalid value that asks for a decision."""
+    """Share of rows with an invalid value that needs a decision."""
     spike: float = 6.0
     """A jump of one row away and back, as a multiple of the channel's 95 % step in the recording."""
     stuck_s: float = 0.5
@@ -48,7 +48,7 @@ class CheckLimits:
     onset: float = 0.1
     """Activity of a recording as a share of what is usual for its gesture."""
     quiet_s: float = 0.7
-    """Stillness that parts two gestures."""
+    """Stillness that separates two gestures."""
     balance: float = 2.0
     """Times more or fewer recordings than the median gesture or person."""
 
@@ -59,7 +59,7 @@ class CheckLimits:
                 raise ConfigError(f"The limit {f.name} is {value!r}; it must be a number above 0.")
 
     def changed(self, given: Mapping[str, float]) -> Self:
-        """Return these limits with some replaced; raises ConfigError for an unknown name."""
+        """Return these limits with some replaced; raise ConfigError for an unknown name."""
         known = [f.name for f in fields(self)]
         for name in given:
             if name not in known:
@@ -83,7 +83,7 @@ class Issue:
     severity: Severity | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Finding:
     """A finding as it is reported.
 
@@ -91,10 +91,10 @@ class Finding:
     it is known and no fault.
     """
 
-    recording: str
-    stream: str
-    subject: str
-    gesture: str
+    recording: str = ""
+    stream: str = ""
+    subject: str = ""
+    gesture: str = ""
     check: str
     severity: Severity
     message: str
@@ -107,7 +107,3 @@ class Finding:
     def about(self) -> str:
         """The id that marks use: of a recording, a stream, a person, or "" for the data set."""
         return self.recording or self.stream or self.subject
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
-        return asdict(self)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -14,6 +15,7 @@ from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import Frames
 from plushsense.dataset.quality.findings import CheckLimits
 from plushsense.dataset.store import Dataset, RecordingInfo, StreamInfo
+from plushsense.recording.takes import measured_rate_hz
 
 NEVER_STOPPED_FACTOR = 10.0
 SLOW_FACTOR = 2.5
@@ -26,16 +28,14 @@ class Examination:
     """Rows of a recording or stream under examination.
 
     ``rows_named`` is the count in the file's name (None if there is none), ``usual_rows`` the median over the
-    recordings of the gesture.
-
-    ``first_row`` is the row of the file at which ``frames`` begin (after trimming). ``malformed`` counts unreadable
-    lines of the file, ``cut`` is whether its last line is incomplete, ``stream`` whether it is a whole session.
+    recordings of the gesture, ``first_row`` the row of the file at which ``frames`` begin. ``malformed`` counts
+    unreadable lines of the file, ``cut`` is whether its last line is incomplete, ``stream`` whether it is a stream.
     """
 
     frames: Frames
     layout: Layout
-    rows_named: int | None
-    usual_rows: float | None
+    rows_named: int | None = None
+    usual_rows: float | None = None
     limits: CheckLimits = field(default_factory=CheckLimits)
     first_row: int = 0
     rows_in_file: int | None = None
@@ -101,7 +101,7 @@ class Examination:
             return found
         # With uneven stamps, a delay that the following frames catch up is no gap: compare the time of the rows
         # around with their number.
-        rate = measured_rate_hz(self.frames)
+        rate = measured_rate_hz(self.frames.device_ms)
         time, reach = self.frames.device_ms, 15
         low, high = np.maximum(found - reach, 0), np.minimum(found + 1 + reach, len(time) - 1)
         late = (time[high] - time[low]) - (high - low) * 1000.0 / rate
@@ -118,14 +118,6 @@ def usual_rows(recordings: Iterable[tuple[str, int]]) -> dict[str, float]:
     for gesture, n in recordings:
         rows.setdefault(gesture, []).append(n)
     return {gesture: float(np.median(ns)) for gesture, ns in rows.items()}
-
-
-def measured_rate_hz(frames: Frames) -> float:
-    """Return frames per second by the device clock, without gaps or resets; 0 for fewer than two frames."""
-    steps = np.diff(frames.device_ms)
-    even = steps[(steps >= 0) & (steps <= 1000)]
-    passed = float(even.sum())
-    return 1000.0 * len(even) / passed if passed > 0 else 0.0
 
 
 def duration_s(frames: Frames) -> float:
@@ -193,12 +185,10 @@ def _activity(values: NDArray[np.float64], hop: int, level: NDArray[np.bool_]) -
     n = max(1, len(values) // hop)
     blocks = values[: n * hop].reshape(n, -1, values.shape[1])
     high, low = blocks.max(axis=1), blocks.min(axis=1)
-    both = slice(None, -1), slice(1, None)
+    moved = high - low
     if n > 1:
-        moved = np.maximum(high[both[0]], high[both[1]]) - np.minimum(low[both[0]], low[both[1]])
+        moved = np.maximum(high[:-1], high[1:]) - np.minimum(low[:-1], low[1:])
         moved = np.vstack([moved, moved[-1:]])
-    else:
-        moved = high - low
     if level.any():
         raised = (high + low)[:, level] / 2
         moved[:, level] = np.maximum(moved[:, level], raised - np.percentile(raised, 10, axis=0))
@@ -224,9 +214,7 @@ def summarize(info: RecordingInfo | StreamInfo, frames: Frames, layout: Layout) 
     held_low[level] = 0
     top_at = np.where(held_low > held_top, low_at, top_at)
     top = values[top_at, np.arange(c)]
-    low, q2, q98 = (
-        np.percentile(values, (10, 2, 98), axis=0) if not stream else np.percentile(values[::10], (10, 2, 98), axis=0)
-    )
+    low, q2, q98 = np.percentile(values[::10] if stream else values, (10, 2, 98), axis=0)
     lows = None
     if stream:
         rows = max(1, round(_CHUNK_S * 1000 / max(mean_ms, 1e-3)))
@@ -247,16 +235,10 @@ def summarize(info: RecordingInfo | StreamInfo, frames: Frames, layout: Layout) 
         (values == top).sum(axis=0),
         q98 - q2,
         low,
-        b"" if stream else _content(frames),
+        # Copies under other names or clocks have the same values.
+        b"" if stream else hashlib.sha256(np.ascontiguousarray(frames.values).tobytes()).digest(),
         lows,
     )
-
-
-def _content(frames: Frames) -> bytes:
-    """Return a hash of the values alone, equal for copies under other names or clocks."""
-    import hashlib
-
-    return hashlib.sha256(np.ascontiguousarray(frames.values).tobytes()).digest()
 
 
 @dataclass(frozen=True)
@@ -271,12 +253,12 @@ class DatasetSummary:
     @cached_property
     def groups(self) -> dict[str, list[RecordingSummary]]:
         """Recordings that should be alike: of one gesture, and of one person if the gesture is free choice."""
-        found: dict[str, list[RecordingSummary]] = {}
+        groups: dict[str, list[RecordingSummary]] = {}
         for o in self.recordings:
-            gesture = self.dataset.gestures.find(o.info.gesture) if isinstance(o.info, RecordingInfo) else None
+            gesture = self.dataset.gestures.find(gesture_of(o))
             free = gesture is not None and gesture.free_choice
-            found.setdefault(f"{gesture_of(o)}\n{o.info.subject}" if free else gesture_of(o), []).append(o)
-        return found
+            groups.setdefault(f"{gesture_of(o)}\n{o.info.subject}" if free else gesture_of(o), []).append(o)
+        return groups
 
     @cached_property
     def noise(self) -> NDArray[np.float64]:

@@ -11,8 +11,23 @@ from plushsense.dataset.quality.findings import CheckLimits, Issue, Severity
 from plushsense.dataset.quality.measurements import NEVER_STOPPED_FACTOR, Examination
 
 _FEW = 0.01
-_TELLING_ROWS = 20
+_SPIKE_ROWS = 20
 _OF_SPREAD = 0.02
+_SHOWN = 50
+_NIGHT_MS = 6 * 3_600_000
+_LEFT_OVER = 3
+_STANDSTILL_MS = 5000
+_RATE_OVER_S = 3
+_FEW_LOST = 3
+
+
+def _ranges(rows: NDArray[np.int64], s: Examination, length: int = 1) -> tuple[tuple[int, int], ...]:
+    """Return the ranges of rows of the file that begin at the first of ``rows``."""
+    return tuple((int(r) + s.first_row, int(r) + s.first_row + length) for r in rows[:_SHOWN])
+
+
+def _plural(n: int, what: str) -> str:
+    return f"{n} {what}{'s' if n > 1 else ''}"
 
 
 def _weight(share: float, limits: CheckLimits) -> Severity | None:
@@ -21,9 +36,9 @@ def _weight(share: float, limits: CheckLimits) -> Severity | None:
 
 
 def rows_against_name(s: Examination) -> Iterator[Issue]:
-    held = len(s.frames) if s.rows_in_file is None else s.rows_in_file
-    if s.rows_named is not None and s.rows_named != held:
-        yield Issue(f"holds {held} rows, its name says {s.rows_named}")
+    rows = len(s.frames) if s.rows_in_file is None else s.rows_in_file
+    if s.rows_named is not None and s.rows_named != rows:
+        yield Issue(f"holds {rows} rows, its name says {s.rows_named}")
 
 
 def never_stopped(s: Examination) -> Iterator[Issue]:
@@ -43,9 +58,9 @@ def garbage(s: Examination) -> Iterator[Issue]:
         channels = np.flatnonzero(outside.any(axis=0)).tolist()
         names = [s.layout.names[c] for c in channels]
         yield Issue(
-            f"{int(outside.sum())} value{'s' if outside.sum() > 1 else ''} outside the valid range "
+            f"{_plural(int(outside.sum()), 'value')} outside the valid range "
             f"({', '.join(names)}; first in row {s.row(int(np.argmax(rows)))})",
-            tuple((int(r) + s.first_row, int(r) + s.first_row + 1) for r in np.flatnonzero(rows)[:_SHOWN]),
+            _ranges(np.flatnonzero(rows), s),
             tuple(channels),
             severity=_weight(float(rows.mean()), s.limits),
         )
@@ -55,9 +70,9 @@ def blank_rows(s: Examination) -> Iterator[Issue]:
     rows = ~s.frames.values.any(axis=1)
     if s.layout.n_channels > 1 and rows.any():
         yield Issue(
-            f"{int(rows.sum())} row{'s' if rows.sum() > 1 else ''} in which every channel reads 0 "
+            f"{_plural(int(rows.sum()), 'row')} in which every channel reads 0 "
             f"(first row {s.row(int(np.argmax(rows)))})",
-            tuple((int(r) + s.first_row, int(r) + s.first_row + 1) for r in np.flatnonzero(rows)[:_SHOWN]),
+            _ranges(np.flatnonzero(rows), s),
             severity=_weight(float(rows.mean()), s.limits),
         )
 
@@ -65,7 +80,7 @@ def blank_rows(s: Examination) -> Iterator[Issue]:
 def spikes(s: Examination) -> Iterator[Issue]:
     """Find single rows in which a channel jumps far away and back: a failed reading."""
     values = s.frames.values
-    if len(values) < _TELLING_ROWS:
+    if len(values) < _SPIKE_ROWS:
         return
     steps = np.diff(values, axis=0)
     there, back = steps[:-1], steps[1:]
@@ -78,16 +93,16 @@ def spikes(s: Examination) -> Iterator[Issue]:
     rows = np.flatnonzero(far.any(axis=1)) + 1
     if len(rows):
         yield Issue(
-            f"{len(rows)} row{'s' if len(rows) > 1 else ''} in which a value jumps far away and back "
+            f"{_plural(len(rows), 'row')} in which a value jumps far away and back "
             f"(first row {s.row(rows[0])}): a reading that failed?",
-            tuple((int(r) + s.first_row, int(r) + s.first_row + 1) for r in rows[:_SHOWN]),
+            _ranges(rows, s),
             severity=_weight(len(rows) / len(values), s.limits),
         )
 
 
 def malformed(s: Examination) -> Iterator[Issue]:
     if s.malformed:
-        yield Issue(f"{s.malformed} malformed line{'s' if s.malformed > 1 else ''} left out")
+        yield Issue(f"{_plural(s.malformed, 'malformed line')} left out")
 
 
 def cut_line(s: Examination) -> Iterator[Issue]:
@@ -95,52 +110,34 @@ def cut_line(s: Examination) -> Iterator[Issue]:
         yield Issue("the last line is cut off: left out")
 
 
-_SHOWN = 50
-_NIGHT_MS = 6 * 3_600_000
-_LEFT_OVER = 3
-_STANDSTILL_MS = 5000
-_RATE_OVER_S = 3
-_FEW_LOST = 3
-
-
-def _around(rows: NDArray[np.int64], s: Examination) -> tuple[tuple[int, int], ...]:
-    """Return the first places as stretches of two rows of the file."""
-    return tuple((int(r) + s.first_row, int(r) + s.first_row + 2) for r in rows[:_SHOWN])
-
-
 def format_duration(ms: float) -> str:
     """Format a time in a suitable unit."""
-    return (
-        f"{ms:.0f} ms"
-        if ms < 10_000
-        else f"{ms / 1000:.0f} s"
-        if ms < 600_000
-        else f"{ms / 60_000:.0f} min"
-        if ms < 36_000_000
-        else f"{ms / 3_600_000:.0f} h"
-    )
+    for limit_ms, unit_ms, unit in ((10_000, 1, "ms"), (600_000, 1000, "s"), (36_000_000, 60_000, "min")):
+        if ms < limit_ms:
+            return f"{ms / unit_ms:.0f} {unit}"
+    return f"{ms / 3_600_000:.0f} h"
 
 
 def clock_reset(s: Examination) -> Iterator[Issue]:
     back = np.flatnonzero(s.steps < 0)
-    whole: Severity | None = None
+    of_stream: Severity | None = None
     if s.stream:
         # A stream's first rows may be left over in the buffer of the serial port.
-        whole = "info" if len(back) and back.max() < _LEFT_OVER else "warning"
+        of_stream = "info" if len(back) and back.max() < _LEFT_OVER else "warning"
     if len(back):
         yield Issue(
             f"the device clock runs backwards {len(back)}× (first after row {s.row(back[0])}, "
             f"by {format_duration(-int(s.steps[back[0]]))})",
-            _around(back, s),
-            severity=whole,
+            _ranges(back, s, 2),
+            severity=of_stream,
         )
     if len(s.jumps):
         most = int(s.steps[s.jumps].max())
         yield Issue(
             f"the device clock leaps ahead {len(s.jumps)}× (first after row {s.row(s.jumps[0])}, at most "
             f"{format_duration(most)}) while hardly any time passes on the computer",
-            _around(s.jumps, s),
-            severity="info" if s.jumps.max() < _LEFT_OVER else whole,
+            _ranges(s.jumps, s, 2),
+            severity="info" if s.jumps.max() < _LEFT_OVER else of_stream,
         )
 
 
@@ -149,15 +146,14 @@ def gaps(s: Examination) -> Iterator[Issue]:
         longest = int(s.steps[s.gaps].max())
         at = int(s.gaps[int(np.argmax(s.steps[s.gaps]))])
         yield Issue(
-            f"{len(s.gaps)} gap{'s' if len(s.gaps) > 1 else ''} over {s.gap_ms:.0f} ms, the longest {longest} ms "
-            f"(after row {s.row(at)})",
-            _around(s.gaps, s),
+            f"{_plural(len(s.gaps), 'gap')} over {s.gap_ms:.0f} ms, the longest {longest} ms (after row {s.row(at)})",
+            _ranges(s.gaps, s, 2),
             severity="error" if not s.stream and longest > s.limits.long_gap_ms else None,
         )
 
 
 def lost_frames(s: Examination) -> Iterator[Issue]:
-    """Count periods without a frame; with an uneven clock only gaps count."""
+    """Count the frames that are missing by the device clock; if it is uneven, only those in gaps."""
     if s.period_ms <= 0:
         return
     # Pauses and restarts have checks of their own.
@@ -171,7 +167,7 @@ def lost_frames(s: Examination) -> Iterator[Issue]:
     if lost >= _FEW_LOST and share > s.limits.lost:
         yield Issue(
             f"about {lost} of {lost + len(s.frames)} frames are lost ({100 * share:.1f} %) by the device clock",
-            _around(long, s),
+            _ranges(long, s, 2),
         )
 
 
@@ -190,11 +186,10 @@ def rate(s: Examination) -> Iterator[Issue]:
     """Compare the measured rate, outside gaps, with that of the layout."""
     even = s.steps[(s.steps >= 0) & (s.steps <= s.gap_ms)]
     nominal = s.layout.rate_hz
-    if len(even) < 10 or even.sum() <= 0:
+    # With uneven stamps, the rate needs more rows.
+    if len(even) < max(10, _RATE_OVER_S * nominal if s.uneven else 0) or even.sum() <= 0:
         return
     measured = 1000.0 * len(even) / float(even.sum())
-    if s.uneven and len(even) < _RATE_OVER_S * nominal:
-        return  # Too short for a rate with uneven stamps.
     if abs(measured - nominal) > s.limits.rate * nominal:
         yield Issue(f"measured {measured:.1f} Hz where the layout says {nominal:g} Hz")
 
@@ -214,5 +209,5 @@ def resumed(s: Examination) -> Iterator[Issue]:
     yield Issue(
         f"goes on after a pause {len(at)}× (the longest {format_duration(longest)} by the computer's clock, "
         f"first after row {s.row(at[0])}{', most likely on another day' if days else ''})",
-        _around(at, s),
+        _ranges(at, s, 2),
     )

@@ -15,14 +15,13 @@ from nicegui import run, ui
 from plushsense.core.errors import ConfigError, PlushSenseError
 from plushsense.core.recorder_csv import SIMULATION_MARK
 from plushsense.dataset.index import open_dataset
-from plushsense.dataset.people import read_people
 from plushsense.dataset.privacy.pseudonyms import is_drawn
 from plushsense.dataset.publishing.checking import VALIDATORS
 from plushsense.dataset.publishing.contents import PUBLIC_COLUMNS
 from plushsense.dataset.publishing.croissant import CROISSANT_FILE
-from plushsense.dataset.publishing.description import CHECKSUMS
-from plushsense.dataset.publishing.readme import REIDENTIFICATION_JSON
+from plushsense.dataset.publishing.description import CHECKSUMS, REIDENTIFICATION_JSON
 from plushsense.dataset.publishing.tables import list_package_files
+from plushsense.dataset.store import read_people
 from plushsense.studio.app.guard import download_address
 from plushsense.studio.app.jobs import DONE, Jobs, StudioJob
 from plushsense.studio.app.shell import Page, address, html, moment, set_address, tag
@@ -32,7 +31,7 @@ from plushsense.studio.widgets.elements import WorkPanel, link, notice, size, ta
 
 KEYS = "keys"
 """Folder of the workspace for secrets: neither in a data set nor in a package."""
-# Shifted dates are later than this (see `dataset.keyfile`).
+# Shifted dates are later than this (see `dataset.privacy.pseudonyms`).
 _MOVED_MS = 4_102_444_800_000
 _TOOLS = {
     "publish": ("mlcroissant", "frictionless", "rocrate", "datacite"),

@@ -29,7 +29,7 @@ from plushsense.recording.setup import (
     speed_of,
     with_speed,
 )
-from plushsense.recording.status import RecorderStatus, StepResult
+from plushsense.recording.states import RecorderStatus, StepResult
 from plushsense.studio.app.toys import TappedDevice
 from plushsense.studio.app.workspace import VIRTUAL, ChangeSignal, Workspace
 
@@ -78,7 +78,7 @@ class ActiveSession:
 
         Args:
             key: " ", "r", "s", "b", "p" as in the terminal, or ``go:<number of the step>``.
-            seen: `plushsense.recording.status.RecorderStatus.seen` of the displayed status.
+            seen: `plushsense.recording.states.RecorderStatus.seen` of the displayed status.
 
         Raises:
             ConfigError: for an unknown command.

@@ -12,7 +12,7 @@ from markupsafe import Markup
 from nicegui import run, ui
 from nicegui.element import Element
 
-from plushsense.recording.status import RecorderStatus
+from plushsense.recording.states import RecorderStatus
 from plushsense.studio.app.shell import LINES, Keys, Page, focus, html, named, on_change, on_click, tag
 from plushsense.studio.app.words import Words
 from plushsense.studio.pages.record.controller import ActiveSession, RecordController

@@ -14,9 +14,8 @@ from urllib.parse import quote, unquote, urlencode
 from nicegui import background_tasks, context, run, ui
 
 from plushsense.core.errors import PlushSenseError
-from plushsense.dataset.quality.checking import author_name
+from plushsense.dataset.quality.checking import CHECKS, author_name
 from plushsense.dataset.quality.findings import SEVERITIES
-from plushsense.dataset.quality.registry import CHECKS
 from plushsense.studio.app.shell import Page, address, on_change, set_address, tag
 from plushsense.studio.pages.review.review import EXCLUDED, LABELLED, LOOKING, STATES, Review, ReviewedRecording
 
