@@ -37,7 +37,7 @@ from plushsense.cli.search import report_search
 from plushsense.core.errors import PlushSenseError
 from plushsense.experiments.search.halving import Costs, Rung, Scores, SearchSpec, halving
 from plushsense.experiments.search.run import prepare, search
-from plushsense.experiments.sweep.run import Sweep, report_jobs, sweep
+from plushsense.experiments.sweep.run import Sweep, sweep
 from plushsense.models.arch import PAPER_ARCHITECTURES
 from plushsense.trials.grid import GridSpec
 
@@ -161,7 +161,7 @@ def prove(args: argparse.Namespace) -> int:
     )  # fmt: skip
     changes = {"architectures": args.architectures, "filters": args.filters}
     limits = {"rungs": args.rungs, "share": args.share, "eta": args.eta}
-    ready = prepare(dataset, grid, changes, limits)
+    ready = prepare(dataset, grid, {**changes, **limits})
     names = [(p.trial.arch.symbol, "/".join(map(str, p.trial.arch.filters))) for p in ready.plans[-1].trials]
     labels = [f"{arch} {filters}" for arch, filters in names]
 
@@ -174,7 +174,7 @@ def prove(args: argparse.Namespace) -> int:
     say(f"searches: {time.monotonic() - began:.0f} s; now the grid")
     at = tuple(sorted({*args.rungs, *(e for e in args.at if e < last)}))
     swept = sweep(
-        dataset, grid, **changes, epochs=at, seeds=every, workers=args.workers, table=report_jobs,
+        dataset, grid, **changes, epochs=at, seeds=every, workers=args.workers, display=True,
     )  # fmt: skip
     if swept.summary["done"] < swept.summary["trials"]:
         say(f"{swept.summary['trials'] - swept.summary['done']} trials of the grid failed: no comparison.")

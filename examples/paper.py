@@ -195,7 +195,7 @@ class Paper:
             context="loop",
             classes="all",
             seed=seed,
-            progress=lambda p: say(f"  fold {p.done} of {p.folds} done") if p.epoch == 0 else None,
+            progress=lambda p: say(f"  fold {p.done} of {p.total} done") if p.epoch == 0 else None,
             **more,
         )
         return result.to_dict()

@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 from plushsense.core.errors import ConfigError, TrainingError
-from plushsense.evaluation.crossval import FoldProgress, evaluate
+from plushsense.evaluation.crossval import evaluate
 from plushsense.jobs.journal import Journal
+from plushsense.jobs.progress import JobProgress
 
 HERE = Path(__file__).parents[1]
 
@@ -86,14 +87,14 @@ def test_a_holdout_scores_what_it_tested_only() -> None:
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_progress_and_the_same_result_from_several_processes(tmp_path: Path, workers: int) -> None:
-    said: list[FoldProgress] = []
+    said: list[JobProgress] = []
     windows = study()
     found = evaluate(windows, windows, "by-subject:3", Oracle(str(tmp_path)), workers=workers, progress=said.append)
     assert [s.done for s in said if s.epoch == 0] == [1, 2, 3]
-    assert sorted((s.fold, s.epoch) for s in said if s.epoch) == [
+    assert sorted((s.name, s.epoch) for s in said if s.epoch) == [
         (f"fold {f}", e) for f in (1, 2, 3) for e in (1, 2, 3)
     ]
-    assert all(s.folds == 3 and s.epochs in (0, 3) for s in said)
+    assert all(s.total == 3 and s.epochs in (0, 3) for s in said)
     assert found.to_dict()["accuracy"]["mean"] == 1.0
     assert sum(trainings(tmp_path).values()) == 3
 
@@ -102,7 +103,7 @@ def test_finished_folds_are_not_trained_again_and_changed_ones_are(tmp_path: Pat
     windows, journal, oracle = study(), Journal(tmp_path / "journal"), Oracle(str(tmp_path))
     ask: dict[str, Any] = {"journal": journal, "key": {"arch": "a", "seed": 1}}
     first = evaluate(windows, windows, "by-subject:3", oracle, **ask)
-    said: list[FoldProgress] = []
+    said: list[JobProgress] = []
     again = evaluate(windows, windows, "by-subject:3", oracle, progress=said.append, **ask)
     assert sum(trainings(tmp_path).values()) == 3 and said[-1].resumed == 3
     assert again.to_dict() == first.to_dict()

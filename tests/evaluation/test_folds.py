@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from plushsense.core.errors import BadInput, ConfigError
-from plushsense.evaluation.folds import fold_windows
+from plushsense.evaluation.crossval import fold_windows
 from plushsense.scoring.splits import parse_split
 from plushsense.windows.cut import WindowSet
 from support.fakes import study

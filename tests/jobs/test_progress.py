@@ -134,9 +134,8 @@ def use(reporter: JobsReporter, pause: float = 0.0) -> None:
 
 def make(stream: io.TextIOBase) -> JobsReporter:
     return JobsReporter(
-        "sweep",
         JOBS,
-        read=lambda message: JobStep(*message),
+        title="sweep",
         score=lambda job, result: BestScore(result["score"], JOBS[job.id].name),
         stream=stream,  # type: ignore[arg-type]
     )

@@ -45,5 +45,5 @@ def test_grids_are_measured_where_it_is_asked_for(dataset: Dataset) -> None:
     told = preview(dataset, measure=True, **small)
     assert told["problems"] == [] and told["seconds"] > 0
     asked = {"batches": "full", "architectures": "14d1_5d1,9d1_5d1,5d1_5d1", "filters": "4,4", "split": "by-subject:2"}
-    found = preview_search(dataset, asked={"rungs": "1,2"}, changes=asked, measure=True)
+    found = preview_search(dataset, rungs="1,2", measure=True, **asked)
     assert found["seconds"] > 0

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from plushsense.core.errors import ConfigError
-from plushsense.trials.grid import FULL, GRIDS, GridSpec, changed, load_grid
+from plushsense.trials.grid import FULL, GRIDS, GridSpec, load_grid
 
 FILE = """
 [grid]
@@ -50,7 +50,7 @@ def test_options_go_over_it_as_text() -> None:
     assert (grid.architectures, grid.filters) == (("14d1", "250"), ((4, 6, 8, 8), (8, 12, 16, 16)))
     assert (grid.epochs, grid.batches, grid.seeds) == ((10, 20), (64, FULL), (0, 1))
     assert grid.split == "windows:holdout"
-    assert changed(grid, {"filters": "4,6,8,8"})[0].filters == ((4, 6, 8, 8),)
+    assert load_grid(grid, {"filters": "4,6,8,8"})[0].filters == ((4, 6, 8, 8),)
 
 
 def test_what_cannot_be_read_is_said_all_at_once_and_the_rest_is_read(tmp_path: Path) -> None:

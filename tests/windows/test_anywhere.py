@@ -14,7 +14,7 @@ from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks
 from plushsense.dataset.store import Dataset
-from plushsense.evaluation.folds import fold_windows
+from plushsense.evaluation.crossval import fold_windows
 from plushsense.scoring.splits import parse_split
 from plushsense.windows.anywhere import AnywhereSpec, add_idle_gesture, cut_anywhere
 from plushsense.windows.cut import WindowSet, WindowSpec, cut_windows

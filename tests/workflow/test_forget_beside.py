@@ -102,7 +102,7 @@ def ended(*at: Any) -> bool:
     (now,) = at
     if getattr(now, "rung", 0) < getattr(now, "rungs", 0):
         return False
-    return bool(now.done == next(getattr(now, name) for name in ("folds", "jobs", "trainings") if hasattr(now, name)))
+    return bool(now.done == now.total)
 
 
 @pytest.fixture
@@ -170,7 +170,7 @@ def test_done_again_it_is_without_the_person(folder: Path) -> None:
 def test_the_command_says_so_and_forget_can_be_given_again(
     folder: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("plushsense.cli.evaluate.report_folds", lambda _: forgetting(folder, ended))
+    monkeypatch.setattr("plushsense.cli.evaluate.report_jobs", lambda *_: forgetting(folder, ended))
     ran = cli("evaluate", folder, "--filters", "2,3,3", "--context", "loop", "--epochs", 1, "--workers", 1)
     assert ran.status == 2
     assert [line for line in ran.err.splitlines() if "while this ran" in line]

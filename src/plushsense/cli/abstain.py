@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.cli.output import emit, figure, say, spread, table, warn
-from plushsense.cli.settings import add_settings, add_workers, marks, settings
-from plushsense.jobs.progress import ProgressReporter
+from plushsense.cli.settings import add_settings, add_workers, marks, report_jobs, settings
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -41,7 +40,6 @@ def run(args: argparse.Namespace) -> int:
 
     config = settings(args, workers=args.workers)
     out = Path(args.out) if args.out else Path(args.dataset) / "abstaining"
-    reporter = ProgressReporter("training", "networks", keep=True)
     result = abstaining(
         args.dataset,
         config,
@@ -49,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
         withhold=args.withhold,
         coverage=args.coverage,
         out=out,
-        progress=lambda done, total, resumed: reporter(done, total, resumed=resumed),
+        progress=report_jobs("training", "networks"),
         warn=warn,
     )
     say(f"written: {out}")

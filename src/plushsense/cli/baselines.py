@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from plushsense.cli.output import emit, say, warn
-from plushsense.cli.settings import add_out, add_settings, add_work, listed, settings
-from plushsense.jobs.progress import ProgressReporter
-
-if TYPE_CHECKING:
-    from plushsense.experiments.baselines.score import CompareProgress
+from plushsense.cli.settings import add_out, add_settings, add_work, listed, report_jobs, settings
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -64,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
         out=out,
         overwrite=args.force,
         cluster=args.cluster,
-        progress=_report_fits(),
+        progress=report_jobs("comparing", "fits"),
         warn=warn,
     )
     result |= {"out": str(out), "report": str(out / PAGE)}
@@ -89,13 +84,3 @@ def lines(result: dict[str, Any]) -> list[str]:
     if any(split["leaky"] for split in result["splits"]):
         out += ["", COUNTS if result["gaps"] else LEAKY]
     return out
-
-
-def _report_fits() -> Callable[[CompareProgress], None]:
-    """Return a callback that reports the fits of a comparison."""
-    reporter = ProgressReporter("comparing", "fits", keep=True)
-
-    def report(at: CompareProgress) -> None:
-        reporter(at.done, at.jobs, detail=at.what, resumed=at.resumed)
-
-    return report

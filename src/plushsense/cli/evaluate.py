@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.cli.output import emit, figure, say, spread, table, warn
-from plushsense.cli.settings import add_out, add_settings, add_work, marks, report_folds, settings
+from plushsense.cli.settings import add_out, add_settings, add_work, marks, report_jobs, settings
 from plushsense.workflow.reporting import name_of
 
 
@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
         overwrite=args.force,
         cluster=args.cluster,
         int8=args.int8,
-        progress=report_folds("evaluating"),
+        progress=report_jobs("evaluating"),
         warn=warn,
     )
     report = write_report(out / PAGE, dataset, [out])

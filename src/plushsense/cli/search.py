@@ -8,27 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from plushsense.cli.output import emit, figure, say, table, warn
-from plushsense.cli.settings import add_networks, add_work, marks
+from plushsense.cli.settings import add_grid, add_out, add_work, grid_changes, marks
 from plushsense.cli.sweep import several
 from plushsense.jobs.progress import ProgressReporter
 
 if TYPE_CHECKING:
     from plushsense.experiments.search.run import SearchProgress
 
-# Keys of the grid that an option changes, each an attribute of the arguments.
-_CHANGES = (
-    "split",
-    "architectures",
-    "filters",
-    "batches",
-    "padding",
-    "norm",
-    "context",
-    "classes",
-    "device",
-    "threads",
-)
-_ASKED = ("rungs", "folds", "share", "eta", "max_parameters", "max_state_bytes", "max_macs_per_step")
+_SEARCH_OPTIONS = ("rungs", "folds", "share", "eta", "max_parameters", "max_state_bytes", "max_macs_per_step")
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -37,60 +24,46 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--grid",
         default="paper",
         metavar="GRID",
-        help="whose networks are tried: paper (default, 52), or a TOML file with [grid] and [search]",
+        help="networks to try: paper (default, 52), or a TOML file with [grid] and [search]",
     )
     parser.add_argument("--max-parameters", type=int, metavar="P", help="only networks of at most P parameters")
     parser.add_argument(
-        "--max-state-bytes", type=int, metavar="S", help="of at most S bytes of state between samples, 8-bit"
+        "--max-state-bytes", type=int, metavar="S", help="only networks of at most S bytes of 8-bit state"
     )
     parser.add_argument(
-        "--max-macs-per-step", type=int, metavar="M", help="of at most M multiply-accumulates a step of 50 ms"
+        "--max-macs-per-step", type=int, metavar="M", help="only networks of at most M multiply-accumulates in 50 ms"
     )
     parser.add_argument(
         "--split", metavar="SPLIT", help="by-subject:5 (default), leave-one-subject-out, by-recording:K, windows:K"
     )
     parser.add_argument("--rungs", metavar="N,...", help="epochs after which networks are compared (4,15,60)")
-    parser.add_argument("--folds", metavar="N,...", help="folds that the rungs before the last look at (default: all)")
+    parser.add_argument("--folds", metavar="N,...", help="folds to use in each rung but the last (default: all)")
     parser.add_argument(
         "--share",
         type=float,
         metavar="X",
-        help="of the cost of the whole grid, at most (0.25; more if only few networks fit)",
+        help="largest share of the cost of the whole grid (0.25; more if only few networks fit)",
     )
-    parser.add_argument("--eta", type=float, metavar="X", help="one in X goes on from each rung, if cost allows (2)")
-    parser.add_argument("--seeds", type=int, metavar="N", help="seeds of every training, 0 to N - 1 (1)")
-    add_networks(parser)
-    parser.add_argument("--batches", metavar="N,...", help="windows a batch, or full (64)")
-    parser.add_argument("--padding", help="stream (default), causal or mirror")
-    parser.add_argument("--norm", help="batch (default) or layer")
-    parser.add_argument("--context", help="stream (default) or loop")
-    parser.add_argument("--classes", metavar="LABELS", help="shared (default), all, or labels")
-    parser.add_argument(
-        "--out",
-        metavar="DIR",
-        help="folder for the tables and search.json (default: DATASET/evaluations/search-GRID-…)",
-    )
-    parser.add_argument("--force", action="store_true", help="replace a search of another grid or data in --out")
+    parser.add_argument("--eta", type=float, metavar="X", help="one in X continues after each rung, if the cost allows (2)")
+    defaults = {"batches": "64", "padding": "stream", "norm": "batch", "context": "stream", "classes": "shared"}
+    add_grid(parser, {**defaults, "device": "auto", "seeds": "1"})
+    default = "DATASET/evaluations/search-GRID-…"
+    add_out(parser, "the tables and search.json", default, "a search of other settings or data")
     add_work(parser, "trainings")
-    parser.add_argument("--device", help="auto (default), cpu or cuda")
     parser.add_argument(
-        "--dry-run", action="store_true", help="say what would be tried, left out and spent; no training"
+        "--dry-run", action="store_true", help="print what would be tried, left out and spent, without training"
     )
 
 
 def run(args: argparse.Namespace) -> int:
     from plushsense.experiments.search.run import search
 
-    changes: dict[str, Any] = {key: getattr(args, key) for key in _CHANGES}
-    if args.seeds is not None:
-        changes["seeds"] = tuple(range(args.seeds))
-    asked = {key: getattr(args, key) for key in _ASKED}
+    changes = grid_changes(args, "split", *_SEARCH_OPTIONS)
     if args.dry_run:
-        return _dry_run(args, changes, asked)
-    found = search(
+        return _dry_run(args, changes)
+    done = search(
         args.dataset,
         args.grid,
-        **asked,
         out=None if args.out is None else Path(args.out),
         overwrite=args.force,
         workers=args.workers or 0,
@@ -99,16 +72,16 @@ def run(args: argparse.Namespace) -> int:
         warn=warn,
         **changes,
     )
-    shown = found.to_dict()
-    say(f"written: {found.out}")
-    emit(args, shown, lines(shown))
+    result = done.to_dict()
+    say(f"written: {done.out}")
+    emit(args, result, lines(result))
     return 0
 
 
-def _dry_run(args: argparse.Namespace, changes: dict[str, Any], asked: dict[str, Any]) -> int:
+def _dry_run(args: argparse.Namespace, changes: dict[str, Any]) -> int:
     from plushsense.experiments.search.run import preview_search
 
-    found = preview_search(args.dataset, args.grid, asked=asked, changes=changes, warn=warn)
+    found = preview_search(args.dataset, args.grid, warn=warn, **changes)
     text = [f"left out: {row['arch']} {row['filters']}: {row['why']}" for row in found["left_out"]]
     rungs = ", ".join(f"{e} epochs on {f} folds" for e, f in zip(found["rungs"], found["folds"], strict=True))
     text += [
@@ -129,10 +102,10 @@ def report_search() -> Callable[[SearchProgress], None]:
     def report(at: SearchProgress) -> None:
         title = f"search, rung {at.rung} of {at.rungs}, networks {at.networks}"
         reporter = reporters.setdefault(at.rung, ProgressReporter(title, "trainings", keep=True))
-        best = "" if at.best is None else f"best so far {at.best[0]} {at.best[1]:.3f}"
-        epoch = f"{at.what} epoch {at.epoch} of {at.epochs}" if at.epoch else ""
+        best = "" if at.best is None else f"best so far {at.best.name} {at.best.score:.3f}"
+        epoch = f"{at.name} epoch {at.epoch} of {at.epochs}" if at.epoch else ""
         detail = ", ".join(filter(None, (best, epoch)))
-        reporter(at.done, at.trainings, detail=detail, resumed=at.resumed, share=at.share)
+        reporter(at.done, at.total, detail=detail, resumed=at.resumed, share=at.share)
 
     return report
 
@@ -163,12 +136,12 @@ def lines(s: dict[str, Any]) -> list[str]:
     )
     out.append(
         f"\nBest: {best['arch']} with {best['filters']}, macro-F1 {figure(best['macro_f1'])}{mark} over "
-        f"{best['folds']} folds. It is the best of {s['chosen_among']} on these people, which flatters it a little."
+        f"{best['folds']} folds. It is the best of {s['chosen_among']} on these people, so its score is slightly too high."
     )
     small = s["smallest_equal"]
     if small["trial"] != best["trial"]:
         out.append(
-            f"Smallest that cannot be told from it: {small['arch']} with {small['filters']}, {small['parameters']:,} "
+            f"Smallest that does not differ significantly: {small['arch']} with {small['filters']}, {small['parameters']:,} "
             f"parameters, macro-F1 {figure(small['macro_f1'])}{mark}."
         )
     out.append(
@@ -180,7 +153,7 @@ def lines(s: dict[str, Any]) -> list[str]:
 
 
 def _rungs(s: dict[str, Any], mark: str) -> str:
-    """Format one row a network, the longest trained first: its score after each rung, and why it stopped."""
+    """Format a row for each network, the longest trained first: its score after each rung, and why it stopped."""
     rows: dict[tuple[str, str, str], list[object]] = {}
     for i, rung in enumerate(s["rungs"]):
         for n in rung["networks"]:

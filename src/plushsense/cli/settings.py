@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from plushsense.jobs.progress import ProgressReporter
 
 if TYPE_CHECKING:
-    from plushsense.evaluation.crossval import FoldProgress
+    from plushsense.jobs.progress import JobProgress
     from plushsense.workflow.config import RunConfig
 
 
@@ -74,13 +74,34 @@ def add_out(parser: argparse.ArgumentParser, files: str, default: str, replaced:
     parser.add_argument("--force", action="store_true", help=f"replace {replaced} in --out")
 
 
-def add_networks(parser: argparse.ArgumentParser) -> None:
-    """Add the options that choose networks of a grid; by default all of the grid."""
-    parser.add_argument("--architectures", metavar="SPEC,...", help="only these networks (default: the grid's)")
-    parser.add_argument(
-        "--filters", metavar="SETS", help="only these filters: 4,6,8,8 or several sets, 4/6/8/8,8/12/16/16"
-    )
+# Options that change a key of a grid: its metavar and help.
+_GRID_OPTIONS: dict[str, tuple[str | None, str]] = {
+    "architectures": ("SPEC,...", "only these networks"),
+    "filters": ("SETS", "only these filters: 4,6,8,8 or several sets, 4/6/8/8,8/12/16/16"),
+    "batches": ("N,...", "only these batches: numbers of windows, or full"),
+    "padding": (None, "stream, causal or mirror"),
+    "norm": (None, "batch or layer"),
+    "context": (None, "stream or loop"),
+    "classes": ("LABELS", "all, shared, or labels joined by commas"),
+    "device": (None, "auto, cpu or cuda"),
+}
+
+
+def add_grid(parser: argparse.ArgumentParser, defaults: Mapping[str, str]) -> None:
+    """Add the options that change a grid; ``defaults`` says what applies without an option, else it is the grid's."""
+    for key, (metavar, words) in _GRID_OPTIONS.items():
+        default = defaults.get(key, "the grid's")
+        parser.add_argument(f"--{key}", metavar=metavar, help=f"{words} (default: {default})")
+    default = defaults.get("seeds", "the grid's")
+    parser.add_argument("--seeds", type=int, metavar="N", help=f"seeds 0 to N - 1 (default: {default})")
     parser.add_argument("--threads", type=int, metavar="N", help="threads of a training, part of its identity (1)")
+
+
+def grid_changes(args: argparse.Namespace, *more: str) -> dict[str, Any]:
+    """Return the keys of a grid that options change, and the options ``more`` of the verb."""
+    changes: dict[str, Any] = {key: getattr(args, key) for key in (*_GRID_OPTIONS, "threads", *more)}
+    # An empty tuple is reported with the other problems of the grid.
+    return changes | {"seeds": None if args.seeds is None else tuple(range(args.seeds))}
 
 
 def marks(result: Mapping[str, Any]) -> list[str]:
@@ -129,13 +150,13 @@ def report_epochs(title: str = "training") -> Callable[[int, int, dict[str, Any]
     return report
 
 
-def report_folds(title: str) -> Callable[[FoldProgress], None]:
-    """Return a callback that reports the folds of a cross-validation."""
-    reporter = ProgressReporter(title, "folds", keep=True)
+def report_jobs(title: str, unit: str = "folds") -> Callable[[JobProgress], None]:
+    """Return a callback that reports how many jobs are done, and the last job with its epoch."""
+    reporter = ProgressReporter(title, unit, keep=True)
 
-    def report(at: FoldProgress) -> None:
-        detail = f"{at.fold} epoch {at.epoch}" if at.epoch else ""
-        reporter(at.done, at.folds, detail=detail, resumed=at.resumed)
+    def report(at: JobProgress) -> None:
+        detail = f"{at.name} epoch {at.epoch}" if at.epoch else at.name
+        reporter(at.done, at.total, detail=detail, resumed=at.resumed)
 
     return report
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.cli.output import emit, say, table, warn
-from plushsense.cli.settings import add_settings, add_workers, listed, marks, report_folds, settings
+from plushsense.cli.settings import add_settings, add_workers, listed, marks, report_jobs, settings
 from plushsense.core.errors import ConfigError
 
 
@@ -85,7 +85,7 @@ def _run_split(args: argparse.Namespace) -> int:
         overwrite=args.force,
         late_s=args.late,
         anywhere_pool_s=args.anywhere_pool,
-        progress=report_folds("streams"),
+        progress=report_jobs("streams"),
         warn=warn,
     )
     if args.out:

@@ -7,13 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.cli.output import emit, figure, say, table, warn
-from plushsense.cli.settings import add_networks, add_work, marks
-
-# Keys of the grid that an option changes, each an attribute of the arguments.
-_CHANGES = (
-    "split", "architectures", "filters", "epochs", "batches", "padding", "norm", "context", "classes", "device",
-    "threads",
-)  # fmt: skip
+from plushsense.cli.settings import add_grid, add_out, add_work, grid_changes, marks
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -25,49 +19,38 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="leave-one-subject-out, by-subject:K, by-recording:K; leaky, as in the paper: windows:holdout, windows:K "
         "(default: the grid's; paper windows:holdout)",
     )
-    parser.add_argument(
-        "--out", metavar="DIR", help="folder for the tables and sweep.json (default: DATASET/evaluations/sweep-GRID)"
-    )
-    parser.add_argument("--force", action="store_true", help="replace a sweep of another grid or data in --out")
+    default = "DATASET/evaluations/sweep-GRID"
+    add_out(parser, "the tables and sweep.json", default, "a sweep of other settings or data")
     add_work(parser, "trainings")
-    parser.add_argument("--seeds", type=int, metavar="N", help="seeds of every trial, 0 to N - 1 (default: the grid's)")
-    add_networks(parser)
+    of_paper = {"padding": "mirror", "norm": "batch", "context": "loop", "classes": "all", "device": "auto"}
+    add_grid(parser, {key: f"the grid's; paper {value}" for key, value in of_paper.items()})
     parser.add_argument("--epochs", metavar="N,...", help="only these numbers of epochs (default: the grid's)")
-    parser.add_argument("--batches", metavar="N,...", help="only these batches, windows or full (default: the grid's)")
-    parser.add_argument("--padding", help="stream, causal or mirror (default: the grid's; paper mirror)")
-    parser.add_argument("--norm", help="batch or layer (default: the grid's; paper batch)")
-    parser.add_argument("--context", help="stream or loop (default: the grid's; paper loop)")
-    parser.add_argument("--classes", metavar="LABELS", help="all, shared, or labels (default: the grid's; paper all)")
-    parser.add_argument("--device", help="auto, cpu or cuda (default: the grid's; paper auto)")
     parser.add_argument(
-        "--dry-run", action="store_true", help="say what would be trained and what is wrong; no training"
+        "--dry-run", action="store_true", help="print what would be trained and all problems, without training"
     )
 
 
 def run(args: argparse.Namespace) -> int:
-    from plushsense.experiments.sweep.run import report_jobs, sweep
+    from plushsense.experiments.sweep.run import sweep
 
-    changes: dict[str, Any] = {key: getattr(args, key) for key in _CHANGES}
-    if args.seeds is not None:
-        # None at all is a problem of the grid, said with the others.
-        changes["seeds"] = tuple(range(args.seeds))
+    changes = grid_changes(args, "split", "epochs")
     if args.dry_run:
         return _dry_run(args, changes)
-    found = sweep(
+    done = sweep(
         args.dataset,
         args.grid,
         out=None if args.out is None else Path(args.out),
         overwrite=args.force,
         workers=args.workers or 0,
         cluster=args.cluster,
-        table=report_jobs,
+        display=True,
         warn=warn,
         **changes,
     )
-    shown = found.to_dict()
-    say(f"written: {found.out}; a page of it:  plushsense report {found.out}")
-    emit(args, shown, lines(shown))
-    return 1 if shown["trainings_lost"] else 0
+    result = done.to_dict()
+    say(f"written: {done.out}; make a page of it with  plushsense report {done.out}")
+    emit(args, result, lines(result))
+    return 1 if result["trainings_lost"] else 0
 
 
 def _dry_run(args: argparse.Namespace, changes: dict[str, Any]) -> int:

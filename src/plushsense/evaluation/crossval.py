@@ -1,6 +1,8 @@
 """Cross-validation: one training for each fold through the journal, all predictions kept, then scored.
 
-Training is passed in as a picklable callable, so that this package needs no PyTorch and folds run in parallel.
+Training is passed in as a picklable callable, so that this package needs no PyTorch and folds run in parallel. Windows
+to train on and to score may be cut from the same recordings with different contexts: the split is made over recordings
+and so is the same for both.
 """
 
 from __future__ import annotations
@@ -9,23 +11,106 @@ import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import ConfigError
+from plushsense.core.errors import BadInput, ConfigError
 from plushsense.core.gestures import NOBODY
-from plushsense.evaluation.folds import WindowFold, fold_windows
 from plushsense.evaluation.scores import FoldRecord, Predictions, compute_scores, gather_predictions, write_predictions
 from plushsense.jobs.journal import Journal, Result, job_id
 from plushsense.jobs.pool import Job, Report, run_jobs
+from plushsense.jobs.progress import JobInfo, JobProgress, JobsReporter
 from plushsense.scoring import metrics
-from plushsense.scoring.splits import Split, parse_split
+from plushsense.scoring.splits import Fold, Index, Split, make_folds, parse_split, purge
 from plushsense.windows.cut import WindowSet
 
 # Part of every job's id: raise it when the meaning of a stored fold changes.
 _VERSION = 1
+
+
+def fold_windows(train: WindowSet, score: WindowSet, split: Split, seed: int = 0) -> list[Fold]:
+    """Return the folds of ``split`` as windows: train and validation index ``train``, test indexes ``score``.
+
+    No window that touches a tested recording in its stream is trained or validated on.
+
+    Raises:
+        BadInput: when the two sets do not belong together, or the split cannot be made of them.
+    """
+    if train.labels != score.labels or train.inputs != score.inputs:
+        raise BadInput("The windows to train on and those to score differ in gestures or channels: cut both alike.")
+    if split.leaky:
+        if train is not score and not _same(train, score):
+            raise ConfigError(
+                f"The split {split.text} divides windows, so it scores the very windows it drew from: "
+                "cut both with the same context, or use by-recording:5."
+            )
+        return make_folds(split, score.subject, score.y, seed)
+    recordings = _Recordings.of(train, score)
+    of_train, of_score = recordings.place(train), recordings.place(score)
+    found = []
+    for fold in make_folds(split, recordings.subject, recordings.y, seed):
+        keep = purge(train.stream, train.window_rows, *recordings.rows(fold.test))
+        windows = Fold(
+            fold.name,
+            fold.subjects,
+            np.flatnonzero(np.isin(of_train, fold.train) & keep),
+            np.flatnonzero(np.isin(of_train, fold.validation) & keep),
+            np.flatnonzero(np.isin(of_score, fold.test)),
+        )
+        _require_windows(windows, fold, split)
+        found.append(windows)
+    return found
+
+
+@dataclass(frozen=True)
+class _Recordings:
+    """The recordings (R,) of both sets; rows in a stream as ids and (R, 2), −1 where there is none."""
+
+    ids: NDArray[np.str_]
+    subject: NDArray[np.str_]
+    y: Index
+    stream: NDArray[np.str_]
+    stream_rows: Index
+
+    @classmethod
+    def of(cls, *sets: WindowSet) -> _Recordings:
+        ids = np.concatenate([_ids(s) for s in sets])
+        subject, stream = (np.concatenate([getattr(s, name) for s in sets]) for name in ("subject", "stream"))
+        y = np.concatenate([s.y for s in sets])
+        rows = np.concatenate([s.recording_rows for s in sets])
+        # Of all windows of a recording, take one whose place in a stream is known.
+        order = np.lexsort((rows[:, 0] < 0, ids))
+        unique, first = np.unique(ids[order], return_index=True)
+        pick = order[first]
+        return cls(unique, subject[pick], y[pick], stream[pick], rows[pick])
+
+    def place(self, windows: WindowSet) -> Index:
+        """Return the recording of each window as an index into these, (N,)."""
+        return np.searchsorted(self.ids, _ids(windows)).astype(np.int64)
+
+    def rows(self, index: Index) -> tuple[NDArray[np.str_], Index]:
+        """Return stream and rows of some recordings, as `purge` takes them."""
+        return self.stream[index], self.stream_rows[index]
+
+
+def _ids(windows: WindowSet) -> NDArray[np.str_]:
+    return np.array(windows.recording_ids, dtype=np.str_)[windows.recording]
+
+
+def _same(one: WindowSet, other: WindowSet) -> bool:
+    return one.x.shape == other.x.shape and bool(
+        np.array_equal(one.x, other.x) and np.array_equal(_ids(one), _ids(other))
+    )
+
+
+def _require_windows(fold: Fold, recordings: Fold, split: Split) -> None:
+    for name in ("train", "test"):
+        if not len(getattr(fold, name)):
+            touched = ": every window that could train touches a tested recording in its stream"
+            reason = touched if len(getattr(recordings, name)) else ""
+            raise BadInput(f"Split {split.text} leaves {fold.name} no windows to {name} with{reason}: use fewer folds.")
 
 
 @dataclass(frozen=True)
@@ -53,21 +138,6 @@ class FitPredict(Protocol):
     ) -> FoldOutput:
         """Train and predict; ``progress`` is called with (epoch, epochs at most, the epoch's row)."""
         ...
-
-
-class FoldProgress(NamedTuple):
-    """Progress of an evaluation: ``epoch`` of ``epochs`` in ``fold``; epoch 0: the fold is done.
-
-    ``row``: the epoch's row of the history, where what trains gives one.
-    """
-
-    done: int
-    folds: int
-    fold: str
-    epoch: int
-    epochs: int
-    resumed: int
-    row: dict[str, Any] | None = None
 
 
 @dataclass
@@ -124,7 +194,7 @@ def evaluate(
     workers: int = 1,
     cluster: str | None = None,
     seed: int = 0,
-    progress: Callable[[FoldProgress], None] | None = None,
+    progress: Callable[[JobProgress], None] | None = None,
 ) -> Evaluation:
     """Train and score once a fold of ``split``.
 
@@ -137,6 +207,8 @@ def evaluate(
         workers: folds at a time, each in a process of its own.
         cluster: address of a Ray cluster that does the folds instead.
         seed: of the split.
+        progress: called when a fold reports an epoch, with (epoch, epochs, row of the history) as its message, or is
+            done.
 
     Raises:
         BadInput: for a split that cannot be made; PlushSenseError: what ``fit_predict`` raises.
@@ -147,7 +219,7 @@ def evaluate(
     folds = fold_windows(train_windows, score_windows, parsed, seed)
     base = {"version": _VERSION, "key": dict(key or {}), "windows": _prints(train_windows, score_windows)}
     jobs = [Job(job_id({**base, "fold": fold_fingerprint(fold)}), fold) for fold in folds]
-    reporter = _FoldReporter(len(folds), progress)
+    reporter = JobsReporter({job.id: JobInfo(job.task.name, 1.0) for job in jobs}, progress=progress)
     results = run_jobs(
         jobs,
         _FoldWork(fit_predict),
@@ -155,8 +227,8 @@ def evaluate(
         workers=workers,
         cluster=cluster,
         journal=journal,
-        on_done=reporter.done,
-        on_report=reporter.epoch,
+        on_done=reporter.on_done,
+        on_report=reporter.on_report,
     )
     outcomes = [results[job.id] for job in jobs]
     records = [
@@ -193,7 +265,7 @@ class _FoldWork:
 
     fit_predict: FitPredict
 
-    def __call__(self, shared: Any, task: WindowFold, report: Report, /) -> Result:
+    def __call__(self, shared: Any, task: Fold, report: Report, /) -> Result:
         train, score = shared
         score = train if score is None else score
 
@@ -220,27 +292,6 @@ class _FoldWork:
         }
 
 
-class _FoldReporter:
-    """Turns the callbacks of `run_jobs` into `FoldProgress`."""
-
-    def __init__(self, folds: int, progress: Callable[[FoldProgress], None] | None) -> None:
-        self._folds, self._progress = folds, progress
-        self._done = self._resumed = 0
-
-    def done(self, job: Job, result: Result, resumed: bool) -> None:
-        self._done += 1
-        self._resumed += resumed
-        self._report(job, 0, 0)
-
-    def epoch(self, job: Job, message: tuple[int, int, dict[str, Any]]) -> None:
-        self._report(job, *message)
-
-    def _report(self, job: Job, epoch: int, epochs: int, row: dict[str, Any] | None = None) -> None:
-        if self._progress is not None:
-            at = (self._done, self._folds, job.task.name, epoch, epochs, self._resumed)
-            self._progress(FoldProgress(*at, row))
-
-
 def context_of(windows: WindowSet) -> str:
     """Return the kind of context: "anywhere" or "stream" where any window has a real past, else "loop" or "inside"."""
     present = set(np.unique(windows.context).tolist())
@@ -261,7 +312,7 @@ def windows_fingerprint(windows: WindowSet) -> str:
     return digest.hexdigest()
 
 
-def fold_fingerprint(fold: WindowFold) -> str:
+def fold_fingerprint(fold: Fold) -> str:
     """Return the hash of the windows that a fold trains on, validates on and tests."""
     digest = hashlib.sha256()
     for index in (fold.train, fold.validation, fold.test):

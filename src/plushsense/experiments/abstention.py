@@ -20,10 +20,10 @@ from plushsense.core.errors import BadInput, ConfigError, DatasetError
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.dataset.index import as_dataset, open_dataset
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
-from plushsense.evaluation.crossval import fold_fingerprint, windows_fingerprint
-from plushsense.evaluation.folds import WindowFold, fold_windows
+from plushsense.evaluation.crossval import fold_fingerprint, fold_windows, windows_fingerprint
 from plushsense.jobs.journal import Job, Report, Result, job_id
 from plushsense.jobs.pool import run_jobs
+from plushsense.jobs.progress import JobInfo, JobProgress, JobsReporter
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.reports.figures import new_figure
@@ -32,7 +32,7 @@ from plushsense.runtime.events import ONE
 from plushsense.runtime.fixed import smoothing_weight
 from plushsense.runtime.trace import TraceReplayer
 from plushsense.scoring.metrics import RiskCoverage, auroc, confidences, risk_coverage
-from plushsense.scoring.splits import parse_split
+from plushsense.scoring.splits import Fold, parse_split
 from plushsense.training.spec import TrainSpec
 from plushsense.tuning.decisions import (
     COVERAGE,
@@ -312,7 +312,7 @@ class _AnswerWork:
     coverage: float
     known_share: float
 
-    def __call__(self, shared: WindowSet, task: tuple[WindowFold, str], report: Report, /) -> Result:
+    def __call__(self, shared: WindowSet, task: tuple[Fold, str], report: Report, /) -> Result:
         from plushsense.training.fit import fit
 
         fold, withheld = task
@@ -335,7 +335,7 @@ def _opened(path: str) -> Dataset:
     return open_dataset(Path(path))
 
 
-def _without_other_people(fold: WindowFold, windows: WindowSet, dataset: Dataset) -> WindowFold:
+def _without_other_people(fold: Fold, windows: WindowSet, dataset: Dataset) -> Fold:
     """Return the fold without training windows from the streams of validation and test people."""
     heard = set(windows.subject[np.concatenate([fold.validation, fold.test])].tolist()) - {NOBODY}
     return replace(fold, train=fold.train[outside_streams(windows, dataset, heard)[fold.train]])
@@ -369,7 +369,7 @@ def abstaining(
     coverage: float = COVERAGE,
     known_share: float = KNOWN_SHARE,
     out: str | os.PathLike[str] | None = None,
-    progress: Callable[[int, int, int], None] | None = None,
+    progress: Callable[[JobProgress], None] | None = None,
     warn: Warn = silent,
     **settings: Any,
 ) -> Abstaining:
@@ -384,7 +384,7 @@ def abstaining(
             trainings again for each gesture.
         coverage: at which the conformal sets are fitted; known_share: of known gestures that pass as known.
         out: a folder for ``abstaining.json`` and the figure.
-        progress: called with (trainings done, of all, from before).
+        progress: called when a training is done.
 
     Raises:
         ConfigError: for a split of windows or recordings; DatasetError: without streams.
@@ -423,21 +423,14 @@ def abstaining(
         Job(job_id({**key, "fold": fold_fingerprint(fold), "withheld": label}), (fold, label))
         for fold, label in [*((fold, "") for fold in folds), *without]
     ]
-    done = resumed = 0
-
-    def count(_: Job, __: Result, kept: bool) -> None:
-        nonlocal done, resumed
-        done, resumed = done + 1, resumed + kept
-        if progress is not None:
-            progress(done, len(jobs), resumed)
-
+    reporter = JobsReporter({job.id: JobInfo(job.task[0].name, 1.0) for job in jobs}, progress=progress)
     results = run_jobs(
         jobs,
         _AnswerWork(str(dataset.path), arch, config.training, gestures, coverage, known_share),
         shared=windows,
         workers=config.evaluation.processes,
         journal=journal_of(dataset, "abstaining"),
-        on_done=count,
+        on_done=reporter.on_done,
     )
     answers = [
         FoldAnswers(

@@ -22,12 +22,11 @@ from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import HEAD, Dataset
 from plushsense.deploy.quantize import calibration, integer_network, integer_probabilities, refuse_undeployable
-from plushsense.evaluation.crossval import context_of, fold_fingerprint, windows_fingerprint
-from plushsense.evaluation.folds import WindowFold, fold_windows
+from plushsense.evaluation.crossval import context_of, fold_fingerprint, fold_windows, windows_fingerprint
 from plushsense.live.adaptation import Personal, PersonalSpec, RecordingScores, judge, personalise, restore_original
 from plushsense.models.bundle import Bundle
 from plushsense.scoring import metrics
-from plushsense.scoring.splits import parse_split, purge
+from plushsense.scoring.splits import Fold, parse_split, purge
 from plushsense.windows.cut import WindowSet, whole_gestures
 from plushsense.workflow.config import RunConfig, from_settings
 from plushsense.workflow.preparation import Warn, choose_classes, silent, windows_for
@@ -462,7 +461,7 @@ def evaluate_adapting(
     key = {"windows": windows_fingerprint(windows), "arch": arch.to_dict(), "layout": dataset.layout.to_dict()}
     tell = progress or (lambda _: None)
 
-    def bundle_of(fold: WindowFold) -> Bundle:
+    def bundle_of(fold: Fold) -> Bundle:
         made = json.dumps({**key, "fold": fold_fingerprint(fold), "training": config.training.key()}, sort_keys=True)
         path = dataset.path / CACHE / "adapting" / f"{hashlib.sha256(made.encode()).hexdigest()[:32]}.plush"
         if path.exists():

@@ -10,6 +10,7 @@ import os
 import sys
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, NamedTuple, Self, TextIO
@@ -32,18 +33,39 @@ class JobInfo(NamedTuple):
 
 
 class JobStep(NamedTuple):
-    """The step (epoch) that a job has reached, and its last loss."""
+    """The step (epoch) that a job has reached, its last loss, and the step ``first`` that it continued from."""
 
     step: int
     steps: int
     loss: float | None = None
+    first: int = 0
 
 
 class BestScore(NamedTuple):
-    """A score, higher is better, and the name of what reached it."""
+    """A score, higher is better, and the name (and table row, if there is one) of what reached it."""
 
     score: float
     name: str
+    row: Mapping[str, Any] | None = None
+
+
+@dataclass(frozen=True)
+class JobProgress:
+    """Progress of many jobs: ``done`` of ``total``, of which an earlier run finished ``resumed``.
+
+    ``share`` is the finished share of the cost, that of running jobs included. ``name`` is the job that caused this
+    report: it has reached ``epoch`` of ``epochs`` and sent ``message``, or it is done (epoch 0).
+    """
+
+    done: int
+    total: int
+    resumed: int
+    share: float
+    name: str
+    epoch: int = 0
+    epochs: int = 0
+    message: Any = None
+    best: BestScore | None = None
 
 
 @dataclass(frozen=True)
@@ -102,10 +124,10 @@ class ProgressStatus:
         return Group(*[*head, *body][:height])
 
 
-class Reporter:
-    """Base of both reporters: the display itself, drawn by a thread of its own.
+class Reporter(ABC):
+    """Base of both reporters: draws the display in a thread of its own.
 
-    A terminal that is closed in the meantime ends the display, never the work.
+    Closing the terminal ends the display, never the work.
     """
 
     def __init__(self, *, keep: bool, stream: TextIO | None) -> None:
@@ -152,9 +174,9 @@ class Reporter:
         with self._lock:
             self._messages.append(printable(text))
 
+    @abstractmethod
     def status(self, now: float) -> ProgressStatus:
         """Return what to display at ``now``, in seconds of `time.monotonic`."""
-        raise NotImplementedError
 
     def _run(self, out: TextIO) -> None:
         # A closed terminal or a full disk must not stop the work.
@@ -291,7 +313,7 @@ class JobsState:
         self.done.add(job)
         if resumed:
             self.resumed.add(job)
-        if best is not None and (self.best is None or best.score > self.best.score):
+        if best is not None and (self.best is None or best.score >= self.best.score):
             self.best = best
 
     def fail(self, job: str, why: str) -> None:
@@ -344,7 +366,8 @@ class JobsState:
 
     def _open(self) -> dict[str, float]:
         """Return the remaining cost of every job that is neither done nor failed."""
-        parts = {job: min(1.0, s.step / max(1, s.steps)) for job, (_, s) in self._running.items() if s is not None}
+        steps = {job: step for job, (_, step) in self._running.items() if step is not None}
+        parts = {job: min(1.0, (s.step - s.first) / max(1, s.steps - s.first)) for job, s in steps.items()}
         return {
             job: info.cost * (1.0 - parts.get(job, 0.0))
             for job, info in self.jobs.items()
@@ -352,18 +375,27 @@ class JobsState:
         }
 
 
+def read_epoch(_: Job, message: Sequence[Any]) -> JobStep:
+    """Return the step in a message that begins with (epoch, epochs)."""
+    return JobStep(message[0], message[1])
+
+
 class JobsReporter(Reporter):
-    """Reports the progress of many jobs, as a context manager; its ``on_…`` methods are the callbacks of `run_jobs`."""
+    """Follows many jobs; its ``on_…`` methods are the callbacks of `run_jobs`.
+
+    It calls ``progress`` when a job reports or is done, and displays the jobs while it is used as a context manager.
+    """
 
     def __init__(
         self,
-        title: str,
         jobs: Mapping[str, JobInfo],
         *,
-        read: Callable[[Any], JobStep | None],
+        title: str = "",
+        unit: str = "jobs",
+        read: Callable[[Job, Any], JobStep] = read_epoch,
         score: Callable[[Job, Result], BestScore | None] | None = None,
         score_name: str = "score",
-        unit: str = "jobs",
+        progress: Callable[[JobProgress], None] | None = None,
         stream: TextIO | None = None,
     ) -> None:
         """Prepare the display.
@@ -372,10 +404,11 @@ class JobsReporter(Reporter):
             jobs: name and cost of every job, by its id.
             read: returns the step in a message of a job.
             score: returns the score of a result.
+            progress: called when a job reports or is done.
         """
         super().__init__(keep=True, stream=stream)
         self._title, self._unit = title, unit
-        self._read, self._score, self._score_name = read, score, score_name
+        self._read, self._score, self._score_name, self._progress = read, score, score_name, progress
         self.state = JobsState(jobs, time.monotonic())
 
     def start(self) -> None:
@@ -389,16 +422,17 @@ class JobsReporter(Reporter):
 
     def on_report(self, job: Job, message: Any) -> None:
         """Record the step in a message of a job."""
-        step = self._read(message)
-        if step is not None:
-            with self._lock:
-                self.state.step(job.id, step, time.monotonic())
+        step = self._read(job, message)
+        with self._lock:
+            self.state.step(job.id, step, time.monotonic())
+        self._notify(job, step, message)
 
     def on_done(self, job: Job, result: Result, resumed: bool) -> None:
         """Mark a job as done and keep its score if it is the best."""
         best = None if self._score is None else self._score(job, result)
         with self._lock:
             self.state.finish(job.id, best, resumed)
+        self._notify(job)
 
     def on_failed(self, job: Job, error: Exception) -> None:
         """Mark a job as given up and write the reason above the display."""
@@ -406,6 +440,13 @@ class JobsReporter(Reporter):
         with self._lock:
             self.state.fail(job.id, why)
         self.write(f"{self.state.jobs[job.id].name} failed: {why}")
+
+    def _notify(self, job: Job, step: JobStep | None = None, message: Any = None) -> None:
+        if self._progress is None:
+            return
+        s, (epoch, epochs) = self.state, (0, 0) if step is None else step[:2]
+        done, total, resumed, name = len(s.done), len(s.jobs), len(s.resumed), s.jobs[job.id].name
+        self._progress(JobProgress(done, total, resumed, s.share, name, epoch, epochs, message, s.best))
 
     def status(self, now: float) -> ProgressStatus:
         with self._lock:

@@ -32,6 +32,7 @@ from plushsense.deploy.package import changed_copies
 from plushsense.deploy.profile import profile
 from plushsense.deploy.proof.vectors import Export
 from plushsense.deploy.proof.verify import verify
+from plushsense.jobs.progress import JobProgress
 from plushsense.studio.app.jobs import UNFINISHED
 from plushsense.studio.pages.export.exports import folder_digest
 from plushsense.workflow.api import simulate
@@ -287,18 +288,13 @@ def run_evaluate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]
 
     dataset = open_dataset(spec["dataset"])
     out = dataset.path / "evaluations" / name_of(config, dataset)
-    clock, running = Clock(), dict[str, float]()
+    clock = Clock()
 
-    def fold(at: Any) -> None:
-        if at.epoch:
-            running[at.fold] = at.epoch / at.epochs
-        else:
-            running.pop(at.fold, None)
-        share = (at.done + sum(running.values())) / at.folds
-        row = at.row or {}
+    def fold(at: JobProgress) -> None:
+        row = at.message[2] if at.epoch else {}
         scores = {k: row.get(k) for k in ("train_loss", "validation_loss", "validation_accuracy")}
-        counts = {"done": at.done, "folds": at.folds, "resumed": at.resumed, "fold": at.fold}
-        reporter.progress(stage="training", epoch=at.epoch, epochs=at.epochs, **counts, **scores, **clock.at(share))
+        counts = {"done": at.done, "folds": at.total, "resumed": at.resumed, "fold": at.name}
+        reporter.progress(stage="training", epoch=at.epoch, epochs=at.epochs, **counts, **scores, **clock.at(at.share))
 
     result = evaluate(dataset, config, out=out, int8=bool(spec.get("int8")), progress=fold, warn=reporter.warn)
     report = write_report(out / PAGE, dataset, [out])
@@ -328,9 +324,10 @@ def run_sweep(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     reporter.progress(stage="reading", share=0.0)
     clock = Clock()
 
-    def training(at: Any) -> None:
-        best = at.best and {key: at.best[key] for key in ("arch", "filters", "accuracy", "macro_f1")}
-        counts = {"done": at.done, "trainings": at.trainings, "resumed": at.resumed, "what": at.what}
+    def training(at: JobProgress) -> None:
+        row = at.best and at.best.row
+        best = row and {key: row[key] for key in ("arch", "filters", "accuracy", "macro_f1")}
+        counts = {"done": at.done, "trainings": at.total, "resumed": at.resumed, "what": at.name}
         reporter.progress(stage="training", epoch=at.epoch, epochs=at.epochs, best=best, **counts, **clock.at(at.share))
 
     done = sweep(spec["dataset"], spec["grid"], progress=training, warn=reporter.warn, **changes)
@@ -345,22 +342,20 @@ def run_search(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Run a search; return ``out`` and the main figures of the summary, in a dry run the preview."""
     from plushsense.experiments.search.run import preview_search, search
 
-    limits, changes = dict(spec.get("asked", {})), dict(spec.get("changes", {}))
+    changes = {**spec.get("asked", {}), **spec.get("changes", {})}
     if spec.get("dry"):
-        return preview_search(
-            spec["dataset"], spec["grid"], asked=limits, changes=changes, measure=True, warn=reporter.warn
-        )
+        return preview_search(spec["dataset"], spec["grid"], measure=True, warn=reporter.warn, **changes)
     reporter.progress(stage="reading", share=0.0)
     clock = Clock()
 
     def training(at: Any) -> None:
-        best = at.best and {"title": at.best[0], "macro_f1": at.best[1]}
-        counts = {"rung": at.rung, "rungs": at.rungs, "networks": at.networks, "what": at.what}
-        counts |= {"done": at.done, "trainings": at.trainings, "resumed": at.resumed}
+        best = at.best and {"title": at.best.name, "macro_f1": at.best.score}
+        counts = {"rung": at.rung, "rungs": at.rungs, "networks": at.networks, "what": at.name}
+        counts |= {"done": at.done, "trainings": at.total, "resumed": at.resumed}
         share = min(1.0, at.share)
         reporter.progress(stage="training", epoch=at.epoch, epochs=at.epochs, best=best, **counts, **clock.at(share))
 
-    done = search(spec["dataset"], spec["grid"], **limits, progress=training, warn=reporter.warn, **changes)
+    done = search(spec["dataset"], spec["grid"], progress=training, warn=reporter.warn, **changes)
     s = done.summary
     keys = ("name", "split", "leaky", "context", "simulated", "candidates", "winner", "smallest_equal", "seconds")
     return {"out": str(done.out), **{key: s[key] for key in keys}, "command": s["command"]}

@@ -17,7 +17,7 @@ import numpy as np
 from plushsense.core.gestures import NOBODY
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
-from plushsense.evaluation.folds import fold_windows
+from plushsense.evaluation.crossval import fold_windows
 from plushsense.models.arch import Arch
 from plushsense.scoring.splits import parse_split
 from plushsense.training.spec import TrainSpec

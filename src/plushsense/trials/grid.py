@@ -8,6 +8,7 @@ training of its own.
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -295,8 +296,13 @@ TABLES = ("grid", "search")
 Spec = TypeVar("Spec", bound="DataclassInstance")
 
 
-def load_grid(name_or_path: str | Path, changes: Mapping[str, Any] | None = None) -> tuple[GridSpec, list[str]]:
-    """Read a grid by its name or from a TOML file, with ``changes`` over it (values, or text as on the command line).
+def load_grid(
+    grid: GridSpec | str | os.PathLike[str], changes: Mapping[str, Any] | None = None
+) -> tuple[GridSpec, list[str]]:
+    """Return a grid given as such, by its name or as a TOML file, with ``changes`` applied.
+
+    Args:
+        changes: new values of some keys, or their text as on the command line; None leaves a key as it is.
 
     Returns:
         the grid, and one sentence for each key or value that cannot be read; those are as in the paper's grid.
@@ -304,19 +310,17 @@ def load_grid(name_or_path: str | Path, changes: Mapping[str, Any] | None = None
     Raises:
         ConfigError: for an unknown name, or a file that is missing or not TOML.
     """
-    if str(name_or_path) in GRIDS:
-        grid, found = GRIDS[str(name_or_path)], list[str]()
-    else:
-        tables, found = grid_tables(name_or_path)
-        grid, more = over(GridSpec(name=Path(name_or_path).stem), tables["grid"], f"[grid] in '{name_or_path}'")
-        found += more
-    grid, more = changed(grid, changes or {})
+    found: list[str] = []
+    if not isinstance(grid, GridSpec):
+        path = os.fspath(grid)
+        if path in GRIDS:
+            grid = GRIDS[path]
+        else:
+            tables, found = grid_tables(path)
+            grid, more = over(GridSpec(name=Path(path).stem), tables["grid"], f"[grid] in '{path}'")
+            found += more
+    grid, more = over(grid, changes or {}, "the grid")
     return grid, found + more
-
-
-def changed(grid: GridSpec, changes: Mapping[str, Any]) -> tuple[GridSpec, list[str]]:
-    """Return a grid with some keys changed, as in `load_grid`; a change of None is ignored."""
-    return over(grid, {key: value for key, value in changes.items() if value is not None}, "the grid")
 
 
 def grid_tables(path: str | Path) -> tuple[dict[str, Mapping[str, Any]], list[str]]:
@@ -344,11 +348,11 @@ def grid_tables(path: str | Path) -> tuple[dict[str, Mapping[str, Any]], list[st
 def over(spec: Spec, table: Mapping[str, Any], where: str) -> tuple[Spec, list[str]]:
     """Return a grid (or another spec) with the values of a table, and a message for each key or value that is wrong.
 
-    Values may be text as on the command line, lists joined by commas. Of a list with a wrong item the others are kept,
-    so that what else is wrong with the grid is reported of it and not of the default.
+    Values may be text as on the command line, with commas between the items of a list; None leaves the value of the
+    grid. If one item of a list is wrong, the others are kept, so that further problems are found in them.
     """
     kinds = get_type_hints(type(spec))
-    parsed = {key: _from_text(key, value, kinds.get(key)) for key, value in table.items()}
+    parsed = {key: _from_text(key, value, kinds.get(key)) for key, value in table.items() if value is not None}
     values, found = check_table(parsed, type(spec), where)
     return replace(spec, **values), found
 

@@ -20,14 +20,13 @@ from numpy.typing import NDArray
 from plushsense.core.errors import BadInput, ConfigError, DivergedError
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.dataset.store import Dataset
-from plushsense.evaluation.crossval import fold_fingerprint, windows_fingerprint
-from plushsense.evaluation.folds import WindowFold, fold_windows
+from plushsense.evaluation.crossval import fold_fingerprint, fold_windows, windows_fingerprint
 from plushsense.jobs.journal import JOURNAL, UNFINISHED, Journal, Result, job_id, keep_if_possible
 from plushsense.jobs.pool import Job, Report, run_jobs
 from plushsense.models.arch import Arch
 from plushsense.scoring import metrics
 from plushsense.scoring.metrics import Counts
-from plushsense.scoring.splits import Split, parse_split
+from plushsense.scoring.splits import Fold, Split, parse_split
 from plushsense.training.spec import TrainSpec
 from plushsense.trials.grid import FULL, GridSpec, Trial, first_line, problems, trainings
 from plushsense.windows.cut import WindowSet, shared_gestures
@@ -104,7 +103,7 @@ class Plan:
     split: Split
     gestures: GestureSet
     sets: dict[int, WindowSet]
-    folds: dict[int, list[WindowFold]]
+    folds: dict[int, list[Fold]]
     trials: tuple[PlannedTrial, ...]
     jobs: tuple[Job, ...]
 
@@ -192,7 +191,7 @@ class _Cut:
     grid: GridSpec
     gestures: GestureSet
     sets: dict[int, WindowSet]
-    by_span: dict[int, list[WindowFold]]
+    by_span: dict[int, list[Fold]]
     window: Arch
 
     @classmethod
@@ -216,11 +215,11 @@ class _Cut:
         """Windows without more past."""
         return self.sets[self.window.span]
 
-    def folds(self) -> list[WindowFold]:
+    def folds(self) -> list[Fold]:
         """Return the folds of the windows of a span."""
         return self.at(self.window)[1]
 
-    def at(self, arch: Arch) -> tuple[WindowSet, list[WindowFold]]:
+    def at(self, arch: Arch) -> tuple[WindowSet, list[Fold]]:
         """Return the windows that a network needs, and their folds."""
         # A network that reads no more than a window reads the end of that window.
         span = max(arch.span, arch.window)

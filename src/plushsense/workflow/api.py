@@ -27,11 +27,12 @@ from plushsense.deploy.quantize import (
     quantize,
     refuse_undeployable,
 )
-from plushsense.evaluation.crossval import EpochProgress, Evaluation, FoldOutput, FoldProgress, windows_fingerprint
+from plushsense.evaluation.crossval import EpochProgress, Evaluation, FoldOutput, windows_fingerprint
 from plushsense.evaluation.crossval import evaluate as crossvalidate
 from plushsense.evaluation.scores import FoldRecord, gather_predictions
 from plushsense.evaluation.scores import compute_scores as score_predictions
 from plushsense.jobs.journal import UNFINISHED, Journal, job_id, keep_if_possible
+from plushsense.jobs.progress import JobProgress
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.runtime.decisions import DecideSpec
@@ -324,7 +325,7 @@ def evaluate(
     overwrite: bool = False,
     cluster: str | None = None,
     int8: bool = False,
-    progress: Callable[[FoldProgress], None] | None = None,
+    progress: Callable[[JobProgress], None] | None = None,
     warn: Warn = silent,
     **settings: Any,
 ) -> Evaluation:

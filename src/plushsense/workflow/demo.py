@@ -74,7 +74,7 @@ def run_demo(out: Path, *, quick: bool = False, stage: Stage, progress: Progress
         split=f"by-subject:{size.folds}",
         out=evaluation,
         overwrite=True,
-        progress=lambda at: progress("folds", at.done, at.folds),
+        progress=lambda at: progress("folds", at.done, at.total),
     ).to_dict()
     stage(f"4/6  live: {size.live_s:.0f} s of a virtual person left out of the training")
     live = _live(bundle, size.live_s)

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from plushsense.core.errors import DatasetError
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
-from plushsense.evaluation.folds import WindowFold, fold_windows
+from plushsense.evaluation.crossval import fold_windows
 from plushsense.models.arch import Arch
-from plushsense.scoring.splits import VALIDATION_SHARE, Split, parse_split
+from plushsense.scoring.splits import VALIDATION_SHARE, Fold, Split, parse_split
 from plushsense.windows.anywhere import AnywhereSpec, add_idle_gesture, cut_anywhere
 from plushsense.windows.cut import ANYWHERE, WindowSet, WindowSpec, cut_windows, shared_gestures
 from plushsense.workflow.config import ALL, SHARED, RunConfig
@@ -100,7 +100,7 @@ class TrainValidationSplit:
     split: Split
     kind: str
     description: str
-    fold: WindowFold
+    fold: Fold
     train: NDArray[np.int64]
     watch: NDArray[np.int64]
 

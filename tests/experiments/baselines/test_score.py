@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 from plushsense.core.errors import BadInput, ConfigError
-from plushsense.experiments.baselines.score import CompareProgress, Contender, compare
+from plushsense.experiments.baselines.score import Contender, compare
 from plushsense.jobs.journal import Journal
+from plushsense.jobs.progress import JobProgress
 from plushsense.windows.cut import WindowSet
 
 HERE = Path(__file__).parents[2]
@@ -74,7 +75,7 @@ def fits(folder: Path) -> int:
 
 def test_side_by_side_with_the_gap(tmp_path: Path) -> None:
     windows = study(windows=4)
-    said: list[CompareProgress] = []
+    said: list[JobProgress] = []
     table = compare(windows, [known(tmp_path), known(tmp_path, "other")], SPLITS, progress=said.append)
     json.dumps(table, allow_nan=False)
     assert [(r["name"], r["split"]) for r in table["models"]] == [
@@ -91,7 +92,7 @@ def test_side_by_side_with_the_gap(tmp_path: Path) -> None:
     assert all(r["predict_ms"] > 0 and r["predict_batch_ms"] > 0 and r["train_s"] > 0 for r in table["models"])
     assert honest["size_bytes"] % 8 == 0 and honest["size_bytes"] > 0
     assert (table["windows"], table["subjects"], table["recordings"]) == (len(windows), 6, 30)
-    assert [s.done for s in said] == list(range(1, 21)) and fits(tmp_path) == 20 == said[-1].jobs
+    assert [s.done for s in said] == list(range(1, 21)) and fits(tmp_path) == 20 == said[-1].total
 
 
 def test_finished_fits_are_kept_and_a_changed_key_is_another_job(tmp_path: Path) -> None:

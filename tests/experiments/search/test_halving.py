@@ -250,7 +250,7 @@ def test_a_search_in_a_file(tmp_path: Path) -> None:
         "[search]\nrungs = [2, 9]\nshare = 0.5\nmax_parameters = 9000\n"
         "[search.space]\nkernels = [5, 9, 19, 39]\ndilations = [1, 2, 4]\nnetworks = 6\n"
     )
-    grid, spec, found = load_search(path, {"batches": "32"}, {"share": 0.75, "eta": None})
+    grid, spec, found = load_search(path, {"batches": "32", "share": 0.75, "eta": None})
     assert found == []
     assert (spec.rungs, spec.share, spec.max_parameters) == ((2, 9), 0.75, 9000)
     assert (grid.name, grid.epochs, grid.split, grid.batches) == ("mine", (2, 9), "by-subject:3", (32,))

@@ -42,8 +42,8 @@ def grid_keys() -> dict[str, Any]:
 
 
 def test_its_scores_are_those_of_trainings_without_a_stop(dataset: Dataset, recordings: Path, tmp_path: Path) -> None:
-    told: list[SearchProgress] = []
-    found = search(dataset, seeds=(0, 1), progress=told.append, **QUICK, **SMALL)
+    seen: list[SearchProgress] = []
+    found = search(dataset, seeds=(0, 1), progress=seen.append, **QUICK, **SMALL)
     other = import_recordings(recordings, tmp_path / "other", layout="accel-3").dataset
     whole = sweep(other, epochs=(1, 2, 4), seeds=(0, 1), out=tmp_path / "o", **grid_keys())
     scores = {(row["arch"], row["epochs"]): row for row in whole.trials.iter_rows(named=True)}
@@ -77,8 +77,8 @@ def test_its_scores_are_those_of_trainings_without_a_stop(dataset: Dataset, reco
     assert (len(best["by_fold"]), len(best["by_seed"])) == (2, 2)
     assert sum(best["by_fold"]) / 2 == pytest.approx(best["macro_f1"]) == sum(best["by_seed"]) / 2
     assert s["cost"]["share"] <= 0.6 and s["cost"]["macs"] == pytest.approx(sum(r["macs"] for r in s["rungs"]))
-    assert told[-1].share == pytest.approx(s["cost"]["macs"] / s["cost"]["bound_macs"])
-    assert (told[-1].rung, told[-1].done) == (3, told[-1].trainings) and told[-1].best is not None
+    assert seen[-1].share == pytest.approx(s["cost"]["macs"] / s["cost"]["bound_macs"])
+    assert (seen[-1].rung, seen[-1].done) == (3, seen[-1].total) and seen[-1].best is not None
     assert json.loads((found.out / "search.json").read_text()) == json.loads(json.dumps(s))
     assert best["arch"] in repr(found) and "leaky" not in repr(found)
 

@@ -11,7 +11,7 @@ import pytest
 import plushsense as ps
 from plushsense.core.gestures import NOBODY
 from plushsense.dataset.store import Dataset
-from plushsense.evaluation.folds import fold_windows
+from plushsense.evaluation.crossval import fold_windows
 from plushsense.experiments.abstention import _without_other_people
 from plushsense.experiments.streams.run import TrainStreams, recipes_for
 from plushsense.experiments.streams.score import PeopleFold

@@ -19,8 +19,9 @@ from polars.testing import assert_frame_equal
 from plushsense.core.errors import ConfigError, DivergedError, TrainingError
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.store import Dataset
-from plushsense.experiments.sweep.run import SweepProgress, sweep
+from plushsense.experiments.sweep.run import sweep
 from plushsense.jobs.journal import UNFINISHED
+from plushsense.jobs.progress import JobProgress
 from plushsense.trials import tables as sweep_tables
 from plushsense.trials.plan import JOURNAL
 
@@ -62,9 +63,9 @@ def test_where_validation_stops_each_is_trained_apart(dataset: Dataset, tmp_path
 
 
 def test_the_folder_holds_what_it_promises(dataset: Dataset, tmp_path: Path) -> None:
-    told: list[SweepProgress] = []
+    seen: list[JobProgress] = []
     out = tmp_path / "o"
-    found = sweep(dataset, epochs=(1, 3), seeds=(0, 1), split="by-subject:2", out=out, progress=told.append, **SMALL)
+    found = sweep(dataset, epochs=(1, 3), seeds=(0, 1), split="by-subject:2", out=out, progress=seen.append, **SMALL)
     assert sorted(p.name for p in out.iterdir()) == [
         "curves.parquet", "runs.parquet", "sweep.json", "trials.csv", "trials.parquet",
     ]  # fmt: skip
@@ -92,17 +93,17 @@ def test_the_folder_holds_what_it_promises(dataset: Dataset, tmp_path: Path) -> 
         assert sum(map(sum, confusion)) == 2 * tested, "two seeds, each window once a seed"
     for rows in summary["per_class"].values():
         assert [row["label"] for row in rows] == summary["labels"]
-    assert (told[-1].done, told[-1].trainings) == (16, 16) and told[-1].share == pytest.approx(1.0)
+    assert (seen[-1].done, seen[-1].total) == (16, 16) and seen[-1].share == pytest.approx(1.0)
     assert "8 of 8 trials" in repr(found) and "<table>" in found._repr_html_()
     assert_frame_equal(found.trials, trials)
 
 
 def _tested(dataset: Dataset) -> list[Any]:
-    from plushsense.trials.grid import GRIDS, changed
+    from plushsense.trials.grid import load_grid
     from plushsense.trials.plan import plan
 
     keys = {key: value for key, value in SMALL.items() if key != "workers"}
-    grid, _ = changed(GRIDS["paper"], {**keys, "split": "by-subject:2"})
+    grid, _ = load_grid("paper", {**keys, "split": "by-subject:2"})
     return [fold.test for fold in next(iter(plan(dataset, grid).folds.values()))]
 
 

@@ -22,8 +22,9 @@ from plushsense.core.version import __version__
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
 from plushsense.experiments.baselines.models import BASELINES, FEATURES, ROCKETS, TITLES, TOO_LONG, classical, rockets
-from plushsense.experiments.baselines.score import CompareProgress, Contender, Reader, compare
+from plushsense.experiments.baselines.score import Contender, Reader, compare
 from plushsense.jobs.journal import job_id
+from plushsense.jobs.progress import JobProgress
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.models.reference import Network
@@ -159,7 +160,7 @@ def baselines(
     out: str | os.PathLike[str] | None = None,
     overwrite: bool = False,
     cluster: str | None = None,
-    progress: Callable[[CompareProgress], None] | None = None,
+    progress: Callable[[JobProgress], None] | None = None,
     warn: Warn = silent,
     **settings: Any,
 ) -> dict[str, Any]:

@@ -10,20 +10,20 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, need
 from plushsense.core.gestures import NOBODY
-from plushsense.evaluation.crossval import context_of, fold_fingerprint, windows_fingerprint
-from plushsense.evaluation.folds import WindowFold, fold_windows
+from plushsense.evaluation.crossval import context_of, fold_fingerprint, fold_windows, windows_fingerprint
 from plushsense.evaluation.scores import FoldRecord, compute_scores, gather_predictions
 from plushsense.jobs.journal import Journal, Result, job_id
 from plushsense.jobs.pool import Job, Report, run_jobs
+from plushsense.jobs.progress import JobInfo, JobProgress, JobsReporter
 from plushsense.scoring.metrics import column_metrics
-from plushsense.scoring.splits import Split, parse_split
+from plushsense.scoring.splits import Fold, Split, parse_split
 from plushsense.windows.cut import WindowSet
 
 # Part of every job's id: raise it when the meaning of a stored fold changes.
@@ -72,19 +72,10 @@ class Contender:
         return f"{self.title}, {self.features}{', PCA' if self.pca else ''}"
 
 
-class CompareProgress(NamedTuple):
-    """Where a comparison stands: ``what`` was just done."""
-
-    done: int
-    jobs: int
-    what: str
-    resumed: int
-
-
 @dataclass(frozen=True)
 class _Task:
     contender: Contender
-    fold: WindowFold
+    fold: Fold
 
 
 def compare(
@@ -96,7 +87,7 @@ def compare(
     workers: int = 1,
     cluster: str | None = None,
     seed: int = 0,
-    progress: Callable[[CompareProgress], None] | None = None,
+    progress: Callable[[JobProgress], None] | None = None,
 ) -> dict[str, Any]:
     """Fit and score every contender in every fold of every split, all on the same windows.
 
@@ -130,9 +121,10 @@ def compare(
                 for fold, mark in zip(made, prints[text], strict=True)
             ]
     everything = [job for some in jobs.values() for job in some]
-    told = _Teller(len(everything), progress)
+    infos = {job.id: JobInfo(f"{job.task.contender.words}, {job.task.fold.name}", 1.0) for job in everything}
+    reporter = JobsReporter(infos, progress=progress)
     results = run_jobs(
-        everything, _work, shared=windows, workers=workers, journal=journal, cluster=cluster, on_done=told.done
+        everything, _work, shared=windows, workers=workers, journal=journal, cluster=cluster, on_done=reporter.on_done
     )
     rows = [
         _row(contenders[i], split, folds[split.text], [results[job.id] for job in jobs[i, split.text]], windows)
@@ -148,7 +140,7 @@ def compare(
         "labels": list(windows.labels),
         "seed": seed,
         "jobs": len(everything),
-        "resumed": told.resumed,
+        "resumed": len(reporter.state.resumed),
         "models": rows,
         "gaps": gaps(rows),
     }
@@ -231,7 +223,7 @@ def _one_thread() -> Iterator[None]:
 
 
 def _row(
-    contender: Contender, split: Split, folds: list[WindowFold], outcomes: list[Result], windows: WindowSet
+    contender: Contender, split: Split, folds: list[Fold], outcomes: list[Result], windows: WindowSet
 ) -> dict[str, Any]:
     records = [
         FoldRecord(f.name, f.subjects, (len(f.train), len(f.validation), len(f.test)), 0, float(o["train_s"]))
@@ -261,18 +253,3 @@ def _row(
         "train_s": middle("train_s"),
         "train_s_in_all": float(sum(o["train_s"] for o in outcomes)),
     }
-
-
-class _Teller:
-    """Turns finished jobs into `CompareProgress`."""
-
-    def __init__(self, jobs: int, progress: Callable[[CompareProgress], None] | None) -> None:
-        self._jobs, self._progress = jobs, progress
-        self._done = self.resumed = 0
-
-    def done(self, job: Job, result: Result, resumed: bool) -> None:
-        self._done += 1
-        self.resumed += resumed
-        if self._progress is not None:
-            what = f"{job.task.contender.words}, {job.task.fold.name}"
-            self._progress(CompareProgress(self._done, self._jobs, what, self.resumed))

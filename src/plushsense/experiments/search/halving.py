@@ -11,9 +11,10 @@ Cost is in multiply-accumulates (MAC): of a window × windows × epochs, forward
 from __future__ import annotations
 
 import math
+import os
 import random
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -377,11 +378,13 @@ DEFAULTS: dict[str, Any] = {
 
 
 def load_search(
-    name_or_path: str | Path, changes: Mapping[str, Any] | None = None, search: Mapping[str, Any] | None = None
+    grid: GridSpec | str | os.PathLike[str], changes: Mapping[str, Any] | None = None
 ) -> tuple[GridSpec, SearchSpec, list[str]]:
-    """Grid and search by a grid's name or from a TOML file, with ``changes`` and ``search`` over them (None: none).
+    """Return a grid and the search in it, with ``changes`` applied; the grid's epochs are the rungs.
 
-    The grid's epochs are the rungs.
+    Args:
+        grid: a grid, its name or the path of a TOML file.
+        changes: new values of keys of `SearchSpec` and of the grid; None leaves a key as it is.
 
     Returns:
         both, and one sentence for each key or value that cannot be read; those are as if they were not there.
@@ -389,30 +392,31 @@ def load_search(
     Raises:
         ConfigError: for an unknown name, or a file that is missing or not TOML.
     """
-    if str(name_or_path) in GRIDS:
-        base, table, asked, found = GRIDS[str(name_or_path)], dict[str, Any](), dict[str, Any](), list[str]()
+    table, settings, found = dict[str, Any](), dict[str, Any](), list[str]()
+    if isinstance(grid, GridSpec):
+        path, base = grid.name, grid
     else:
-        tables, found = grid_tables(name_or_path)
-        base, table, asked = GridSpec(name=Path(name_or_path).stem), dict(tables["grid"]), dict(tables["search"])
-    where = f"[search] in '{name_or_path}'"
-    space = asked.pop("space", None)
-    spec, more = over(SearchSpec(), asked, where)
+        path = os.fspath(grid)
+        base = GRIDS.get(path, GridSpec(name=Path(path).stem))
+        if path not in GRIDS:
+            tables, found = grid_tables(path)
+            table, settings = dict(tables["grid"]), dict(tables["search"])
+        table = DEFAULTS | table
+    space = settings.pop("space", None)
+    spec, more = over(SearchSpec(), settings, f"[search] in '{path}'")
     found += more
-    spec, more = asked_of(spec, search)
+    names = {field.name for field in fields(SearchSpec)}
+    spec, more = over(spec, {key: value for key, value in (changes or {}).items() if key in names}, "the search")
     found += more
     if space is not None:
-        symbols, more = _symbols(space, f"[search.space] in '{name_or_path}'")
+        symbols, more = _symbols(space, f"[search.space] in '{path}'")
         found += more
         table |= {"architectures": symbols} if symbols else {}
-    grid, more = over(base, DEFAULTS | table, f"[grid] in '{name_or_path}'")
+    base, more = over(base, table, f"[grid] in '{path}'")
     found += more
-    grid, more = over(grid, _given(changes) | {"epochs": spec.rungs}, "the grid")
-    return grid, spec, found + more
-
-
-def asked_of(spec: SearchSpec, search: Mapping[str, Any] | None) -> tuple[SearchSpec, list[str]]:
-    """Return a search with some keys changed, as in `load_search`."""
-    return over(spec, _given(search), "the search")
+    of_grid = {key: value for key, value in (changes or {}).items() if key not in names}
+    base, more = over(base, of_grid | {"epochs": spec.rungs}, "the grid")
+    return base, spec, found + more
 
 
 def _symbols(space: Any, where: str) -> tuple[tuple[str, ...], list[str]]:
@@ -421,7 +425,3 @@ def _symbols(space: Any, where: str) -> tuple[tuple[str, ...], list[str]]:
     made, found = over(Space(), space, where)
     found += problems_space(made)
     return (() if found else drawn(made)), found
-
-
-def _given(changes: Mapping[str, Any] | None) -> dict[str, Any]:
-    return {key: value for key, value in (changes or {}).items() if value is not None}

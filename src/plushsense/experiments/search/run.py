@@ -1,76 +1,75 @@
-"""A search: the networks of a grid by successive halving, within a stated share of what the whole grid would cost.
+"""A search: the networks of a grid by successive halving, for at most a given share of the cost of the whole grid.
 
-Its trainings are a sweep's, with the same ids in the same journal: one that a sweep has done is not done again, and
-the other way round. A training that goes on to the next rung starts from its state of the last; where the journal
-holds none (it is of a sweep), from the beginning, with the same outcome.
+Its trainings are those of a sweep, with the same ids in the same journal, so that neither repeats what the other has
+done. A training in a later rung starts from its state at the end of the rung before. If the journal holds no such state
+(a sweep saves none), it starts from the beginning, with the same result.
 """
 
 from __future__ import annotations
 
+import json
 import os
+import shlex
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from statistics import stdev
+from typing import Any
 
 import numpy as np
 
 from plushsense.core.errors import BadInput, ConfigError
+from plushsense.core.files import write_file
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
 from plushsense.experiments.search.halving import (
     QUARTER,
     Costs,
+    FinishedRung,
+    Halved,
     Rung,
     Scores,
     SearchSpec,
-    asked_of,
     halving,
+    limits_text,
     load_search,
     none_left,
     problems,
 )
-from plushsense.experiments.search.score import Prepared, SearchTables, left_out, summed_up, write_summary
-from plushsense.jobs.journal import Result
+from plushsense.jobs.journal import Result, job_id
 from plushsense.jobs.pool import Job
+from plushsense.jobs.progress import BestScore, JobInfo, JobProgress, JobsReporter, JobStep
 from plushsense.models.arch import Arch, slashed
+from plushsense.scoring.metrics import pareto_front
 from plushsense.training.engine import FitState
 from plushsense.trials.estimate import plan_seconds
-from plushsense.trials.grid import GridSpec, changed
+from plushsense.trials.grid import GridSpec
 from plushsense.trials.plan import (
     GridProblems,
+    Plan,
     PlannedRun,
-    Task,
+    PlannedTrial,
     TrainingOutcome,
     outcome,
     plans_by_epochs,
     processes,
     train_all,
 )
-from plushsense.trials.tables import check_place, summary_head
+from plushsense.trials.tables import Tables, check_place, summary_head
 from plushsense.workflow.preparation import Warn, silent
 
+SUMMARY, SETTINGS = "search.json", "train.toml"
 
-class SearchProgress(NamedTuple):
-    """Where a search stands: trainings ``done`` in this rung (from 1); ``share`` of the cost it may have.
 
-    ``epoch`` of ``epochs`` in ``what``, 0: that training is done; ``networks`` in the rung; ``best`` the best network
-    of the rung before and its macro-F1.
-    """
+@dataclass(frozen=True)
+class SearchProgress(JobProgress):
+    """Progress of the trainings of a rung (from 1) with its ``networks``; ``share`` is of the cost that is allowed."""
 
-    rung: int
-    rungs: int
-    networks: int
-    done: int
-    trainings: int
-    resumed: int
-    share: float
-    what: str
-    epoch: int
-    epochs: int
-    best: tuple[str, float] | None
+    rung: int = 0
+    rungs: int = 0
+    networks: int = 0
 
 
 @dataclass(frozen=True)
@@ -93,26 +92,51 @@ class Search:
         )
 
 
+@dataclass(frozen=True)
+class SearchPlan:
+    """A search before it runs: a plan for each rung with the same networks, their costs, and the networks left out."""
+
+    grid: GridSpec
+    spec: SearchSpec
+    plans: tuple[Plan, ...]
+    costs: Costs
+    left_out: tuple[Arch, ...]
+
+    @property
+    def id(self) -> str:
+        """The same for the same data and settings."""
+        return job_id({"plans": [plan.id for plan in self.plans], "search": self.spec.to_dict()})
+
+    def macs(self, rung: int, job: str) -> float:
+        """Multiply-accumulates of a training up to a rung, from the first epoch."""
+        return self.plans[rung].macs(self._jobs[rung][job])
+
+    @cached_property
+    def _jobs(self) -> list[dict[str, Job]]:
+        return [{job.id: job for job in plan.jobs} for plan in self.plans]
+
+    def left_out_rows(self) -> list[dict[str, str]]:
+        """Return the networks beyond the limits, and by how much."""
+        return [
+            {"arch": arch.symbol, "filters": slashed(arch.filters), "why": limits_text(self.spec.over(arch))}
+            for arch in self.left_out
+        ]
+
+
 def prepare(
     dataset: Dataset,
     grid: GridSpec | str | os.PathLike[str] = "paper",
     changes: Mapping[str, Any] | None = None,
-    asked: Mapping[str, Any] | None = None,
     warn: Warn = silent,
-) -> Prepared:
-    """Read, check and plan a search: ``changes`` to the grid, ``asked`` of the search; else as `search`.
+) -> SearchPlan:
+    """Read, check and plan a search; arguments as for `search`.
 
     Raises:
         ConfigError: with all problems at once; or when no network is within the limits, or the share does not suffice.
     """
-    if isinstance(grid, GridSpec):
-        spec, told = asked_of(SearchSpec(), asked)
-        settled, more = changed(replace(grid, epochs=spec.rungs), changes or {})
-        told += more
-    else:
-        settled, spec, told = load_search(os.fspath(grid), changes, asked)
+    settled, spec, unreadable = load_search(grid, changes)
     wrong = problems(spec)
-    # What is wrong with the rungs is said of them, not of the epochs that they become.
+    # Wrong rungs are reported as such, not as the epochs that they become.
     checked = replace(settled, epochs=(1,)) if wrong else settled
     archs: list[Arch] = []
 
@@ -120,11 +144,11 @@ def prepare(
         archs.append(arch)
         return not spec.over(arch)
 
-    plans = plans_by_epochs(dataset, checked, [*told, *wrong, *_stops_early(settled)], warn, fits)
+    plans = plans_by_epochs(dataset, checked, [*unreadable, *wrong, *_stops_early(settled)], warn, fits)
     archs = archs[: len(archs) // len(plans)]
-    if not plans[-1].trials:
-        raise ConfigError(none_left(spec, archs))
     last = plans[-1]
+    if not last.trials:
+        raise ConfigError(none_left(spec, archs))
     folds = len(next(iter(last.folds.values())))
     if wrong := problems(spec, folds):
         raise GridProblems(wrong)
@@ -145,20 +169,20 @@ def prepare(
             filters.setdefault(arch.symbol, []).append(slashed(arch.filters))
         named = "; ".join(f"{symbol} with {', '.join(several)}" for symbol, several in filters.items())
         warn(f"{len(over)} of {len(dict.fromkeys(archs))} networks are beyond the limits and left out: {named}")
-    return Prepared(settled, spec, tuple(plans), costs, tuple(over))
+    return SearchPlan(settled, spec, tuple(plans), costs, tuple(over))
 
 
 def _stops_early(grid: GridSpec) -> list[str]:
     try:
         patience = grid.training.patience
     except (BadInput, KeyError):
-        # Said among the problems of the grid.
+        # It is reported among the problems of the grid.
         return []
     if patience is None:
         return []
     return [
-        f"Trainings that stop early (patience {patience}, preset {grid.preset}) cannot go on from where they stood: "
-        "take the preset people or search, without patience."
+        f"Trainings that stop early (patience {patience}, preset {grid.preset}) cannot be continued in the next rung: "
+        "use the preset people or search, without patience."
     ]
 
 
@@ -166,13 +190,6 @@ def search(
     dataset: Dataset | str | os.PathLike[str],
     grid: GridSpec | str | os.PathLike[str] = "paper",
     *,
-    rungs: Sequence[int] | None = None,
-    folds: Sequence[int] | None = None,
-    share: float | None = None,
-    eta: float | None = None,
-    max_parameters: int | None = None,
-    max_state_bytes: int | None = None,
-    max_macs_per_step: int | None = None,
     out: str | os.PathLike[str] | None = None,
     overwrite: bool = False,
     workers: int = 0,
@@ -183,37 +200,33 @@ def search(
 ) -> Search:
     """Find the network with the best macro-F1 within limits, for at most a share of the cost of the whole grid.
 
-    Finished trainings are kept in the data set's ``cache`` folder; a search that was stopped or killed goes on there.
+    Finished trainings are kept in the data set's ``cache`` folder; a search that was stopped or killed continues there.
 
     Args:
-        grid: whose networks and batches are tried: "paper", the path of a TOML file (its [search] too), a `GridSpec`.
-            But for a `GridSpec`, what it leaves open is as in `training.searchfile.DEFAULTS`.
-        rungs, folds, share, eta, max_parameters, max_state_bytes, max_macs_per_step: see `SearchSpec`.
+        grid: the networks and batches to try: "paper", the path of a TOML file (with a table [search]), or a
+            `GridSpec`. Unless it is a `GridSpec`, what it leaves open is as in `halving.DEFAULTS`.
         out: default ``evaluations/search-<name>-<hash>`` in the data set.
         workers: trainings at a time; 0: as many as the processors hold.
         cluster: address of a Ray cluster that trains instead of this machine's processes.
-        changes: keys of a grid, as ``split="by-subject:5"``, ``architectures=…``, ``seeds=(0, 1)``.
+        progress: called when a training reports an epoch or is done.
+        changes: keys of `SearchSpec`, as ``max_parameters=10_000``, ``rungs=(4, 15, 60)``, and of a grid, as
+            ``split="by-subject:5"``, ``architectures=…``, ``seeds=(0, 1)``.
 
     Raises:
         ConfigError: with all problems at once, before anything is trained; TrainingError: when every training failed.
     """
     began = time.monotonic()
     dataset = as_dataset(dataset)
-    asked = {
-        "rungs": rungs, "folds": folds, "share": share, "eta": eta, "max_parameters": max_parameters,
-        "max_state_bytes": max_state_bytes, "max_macs_per_step": max_macs_per_step,
-    }  # fmt: skip
-    ready = prepare(dataset, grid, changes, asked, warn)
+    ready = prepare(dataset, grid, changes, warn)
     place = Path(out) if out is not None else dataset.path / "evaluations" / f"search-{ready.grid.name}-{ready.id[:8]}"
     check_place(place, ready.id, replace=overwrite)
-    says = {**summary_head(dataset, ready.plans[-1]), "id": ready.id, "kind": "search", "search": ready.spec.to_dict()}
-    trainer = _Trainer(ready, dataset, place, says, processes(workers, ready.grid.threads), cluster, progress)
-    found = halving(ready.costs, trainer)
-    tables = trainer.tables
-    summary = summed_up(ready, found, tables, dataset, place)
+    trainer = _Trainer(ready, dataset, place, processes(workers, ready.grid.threads), cluster, progress)
+    summary = _summary(ready, halving(ready.costs, trainer), trainer, dataset.path)
     summary |= {"seconds": round(time.monotonic() - began, 1), "trainings_resumed": trainer.resumed}
     with dataset.generation.writing():
-        write_summary(place, summary)
+        write_file(place / SUMMARY, json.dumps(summary, ensure_ascii=False, indent=1, allow_nan=False))
+        if settings := _settings(summary["grid"]):
+            write_file(place / SETTINGS, settings)
     return Search(place, summary)
 
 
@@ -221,34 +234,33 @@ def preview_search(
     dataset: Dataset | str | os.PathLike[str],
     grid: GridSpec | str | os.PathLike[str] = "paper",
     *,
-    asked: Mapping[str, Any] | None = None,
-    changes: Mapping[str, Any] | None = None,
     measure: bool = False,
     warn: Warn = silent,
+    **changes: Any,
 ) -> dict[str, Any]:
     """Return what `search` would try and spend, without training.
 
-    ``measure``: also ``seconds``, about how long it takes here at most (see `estimating.plan_seconds`).
+    ``measure``: also ``seconds``, an estimate of the time that it takes at most on this machine.
     """
     dataset = as_dataset(dataset)
-    ready = prepare(dataset, grid, changes, asked, warn)
+    ready = prepare(dataset, grid, changes, warn)
     costs, last = ready.costs, ready.plans[-1]
     workers = processes(0, ready.grid.threads)
     return {
         **({"seconds": plan_seconds(last, costs.bound, workers)} if measure else {}),
         "name": ready.grid.name,
         "id": ready.id,
-        "split": ready.plans[-1].split.text,
-        "leaky": ready.plans[-1].split.leaky,
+        "split": last.split.text,
+        "leaky": last.split.leaky,
         "simulated": dataset.head.simulated,
-        "candidates": len(ready.plans[-1].trials),
-        "left_out": left_out(ready),
+        "candidates": len(last.trials),
+        "left_out": ready.left_out_rows(),
         "rungs": list(ready.spec.rungs),
         "folds": list(costs.folds),
         "seeds": len(ready.grid.seeds),
         "grid_macs": costs.whole,
         "bound_macs": costs.bound,
-        "bound_share": ready.costs.share,
+        "bound_share": costs.share,
         "first_share": float(costs.step(0).sum()) / costs.whole,
         "least_share": costs.least,
         "grid": ready.grid.to_dict(),
@@ -256,55 +268,93 @@ def preview_search(
     }
 
 
+class _SearchTables(Tables):
+    """The tables of a search. A network that was not trained to the end is partial, whatever its score."""
+
+    def _row(self, planned: PlannedTrial) -> dict[str, Any]:
+        row = super()._row(planned)
+        part = row["status"] == "done" and planned.trial.epochs < self.plan.grid.epochs[-1]
+        return row | {"status": "partial"} if part else row
+
+
 class _Trainer:
-    """Trains the rungs, and keeps the tables."""
+    """Trains the rungs and, after each, writes the tables of what has been trained."""
 
     def __init__(
         self,
-        ready: Prepared,
+        ready: SearchPlan,
         dataset: Dataset,
         out: Path,
-        says: dict[str, Any],
         workers: int,
         cluster: str | None,
         progress: Callable[[SearchProgress], None] | None,
     ) -> None:
-        self._ready, self._progress = ready, progress
-        self._train = partial(train_all, dataset, ready.plans[-1], workers=workers, cluster=cluster)
+        self._ready, self._dataset, self.out, self._progress = ready, dataset, out, progress
+        self._workers, self._cluster = workers, cluster
+        self.head = {**summary_head(dataset, ready.plans[-1]), "id": ready.id, "kind": "search"}
+        self.head["search"] = ready.spec.to_dict()
         self.resumed = 0
-        self.tables = SearchTables(ready, out, says, dataset.generation.writing)
-        self._results: dict[str, Result] = {}
         self._spent = 0.0
-        self._best: tuple[str, float] | None = None
+        self._best: BestScore | None = None
+        self._results: dict[str, Result] = {}
+        self._outcomes: dict[str, TrainingOutcome] = {}
+        self._reached: dict[int, PlannedTrial] = {}
 
     def __call__(self, rung: Rung) -> Scores:
+        """Train the networks of a rung; return their macro-F1 (networks, seeds × folds)."""
         plan = self._ready.plans[rung.number]
-        runs = {
-            network: [run for run in plan.trials[network].runs if run.fold_index < rung.folds]
-            for network in rung.entered
-        }
-        wanted = {run.job: run for several in runs.values() for run in several}
+        runs = {n: [run for run in plan.trials[n].runs if run.fold_index < rung.folds] for n in rung.entered}
+        run_of = {run.job: run for several in runs.values() for run in several}
         before = self._jobs_before(rung, runs)
-        jobs, costs = [], dict[str, float]()
+        jobs, infos = [], dict[str, JobInfo]()
         for job in plan.jobs:
-            if job.id in wanted:
+            if job.id in run_of:
                 earlier = before.get(job.id)
-                costs[job.id] = plan.macs(job) - (0 if earlier is None else self._ready.macs(rung.number - 1, earlier))
-                jobs.append(Job(job.id, self._going_on(job.task, earlier, rung)))
-        teller = _Teller(self._ready, rung, costs, self._spent, self._best, self._progress)
-
-        self._results = self._train(jobs=jobs, on_done=teller.done, on_report=teller.epoch)
-        self.resumed += teller.resumed
+                cost = plan.macs(job) - (0 if earlier is None else self._ready.macs(rung.number - 1, earlier))
+                infos[job.id] = JobInfo(f"{job.task.arch.title} batch {job.task.spec.batch}", cost)
+                jobs.append(self._continued(job, earlier, last=rung.number + 1 == len(self._ready.plans)))
+        reporter = JobsReporter(infos, read=_read_epoch, progress=self._report(rung) if self._progress else None)
+        reporter.state.best = self._best
+        self._results = train_all(
+            self._dataset,
+            self._ready.plans[-1],
+            jobs,
+            workers=self._workers,
+            cluster=self._cluster,
+            on_done=reporter.on_done,
+            on_report=reporter.on_report,
+        )
+        self.resumed += len(reporter.state.resumed)
         self._spent += rung.cost
-        outcomes = {job: outcome(plan, wanted[job], result) for job, result in self._results.items()}
+        outcomes = {job: outcome(plan, run_of[job], result) for job, result in self._results.items()}
         scores = np.array([[_score(outcomes[run.job], rung.epochs) for run in runs[n]] for n in rung.entered])
-        self.tables.take(rung, runs, outcomes)
+        self._outcomes |= outcomes
+        self._reached |= {n: replace(plan.trials[n], runs=tuple(several)) for n, several in runs.items()}
+        self._tables().write()
         means = scores.mean(axis=1)
         if np.isfinite(means).any():
             first = int(np.nanargmax(means))
-            arch = plan.trials[rung.entered[first]].trial.arch
-            self._best = arch.title, float(means[first])
+            self._best = BestScore(float(means[first]), plan.trials[rung.entered[first]].trial.arch.title)
         return scores
+
+    def rows(self) -> dict[int, dict[str, Any]]:
+        """Return the row of each network in the table of trials."""
+        return dict(zip(sorted(self._reached), self._tables().trial_rows(), strict=True))
+
+    @property
+    def seconds(self) -> float:
+        """Duration of all training that led to the states which the networks have reached."""
+        jobs = {run.job for planned in self._reached.values() for run in planned.runs}
+        return sum(self._outcomes[job].seconds for job in jobs)
+
+    def _tables(self) -> Tables:
+        trials = tuple(self._reached[network] for network in sorted(self._reached))
+        used = {run.job for planned in trials for run in planned.runs}
+        jobs = tuple(job for plan in self._ready.plans for job in plan.jobs if job.id in used)
+        reached = replace(self._ready.plans[-1], trials=trials, jobs=jobs)
+        tables = _SearchTables(reached, self.out, self.head, writing=self._dataset.generation.writing)
+        tables.outcomes = {job: self._outcomes[job] for job in sorted(used)}
+        return tables
 
     def _jobs_before(self, rung: Rung, runs: Mapping[int, Sequence[PlannedRun]]) -> dict[str, str]:
         """Return the training of the rung before that each of these continues."""
@@ -315,57 +365,141 @@ class _Trainer:
         pairs = [(run.job, ids[n, run.seed, run.fold_index]) for n, several in runs.items() for run in several]
         return {job: old for job, old in pairs if old in self._results}
 
-    def _going_on(self, task: Task, earlier: str | None, rung: Rung) -> Task:
-        last = rung.number + 1 == len(self._ready.plans)
-        task = replace(task, stateful=not last)
-        held = None if earlier is None else self._results[earlier]
-        if held is None or "random" not in held:
-            return task
-        return replace(task, start=FitState.from_arrays(held), spent_s=float(held["seconds"]))
+    def _continued(self, job: Job, earlier: str | None, last: bool) -> Job:
+        """Return the job with a task that starts from the state of the ``earlier`` one, if that has been kept."""
+        task = replace(job.task, stateful=not last)
+        result = {} if earlier is None else self._results[earlier]
+        if "random" in result:
+            task = replace(task, start=FitState.from_arrays(result), spent_s=float(result["seconds"]))
+        return Job(job.id, task)
+
+    def _report(self, rung: Rung) -> Callable[[JobProgress], None]:
+        """Return a callback that reports the trainings of a rung as part of the search."""
+        progress, bound, spent, plans = self._progress, self._ready.costs.bound, self._spent, self._ready.plans
+        assert progress is not None
+
+        def report(at: JobProgress) -> None:
+            shown = {**vars(at), "share": (spent + at.share * rung.cost) / bound}
+            progress(SearchProgress(**shown, rung=rung.number + 1, rungs=len(plans), networks=len(rung.entered)))
+
+        return report
 
 
-def _score(found: TrainingOutcome, epochs: int) -> float:
-    scored = found.scored.get(epochs)
+def _read_epoch(job: Job, message: tuple[int, int, float]) -> JobStep:
+    start = job.task.start
+    return JobStep(*message, first=0 if start is None else start.epoch)
+
+
+def _score(trained: TrainingOutcome, epochs: int) -> float:
+    scored = trained.scored.get(epochs)
     value = None if scored is None else scored.figures["macro_f1"]
     return float("nan") if value is None else value
 
 
-class _Teller:
-    """Turns what jobs of a rung say into `SearchProgress`; the share counts multiply-accumulates."""
+def _summary(ready: SearchPlan, done: Halved, trainer: _Trainer, dataset: Path) -> dict[str, Any]:
+    """Return the content of ``search.json``."""
+    rows = trainer.rows()
+    last = done.rungs[-1]
+    finalists = [_finalist(ready, last, network, rows[network]) for network in last.kept]
+    axes = ("parameters", "macs_per_step", "state_bytes_int8")
+    front = pareto_front([(row["macro_f1"], *(row[axis] for axis in axes)) for row in finalists])
+    for row, on, network in zip(finalists, front, last.kept, strict=True):
+        row |= {"pareto": on, "equals_best": network == done.best or network in done.equals}
+    winner = finalists[0]
+    return {
+        **trainer.head,
+        "candidates": len(ready.plans[-1].trials),
+        "left_out": ready.left_out_rows(),
+        "rungs": [_rung(ready, compared) for compared in done.rungs],
+        "winner": winner,
+        "smallest_equal": min((row for row in finalists if row["equals_best"]), key=lambda row: row["parameters"]),
+        "finalists": finalists,
+        "cost": {
+            "macs": done.spent,
+            "bound_macs": done.bound,
+            "grid_macs": done.whole,
+            "share": done.spent / done.whole,
+            "bound_share": ready.costs.share,
+            "training_seconds": round(trainer.seconds, 1),
+        },
+        "ranked_by": "macro_f1",
+        "chosen_among": len(ready.plans[-1].trials),
+        "command": shlex.join(_command(ready.grid, winner, dataset, trainer.out)),
+    }
 
-    def __init__(
-        self,
-        ready: Prepared,
-        rung: Rung,
-        costs: Mapping[str, float],
-        spent: float,
-        best: tuple[str, float] | None,
-        progress: Callable[[SearchProgress], None] | None,
-    ) -> None:
-        self._ready, self._rung, self._costs = ready, rung, costs
-        self._spent, self._best, self._progress = spent, best, progress
-        self._done = self.resumed = 0
-        self._running: dict[str, float] = {}
 
-    def done(self, job: Job, result: Result, resumed: bool) -> None:
-        self._done += 1
-        self.resumed += resumed
-        self._running.pop(job.id, None)
-        self._spent += self._costs[job.id]
-        self._tell(job, 0, 0)
+def _finalist(ready: SearchPlan, last: FinishedRung, network: int, row: Mapping[str, Any]) -> dict[str, Any]:
+    scores = last.scores[last.rung.entered.index(network)].reshape(len(ready.grid.seeds), -1)
+    by_fold, by_seed = (list(map(float, scores.mean(axis=axis))) for axis in (0, 1))
+    return {
+        **row,
+        "by_fold": by_fold,
+        "by_seed": by_seed,
+        "sd_folds": stdev(by_fold) if len(by_fold) > 1 else None,
+        "sd_seeds": stdev(by_seed) if len(by_seed) > 1 else None,
+    }
 
-    def epoch(self, job: Job, message: tuple[int, int, float]) -> None:
-        from_epoch = 0 if job.task.start is None else job.task.start.epoch
-        part = (message[0] - from_epoch) / max(1, message[1] - from_epoch)
-        self._running[job.id] = part * self._costs[job.id]
-        self._tell(job, *message[:2])
 
-    def _tell(self, job: Job, epoch: int, epochs: int) -> None:
-        if self._progress is None:
-            return
-        task: Task = job.task
-        what = f"{task.arch.title} batch {task.spec.batch}"
-        share = (self._spent + sum(self._running.values())) / self._ready.costs.bound
-        rung = self._rung
-        at = (rung.number + 1, len(self._ready.plans), len(rung.entered), self._done, len(self._costs), self.resumed)
-        self._progress(SearchProgress(*at, share, what, epoch, epochs, self._best))
+_WENT = {
+    "score": "below the cut",
+    "cost": "no budget left for it",
+    "failed": "its training failed",
+}
+
+
+def _rung(ready: SearchPlan, compared: FinishedRung) -> dict[str, Any]:
+    rung = compared.rung
+    trials = ready.plans[rung.number].trials
+    final = rung.number + 1 == len(ready.plans)
+    # Networks without a mean come last.
+    ranked = [*compared.kept, *sorted(compared.left, key=lambda n: -np.nan_to_num(compared.means[n], nan=-np.inf))]
+    networks = []
+    for network in ranked:
+        trial = trials[network].trial
+        went = _WENT[compared.left[network]] if network in compared.left else "to the end" if final else "on"
+        mean = compared.means[network]
+        networks.append(
+            {
+                "trial": trials[network].id,
+                "arch": trial.arch.symbol,
+                "filters": slashed(trial.arch.filters),
+                "batch_asked": str(trial.batch),
+                "macro_f1": None if np.isnan(mean) else mean,
+                "went": went,
+            }
+        )
+    return {
+        "epochs": rung.epochs,
+        "folds": rung.folds,
+        "entered": len(rung.entered),
+        "kept": len(compared.kept),
+        "macs": rung.cost,
+        "share": rung.cost / ready.costs.whole,
+        "standard_error": compared.error,
+        "networks": networks,
+    }
+
+
+def _settings(grid: Mapping[str, Any]) -> str:
+    """Return the settings that ``train`` has no option for as a configuration file; empty where all are defaults."""
+    usual = GridSpec()
+    keys = {
+        "training": ("learning_rate", "halve_every", "augment", "turn_deg", "threads"),
+        "windows": ("window_s", "step_s"),
+    }
+    text = ""
+    for table, names in keys.items():
+        lines = [f"{name} = {json.dumps(grid[name])}\n" for name in names if grid.get(name) != getattr(usual, name)]
+        text += f"[{table}]\n{''.join(lines)}\n" if lines else ""
+    return text
+
+
+def _command(grid: GridSpec, winner: Mapping[str, Any], dataset: Path, out: Path) -> list[str]:
+    """Return the command that trains the winner on everybody."""
+    words = ["plushsense", "train", str(dataset), "--arch", winner["arch"]]
+    words += ["--filters", winner["filters"].replace("/", ","), "--preset", grid.preset]
+    words += ["--padding", grid.padding, "--context", grid.context, "--classes", grid.classes]
+    words += ["--epochs", str(winner["epochs"]), "--batch", str(winner["batch"])]
+    words += [] if grid.norm == "batch" else ["--norm", grid.norm]
+    words += ["--config", str(out / SETTINGS)] if _settings(grid.to_dict()) else []
+    return words

@@ -22,7 +22,6 @@ from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import HEAD, Dataset
 from plushsense.deploy.quantize import calibration
-from plushsense.evaluation.crossval import FoldProgress
 from plushsense.experiments.streams.replay import people_with_streams
 from plushsense.experiments.streams.score import (
     Fitted,
@@ -36,6 +35,7 @@ from plushsense.experiments.streams.score import (
 )
 from plushsense.experiments.streams.systems import ANYWHERE, SYSTEMS, WINDOWS
 from plushsense.jobs.journal import job_id
+from plushsense.jobs.progress import JobProgress
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.runtime.decisions import DecideSpec
@@ -299,7 +299,7 @@ def stream_benchmark(
     overwrite: bool = False,
     late_s: float = LATE_S,
     anywhere_pool_s: float | None = None,
-    progress: Callable[[FoldProgress], None] | None = None,
+    progress: Callable[[JobProgress], None] | None = None,
     warn: Warn = silent,
     **settings: Any,
 ) -> dict[str, Any]:

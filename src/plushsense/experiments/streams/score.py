@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from plushsense.core.errors import BadInput, ConfigError
 from plushsense.core.gestures import GestureSet
 from plushsense.dataset.store import Dataset
-from plushsense.evaluation.crossval import FoldProgress
 from plushsense.experiments.streams.replay import StreamScore, StreamTrace, hear, people_with_streams, quick
 from plushsense.experiments.streams.systems import (
     ANYWHERE,
@@ -37,6 +36,7 @@ from plushsense.experiments.streams.systems import (
 )
 from plushsense.jobs.journal import Journal, Result, job_id
 from plushsense.jobs.pool import Job, Report, run_jobs
+from plushsense.jobs.progress import JobInfo, JobProgress, JobsReporter
 from plushsense.models.bundle import Bundle
 from plushsense.runtime.decisions import DecideSpec, argmax_spec
 from plushsense.runtime.gate import GateSettings
@@ -145,7 +145,7 @@ def crossvalidated_streams(
     key: Mapping[str, Any] | None = None,
     workers: int = 1,
     seed: int = 0,
-    progress: Callable[[FoldProgress], None] | None = None,
+    progress: Callable[[JobProgress], None] | None = None,
 ) -> list[dict[str, Any]]:
     """Fit, tune and score once a fold; what `plushsense.experiments.streams.score.summary` makes figures of.
 
@@ -173,25 +173,15 @@ def crossvalidated_streams(
         "asked": settings.key(dataset.gestures),
     }
     jobs = [Job(job_id({**base, "fold": vars(fold)}), fold) for fold in folds]
-    done = resumed = 0
-
-    def tell(job: Job, epoch: int, epochs: int) -> None:
-        if progress is not None:
-            progress(FoldProgress(done, len(folds), job.task.name, epoch, epochs, resumed))
-
-    def finished(job: Job, _: Result, again: bool) -> None:
-        nonlocal done, resumed
-        done, resumed = done + 1, resumed + again
-        tell(job, 0, 0)
-
+    reporter = JobsReporter({job.id: JobInfo(job.task.name, 1.0) for job in jobs}, progress=progress)
     results = run_jobs(
         jobs,
         _FoldWork(fit, settings),
         shared=dataset,
         workers=workers,
         journal=journal,
-        on_done=finished,
-        on_report=lambda job, message: tell(job, *message),
+        on_done=reporter.on_done,
+        on_report=reporter.on_report,
     )
     return [dict(results[job.id]) for job in jobs]
 

@@ -1,4 +1,4 @@
-"""A sweep: every trial of a grid trained and scored once, kept, and gone on with after whatever stopped it.
+"""Sweeps: train and score every trial of a grid once, and continue after an interruption.
 
 Windows are held once for each span that the networks need (one set for padding mirror and causal), in this process
 and in each worker; a training adds its fold as float32. Results stay in memory until the end: 4 bytes for each tested
@@ -9,138 +9,55 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 from html import escape
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any
 
 from plushsense.core.errors import ForgottenError, need
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
 from plushsense.jobs.journal import JOURNAL, Result, job_id
 from plushsense.jobs.pool import Job
-from plushsense.jobs.progress import BestScore, JobInfo, JobsReporter, JobStep
+from plushsense.jobs.progress import BestScore, JobInfo, JobProgress, JobsReporter, JobStep
 from plushsense.reports.table import Table
 from plushsense.trials.columns import listed_columns
 from plushsense.trials.estimate import plan_seconds
-from plushsense.trials.grid import GridSpec, changed, load_grid
+from plushsense.trials.grid import GridSpec, load_grid
 from plushsense.trials.plan import GridProblems, Plan, Task, plan, processes, train_all
 from plushsense.trials.tables import RUNS, TRIALS, Tables, check_place, summary_head
 from plushsense.workflow.preparation import Warn, silent
 from plushsense.workflow.reporting import journal_of
 
 
-class Watcher(Protocol):
-    """Observer of trainings while they run; a context manager around them."""
-
-    def __enter__(self) -> Any: ...
-
-    def __exit__(self, *_: object) -> None: ...
-
-    def on_start(self, job: Job) -> None:
-        """Note that a training begins."""
-
-    def on_report(self, job: Job, message: Any) -> None:
-        """Note that a training is at (epoch, epochs, loss)."""
-
-    def on_done(self, job: Job, result: Result, resumed: bool) -> None:
-        """Note that a training is done, now or before."""
-
-    def on_failed(self, job: Job, error: Exception) -> None:
-        """Note that a training was given up."""
-
-
-class SweepProgress(NamedTuple):
-    """Where a sweep stands: ``share`` of its work; ``epoch`` of ``epochs`` in ``what``, 0: that training is done.
-
-    ``best`` is the row of the best trial that is complete.
-    """
-
-    done: int
-    trainings: int
-    resumed: int
-    share: float
-    what: str
-    epoch: int
-    epochs: int
-    best: dict[str, Any] | None
-
-
-def report_jobs(planned: Plan, tables: Tables) -> JobsReporter:
-    """Return a reporter of the trainings: what is done, what runs, the best so far, the time left."""
+def _reporter(planned: Plan, tables: Tables, progress: Callable[[JobProgress], None] | None) -> JobsReporter:
+    """Return a reporter of the trainings; their cost is in multiply-accumulates."""
 
     def best(job: Job, result: Result) -> BestScore | None:
         row = tables.best
         if row is None:
             return None
         marks = " (leaky)" * row["leaky"] + " (simulation)" * row["simulated"]
-        return BestScore(row["accuracy"], f"{row['arch']} {row['filters']}{marks}")
+        return BestScore(row["accuracy"], f"{row['arch']} {row['filters']}{marks}", row)
 
-    rows = {job.id: JobInfo(_named(job.task), planned.macs(job)) for job in planned.jobs}
+    def name(task: Task) -> str:
+        return f"{task.arch.title} batch {task.spec.batch} seed {task.spec.seed} fold {task.fold + 1}"
+
     return JobsReporter(
-        f"sweep {planned.grid.name}",
-        rows,
-        read=lambda message: JobStep(*message),
+        {job.id: JobInfo(name(job.task), planned.macs(job)) for job in planned.jobs},
+        title=f"sweep {planned.grid.name}",
+        unit="trainings",
+        read=lambda job, message: JobStep(*message),
         score=best,
         score_name="accuracy",
-        unit="trainings",
+        progress=progress,
     )
 
 
-def _named(task: Task) -> str:
-    return f"{task.arch.title} batch {task.spec.batch} seed {task.spec.seed} fold {task.fold + 1}"
-
-
-class Teller:
-    """Turns what jobs say into `SweepProgress`; the share counts multiply-accumulates, of running trainings too."""
-
-    def __init__(self, planned: Plan, tables: Tables, progress: Callable[[SweepProgress], None] | None) -> None:
-        self._macs = {job.id: planned.macs(job) for job in planned.jobs}
-        self._all = sum(self._macs.values()) or 1
-        self._finished = self._done = self._resumed = 0
-        self._running: dict[str, float] = {}
-        self._tables, self._progress = tables, progress
-
-    def __enter__(self) -> Teller:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Do nothing: no resource is held."""
-
-    def on_start(self, job: Job) -> None:
-        """Do nothing: the first epoch is reported."""
-
-    def on_failed(self, job: Job, error: Exception) -> None:
-        """Stop counting the training's share."""
-        self._running.pop(job.id, None)
-
-    def on_done(self, job: Job, result: Result, resumed: bool) -> None:
-        """Report a training that is done, now or before."""
-        self._done += 1
-        self._resumed += resumed
-        self._running.pop(job.id, None)
-        self._finished += self._macs[job.id]
-        self._tell(job, 0, 0)
-
-    def on_report(self, job: Job, message: tuple[int, int, float]) -> None:
-        """Report a training at (epoch, epochs, loss)."""
-        self._running[job.id] = message[0] / message[1] * self._macs[job.id]
-        self._tell(job, *message[:2])
-
-    def _tell(self, job: Job, epoch: int, epochs: int) -> None:
-        if self._progress is None:
-            return
-        task: Task = job.task
-        what = f"{task.arch.title} batch {task.spec.batch}"
-        share = (self._finished + sum(self._running.values())) / self._all
-        at = (self._done, len(self._macs), self._resumed, share, what, epoch, epochs, self._tables.best)
-        self._progress(SweepProgress(*at))
-
-
-# So many trainings given up, and none done: the rest would go the same way.
+# Stop after so many failed trainings if none has succeeded.
 _HOPELESS = 3
 
 
@@ -189,111 +106,78 @@ def sweep(
     dataset: Dataset | str | os.PathLike[str],
     grid: GridSpec | str | os.PathLike[str] = "paper",
     *,
-    split: str | None = None,
     out: str | os.PathLike[str] | None = None,
     overwrite: bool = False,
     workers: int = 0,
     cluster: str | None = None,
-    progress: Callable[[SweepProgress], None] | None = None,
-    table: Callable[[Plan, Tables], Watcher] | None = None,
+    progress: Callable[[JobProgress], None] | None = None,
+    display: bool = False,
     warn: Warn = silent,
     **changes: Any,
 ) -> Sweep:
     """Train and score every trial of a grid.
 
-    Finished trainings are kept in the data set's ``cache`` folder, and the tables in ``out`` are renewed as they come;
-    a sweep that was stopped or killed goes on from there.
+    Finished trainings are kept in the data set's ``cache`` folder, and the tables in ``out`` are updated during the
+    run; a sweep that was stopped or killed continues from there.
 
     Args:
         grid: "paper", the path of a TOML file, or a `GridSpec`.
-        split: instead of the grid's: "windows:holdout" (the paper's, leaky), "by-subject:5", "leave-one-subject-out".
-        out: default ``evaluations/sweep-<name>`` in the data set; with the split and a hash where the grid was changed.
+        out: default ``evaluations/sweep-<name>`` in the data set; with the split and a hash if the grid was changed.
         workers: trainings at a time; 0: as many as the processors hold.
         cluster: address of a Ray cluster that trains instead of this machine's processes.
-        progress: called with where it stands.
-        table: `report_jobs`, to report the trainings on standard error.
-        changes: keys of a grid, as ``epochs=(20,)``, ``architectures=…``, ``seeds=…``, ``threads=2``.
+        progress: called when a training reports an epoch or is done.
+        display: show the trainings, the best score so far and the time left on standard error.
+        changes: keys of a grid, as ``split="by-subject:5"`` (the paper's is "windows:holdout", which is leaky),
+            ``epochs=(20,)``, ``architectures=…``, ``seeds=…``, ``threads=2``.
 
     Raises:
         ConfigError: with all problems of the grid at once, before anything is trained.
     """
     dataset = as_dataset(dataset)
-    spec, told = resolve(grid, {**changes, "split": split})
-    planned = plan(dataset, spec, told, warn)
+    spec, wrong = load_grid(grid, changes)
+    planned = plan(dataset, spec, wrong, warn)
     place = Path(out) if out is not None else default_place(dataset, grid, spec)
     check_place(place, planned.id, replace=overwrite)
-    tables = Tables(planned, place, summary_head(dataset, planned))
     tables = Tables(planned, place, summary_head(dataset, planned), writing=dataset.generation.writing)
-    teller = Teller(planned, tables, progress)
+    reporter = _reporter(planned, tables, progress)
 
-    watchers = [teller] if table is None else [teller, table(planned, tables)]
+    def done(job: Job, result: Result, resumed: bool) -> None:
+        tables.add(job.id, result, resumed)
+        reporter.on_done(job, result, resumed)
+
+    def failed(job: Job, error: Exception) -> None:
+        if isinstance(error, ForgottenError):
+            raise error
+        tables.lose(job.id, str(error) or type(error).__name__)
+        reporter.on_failed(job, error)
+        # If the first trainings all fail, the others will fail for the same reason.
+        if len(tables.lost) >= _HOPELESS and len(tables.outcomes) == len(tables.resumed):
+            raise error
+
     try:
-        _work_off(planned, dataset, tables, processes(workers, spec.threads), cluster, watchers)
+        with reporter if display else nullcontext():
+            train_all(
+                dataset,
+                planned,
+                planned.jobs,
+                workers=processes(workers, spec.threads),
+                cluster=cluster,
+                on_start=reporter.on_start,
+                on_report=reporter.on_report,
+                on_done=done,
+                on_failed=failed,
+            )
     except BaseException:
-        # What is finished stands in the tables; stopped before anything new, those of before stay.
+        # Write what has been finished. Without any new training, the earlier tables stay as they are.
         if len(tables.outcomes) > len(tables.resumed):
             tables.write()
         raise
     return Sweep(place, tables.write())
 
 
-def _work_off(
-    planned: Plan,
-    dataset: Dataset,
-    tables: Tables,
-    workers: int,
-    cluster: str | None,
-    watchers: Sequence[Watcher],
-) -> None:
-    def started(job: Job) -> None:
-        for watcher in watchers:
-            watcher.on_start(job)
-
-    def reported(job: Job, message: Any) -> None:
-        for watcher in watchers:
-            watcher.on_report(job, message)
-
-    def done(job: Job, result: Result, resumed: bool) -> None:
-        tables.add(job.id, result, resumed)
-        for watcher in watchers:
-            watcher.on_done(job, result, resumed)
-
-    def failed(job: Job, error: Exception) -> None:
-        if isinstance(error, ForgottenError):
-            raise error
-        tables.lose(job.id, str(error) or type(error).__name__)
-        for watcher in watchers:
-            watcher.on_failed(job, error)
-        # What keeps the first ones from being trained keeps them all.
-        if len(tables.lost) >= _HOPELESS and len(tables.outcomes) == len(tables.resumed):
-            raise error
-
-    with ExitStack() as stack:
-        for watcher in watchers:
-            stack.enter_context(watcher)
-        train_all(
-            dataset,
-            planned,
-            planned.jobs,
-            workers=workers,
-            cluster=cluster,
-            on_start=started,
-            on_report=reported,
-            on_done=done,
-            on_failed=failed,
-        )
-
-
-def resolve(grid: GridSpec | str | os.PathLike[str], changes: dict[str, Any]) -> tuple[GridSpec, list[str]]:
-    """Return a grid with changes applied, and a sentence for each that could not be read."""
-    if not isinstance(grid, GridSpec):
-        return load_grid(os.fspath(grid), changes)
-    return changed(grid, changes)
-
-
 def default_place(dataset: Dataset, grid: GridSpec | str | os.PathLike[str], spec: GridSpec) -> Path:
     """Return the output folder of a sweep; that of a changed grid has its split and a hash in the name."""
-    plain, _ = resolve(grid, {})
+    plain, _ = load_grid(grid)
     name = f"sweep-{spec.name}"
     if plain != spec:
         split = re.sub(r"[^A-Za-z0-9-]+", "-", spec.split)
@@ -311,12 +195,12 @@ def preview(
 ) -> dict[str, Any]:
     """Return what `sweep` would train, without training: counts, cost in multiply-accumulates, and all problems.
 
-    ``measure``: also ``seconds``, about how long what is not done yet takes here (see `estimating.plan_seconds`).
+    ``measure``: also ``seconds``, an estimate of the time that the missing trainings take on this machine.
     """
     dataset = as_dataset(dataset)
-    spec, told = resolve(grid, changes)
+    spec, wrong = load_grid(grid, changes)
     try:
-        planned = plan(dataset, spec, told, warn)
+        planned = plan(dataset, spec, wrong, warn)
     except GridProblems as cause:
         return {"name": spec.name, "trials": 0, "problems": list(cause.found), "grid": spec.to_dict()}
     journal = journal_of(dataset, JOURNAL)
