@@ -24,7 +24,8 @@ import plushsense as ps
 from plushsense.core.errors import PlushSenseError
 from plushsense.experiments.baselines.run import baselines
 from plushsense.experiments.sweep.run import sweep
-from plushsense.trials.paper import CHOSEN, TABLE4
+from plushsense.experiments.sweep.tables import TABLE4
+from plushsense.trials.grid import CHOSEN
 from plushsense.windows.cut import WindowSpec
 
 UNTESTED = "Untested on the original archive, which was not available to this project."

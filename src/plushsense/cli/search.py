@@ -141,7 +141,7 @@ def lines(s: dict[str, Any]) -> list[str]:
     small = s["smallest_equal"]
     if small["trial"] != best["trial"]:
         out.append(
-            f"Smallest that does not differ significantly: {small['arch']} with {small['filters']}, {small['parameters']:,} "
+            f"Smallest within one standard error of it: {small['arch']} with {small['filters']}, {small['parameters']:,} "
             f"parameters, macro-F1 {figure(small['macro_f1'])}{mark}."
         )
     out.append(

@@ -165,15 +165,19 @@ def compute_scores(
     # The paper's average runs over all 18 classes, so the toy at rest with nobody counts in its fold.
     all_classes = [metrics.macro_f1(scorer.counts(m), all_classes=True) for m in of_fold]
     everything = scorer.counts(np.ones(len(people), dtype=np.bool_))
+    affect_names, by_affect = metrics.grouped(everything, affects)
     return {
         **{name: metrics.summary([f[name] for f in single]) for name in metrics.METRICS},
         "macro_f1_all_classes": metrics.summary(all_classes),
         "over": "subjects" if apart else "folds",
         "by_recording": scorer.by_recording(counted),
         "pooled": _plain(metrics.scores_of(everything)),
-        "per_class": _per_class(everything, predictions.labels, affects),
+        "per_class": [
+            {"label": row["label"], "affect": affect, **row}
+            for row, affect in zip(metrics.class_rows(everything, predictions.labels), affects, strict=True)
+        ],
         "confusion": {"labels": list(predictions.labels), "counts": everything.tolist()},
-        "confusion_affect": _grouped(everything, affects),
+        "confusion_affect": {"labels": list(affect_names), "counts": by_affect.tolist()},
         "by_context": scorer.by_context(counted),
         "nobody": None if people.all() else scorer.size(~people) | {"accuracy": scorer.figures(~people)["accuracy"]},
         "folds": [_fold(fold, scorer, mask & counted) for fold, mask in zip(folds, of_fold, strict=True)],
@@ -219,26 +223,6 @@ class _Scorer:
 def _plain(figures: dict[str, float]) -> dict[str, float | None]:
     """Replace NaN, which JSON does not know, by None."""
     return {name: float(value) if np.isfinite(value) else None for name, value in figures.items()}
-
-
-def _per_class(counts: Counts, labels: tuple[str, ...], affects: tuple[str, ...]) -> list[dict[str, Any]]:
-    by_class = metrics.class_scores(counts)
-    return [
-        {
-            "label": labels[k],
-            "affect": affects[k],
-            "precision": float(by_class.precision[k]),
-            "recall": float(by_class.recall[k]),
-            "f1": float(by_class.f1[k]),
-            "support": int(by_class.support[k]),
-        }
-        for k in range(len(labels))
-    ]
-
-
-def _grouped(counts: Counts, groups: tuple[str, ...]) -> dict[str, Any]:
-    names, table = metrics.grouped(counts, groups)
-    return {"labels": list(names), "counts": table.tolist()}
 
 
 def _fold(fold: FoldRecord, scorer: _Scorer, mask: Mask) -> dict[str, Any]:

@@ -147,6 +147,21 @@ def class_scores(counts: Counts) -> ClassScores:
     )
 
 
+def class_rows(counts: Counts, labels: Sequence[str]) -> list[dict[str, Any]]:
+    """Return label, precision, recall, F1 and support of each class as plain values."""
+    scores = class_scores(counts)
+    return [
+        {
+            "label": label,
+            "precision": float(scores.precision[k]),
+            "recall": float(scores.recall[k]),
+            "f1": float(scores.f1[k]),
+            "support": int(scores.support[k]),
+        }
+        for k, label in enumerate(labels)
+    ]
+
+
 def macro_recall(counts: Counts) -> float:
     """Return the mean recall of the classes that are present in the truth; NaN without any."""
     return _mean(class_scores(counts).recall[counts.sum(axis=1) > 0])

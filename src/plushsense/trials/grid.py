@@ -20,6 +20,7 @@ from plushsense.core.errors import ArchError, BadInput, ConfigError, nearest
 from plushsense.core.layouts import Layout
 from plushsense.core.toml import check_table, read_toml, unknown_key
 from plushsense.models.arch import (
+    DEFAULT_FILTERS,
     NORMS,
     PADDINGS,
     PAPER_ARCHITECTURES,
@@ -95,6 +96,10 @@ class GridSpec:
 
 # Paper, section 3.6: 13 architectures × 4 filter sets × 3 epochs × 3 batches = 468 trials.
 GRIDS: dict[str, GridSpec] = {"paper": GridSpec(name="paper")}
+# The network that the paper chose (section 3.6.2 and Figure 10), best with 250 epochs and batches of 64; the other one
+# that it shows (Figure 11).
+CHOSEN = ("14d1_39d2_41d4", slashed(DEFAULT_FILTERS))
+SECOND = ("19d1_19d2_19d4_17d8", "4/6/8/8")
 
 
 @dataclass(frozen=True)

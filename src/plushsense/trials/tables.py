@@ -1,6 +1,8 @@
-"""The results folder of a sweep: tables of trials, runs and curves, and a summary; whole at any moment.
+"""The results folder of a sweep: tables of trials, runs and curves, and a summary; complete at any moment.
 
-Everything in it follows from the plan and the journal, so that it can be deleted and made again.
+Everything in it follows from the plan and the journal, so that it can be deleted and made again. A column of the table
+of trials is a function and a line in `TRIAL_COLUMNS`: Parquet, CSV, ``sweep.json``, the page, the command line,
+notebooks and MLflow read that registry.
 """
 
 from __future__ import annotations
@@ -10,31 +12,29 @@ import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from statistics import fmean, stdev
+from typing import Any, Literal
 
 import numpy as np
 
-from plushsense.core.errors import ConfigError, need
+from plushsense.core.errors import need
 from plushsense.core.files import replacing_file, write_file
 from plushsense.core.version import __version__
 from plushsense.dataset.store import Dataset
 from plushsense.models.arch import slashed
-from plushsense.scoring import metrics
-from plushsense.scoring.metrics import Counts, column_metrics
-from plushsense.trials.columns import TRIAL_COLUMNS, trial_row
-from plushsense.trials.paper import CHOSEN
-from plushsense.trials.plan import CURVE, Plan, PlannedRun, PlannedTrial, TrainingOutcome, outcome
-from plushsense.workflow.reporting import check_folder, machine
+from plushsense.reports.table import Column, Kind
+from plushsense.scoring.metrics import Counts, accuracy_complexity_ratio, class_rows, column_metrics
+from plushsense.trials.grid import CHOSEN
+from plushsense.trials.plan import CURVE, Plan, PlannedRun, PlannedTrial, Scored, TrainingOutcome, outcome
+from plushsense.workflow.reporting import machine
 
-SUMMARY, TRIALS, TRIALS_CSV, RUNS, CURVES = (
-    "sweep.json",
-    "trials.parquet",
-    "trials.csv",
-    "runs.parquet",
-    "curves.parquet",
-)
+SUMMARY = "sweep.json"
+TRIALS, TRIALS_CSV, RUNS, CURVES = "trials.parquet", "trials.csv", "runs.parquet", "curves.parquet"
 BEST = 10
+# The files are updated at most so often.
+_EVERY_S = 5.0
 
 _RUN_COLUMNS: dict[str, type[Any]] = {
     "trial": str,
@@ -63,15 +63,140 @@ _CURVE_COLUMNS: dict[str, type[Any]] = {
 }
 
 
+@dataclass(frozen=True)
+class TrialScores:
+    """A planned trial with the scores of its runs; ``head`` holds what ``sweep.json`` tells of data and split."""
+
+    planned: PlannedTrial
+    scored: tuple[Scored, ...]
+    status: Literal["waiting", "partial", "done", "failed"]
+    head: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, planned: PlannedTrial, outcomes: Mapping[str, TrainingOutcome], head: Mapping[str, Any]) -> TrialScores:
+        """Return the scores of a trial from the outcomes of trainings by job."""
+        finished = [outcomes[run.job] for run in planned.runs if run.job in outcomes]
+        epochs = planned.trial.epochs
+        scored = tuple(outcome.scored[epochs] for outcome in finished if epochs in outcome.scored)
+        if len(scored) < len(finished):
+            # The mean of the runs that went well would flatter.
+            return cls(planned, (), "failed", head)
+        if not scored:
+            return cls(planned, (), "waiting", head)
+        return cls(planned, scored, "done" if len(scored) == len(planned.runs) else "partial", head)
+
+    def mean(self, name: str) -> float | None:
+        """Return the mean of a figure over the runs; None where a run lacks it."""
+        values = [s.figures[name] for s in self.scored]
+        return fmean(numbers) if (numbers := [v for v in values if v is not None]) and None not in values else None
+
+    def sd(self, name: str) -> float | None:
+        """Return the standard deviation of a figure over the runs (n - 1); None for fewer than two."""
+        values = [v for s in self.scored if (v := s.figures[name]) is not None]
+        return stdev(values) if len(values) == len(self.scored) > 1 else None
+
+
+@dataclass(frozen=True)
+class TrialColumn:
+    """A column: the type of its values, the function that gives them, and how it is printed.
+
+    Args:
+        type: str, int, float or bool.
+        value: called with the trial; None where it has no value yet.
+        name: the heading in lists of trials; without one the column is in the files only.
+        kind: format in lists.
+        score: whether the values depend on the split, so that a leaky one is marked.
+        terminal: whether the list of the command line has it, beside that of the page.
+    """
+
+    type: type[Any]
+    value: Callable[[TrialScores], Any]
+    name: str = ""
+    kind: Kind = "text"
+    score: bool = False
+    terminal: bool = True
+
+
+def _of_network(key: str, name: str = "") -> TrialColumn:
+    return TrialColumn(int, lambda t: getattr(t.planned.trial.arch, key), name, "count")
+
+
+def _of_sweep(key: str, kind: type[Any]) -> TrialColumn:
+    return TrialColumn(kind, lambda t: t.head[key])
+
+
+def _mean(key: str, name: str = "", kind: Kind = "share") -> TrialColumn:
+    return TrialColumn(float, lambda t: t.mean(key), name, kind, score=True, terminal=key in column_metrics())
+
+
+def _sd(key: str, kind: Kind) -> TrialColumn:
+    return TrialColumn(float, lambda t: t.sd(key), "± sd", kind, score=True, terminal=False)
+
+
+def _metric_columns() -> dict[str, TrialColumn]:
+    columns: dict[str, TrialColumn] = {}
+    for key, metric in column_metrics().items():
+        kind: Kind = "percent" if metric.percent else "share"
+        columns |= {key: _mean(key, metric.name, kind), f"{key}_sd": _sd(key, kind)}
+    return columns
+
+
+def _seconds(trial: TrialScores) -> float | None:
+    return sum(s.seconds for s in trial.scored) if trial.scored else None
+
+
+def _acr(trial: TrialScores) -> float | None:
+    return accuracy_complexity_ratio(trial.mean("accuracy"), trial.planned.trial.arch.parameters)
+
+
+TRIAL_COLUMNS: dict[str, TrialColumn] = {
+    "trial": TrialColumn(str, lambda t: t.planned.id, "trial", terminal=False),
+    "arch": TrialColumn(str, lambda t: t.planned.trial.arch.symbol, "architecture"),
+    "filters": TrialColumn(str, lambda t: slashed(t.planned.trial.arch.filters), "filters"),
+    "filter_set": TrialColumn(str, lambda t: slashed(t.planned.trial.filter_set)),
+    "padding": TrialColumn(str, lambda t: t.planned.trial.arch.padding),
+    "norm": TrialColumn(str, lambda t: t.planned.trial.arch.norm),
+    "epochs": TrialColumn(int, lambda t: t.planned.trial.epochs, "epochs", "count"),
+    "batch": TrialColumn(int, lambda t: max(run.batch for run in t.planned.runs)),
+    "batch_asked": TrialColumn(str, lambda t: str(t.planned.trial.batch), "batch"),
+    "seeds": TrialColumn(int, lambda t: len({run.seed for run in t.planned.runs})),
+    "folds": TrialColumn(int, lambda t: len({run.fold for run in t.planned.runs})),
+    "parameters": _of_network("parameters", "parameters"),
+    "receptive_field": _of_network("receptive_field"),
+    "span": _of_network("span"),
+    "macs_per_window": _of_network("macs_per_window"),
+    "macs_per_step": _of_network("macs_per_step", "MAC/step"),
+    "state_bytes_int8": _of_network("state_bytes_int8"),
+    **_metric_columns(),
+    "validation_accuracy": _mean("validation_accuracy", "accuracy on validation", "percent"),
+    "validation_macro_f1": _mean("validation_macro_f1"),
+    "train_loss": _mean("train_loss"),
+    "acr": TrialColumn(float, _acr, "ACR", "percent", score=True),
+    "seconds": TrialColumn(float, _seconds),
+    "status": TrialColumn(str, lambda t: t.status),
+    "split": _of_sweep("split", str),
+    "leaky": _of_sweep("leaky", bool),
+    "simulated": _of_sweep("simulated", bool),
+}
+
+
+def listed_columns(*, terminal: bool = False) -> list[Column]:
+    """Return the columns of a list of trials on a page, or on a terminal; the trial's name is the last."""
+    listed = {key: c for key, c in TRIAL_COLUMNS.items() if c.name and (c.terminal or not terminal)}
+    return [
+        Column(key, c.name[0].upper() + c.name[1:], c.kind, c.score, plain=c.name)
+        for key, c in sorted(listed.items(), key=lambda item: item[0] == "trial")
+    ]
+
+
 class Tables:
-    """The folder, and all that is known so far. ``writing`` guards the folder, as that of a `Journal` does."""
+    """The outcomes of the trainings so far, and the folder; ``writing`` guards the folder, as that of a `Journal`."""
 
     def __init__(
         self,
         plan: Plan,
         out: Path,
         head: Mapping[str, Any],
-        every_s: float = 5.0,
         writing: Callable[[], AbstractContextManager[object]] = nullcontext,
     ) -> None:
         self.plan, self.out, self.head, self._writing = plan, out, dict(head), writing
@@ -83,7 +208,7 @@ class Tables:
         for planned in plan.trials:
             for run in planned.runs:
                 self._of.setdefault(run.job, []).append((planned, run))
-        self._every_s, self._due = every_s, 0.0
+        self._due = 0.0
         self._began = time.monotonic()
 
     def add(self, job: str, result: Mapping[str, Any], resumed: bool) -> None:
@@ -96,7 +221,7 @@ class Tables:
         if resumed:
             self.resumed.add(job)
         elif time.monotonic() >= self._due:
-            # One that somebody holds open (Windows) stays as it is; the last writing is not so lenient.
+            # A file that another program holds open (Windows) is written again at the end.
             with suppress(OSError):
                 self.write()
 
@@ -109,20 +234,22 @@ class Tables:
         return [self._row(planned) for planned in self.plan.trials]
 
     def _row(self, planned: PlannedTrial) -> dict[str, Any]:
-        return trial_row(planned, self.outcomes, self.head)
+        """Return the value of every column; None where there is none yet."""
+        trial = TrialScores.of(planned, self.outcomes, self.head)
+        return {key: column.value(trial) for key, column in TRIAL_COLUMNS.items()}
 
     def summary(self) -> dict[str, Any]:
         """Return the content of ``sweep.json``."""
         rows = self.trial_rows()
         done = [row for row in rows if row["status"] == "done"]
         best = sorted(filter(_ranked, rows), key=_rank)
-        # Among equals the smallest, then the first of the grid: the test part has no say.
+        # Among equals the smallest, then the first of the grid: scores on the test part do not count.
         chosen = min(
             filter(_ranked, rows),
             key=lambda row: (-(row["validation_macro_f1"] or 0.0), row["parameters"]),
             default=None,
         )
-        shown = self._confusions_kept(best)
+        kept = self._with_confusions(best)
         failed = [
             {"run": job, **_words(*self._of[job][0]), "epochs": epochs, "why": why}
             for job, found in self.outcomes.items()
@@ -147,8 +274,8 @@ class Tables:
             "ranked_by": "accuracy",
             "best": best[:BEST],
             "best_on_validation": chosen,
-            "confusions": {planned.id: self._counts(planned).tolist() for planned in shown},
-            "per_class": {planned.id: self._classes(planned) for planned in shown},
+            "confusions": {p.id: self._counts(p).tolist() for p in kept},
+            "per_class": {p.id: class_rows(self._counts(p), self.plan.gestures.labels) for p in kept},
         }
 
     def write(self) -> dict[str, Any]:
@@ -177,9 +304,9 @@ class Tables:
             self._curves(polars).write_parquet(part)
         summary = self.summary()
         write_file(self.out / SUMMARY, json.dumps(summary, ensure_ascii=False, indent=1, allow_nan=False))
-        # Large tables are written more seldom: never more than a twentieth of the time.
+        # Writing takes at most a twentieth of the time.
         now = time.monotonic()
-        self._due = now + max(self._every_s, 20 * (now - began))
+        self._due = now + max(_EVERY_S, 20 * (now - began))
         return summary
 
     def _run_row(self, planned: PlannedTrial, run: PlannedRun) -> dict[str, Any] | None:
@@ -216,7 +343,7 @@ class Tables:
             )
         return polars.concat(parts) if parts else _frame(polars, [], _CURVE_COLUMNS)
 
-    def _confusions_kept(self, best: Sequence[Mapping[str, Any]]) -> list[PlannedTrial]:
+    def _with_confusions(self, best: Sequence[Mapping[str, Any]]) -> list[PlannedTrial]:
         """Return the trials whose confusions are kept: the best, those of each filter set, the paper's network."""
         picked = [row["trial"] for row in best[:BEST]]
         seen: set[str] = set()
@@ -232,19 +359,6 @@ class Tables:
             start=np.zeros((1, 1), dtype=np.int64),
         )
         return total
-
-    def _classes(self, planned: PlannedTrial) -> list[dict[str, Any]]:
-        found = metrics.class_scores(self._counts(planned))
-        return [
-            {
-                "label": label,
-                "f1": float(found.f1[k]),
-                "recall": float(found.recall[k]),
-                "precision": float(found.precision[k]),
-                "support": int(found.support[k]),
-            }
-            for k, label in enumerate(self.plan.gestures.labels)
-        ]
 
 
 def _ranked(row: Mapping[str, Any]) -> bool:
@@ -274,30 +388,6 @@ def _kind(polars: Any, kind: type[Any]) -> Any:
 def _frame(polars: Any, rows: Sequence[Mapping[str, Any]], columns: Mapping[str, type[Any]]) -> Any:
     schema = {name: _kind(polars, kind) for name, kind in columns.items()}
     return polars.DataFrame([[row[name] for name in columns] for row in rows], schema=schema, orient="row")
-
-
-def check_place(out: Path, identity: str, *, replace: bool = False) -> None:
-    """Refuse an output folder that cannot be written to or holds another sweep.
-
-    Raises:
-        ConfigError: where ``out`` cannot be a folder, or holds (not with ``replace``) a sweep of another grid or data.
-    """
-    check_folder(out, "A sweep")
-    path = out / SUMMARY
-    if replace or not path.exists():
-        return
-    try:
-        held = json.loads(path.read_text(encoding="utf-8"))
-        other = held["id"] != identity
-    except (OSError, ValueError, KeyError, TypeError):
-        raise ConfigError(
-            f"'{path}' is no summary of a sweep: choose another --out, or --force to replace it."
-        ) from None
-    if other:
-        raise ConfigError(
-            f"'{out}' holds a sweep of another grid or other data ({held.get('name')}, {held.get('split')}): choose "
-            "another --out, or --force to replace it; its trainings stay in the journal."
-        )
 
 
 def summary_head(dataset: Dataset, planned: Plan) -> dict[str, Any]:

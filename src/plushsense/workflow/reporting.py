@@ -31,6 +31,36 @@ def check_folder(out: Path, what: str) -> None:
         raise ConfigError(f"{what} cannot be written to '{out}': you may not write in '{there}'.")
 
 
+def check_results(out: Path, what: str, summary: str, identity: str | None = None, *, replace: bool = False) -> None:
+    """Check that results can be written to the folder ``out``, before the work rather than after.
+
+    Args:
+        what: names the results, as in "A sweep".
+        summary: the name of their JSON file, which holds the ``id`` of the results.
+        identity: the id of the new results; without one, any earlier results are refused.
+        replace: accept a folder that holds other results.
+
+    Raises:
+        ConfigError: where ``out`` cannot be a folder, or holds results of other settings or other data.
+    """
+    check_folder(out, what)
+    path = out / summary
+    if replace or not path.exists():
+        return
+    try:
+        held = json.loads(path.read_text(encoding="utf-8"))
+        known = held["id"]
+    except (OSError, ValueError, KeyError, TypeError):
+        held = known = None
+    if identity is None or known != identity:
+        details = ", ".join(str(held[key]) for key in ("name", "split") if key in held) if held else "unknown"
+        other = "already" if identity is None else f"of other settings or other data ({details})"
+        raise ConfigError(
+            f"'{out}' holds {what[0].lower()}{what[1:]} {other}: choose another --out, or --force to replace it; "
+            "finished trainings are kept in the cache of the data set."
+        )
+
+
 def journal_of(dataset: Dataset, kind: str) -> Journal:
     """Return the journal of one kind of results in the data set's cache.
 

@@ -19,7 +19,6 @@ from plushsense.experiments.sweep.report import confusion_words, sections_of, wr
 from plushsense.experiments.sweep.results import read_sweep
 from plushsense.models.arch import PAPER_ARCHITECTURES, PAPER_FILTERS
 from plushsense.scoring.metrics import accuracy_complexity_ratio
-from plushsense.trials import paper
 from support.made_sweep import make_sweep
 
 SMALL = {
@@ -67,10 +66,10 @@ SCORES: dict[tuple[str, str], list[float | None]] = {
 
 def test_acr_is_the_papers():
     assert accuracy_complexity_ratio(0.75, 13262) == pytest.approx(0.75 / math.log10(13262))
-    for (arch, filters), row in paper.TABLE4.items():
-        found = accuracy_complexity_ratio(row.highest, paper.count_parameters(arch, filters))
+    for (arch, filters), row in sweep_tables.TABLE4.items():
+        found = accuracy_complexity_ratio(row.highest, sweep_tables.count_parameters(arch, filters))
         assert found is not None and abs(found - row.acr) < 0.0016, (arch, filters)
-        assert paper.printed_parameters(arch, filters) == row.parameters
+        assert sweep_tables.printed_parameters(arch, filters) == row.parameters
     assert accuracy_complexity_ratio(None, 100) is None and accuracy_complexity_ratio(0.5, 1) is None
 
 
@@ -99,7 +98,7 @@ def test_table3_stands_beside_the_papers_and_names_the_misprint(whole):
     ],
 )
 def test_a_printed_count_is_met_rounded_or_cut_off(said, count, meets):
-    assert paper.agrees(said, count) is meets
+    assert sweep_tables.agrees(said, count) is meets
 
 
 def test_other_data_are_counted_at_the_papers_size_too(tmp_path):

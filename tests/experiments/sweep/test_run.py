@@ -126,7 +126,7 @@ def test_it_goes_on_and_is_made_again_from_the_journal(dataset: Dataset, tmp_pat
     assert_frame_equal(healed.trials.drop("seconds"), first.trials.drop("seconds"), check_exact=True)
     # Threads sum in another order: they are other trainings.
     assert sweep(dataset, epochs=(1, 2), threads=2, **SMALL).summary["resumed"] == 0
-    with pytest.raises(ConfigError, match=r"holds a sweep of another grid or other data.*--force"):
+    with pytest.raises(ConfigError, match=r"holds a sweep of other settings or other data.*--force"):
         sweep(dataset, epochs=(1,), out=first.out, **SMALL)
     assert sweep(dataset, epochs=(1,), out=first.out, overwrite=True, **SMALL).summary["trials"] == 4
 

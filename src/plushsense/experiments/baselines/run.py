@@ -34,7 +34,7 @@ from plushsense.windows.cut import ANYWHERE, WindowSet
 from plushsense.windows.features import Scaler
 from plushsense.workflow.config import RunConfig, from_settings
 from plushsense.workflow.preparation import Warn, choose_classes, silent, windows_for
-from plushsense.workflow.reporting import check_folder, journal_of, machine
+from plushsense.workflow.reporting import check_results, journal_of, machine
 
 SPLITS = ("leave-one-subject-out", "windows:5")
 TABLE, SHEET, PAGE, PICTURE = "baselines.json", "baselines.csv", "baselines.html", "baselines.png"
@@ -190,7 +190,9 @@ def baselines(
     identity = comparison_id(dataset, config, splits, models, features, pca)
     asked = [parse_split(text).text for text in splits]
     if out is not None:
-        _check_place(Path(out), identity, overwrite)
+        need("matplotlib", extra="reports")
+        need("jinja2", extra="reports")
+        check_results(Path(out), "A comparison", TABLE, identity, replace=overwrite)
     gestures = choose_classes(dataset, config.evaluation.classes, warn)
     network = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
     windows = windows_for(dataset, network, config.windows, gestures, warn)
@@ -257,22 +259,3 @@ def save_baselines(table: dict[str, Any], out: Path) -> None:
     (out / PICTURE).write_bytes(png(figure(table), dpi=130))
     write_file(out / PAGE, page(table))
     write_file(out / TABLE, json.dumps(table, ensure_ascii=False, indent=1))
-
-
-def _check_place(out: Path, identity: str, replace: bool) -> None:
-    """Refuse an output folder that cannot be written to or holds another comparison."""
-    need("matplotlib", extra="reports")
-    need("jinja2", extra="reports")
-    check_folder(out, "A comparison")
-    path = out / TABLE
-    if replace or not path.exists():
-        return
-    try:
-        held = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        held = None
-    if not isinstance(held, dict) or held.get("id") != identity:
-        raise ConfigError(
-            f"'{out}' holds a comparison of other settings or other data: choose another --out, or --force to replace "
-            "it."
-        )

@@ -1,1 +1,1 @@
-"""A search of the smallest good network by successive halving. Read run, score; its report is the command line."""
+"""A search of the smallest good network by successive halving. Read halving, run; its report is the command line."""

@@ -57,8 +57,10 @@ from plushsense.trials.plan import (
     processes,
     train_all,
 )
-from plushsense.trials.tables import Tables, check_place, summary_head
+from plushsense.trials.tables import SUMMARY as SWEEP
+from plushsense.trials.tables import Tables, summary_head
 from plushsense.workflow.preparation import Warn, silent
+from plushsense.workflow.reporting import check_results
 
 SUMMARY, SETTINGS = "search.json", "train.toml"
 
@@ -219,7 +221,7 @@ def search(
     dataset = as_dataset(dataset)
     ready = prepare(dataset, grid, changes, warn)
     place = Path(out) if out is not None else dataset.path / "evaluations" / f"search-{ready.grid.name}-{ready.id[:8]}"
-    check_place(place, ready.id, replace=overwrite)
+    check_results(place, "A search", SWEEP, ready.id, replace=overwrite)
     trainer = _Trainer(ready, dataset, place, processes(workers, ready.grid.threads), cluster, progress)
     summary = _summary(ready, halving(ready.costs, trainer), trainer, dataset.path)
     summary |= {"seconds": round(time.monotonic() - began, 1), "trainings_resumed": trainer.resumed}

@@ -46,7 +46,7 @@ from plushsense.windows.anywhere import AnywhereSpec
 from plushsense.windows.cut import WindowSpec
 from plushsense.workflow.config import RunConfig, from_settings
 from plushsense.workflow.preparation import Warn, choose_classes, classes_for, outside_streams, silent, windows_for
-from plushsense.workflow.reporting import check_folder, journal_of
+from plushsense.workflow.reporting import check_results, journal_of
 
 EpochProgress = Callable[[int, int, dict[str, Any]], None]
 
@@ -324,7 +324,9 @@ def stream_benchmark(
     config = config or from_settings(**settings)
     names = _named(systems)
     if out is not None:
-        _check_place(Path(out), overwrite)
+        need("matplotlib", extra="reports")
+        need("jinja2", extra="reports")
+        check_results(Path(out), "A benchmark", TABLE, replace=overwrite)
     people_folds(dataset, split, config.evaluation.seed)  # refused before anything is trained
     recipes = recipes_for(dataset, config, {SYSTEMS[n].network for n in names}, anywhere_pool_s, warn)
     networks = dataset.path / CACHE / "stream-networks"
@@ -378,15 +380,6 @@ def _named(systems: Sequence[str] | None) -> tuple[str, ...]:
         if name not in SYSTEMS:
             raise ConfigError(f"Unknown system '{name}': accepted are {', '.join(SYSTEMS)}.{nearest(name, SYSTEMS)}")
     return tuple(name for name in SYSTEMS if name in systems)
-
-
-def _check_place(out: Path, replace: bool) -> None:
-    """Check that a benchmark can be written to a folder, before the work rather than after."""
-    need("matplotlib", extra="reports")
-    need("jinja2", extra="reports")
-    check_folder(out, "A benchmark")
-    if (out / TABLE).exists() and not replace:
-        raise ConfigError(f"'{out}' holds a benchmark already: choose another --out, or --force to replace it.")
 
 
 def save_benchmark(table: dict[str, Any], out: Path) -> None:

@@ -46,6 +46,7 @@ BARS = 30
 """Architectures that a figure of bars shows, the best; more could not be read."""
 _LETTERS_AN_INCH = 13
 _NARROWEST_IN = 5.2
+_RANKED = 15
 NAMED = 14
 """Points of a front that are named."""
 
@@ -235,9 +236,9 @@ def pareto(sweep: SweepResults, cost: str) -> Figure:
     return figure
 
 
-def acr_bars(sweep: SweepResults, top: int = 15) -> Figure:
+def acr_bars(sweep: SweepResults) -> Figure:
     """Draw the networks with the highest accuracy–complexity ratio."""
-    rows = acr_ranking(sweep).rows[:top]
+    rows = acr_ranking(sweep).rows[:_RANKED]
     figure = _figure(sweep, 9.2, 1.4 + 0.3 * len(rows), "Accuracy–complexity ratio of the best networks")
     axes = figure.add_subplot()
     at = np.arange(len(rows))

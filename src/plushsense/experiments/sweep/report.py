@@ -15,7 +15,7 @@ from plushsense.reports import wording
 from plushsense.reports.figures import png, svg, svg_uri
 from plushsense.reports.page import check_page_path, earlier_files, render_page, write_files, write_page
 from plushsense.reports.table import DASH, Row, Table, count, number, text
-from plushsense.trials import paper
+from plushsense.trials.grid import SECOND
 from plushsense.trials.tables import SUMMARY
 
 if TYPE_CHECKING:
@@ -149,7 +149,7 @@ def _effect(sweep: SweepResults) -> Section:
 
 def _looked_at(sweep: SweepResults, best: Row) -> list[Row]:
     """Return the trials with confusions and curves: the paper's two networks if in the grid, and the best."""
-    found = [sweep.chosen, sweep.best_of(*paper.SECOND), best]
+    found = [sweep.chosen, sweep.best_of(*SECOND), best]
     return list({t["trial"]: t for t in found if t}.values())
 
 
@@ -314,7 +314,7 @@ def about_rows(sweep: SweepResults) -> list[tuple[str, str]]:
         ("Context", wording.CONTEXT_WORDS.get(str(head.get("context")), text(head.get("context")))),
         ("Training preset", text(head.get("preset"))),
         ("Padding", ", ".join(sorted({str(t.get("padding")) for t in sweep.trials})) or DASH),
-        ("Grid", f"{grid} (the paper's has {paper.TRIALS} trials)"),
+        ("Grid", f"{grid} (the paper's has {tables.PAPER_TRIALS} trials)"),
         ("Seeds and folds", wording.describe_runs(sweep.trials)),
         (
             "Trials",

@@ -12,7 +12,7 @@ from typing import Any
 
 from plushsense.core.errors import BadInput, need
 from plushsense.reports.table import Row
-from plushsense.trials.paper import CHOSEN
+from plushsense.trials.grid import CHOSEN
 from plushsense.trials.tables import CURVES, RUNS, SUMMARY, TRIALS
 
 _NEEDED = ("trial", "arch", "filters", "filter_set", "epochs", "batch_asked", "parameters", "accuracy", "macro_f1")

@@ -24,13 +24,12 @@ from plushsense.jobs.journal import JOURNAL, Result, job_id
 from plushsense.jobs.pool import Job
 from plushsense.jobs.progress import BestScore, JobInfo, JobProgress, JobsReporter, JobStep
 from plushsense.reports.table import Table
-from plushsense.trials.columns import listed_columns
 from plushsense.trials.estimate import plan_seconds
 from plushsense.trials.grid import GridSpec, load_grid
 from plushsense.trials.plan import GridProblems, Plan, Task, plan, processes, train_all
-from plushsense.trials.tables import RUNS, TRIALS, Tables, check_place, summary_head
+from plushsense.trials.tables import RUNS, SUMMARY, TRIALS, Tables, listed_columns, summary_head
 from plushsense.workflow.preparation import Warn, silent
-from plushsense.workflow.reporting import journal_of
+from plushsense.workflow.reporting import check_results, journal_of
 
 
 def _reporter(planned: Plan, tables: Tables, progress: Callable[[JobProgress], None] | None) -> JobsReporter:
@@ -137,7 +136,7 @@ def sweep(
     spec, wrong = load_grid(grid, changes)
     planned = plan(dataset, spec, wrong, warn)
     place = Path(out) if out is not None else default_place(dataset, grid, spec)
-    check_place(place, planned.id, replace=overwrite)
+    check_results(place, "A sweep", SUMMARY, planned.id, replace=overwrite)
     tables = Tables(planned, place, summary_head(dataset, planned), writing=dataset.generation.writing)
     reporter = _reporter(planned, tables, progress)
 
