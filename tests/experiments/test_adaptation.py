@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from plushsense.core.errors import BadInput
-from plushsense.experiments.adaptation import Stranger, Touched
-from plushsense.experiments.adaptation import evaluate_adapting_adapting as evaluate_adapting
+from plushsense.experiments.adaptation import HeldOutPerson, Predictors, score_adaptation
 from plushsense.windows.cut import WindowSet
 
 LABELS = ("hold", "tap", "hit")
@@ -65,15 +64,15 @@ class Recorder:
         self.given: list[WindowSet] = []
         self.reader, self.accepted = reader, accepted
 
-    def __call__(self, own: WindowSet) -> Touched:
+    def __call__(self, own: WindowSet) -> Predictors | None:
         self.given.append(own)
-        return Touched({"float": self.reader}, self.accepted)
+        return {"float": self.reader} if self.accepted else None
 
 
 def test_all_choices_and_what_is_gained() -> None:
     windows, times = made()
     adapt = Recorder()
-    found = evaluate_adapting(windows, [Stranger(p, {"float": always_hold}, adapt) for p in ("A", "B")], times)
+    found = score_adaptation(windows, [HeldOutPerson(p, {"float": always_hold}, adapt) for p in ("A", "B")], times)
     assert found["choices"] == 12 and len(adapt.given) == 12 and found["refused"] == 0.0
     assert all(len(own) == 6 and len(set(own.subject)) == 1 for own in adapt.given)
     one = found["engines"]["float"]
@@ -86,31 +85,31 @@ def test_all_choices_and_what_is_gained() -> None:
 def test_the_first_choice_is_the_first_recordings_by_the_clock() -> None:
     windows, times = made()
     adapt = Recorder()
-    evaluate_adapting(windows, [Stranger("A", {"float": always_hold}, adapt)], times)
+    score_adaptation(windows, [HeldOutPerson("A", {"float": always_hold}, adapt)], times)
     first = {windows.recording_ids[r] for r in adapt.given[0].recording}
     assert first == {f"A/{label}_{n}" for label in LABELS for n in (9, 8)}
 
 
 def test_a_loss_is_counted_person_by_person_and_choice_by_choice() -> None:
     windows, times = made()
-    strangers = [
-        Stranger("A", {"float": truth}, Recorder(always_hold)),
-        Stranger("B", {"float": always_hold}, Recorder(truth)),
+    people = [
+        HeldOutPerson("A", {"float": truth}, Recorder(always_hold)),
+        HeldOutPerson("B", {"float": always_hold}, Recorder(truth)),
     ]
-    right = evaluate_adapting(windows, strangers, times)["engines"]["float"]["right"]
+    right = score_adaptation(windows, people, times)["engines"]["float"]["right"]
     assert right == {"mean": 0.0, "worst_mean": -4.0, "worst": -4, "worse_people": 1, "worse_choices": 0.5}
 
 
 def test_what_is_refused_changes_nothing() -> None:
     windows, times = made()
-    found = evaluate_adapting(windows, [Stranger("A", {"float": truth}, Recorder(always_hold, False))], times)
+    found = score_adaptation(windows, [HeldOutPerson("A", {"float": truth}, Recorder(always_hold, False))], times)
     assert found["refused"] == 1.0 and found["engines"]["float"]["right"]["mean"] == 0.0
 
 
 def test_random_choices_differ_from_gesture_to_gesture() -> None:
     windows, times = made()
     adapt = Recorder()
-    found = evaluate_adapting(windows, [Stranger("A", {"float": always_hold}, adapt)], times, random=20)
+    found = score_adaptation(windows, [HeldOutPerson("A", {"float": always_hold}, adapt)], times, random=20)
     assert found["choices"] == 26
     mixed = [{windows.recording_ids[r][-1] for r in own.recording} for own in adapt.given[6:]]
     assert any(len(numbers) > 2 for numbers in mixed) and all(len(own) == 6 for own in adapt.given)
@@ -124,7 +123,7 @@ def test_no_adapting_window_touches_a_tested_recording() -> None:
         tested.append(test)
         return always_hold(test)
 
-    evaluate_adapting(windows, [Stranger("A", {"float": reads}, adapt)], times)
+    score_adaptation(windows, [HeldOutPerson("A", {"float": reads}, adapt)], times)
     for own, test in zip(adapt.given, tested, strict=True):
         for first, last in test.recording_rows:
             assert not ((own.window_rows[:, 0] < last) & (first < own.window_rows[:, 1])).any()
@@ -134,10 +133,10 @@ def test_no_adapting_window_touches_a_tested_recording() -> None:
 def test_engines_are_compared() -> None:
     windows, times = made()
 
-    def adapt(own: WindowSet) -> Touched:
-        return Touched({"float": truth, "int8": truth}, True)
+    def adapt(own: WindowSet) -> Predictors:
+        return {"float": truth, "int8": truth}
 
-    found = evaluate_adapting(windows, [Stranger("A", {"float": truth, "int8": always_hold}, adapt)], times)
+    found = score_adaptation(windows, [HeldOutPerson("A", {"float": truth, "int8": always_hold}, adapt)], times)
     assert found["agreement"] == {"before": pytest.approx(1 / 3), "after": 1.0}
     assert set(found["engines"]) == {"float", "int8"}
 
@@ -145,4 +144,4 @@ def test_engines_are_compared() -> None:
 def test_too_few_recordings_to_test() -> None:
     windows, times = made(each=2)
     with pytest.raises(BadInput, match="more than 2 recordings"):
-        evaluate_adapting(windows, [Stranger("A", {"float": truth}, Recorder())], times)
+        score_adaptation(windows, [HeldOutPerson("A", {"float": truth}, Recorder())], times)

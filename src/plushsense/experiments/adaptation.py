@@ -1,4 +1,4 @@
-"""A bundle adapted to one person, from a data set or a recorder's folder; and how much that helps strangers."""
+"""Adaptation of a bundle to one person, and its effect on people whom the network was not trained on."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import os
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,34 +32,30 @@ from plushsense.windows.cut import WindowSet, whole_gestures
 from plushsense.workflow.config import RunConfig, from_settings
 from plushsense.workflow.preparation import Warn, choose_classes, silent, windows_for
 
-Index = NDArray[np.int64]
-Reader = Callable[[WindowSet], NDArray[np.floating[Any]]]  # windows → probabilities (N, K)
+Predictor = Callable[[WindowSet], NDArray[np.floating[Any]]]
+"""Returns the probabilities (N, K) of windows."""
+Predictors = Mapping[str, Predictor]
+"""A predictor for each engine, "float" first."""
 
 _SCORES = ("accuracy", "macro_f1")
 
 
 @dataclass(frozen=True)
-class Touched:
-    """Result of adapting: a reader by engine; ``accepted`` false: they read as before."""
+class HeldOutPerson:
+    """A person with a network that was not trained on them.
 
-    readers: Mapping[str, Reader]
-    accepted: bool
-
-
-@dataclass(frozen=True)
-class Stranger:
-    """A person with a network that was not trained on them: ``readers`` by engine ("float" first), ``adapt`` is given
-    the windows of the recordings that adapt it.
+    ``adapt`` takes the windows of the recordings to adapt to; it returns the adapted predictors, or None where the
+    network stays as it is.
     """
 
     subject: str
-    readers: Mapping[str, Reader]
-    adapt: Callable[[WindowSet], Touched]
+    predictors: Predictors
+    adapt: Callable[[WindowSet], Predictors | None]
 
 
-def evaluate_adapting_adapting(
+def score_adaptation(
     windows: WindowSet,
-    strangers: Iterable[Stranger],
+    people: Iterable[HeldOutPerson],
     times: Mapping[str, int],
     *,
     use: int = 2,
@@ -66,60 +63,59 @@ def evaluate_adapting_adapting(
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> dict[str, Any]:
-    """Before and after, person by person.
+    """Compare the scores of people before and after adaptation.
 
     Args:
         windows: of everybody.
-        strangers: the people, each with their network.
         times: when each recording was made, by its id: recordings of a gesture are numbered in this order.
-        use: recordings of each gesture that adapt. The choices are all sets of so many numbers, the same for all
-            gestures (10 of 5 recordings); the first is the first recordings of each gesture.
-        random: so many choices more, drawn for each gesture on its own.
-        progress: told each person who is done.
+        use: recordings of each gesture to adapt to. The choices are all sets of so many numbers, the same for all
+            gestures (10 of 5 recordings); the first choice is the first recordings of each gesture.
+        random: further choices, drawn for each gesture on its own.
+        progress: called with each person who is done.
 
     Returns:
         ``context``, ``use``, ``random``, ``choices`` in all, ``refused`` (share of the choices in which the bundle
         stayed as it was); ``engines``: of each ``accuracy`` and ``macro_f1`` with ``before``, ``after`` and ``gain``
-        (mean, sd, ci95 over people), ``first`` (the same gain when the first recordings adapt), ``right`` (recordings
-        right, after less before: ``mean``, ``worst_mean`` of a person, ``worst`` of a choice, ``worse_people``: less by
+        (mean, sd, ci95 over people), ``first`` (the same gain for the first choice), ``right`` (correct recordings
+        after minus before: ``mean``, ``worst_mean`` of a person, ``worst`` of a choice, ``worse_people``: less by
         more than one on average, ``worse_choices``: share of choices) and ``people``, a row each; ``agreement``, the
-        share of the test windows on which the engines say the same, before and after (None with one engine).
+        share of the test windows on which the engines agree, before and after (None with one engine).
 
     Raises:
-        BadInput: when nobody has more recordings of a gesture than adapt.
+        BadInput: when nobody has more than ``use`` recordings of a gesture.
     """
     rows: dict[str, list[dict[str, Any]]] = {}
     same: list[tuple[float, float]] = []
     refused: list[bool] = []
-    for stranger in strangers:
-        mine = windows.take(np.flatnonzero(windows.subject == stranger.subject))
-        tried: dict[str, list[_Change]] = {name: [] for name in stranger.readers}
+    for person in people:
+        mine = windows.take(np.flatnonzero(windows.subject == person.subject))
+        tried: dict[str, list[_Change]] = {name: [] for name in person.predictors}
         for chosen in _choices(mine, times, use, random, seed):
-            own, test = _parts(mine, chosen)
+            own, test = _divide(mine, chosen)
             if not len(own) or not len(test):
                 continue
-            touched = stranger.adapt(own)
-            refused.append(not touched.accepted)
-            before = {name: reader(test) for name, reader in stranger.readers.items()}
-            after = {name: reader(test) for name, reader in touched.readers.items()} if touched.accepted else before
-            for name in stranger.readers:
+            adapted = person.adapt(own)
+            refused.append(adapted is None)
+            before = {name: predict(test) for name, predict in person.predictors.items()}
+            after = before if adapted is None else {name: predict(test) for name, predict in adapted.items()}
+            for name in before:
                 tried[name].append(_Change.of(test, before[name], after[name]))
             if len(before) > 1:
                 same.append((_agreement(list(before.values())), _agreement(list(after.values()))))
         for name, changes in tried.items():
             if changes:
-                rows.setdefault(name, []).append(_row(stranger.subject, changes))
+                rows.setdefault(name, []).append(_row(person.subject, changes))
         if progress is not None:
-            progress(stranger.subject)
+            progress(person.subject)
     if not rows:
-        raise BadInput(f"Nobody has more than {use} recordings of a gesture: none is left to test on with --use {use}.")
+        raise BadInput(f"Nobody has more than {use} recordings of a gesture (--use), so none is left to test on.")
     return {
         "context": context_of(windows),
         "use": use,
         "random": random,
         "choices": len(refused),
         "refused": float(np.mean(refused)),
-        "engines": {name: _summed(people) for name, people in rows.items()},
+        "engines": {name: _summary(people) for name, people in rows.items()},
         "agreement": {when: float(np.mean([each[i] for each in same])) for i, when in enumerate(("before", "after"))}
         if same
         else None,
@@ -128,7 +124,7 @@ def evaluate_adapting_adapting(
 
 @dataclass(frozen=True)
 class _Change:
-    """One choice: recordings tested, how many were right, and both scores; before and after."""
+    """Tested recordings of one choice, how many were correct, and both scores, before and after."""
 
     recordings: int
     right: tuple[int, int]
@@ -152,7 +148,7 @@ class _Change:
 
 
 def _choices(windows: WindowSet, times: Mapping[str, int], use: int, random: int, seed: int) -> Iterator[set[int]]:
-    """Return the recordings that adapt, as numbers of ``windows.recording``."""
+    """Yield the recordings to adapt to, as numbers of ``windows.recording``."""
     by_class = []
     for k in np.unique(windows.y):
         mine = sorted(
@@ -167,8 +163,8 @@ def _choices(windows: WindowSet, times: Mapping[str, int], use: int, random: int
         yield {int(r) for mine in by_class for r in draw.permutation(mine)[:use]}
 
 
-def _parts(windows: WindowSet, chosen: set[int]) -> tuple[WindowSet, WindowSet]:
-    """Return the windows that adapt and those that test."""
+def _divide(windows: WindowSet, chosen: set[int]) -> tuple[WindowSet, WindowSet]:
+    """Return the windows to adapt to, none of which touches a tested recording, and those to test on."""
     adapts = np.isin(windows.recording, sorted(chosen))
     test = windows.take(np.flatnonzero(~adapts))
     keep = purge(windows.stream, windows.window_rows, test.stream, test.recording_rows)
@@ -197,7 +193,7 @@ def _row(subject: str, changes: list[_Change]) -> dict[str, Any]:
     return row
 
 
-def _summed(people: list[dict[str, Any]]) -> dict[str, Any]:
+def _summary(people: list[dict[str, Any]]) -> dict[str, Any]:
     out: dict[str, Any] = {}
     for score in _SCORES:
         before, after, first = (
@@ -220,15 +216,12 @@ def _summed(people: list[dict[str, Any]]) -> dict[str, Any]:
     return out | {"people": people}
 
 
-Given = Dataset | str | os.PathLike[str]
-
-
 @dataclass(frozen=True, eq=False)
 class Adapted:
-    """A bundle after a personal touch, with what it was tried on.
+    """The outcome of `adapt`.
 
-    ``tested``: with ``use``, the recordings that did not adapt it, before and after; None where all of them did.
-    ``left_out`` counts recordings by label that could not be used, with the reason.
+    ``tested``: with ``use``, the scores on the other recordings, before and after; None where all were used.
+    ``left_out`` says for each label why recordings could not be used.
     """
 
     personal: Personal
@@ -240,7 +233,7 @@ class Adapted:
 
     @property
     def bundle(self) -> Bundle:
-        """The adapted bundle, or the one that was given where it was left as it is."""
+        """The adapted bundle, or the given one where it was left as it is."""
         return self.personal.bundle
 
     def save(self, path: str | os.PathLike[str]) -> Path:
@@ -278,7 +271,7 @@ class Adapted:
 
 def adapt(
     bundle: Bundle | str | os.PathLike[str],
-    recordings: Given,
+    recordings: Dataset | str | os.PathLike[str],
     *,
     subject: str | None = None,
     use: int | None = None,
@@ -288,54 +281,52 @@ def adapt(
     """Adapt a bundle's last layer to one person, or leave it as it is where their own recordings do not show a gain.
 
     Args:
-        recordings: a data set, or a folder as a recorder left it.
-        subject: whose; may be left out where there is one person.
-        use: only the first so many recordings of each gesture adapt, and the rest are scored before and after.
-        warn: told what was left out, and what makes the figures say less than they seem to.
+        recordings: a data set, or the folder of a recorder.
+        subject: the person; may be left out where there is only one.
+        use: adapt to the first so many recordings of each gesture only, and score the rest before and after.
+        warn: called with what was left out, and what limits the meaning of the scores.
 
     Raises:
         BadInput: for too few recordings; DatasetError: for an unknown person or another layout;
-        ConfigError: for a ``use`` that is too small; ForgottenError: when somebody was taken out of it meanwhile.
+        ConfigError: for a ``use`` that is too small; ForgottenError: when a person was removed during the run.
     """
     spec = spec or PersonalSpec()
     if use is not None and use < spec.least:
         raise ConfigError(f"--use {use} is too few: accepted are {spec.least} and more recordings of each gesture.")
     given = bundle if isinstance(bundle, Bundle) else Bundle.load(Path(bundle))
     if (before := given.adapted_to) is not None:
-        warn(f"the bundle is adapted to {before}: it is adapted anew, from what it was before")
+        warn(f"the bundle is adapted to {before}: it is adapted again from its original")
     with tempfile.TemporaryDirectory(prefix="plushsense-") as place:
         dataset = _dataset(recordings, given, Path(place))
         person = _person(dataset, subject)
         _same_layout(given, dataset)
-        _tell_of_training(given, person, warn)
-        own, left_out = _only(dataset, person, given, warn)
+        _warn_of_training(given, person, warn)
+        own, left_out = _recordings_of(dataset, person, given, warn)
         windows = windows_for(own, given.arch, whole_gestures(given.windowing), given.gestures, warn)
         times = {r.id: r.epoch_ms for r in own.recordings}
     adapting, test = windows, None
     if use is not None:
-        first = _first(windows, times, use)
-        test = windows.take(np.flatnonzero(~first))
+        everything = set(windows.recording.tolist())
+        adapting, test = _divide(windows, next(_choices(windows, times, use, 0, 0), everything))
         if not len(test):
             raise BadInput(
                 f"No recording of {person} is left to test on: there are at most {use} of each gesture; use fewer."
             )
-        keep = purge(windows.stream, windows.window_rows, test.stream, test.recording_rows)
-        adapting = windows.take(np.flatnonzero(first & keep))
     done = personalise(given, adapting.x, adapting.y, adapting.recording, subject=person, spec=spec)
     for label in done.without:
-        warn(f"{label}: fewer than {spec.least} recordings adapt it, so it is told apart as before")
+        warn(f"{label}: fewer than {spec.least} recordings, so the network recognises it as before")
     tested = None
     if test is not None:
         original = restore_original(given) if before is not None else given
-        readers = (_float_reader(original), _float_reader(done.bundle if done.accepted else original))
-        one, other = (judge(reader(test), test.y, test.recording).judged for reader in readers)
+        predictors = (_float_predictor(original), _float_predictor(done.bundle if done.accepted else original))
+        one, other = (judge(predict(test), test.y, test.recording).judged for predict in predictors)
         tested = (one, other)
     dataset.generation.check()
     return Adapted(done, person, use, tested, left_out, dataset.head.simulated)
 
 
-def _dataset(recordings: Given, bundle: Bundle, place: Path) -> Dataset:
-    """Yield the data set, or a temporary one made of a recorder's folder."""
+def _dataset(recordings: Dataset | str | os.PathLike[str], bundle: Bundle, place: Path) -> Dataset:
+    """Return the data set, or one made of a recorder's folder in the folder ``place``."""
     if isinstance(recordings, Dataset) or (Path(recordings) / HEAD).is_file():
         return as_dataset(recordings)
     if not Path(recordings).exists():
@@ -370,14 +361,14 @@ def _same_layout(bundle: Bundle, dataset: Dataset) -> None:
         )
 
 
-def _tell_of_training(bundle: Bundle, person: str, warn: Warn) -> None:
+def _warn_of_training(bundle: Bundle, person: str, warn: Warn) -> None:
     for key, what in (("subjects", "trained"), ("validation_subjects", "validated")):
         people = bundle.provenance.get(key, ())
         if isinstance(people, list | tuple) and person in people:
-            warn(f"the bundle was {what} on a person {person}: if that is the same one, the scores before flatter")
+            warn(f"the bundle was {what} on a person {person}: if it is the same one, the scores before are too high")
 
 
-def _only(dataset: Dataset, person: str, bundle: Bundle, warn: Warn) -> tuple[Dataset, dict[str, str]]:
+def _recordings_of(dataset: Dataset, person: str, bundle: Bundle, warn: Warn) -> tuple[Dataset, dict[str, str]]:
     """Return the data set with the person's recordings of known gestures, and what is left out."""
     mine = [r for r in dataset.used if r.subject == person]
     known = [r for r in mine if r.gesture in bundle.gestures.labels]
@@ -393,32 +384,21 @@ def _only(dataset: Dataset, person: str, bundle: Bundle, warn: Warn) -> tuple[Da
     return Dataset(dataset.path, dataset.head, known, dataset.streams), left_out
 
 
-def _first(windows: WindowSet, times: dict[str, int], use: int) -> NDArray[np.bool_]:
-    """Return which windows are of the first ``use`` recordings of their gesture, by the clock."""
-    chosen: list[int] = []
-    for k in np.unique(windows.y):
-        mine = {int(r) for r in windows.recording[windows.y == k]}
-        ids = windows.recording_ids
-        chosen += sorted(mine, key=lambda r: (times[ids[r]], ids[r]))[:use]
-    return np.isin(windows.recording, chosen)
-
-
-def _float_reader(bundle: Bundle) -> Reader:
+def _float_predictor(bundle: Bundle) -> Predictor:
     network, scaler = bundle.network(), bundle.scaler
     return lambda windows: network.probabilities(scaler.apply(windows.x))
 
 
-def _integer_reader(bundle: Bundle) -> Reader:
-    network = integer_network(bundle)
-    return lambda windows: integer_probabilities(network, windows.x)
-
-
-def _readers(bundle: Bundle, int8: bool) -> dict[str, Reader]:
-    return {"float": _float_reader(bundle)} | ({"int8": _integer_reader(bundle)} if int8 else {})
+def _predictors(bundle: Bundle, int8: bool) -> dict[str, Predictor]:
+    predictors = {"float": _float_predictor(bundle)}
+    if int8:
+        network = integer_network(bundle)
+        predictors["int8"] = lambda windows: integer_probabilities(network, windows.x)
+    return predictors
 
 
 def evaluate_adapting(
-    dataset: Given,
+    dataset: Dataset | str | os.PathLike[str],
     config: RunConfig | None = None,
     *,
     split: str = "leave-one-subject-out",
@@ -430,19 +410,19 @@ def evaluate_adapting(
     warn: Warn = silent,
     **settings: Any,
 ) -> dict[str, Any]:
-    """Measure how much adapting helps people left out: one network for each fold, adapted to each of its people.
+    """Measure how much adaptation helps people left out: one network for each fold, adapted to each of its people.
 
-    The networks are kept in the data set's ``cache`` folder. Nothing of how a bundle is adapted is tuned here: each
-    person's strength, and whether to adapt at all, comes of the recordings that adapt.
+    The networks are kept in the data set's ``cache`` folder. Adaptation is not tuned here: each person's strength, and
+    whether to adapt at all, follow from the recordings that the network is adapted to.
 
     Args:
         config, settings: as for `plushsense.train`.
-        use, random: see `plushsense.experiments.adaptation.evaluate_adapting`.
-        int8: also deploy each network, before and after.
-        progress: told what is done.
+        use, random: as for `score_adaptation`.
+        int8: also score the deployed networks, before and after.
+        progress: called with a sentence on each finished training or person.
 
     Returns:
-        What `plushsense.experiments.adaptation.evaluate_adapting` returns, and ``split``, ``simulated``, ``spec``.
+        What `score_adaptation` returns, and ``split``, ``simulated``, ``spec``.
     """
     dataset = as_dataset(dataset)
     config = config or from_settings(**settings)
@@ -471,7 +451,6 @@ def evaluate_adapting(
         mine = windows.take(fold.train)
         fitted = fit(mine, windows.take(fold.validation), arch, config.training)
         kept = calibration(arch, fitted.weights, fitted.scaler, mine.x)
-        people = {str(s) for s in mine.subject}
         bundle = Bundle(
             arch,
             fitted.weights,
@@ -484,7 +463,7 @@ def evaluate_adapting(
                 "dataset": dataset.head.name,
                 "dataset_hash": dataset.hash,
                 "simulated": dataset.head.simulated,
-                "subjects": sorted(people),
+                "subjects": sorted({str(s) for s in mine.subject}),
                 "validation_subjects": sorted({str(s) for s in windows.subject[fold.validation]}),
             },
             kept,
@@ -494,34 +473,29 @@ def evaluate_adapting(
         tell(f"trained for {fold.name}, {fitted.seconds:.0f} s")
         return bundle
 
-    def strangers() -> Iterator[Stranger]:
+    def people() -> Iterator[HeldOutPerson]:
         for fold in folds:
             bundle = bundle_of(fold)
-            before = _readers(bundle, int8)
+            before = _predictors(bundle, int8)
             for person in fold.subjects:
-                yield Stranger(person, before, _adapter(bundle, before, person, spec, int8))
+                yield HeldOutPerson(person, before, partial(_adapt_to, bundle, person, spec, int8))
 
-    result = evaluate_adapting_adapting(
+    result = score_adaptation(
         windows,
-        strangers(),
+        people(),
         {r.id: r.epoch_ms for r in dataset.recordings},
         use=use,
         random=random,
         seed=config.evaluation.seed,
         progress=lambda person: tell(f"adapted to {person}"),
     )
-    how = {f.name: getattr(spec, f.name) for f in fields(spec)}
-    return {"split": division.text, "simulated": dataset.head.simulated, "spec": how, **result}
+    return {"split": division.text, "simulated": dataset.head.simulated, "spec": asdict(spec), **result}
 
 
-def _adapter(
-    bundle: Bundle, before: dict[str, Reader], person: str, spec: PersonalSpec, int8: bool
-) -> Callable[[WindowSet], Touched]:
-    def touch(own: WindowSet) -> Touched:
-        try:
-            done = personalise(bundle, own.x, own.y, own.recording, subject=person, spec=spec)
-        except BadInput:
-            return Touched(before, False)  # too few recordings: it stays as it is
-        return Touched(_readers(done.bundle, int8), True) if done.accepted else Touched(before, False)
-
-    return touch
+def _adapt_to(bundle: Bundle, person: str, spec: PersonalSpec, int8: bool, own: WindowSet) -> Predictors | None:
+    """Return the predictors of the bundle adapted to windows of a person; None where it stays as it is."""
+    try:
+        done = personalise(bundle, own.x, own.y, own.recording, subject=person, spec=spec)
+    except BadInput:
+        return None  # too few recordings
+    return _predictors(done.bundle, int8) if done.accepted else None

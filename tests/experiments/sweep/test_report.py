@@ -6,6 +6,7 @@ import csv
 import json
 import math
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ import pytest
 from plushsense.core.errors import BadInput, ConfigError
 from plushsense.experiments.sweep import figures as sweep_figures
 from plushsense.experiments.sweep import tables as sweep_tables
-from plushsense.experiments.sweep.report import confusion_words, sections_of, write_report
+from plushsense.experiments.sweep.report import confusion_words, sections_of, write_sweep_report
 from plushsense.experiments.sweep.results import read_sweep
 from plushsense.models.arch import PAPER_ARCHITECTURES, PAPER_FILTERS
 from plushsense.scoring.metrics import accuracy_complexity_ratio
@@ -62,6 +63,24 @@ SCORES: dict[tuple[str, str], list[float | None]] = {
     ("14d1_39d2_41d4", "4/6/8"): [0.70, 0.2, 0.2, 0.1],
     ("14d1_39d2_41d4", "8/12/16"): [0.8, None, 0.6, 0.4],
 }
+
+
+@dataclass
+class Written:
+    """What a report consists of: the page, the folder beside it, and the files in that."""
+
+    page: Path
+    folder: Path
+    files: list[Path]
+    done: int
+    trials: int
+
+
+def write_report(folder: Path, page: Path | None = None) -> Written:
+    made = write_sweep_report(folder, page)
+    beside = Path(made["files"])
+    files = sorted(path for path in beside.iterdir() if path.name != "README.txt")
+    return Written(Path(made["report"]), beside, files, made["done"], made["trials"])
 
 
 def test_acr_is_the_papers():

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import os
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,21 +19,14 @@ _METRICS = tuple(key for key, c in TRIAL_COLUMNS.items() if c.type in (int, floa
 _PAGE = 1000
 
 
-@dataclass(frozen=True)
-class LoggedTrials:
-    """Numbers of trials logged now and before, and where."""
-
-    new: int
-    before: int
-    uri: str
-    experiment: str
-
-
-def export_trials(sweep: SweepResults, where: str | os.PathLike[str]) -> LoggedTrials:
+def export_trials(sweep: SweepResults, where: str | os.PathLike[str]) -> dict[str, Any]:
     """Log each finished trial as a run; one that is there already is not logged again.
 
     Args:
         where: a tracking URI (``sqlite:///…``, ``http://…``), or a folder, in which ``mlflow.db`` is made.
+
+    Returns:
+        ``uri``, ``experiment``, and the numbers of trials logged now (``new``) and ``before``.
 
     Raises:
         ConfigError: when MLflow refuses the place; MissingExtraError: when it is not installed.
@@ -64,7 +56,8 @@ def export_trials(sweep: SweepResults, where: str | os.PathLike[str]) -> LoggedT
         raise ConfigError(
             f"MLflow refuses '{where}' ({said}): give a folder, or a URI such as sqlite:///x.db."
         ) from None
-    return LoggedTrials(len(finished), len(sweep.done) - len(finished), uri, title)
+    before = len(sweep.done) - len(finished)
+    return {"uri": uri, "experiment": title, "new": len(finished), "before": before}
 
 
 def _place(where: str) -> tuple[str, str | None]:

@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from plushsense.experiments.sweep import figures as draw
 from plushsense.experiments.sweep import tables
 from plushsense.experiments.sweep.results import SweepResults, name_of, read_sweep
@@ -15,6 +17,7 @@ from plushsense.reports import wording
 from plushsense.reports.figures import png, svg, svg_uri
 from plushsense.reports.page import check_page_path, earlier_files, render_page, write_files, write_page
 from plushsense.reports.table import DASH, Row, Table, count, number, text
+from plushsense.scoring.metrics import grouped
 from plushsense.trials.grid import SECOND
 from plushsense.trials.tables import SUMMARY
 
@@ -172,23 +175,21 @@ def _confusions(sweep: SweepResults, shown: Sequence[Row]) -> Section:
 
 def confusion_words(sweep: SweepResults, trial: Row) -> str:
     """Describe a confusion matrix: right, mistaken for the same affect, mistaken for another affect."""
-    counts = sweep.confusion(str(trial["trial"])) or []
-    total = sum(map(sum, counts))
-    right = sum(row[i] for i, row in enumerate(counts))
-    affects = sweep.affects
-    across = sum(n for i, row in enumerate(counts) for j, n in enumerate(row) if affects[i] != affects[j])
+    counts = np.asarray(sweep.confusion(str(trial["trial"])), dtype=np.int64)
+    total, right = int(counts.sum()), int(np.trace(counts))
+    names, by_affect = grouped(counts, sweep.affects)
     share = 100 * right / max(total, 1)
     said = f"Confusion matrix of {name_of(trial)}: {right} of {count(total)} windows right ({share:.1f} %)"
-    if len(set(affects)) > 1:
-        inside = total - right - across
+    if len(names) > 1:
+        same_affect = int(np.trace(by_affect))
         said += (
-            f"; {100 * inside / max(total, 1):.1f} % read as another gesture of the same affect, "
-            f"{100 * across / max(total, 1):.1f} % as one of another affect"
+            f"; {100 * (same_affect - right) / max(total, 1):.1f} % read as another gesture of the same affect, "
+            f"{100 * (total - same_affect) / max(total, 1):.1f} % as one of another affect"
         )
-    pairs = [(n, i, j) for i, row in enumerate(counts) for j, n in enumerate(row) if i != j and n]
-    if pairs:
-        n, i, j = max(pairs, key=lambda p: p[0])
-        said += f". Most often mistaken: {sweep.labels[i]} for {sweep.labels[j]} ({n} windows)"
+    wrong = counts - np.diag(np.diag(counts))
+    if wrong.any():
+        i, j = np.unravel_index(wrong.argmax(), wrong.shape)
+        said += f". Most often mistaken: {sweep.labels[i]} for {sweep.labels[j]} ({wrong[i, j]} windows)"
     return said + "."
 
 
@@ -228,27 +229,33 @@ PAGE, FILES = "report.html", "report-files"
 _DPI = 120
 
 
-@dataclass(frozen=True)
-class WrittenReport:
-    """Files of a report: the page, and the tables and figures."""
-
-    page: Path
-    folder: Path
-    files: tuple[Path, ...]
-    done: int
-    trials: int
+def is_sweep(folder: str | os.PathLike[str]) -> bool:
+    """Return whether this is the results folder of a sweep."""
+    return (Path(folder) / SUMMARY).is_file()
 
 
-def write_report(folder: str | Path, page: str | Path | None = None, *, title: str | None = None) -> WrittenReport:
+def write_sweep_report(
+    folder: str | os.PathLike[str],
+    page: str | os.PathLike[str] | None = None,
+    *,
+    title: str | None = None,
+    mlflow: str | os.PathLike[str] | None = None,
+) -> dict[str, Any]:
     """Write the page of a sweep and, in a folder beside it, each table as CSV and each figure as PNG and SVG.
 
     Args:
-        folder: the results folder that ``plushsense sweep`` wrote; it may still be filling.
+        folder: the results folder of a sweep, which may still be running.
         page: the .html file (default: ``report.html`` in the folder); an older report there is replaced.
+        mlflow: a folder or a tracking URI to log the trials to as well; trials that are there already are not logged
+            again.
+
+    Returns:
+        ``report``, ``files`` (the folder), ``trials``, ``done``, ``mlflow`` ({uri, experiment, new, before} or None),
+        and ``said``, the same in words.
 
     Raises:
         BadInput: where there is no sweep; ConfigError: where the page or its files would replace something else.
-        MissingExtraError: when polars, jinja2 or matplotlib is not installed.
+        MissingExtraError: when polars, jinja2, matplotlib or MLflow is not installed.
     """
     sweep = read_sweep(folder)
     target = check_page_path(Path(page) if page is not None else sweep.folder / PAGE)
@@ -257,15 +264,29 @@ def write_report(folder: str | Path, page: str | Path | None = None, *, title: s
     sections = list(sections_of(sweep))
     drawings = [d for section in sections for d in section.drawings]
     for d in drawings:
-        # Laid out once for both formats.
+        # Compute the layout once for both formats.
         d.figure.draw_without_rendering()
         d.figure.set_layout_engine("none")
     pictures = {d.name: svg(d.figure) for d in drawings}
-    made = dict(_contents(sweep, sections, pictures))
+    files = dict(_contents(sweep, sections, pictures))
     page_text = render(sweep, sections, pictures, title=title, files=beside.name)
-    write_files(beside, made, before)
+    write_files(beside, files, before)
     write_page(target, page_text)
-    return WrittenReport(target, beside, tuple(beside / name for name in made), len(sweep.done), sweep.total)
+    said = [f"{len(files)} tables and figures in {beside}"]
+    logged = None
+    if mlflow is not None:
+        from plushsense.experiments.sweep.mlflow import export_trials
+
+        logged = export_trials(sweep, mlflow)
+        said.append(f"MLflow: {logged['new']} trials logged, {logged['before']} were there already ({logged['uri']})")
+    return {
+        "report": str(target),
+        "files": str(beside),
+        "trials": sweep.total,
+        "done": len(sweep.done),
+        "mlflow": logged,
+        "said": said,
+    }
 
 
 def render(
@@ -350,45 +371,3 @@ def _contents(
         for d in section.drawings:
             yield f"{d.name}.png", png(d.figure, dpi=_DPI)
             yield f"{d.name}.svg", pictures[d.name]
-
-
-def is_sweep(folder: str | os.PathLike[str]) -> bool:
-    """Return whether this is the results folder of a sweep."""
-    return (Path(folder) / SUMMARY).is_file()
-
-
-def write_sweep_report(
-    folder: str | os.PathLike[str],
-    page: str | os.PathLike[str] | None = None,
-    *,
-    title: str | None = None,
-    mlflow: str | os.PathLike[str] | None = None,
-) -> dict[str, Any]:
-    """Write the page of a sweep with its tables and figures as files, and log its trials to MLflow on request.
-
-    Args:
-        folder: what ``plushsense sweep`` wrote; it may still be filling.
-        page: the .html file (default: ``report.html`` in the folder); its files go into a folder beside it.
-        mlflow: a folder or a tracking URI; trials that are there already are not logged again.
-
-    Returns:
-        ``report``, ``files`` (the folder), ``trials``, ``done``, ``mlflow`` ({uri, new, before} or None), and
-        ``said``, the same in words.
-    """
-    made = write_report(Path(folder), None if page is None else Path(page), title=title)
-    said = [f"{len(made.files)} tables and figures in {made.folder}"]
-    exported = None
-    if mlflow is not None:
-        from plushsense.experiments.sweep.mlflow import export_trials
-
-        there = export_trials(read_sweep(Path(folder)), mlflow)
-        exported = {"uri": there.uri, "experiment": there.experiment, "new": there.new, "before": there.before}
-        said.append(f"MLflow: {there.new} trials logged, {there.before} were there already ({there.uri})")
-    return {
-        "report": str(made.page),
-        "files": str(made.folder),
-        "trials": made.trials,
-        "done": made.done,
-        "mlflow": exported,
-        "said": said,
-    }

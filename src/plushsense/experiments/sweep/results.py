@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import statistics
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -150,7 +151,7 @@ class SweepResults:
         return max(self.done, key=lambda t: (float(t["accuracy"]), -int(t["parameters"])), default=None)
 
 
-def read_sweep(folder: str | Path) -> SweepResults:
+def read_sweep(folder: str | os.PathLike[str]) -> SweepResults:
     """Read the results folder of a sweep.
 
     Raises:
