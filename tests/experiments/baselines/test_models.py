@@ -11,9 +11,8 @@ from plushsense.core.errors import BadInput, ConfigError
 from plushsense.experiments.baselines.models import (
     BASELINES,
     FEATURES,
-    TITLES,
     ClassicalFit,
-    ClassicalReader,
+    FittedClassifier,
     classical,
     likelihoods,
 )
@@ -24,9 +23,9 @@ pytestmark = pytest.mark.usefixtures("scikit_learn")
 SAMPLES = 50
 
 
-def fitted(name: str = "knn", features: str = "statistics", pca: bool = False, seed: int = 0) -> ClassicalReader:
+def fitted(name: str = "knn", features: str = "statistics", pca: bool = False, seed: int = 0) -> FittedClassifier:
     reader = ClassicalFit(name, features, pca, SAMPLES, seed)(rhythms(), rhythms(0))
-    assert isinstance(reader, ClassicalReader)
+    assert isinstance(reader, FittedClassifier)
     return reader
 
 
@@ -41,7 +40,7 @@ def test_every_baseline_learns_gives_probabilities_and_repeats_itself(name: str)
         assert np.array_equal(read, again(test))
         if features == "statistics":
             assert (read.argmax(axis=1) == test.y).mean() > 0.8, (name, pca)
-    assert name in TITLES
+    assert BASELINES[name].title
 
 
 @pytest.mark.parametrize("name", ["forest", "extra-trees", "mlp", "subspace-knn"])
@@ -57,11 +56,11 @@ def test_scaling_and_pca_are_fitted_to_the_training_windows_only() -> None:
     other = replace(rhythms(40, seed=5), x=rhythms(40, seed=5).x * 50 + 90_000)
     fit = ClassicalFit("knn", "flattened", True, SAMPLES, 0)
     with_them, without = fit(train, other), fit(train, rhythms(0))
-    assert isinstance(with_them, ClassicalReader) and isinstance(without, ClassicalReader)
+    assert isinstance(with_them, FittedClassifier) and isinstance(without, FittedClassifier)
     with_them(other)
     flat = FEATURES["flattened"](train, SAMPLES)
     for reader in (with_them, without):
-        scaler, pca = reader.pipeline[0], reader.pipeline[1]
+        scaler, pca = reader.model[0], reader.model[1]
         assert scaler.mean_ == pytest.approx(flat.mean(axis=0))
         assert scaler.scale_ == pytest.approx(flat.std(axis=0))
         assert scaler.n_samples_seen_ == len(train)

@@ -149,7 +149,7 @@ def test_what_is_refused(tmp_path: Path) -> None:
         compare(windows, [one], ["by-subjects:3"])
     with pytest.raises(BadInput, match="people"):
         compare(windows, [one], ["by-subject:30"])
-    with pytest.raises(ConfigError, match="stands twice"):
+    with pytest.raises(ConfigError, match="is given twice"):
         compare(windows, [one, one], ["windows:4"])
     assert fits(tmp_path) == 0
     with pytest.raises(ConfigError, match=r"the odd one, windows gave probabilities of the shape \(1, 1\)"):

@@ -1,4 +1,4 @@
-"""The classical programs that a network must beat: statistics or flattened windows, with and without PCA.
+"""The classical programs to compare a network with: statistics or flattened windows, with and without PCA.
 
 A baseline is scaling, perhaps PCA, and a classifier of scikit-learn (extra ``baselines``), all fitted to the training
 windows of a fold and to nothing else. Names such as "cubic SVM" and "subspace kNN" are those of MATLAB's Classification
@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,16 +37,11 @@ def _sklearn(module: str) -> Any:
     return need(f"sklearn.{module}", extra=EXTRA)
 
 
-def _forest(seed: int) -> Any:
-    return _sklearn("ensemble").RandomForestClassifier(TREES, random_state=seed, n_jobs=1)
+class Baseline(NamedTuple):
+    """A classical program: its title in tables, and how its classifier is made from a seed."""
 
-
-def _extra_trees(seed: int) -> Any:
-    return _sklearn("ensemble").ExtraTreesClassifier(TREES, random_state=seed, n_jobs=1)
-
-
-def _knn(seed: int) -> Any:
-    return _sklearn("neighbors").KNeighborsClassifier(5, n_jobs=1)
+    title: str
+    make: Callable[[int], Any]
 
 
 def _subspace_knn(seed: int) -> Any:
@@ -57,49 +52,29 @@ def _subspace_knn(seed: int) -> Any:
     )
 
 
-def _cubic_svm(seed: int) -> Any:
-    return _sklearn("svm").SVC(kernel="poly", degree=3, coef0=1.0, C=1.0)
-
-
-def _rbf_svm(seed: int) -> Any:
-    return _sklearn("svm").SVC(kernel="rbf", C=1.0)
-
-
-def _tree(seed: int) -> Any:
-    return _sklearn("tree").DecisionTreeClassifier(random_state=seed)
-
-
-def _boosting(seed: int) -> Any:
-    return _sklearn("ensemble").HistGradientBoostingClassifier(max_iter=100, early_stopping=False, random_state=seed)
-
-
-def _mlp(seed: int) -> Any:
-    return _sklearn("neural_network").MLPClassifier((64,), max_iter=200, random_state=seed)
-
-
-# How each classifier is made; it is given the seed.
-BASELINES: dict[str, Callable[[int], Any]] = {
-    "forest": _forest,
-    "extra-trees": _extra_trees,
-    "knn": _knn,
-    "subspace-knn": _subspace_knn,
-    "cubic-svm": _cubic_svm,
-    "rbf-svm": _rbf_svm,
-    "tree": _tree,
-    "boosting": _boosting,
-    "mlp": _mlp,
-}
-
-TITLES = {
-    "forest": f"random forest ({TREES})",
-    "extra-trees": f"extra trees ({TREES})",
-    "knn": "kNN (5)",
-    "subspace-knn": "subspace kNN (30)",
-    "cubic-svm": "cubic SVM",
-    "rbf-svm": "RBF SVM",
-    "tree": "decision tree",
-    "boosting": "gradient boosting",
-    "mlp": "MLP (64)",
+BASELINES: dict[str, Baseline] = {
+    "forest": Baseline(
+        f"random forest ({TREES})",
+        lambda seed: _sklearn("ensemble").RandomForestClassifier(TREES, random_state=seed, n_jobs=1),
+    ),
+    "extra-trees": Baseline(
+        f"extra trees ({TREES})",
+        lambda seed: _sklearn("ensemble").ExtraTreesClassifier(TREES, random_state=seed, n_jobs=1),
+    ),
+    "knn": Baseline("kNN (5)", lambda seed: _sklearn("neighbors").KNeighborsClassifier(5, n_jobs=1)),
+    "subspace-knn": Baseline("subspace kNN (30)", _subspace_knn),
+    "cubic-svm": Baseline("cubic SVM", lambda seed: _sklearn("svm").SVC(kernel="poly", degree=3, coef0=1.0, C=1.0)),
+    "rbf-svm": Baseline("RBF SVM", lambda seed: _sklearn("svm").SVC(kernel="rbf", C=1.0)),
+    "tree": Baseline("decision tree", lambda seed: _sklearn("tree").DecisionTreeClassifier(random_state=seed)),
+    "boosting": Baseline(
+        "gradient boosting",
+        lambda seed: _sklearn("ensemble").HistGradientBoostingClassifier(
+            max_iter=100, early_stopping=False, random_state=seed
+        ),
+    ),
+    "mlp": Baseline(
+        "MLP (64)", lambda seed: _sklearn("neural_network").MLPClassifier((64,), max_iter=200, random_state=seed)
+    ),
 }
 
 
@@ -111,7 +86,7 @@ def _flattened(windows: WindowSet, samples: int) -> Floats:
     return windows.x[:, :, -samples:].reshape(len(windows), -1).astype(np.float64)
 
 
-# What takes longest and gains least: on flattened windows of 3 channels one fit took 52 s, on 11 it would take minutes.
+# Left out: on flattened windows of 3 channels one fit took 52 s, on 11 it would take minutes, for little gain.
 TOO_LONG = (("boosting", "flattened", False),)
 
 # What a classifier is given of a window's last ``samples`` samples, (N, values).
@@ -134,30 +109,30 @@ class ClassicalFit:
         steps = [_sklearn("preprocessing").StandardScaler()]
         if self.pca:
             steps.append(_sklearn("decomposition").PCA(PCA_VARIANCE, svd_solver="full"))
-        pipeline = _sklearn("pipeline").make_pipeline(*steps, BASELINES[self.name](self.seed))
+        pipeline = _sklearn("pipeline").make_pipeline(*steps, BASELINES[self.name].make(self.seed))
         with warnings.catch_warnings():
-            # The small network is given its rounds, like everybody; that it could do with more is no news to the user.
+            # The small network has a fixed number of iterations; the user cannot act on a warning about it.
             warnings.simplefilter("ignore", _sklearn("exceptions").ConvergenceWarning)
             pipeline.fit(FEATURES[self.features](train, self.samples), train.y)
-        return ClassicalReader(pipeline, self.features, self.samples)
+        return FittedClassifier(pipeline, lambda windows: FEATURES[self.features](windows, self.samples))
 
 
-class ClassicalReader:
-    """A fitted baseline.
+class FittedClassifier:
+    """A fitted ``model`` with the function that returns its input from windows.
 
-    ``size_bytes`` is the length of its pickle, taken in memory: a measure like MATLAB's "model size", never a format in
-    which anything is kept or read.
+    ``size_bytes`` is the length of the model's pickle in memory, a measure like MATLAB's "model size". Nothing is
+    stored in that format.
     """
 
-    def __init__(self, pipeline: Any, features: str, samples: int) -> None:
-        self.pipeline, self._features, self._samples = pipeline, features, samples
+    def __init__(self, model: Any, view: Callable[[WindowSet], NDArray[Any]]) -> None:
+        self.model, self._view = model, view
 
     @property
     def size_bytes(self) -> int:
-        return len(pickle.dumps(self.pipeline, protocol=pickle.HIGHEST_PROTOCOL))
+        return len(pickle.dumps(self.model, protocol=pickle.HIGHEST_PROTOCOL))
 
     def __call__(self, windows: WindowSet, /) -> NDArray[np.float32]:
-        return likelihoods(self.pipeline, FEATURES[self._features](windows, self._samples), len(windows.labels))
+        return likelihoods(self.model, self._view(windows), len(windows.labels))
 
 
 def likelihoods(model: Any, x: Any, classes: int) -> NDArray[np.float32]:
@@ -202,14 +177,10 @@ def classical(
             if one not in known:
                 raise ConfigError(f"Unknown {what} '{one}': accepted are {', '.join(known)}.{nearest(one, known)}")
     library = f"scikit-learn {need('sklearn', extra=EXTRA).__version__}"
+    key = {"version": BASELINES_VERSION, "library": library, "samples": samples, "seed": seed}
     return [
         Contender(
-            name,
-            TITLES[name],
-            view,
-            reduced,
-            ClassicalFit(name, view, reduced, samples, seed),
-            {"version": BASELINES_VERSION, "library": library, "samples": samples, "seed": seed},
+            name, BASELINES[name].title, view, reduced, ClassicalFit(name, view, reduced, samples, seed), dict(key)
         )
         for view in features
         for reduced in pca
@@ -235,8 +206,8 @@ _FIRST = 32
 class RocketFit:
     """Fits a classifier of random convolutions (Dempster, Schmidt & Webb 2021, 2023) to windows scaled by channel.
 
-    Its kernels are compiled when they first run in a process (seconds to a minute): a few windows are read for that
-    first, so that no time that is reported holds it.
+    Its kernels are compiled when they first run in a process (seconds to a minute). `prepare` does so before the
+    measured time begins.
     """
 
     name: str
@@ -247,29 +218,17 @@ class RocketFit:
         """Fit the classifier to ``train``; ``validation`` is not used."""
         enough_to_learn(train)
         scaler = Scaler.fit(train.x[:, :, -self.samples :])
-        x = scaler.apply(train.x[:, :, -self.samples :])
+
+        def scaled(windows: WindowSet) -> NDArray[np.float32]:
+            return scaler.apply(windows.x[:, :, -self.samples :])
+
         model = _rocket(self.name, self.seed)
-        model.fit(x, train.y)
-        return RocketReader(model, scaler, self.samples)
+        model.fit(scaled(train), train.y)
+        return FittedClassifier(model, scaled)
 
     def prepare(self, train: WindowSet, /) -> None:
-        """Compile, once a process: before the clock starts."""
+        """Compile the kernels, once in each process."""
         _compiled(self.name, train.x.shape[1], min(self.samples, train.x.shape[2]))
-
-
-class RocketReader:
-    """A fitted rocket; ``size_bytes`` the length of its pickle in memory, as for a `ClassicalReader`."""
-
-    def __init__(self, model: Any, scaler: Scaler, samples: int) -> None:
-        self.model, self._scaler, self._samples = model, scaler, samples
-
-    @property
-    def size_bytes(self) -> int:
-        return len(pickle.dumps(self.model, protocol=pickle.HIGHEST_PROTOCOL))
-
-    def __call__(self, windows: WindowSet, /) -> NDArray[np.float32]:
-        x = self._scaler.apply(windows.x[:, :, -self._samples :])
-        return likelihoods(self.model, x, len(windows.labels))
 
 
 def _rocket(name: str, seed: int) -> Any:
@@ -295,14 +254,7 @@ def rockets(names: Sequence[str], samples: int, seed: int) -> list[Contender]:
     library = f"aeon {need('aeon', extra=EXTRA_ROCKETS).__version__}" if names else ""
     if "multirocket-hydra" in names:
         need("torch", extra=EXTRA_ROCKETS)
+    key = {"version": ROCKETS_VERSION, "library": library, "samples": samples, "seed": seed}
     return [
-        Contender(
-            name,
-            ROCKETS[name][0],
-            "windows",
-            False,
-            RocketFit(name, samples, seed),
-            {"version": ROCKETS_VERSION, "library": library, "samples": samples, "seed": seed},
-        )
-        for name in names
+        Contender(name, ROCKETS[name][0], "windows", False, RocketFit(name, samples, seed), dict(key)) for name in names
     ]

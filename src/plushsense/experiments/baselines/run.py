@@ -21,7 +21,7 @@ from plushsense.core.layouts import Layout
 from plushsense.core.version import __version__
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
-from plushsense.experiments.baselines.models import BASELINES, FEATURES, ROCKETS, TITLES, TOO_LONG, classical, rockets
+from plushsense.experiments.baselines.models import BASELINES, FEATURES, ROCKETS, TOO_LONG, classical, rockets
 from plushsense.experiments.baselines.score import Contender, Reader, compare
 from plushsense.jobs.journal import job_id
 from plushsense.jobs.progress import JobProgress
@@ -199,7 +199,7 @@ def baselines(
     for name, view, reduced in TOO_LONG:
         if name in names and view in features and reduced in PCA[pca]:
             how = "with" if reduced else "without"
-            warn(f"left out: {TITLES[name]} on {view} windows {how} PCA, which takes too long")
+            warn(f"left out: {BASELINES[name].title} on {view} windows {how} PCA, which takes too long")
     table = compare(
         windows,
         contenders(names, features, PCA[pca], config, network, dataset.layout, gestures, windows),

@@ -1,7 +1,8 @@
-"""Several programs on the same windows under several splits, side by side: how good each is, how large, how quick.
+"""Comparison of several programs on the same windows under several splits: their scores, sizes and times.
 
-Every program × split × fold is one job of the journal. What a program is, is handed in as a picklable callable, as in
-``crossval``; nothing here knows of scikit-learn or PyTorch. Sizes and times are taken here, for all programs alike.
+Every program × split × fold is one job of the journal. A program is passed in as a picklable callable, as in
+``crossval``, so that this module needs neither scikit-learn nor PyTorch. Sizes and times are measured here, for all
+programs alike.
 """
 
 from __future__ import annotations
@@ -28,9 +29,9 @@ from plushsense.windows.cut import WindowSet
 
 # Part of every job's id: raise it when the meaning of a stored fold changes.
 _VERSION = 2
-# Windows that are read one at a time for a latency; the first few warm caches and do not count.
+# Number of windows that are read one at a time for a latency, and of those before that warm the caches.
 _TIMED, _WARM = 20, 3
-# Processor time of this process, which is on one thread: what else runs on the machine lengthens it little.
+# Processor time of this process, which uses one thread: other programs on the machine hardly change it.
 _clock = time.process_time
 
 
@@ -43,20 +44,19 @@ class Reader(Protocol):
     def __call__(self, windows: WindowSet, /) -> NDArray[np.float32]: ...
 
 
-class Fit(Protocol):
-    """Fits a program to the first windows, may watch the second; picklable, the same for the same input.
+Fit = Callable[[WindowSet, WindowSet], Reader]
+"""Fits a program to training windows; it may use the second windows for validation.
 
-    One that has something to do once a process, such as compiling, has a method ``prepare(train)``.
-    """
-
-    def __call__(self, train: WindowSet, validation: WindowSet, /) -> Reader: ...
+It is picklable and deterministic. For work that is done once in each process, such as compiling, it may have a method
+``prepare(train)``, which is not timed.
+"""
 
 
 @dataclass(frozen=True)
 class Contender:
-    """A program in the comparison: its name, what it reads of a window, and how it is fitted.
+    """A program in the comparison: its name, the features that it reads, and the function that fits it.
 
-    ``key`` says everything that ``fit`` depends on beside name, features and PCA.
+    ``key`` holds everything that ``fit`` depends on besides name, features and PCA.
     """
 
     name: str
@@ -68,7 +68,7 @@ class Contender:
 
     @property
     def words(self) -> str:
-        """One line that tells it from the others."""
+        """A description in one line."""
         return f"{self.title}, {self.features}{', PCA' if self.pca else ''}"
 
 
@@ -91,7 +91,7 @@ def compare(
 ) -> dict[str, Any]:
     """Fit and score every contender in every fold of every split, all on the same windows.
 
-    Everybody trains on the training windows of a fold only; those that validate are there for who stops early.
+    Programs are fitted to the training windows of a fold; its validation windows are for early stopping only.
 
     Returns:
         ``context``, ``splits``, ``windows``, ``recordings``, ``subjects``, ``labels``, ``seed``, ``jobs``,
@@ -99,18 +99,18 @@ def compare(
         one that keeps people apart.
 
     Raises:
-        ConfigError, BadInput: for a split that is unknown, asked twice or cannot be made.
+        ConfigError, BadInput: for a split that is unknown, given twice or cannot be made.
         MissingExtraError: without threadpoolctl, which comes with scikit-learn.
     """
     need("threadpoolctl", extra="baselines")
     if not contenders:
-        raise ConfigError("No program is left to compare: name one or more, such as  --models forest,knn")
-    asked = _parsed(splits)
-    folds = {split.text: fold_windows(windows, windows, split, seed) for split in asked}
+        raise ConfigError("No program is left to compare: give one or more, such as  --models forest,knn")
+    parsed = _parsed(splits)
+    folds = {split.text: fold_windows(windows, windows, split, seed) for split in parsed}
     base = {"version": _VERSION, "windows": windows_fingerprint(windows), "rate_hz": windows.rate_hz}
     names = [(c.name, c.features, c.pca) for c in contenders]
     if len(set(names)) < len(names):
-        raise ConfigError("A program stands twice in the comparison: name each once.")
+        raise ConfigError("A program is given twice: name each once.")
     prints = {text: [fold_fingerprint(fold) for fold in made] for text, made in folds.items()}
     jobs: dict[tuple[int, str], list[Job]] = {}
     for i, contender in enumerate(contenders):
@@ -129,11 +129,11 @@ def compare(
     rows = [
         _row(contenders[i], split, folds[split.text], [results[job.id] for job in jobs[i, split.text]], windows)
         for i in range(len(contenders))
-        for split in asked
+        for split in parsed
     ]
     return {
         "context": context_of(windows),
-        "splits": [{"split": split.text, "leaky": split.leaky, "folds": len(folds[split.text])} for split in asked],
+        "splits": [{"split": split.text, "leaky": split.leaky, "folds": len(folds[split.text])} for split in parsed],
         "windows": len(windows),
         "recordings": len(np.unique(windows.recording)),
         "subjects": len(set(windows.subject.tolist()) - {NOBODY}),
@@ -147,7 +147,7 @@ def compare(
 
 
 def gaps(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return by how much each leaky split flatters each program, against each split that keeps people apart."""
+    """Return how much higher each program scores in each leaky split than in each split by person."""
     found = []
     for honest in (row for row in rows if row["apart"]):
         for leaky in (row for row in rows if row["leaky"]):
@@ -170,7 +170,7 @@ def _parsed(splits: Sequence[str]) -> list[Split]:
     found = [parse_split(text) for text in splits]
     for i, split in enumerate(found):
         if split in found[:i]:
-            raise ConfigError(f"The split {split.text} is asked for twice: name each once.")
+            raise ConfigError(f"The split {split.text} is given twice: name each once.")
     return found
 
 
