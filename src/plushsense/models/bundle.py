@@ -22,8 +22,9 @@ from safetensors.numpy import save as save_tensors
 
 from plushsense.core.errors import BadInput, BundleError
 from plushsense.core.files import write_file
-from plushsense.core.gestures import GestureSet
+from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.layouts import Layout
+from plushsense.dataset.store import UNKNOWN_SUBJECT
 from plushsense.models.arch import Arch
 from plushsense.models.reference import Network, check_weights
 from plushsense.windows.features import Scaler
@@ -205,6 +206,13 @@ class Bundle:
             "content": content,
         }
         return bytes(save_tensors(weights, metadata={"plushsense": _canonical(head)}))
+
+
+def known_people(provenance: Mapping[str, Any]) -> set[str]:
+    """Return the codes of the people that a bundle was trained on or chosen by, without nobody and the unknown."""
+    listed = [provenance.get(key) for key in ("subjects", "validation_subjects")]
+    codes = {str(code) for each in listed if isinstance(each, list | tuple) for code in each}
+    return codes - {NOBODY, UNKNOWN_SUBJECT}
 
 
 def _header(data: bytes, path: str | Path) -> dict[str, Any]:

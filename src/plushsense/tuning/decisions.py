@@ -27,6 +27,7 @@ from plushsense.runtime.health import MOST_MS, HealthSettings
 from plushsense.runtime.trace import TraceReplayer, trace_of
 from plushsense.tuning.events import OTHER, EventCosts, MarkedStream, Truth, tune
 from plushsense.tuning.gate import fit_gate
+from plushsense.windows.clock import row_times_us
 from plushsense.windows.cut import cut_windows, whole_gestures
 
 _MARGIN = 0.1  # of what people showed
@@ -333,15 +334,6 @@ def marked_streams(
     return out
 
 
-def stream_times_us(frames: Frames, period_us: int) -> Ints:
-    """Return the time (T,) of every row as `FrameReader` counts it.
-
-    From the first, and on over a reset of the clock.
-    """
-    step = np.diff(frames.device_ms.astype(np.int64), prepend=frames.device_ms[:1]) * 1000
-    return np.cumsum(np.where(step < 0, period_us, step))
-
-
 def truths_of(
     frames: Frames, recordings: Sequence[RecordingInfo], gestures: GestureSet, period_us: int
 ) -> tuple[Truth, ...]:
@@ -349,7 +341,7 @@ def truths_of(
 
     Excluded recordings, and other gestures, are `OTHER`.
     """
-    times = stream_times_us(frames, period_us)
+    times = row_times_us(frames, period_us)
     out = []
     for r in recordings:
         first, last = r.stream_row + r.start, r.stream_row + r.stop

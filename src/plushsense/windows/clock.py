@@ -25,6 +25,12 @@ from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import Frames
 
 
+def row_times_us(frames: Frames, period_us: int) -> NDArray[np.int64]:
+    """Return the time (T,) of every row in a live stream: from 0, and continuing where the clock was reset."""
+    step = np.diff(frames.device_ms.astype(np.int64), prepend=frames.device_ms[:1]) * 1000
+    return np.cumsum(np.where(step < 0, period_us, step))
+
+
 @dataclass(frozen=True)
 class Segment:
     """Even samples without a break.

@@ -26,7 +26,6 @@ from plushsense.experiments.streams.replay import (
     people_with_streams,
     quick,
     rate,
-    row_times_s,
     score,
     truth_of,
     usual_rows,
@@ -62,6 +61,7 @@ from plushsense.runtime.fixed import smoothing_weight
 from plushsense.runtime.gate import JERK, GateSettings, Rule, Signal, Term
 from plushsense.runtime.trace import Part, Trace, TraceReplayer, replay, reported_events, trace_of
 from plushsense.scoring.events import Interval
+from plushsense.windows.clock import row_times_us
 from plushsense.windows.features import Scaler
 
 ACCEL = load_layout("accel-3")
@@ -152,7 +152,7 @@ def bundle(seed: int = 3, people: tuple[str, ...] = ()) -> Bundle:
 
 def test_rows_have_the_time_of_the_trace() -> None:
     frames = troubled()
-    times = row_times_s(frames, 10_000)
+    times = row_times_us(frames, 10_000) / 1e6
     trace = trace_of(frames, bundle())
     assert [p.start_us / 1e6 for p in trace.parts] == pytest.approx([times[0], times[300], times[600]], abs=0.011)
     assert [p.ends_us / 1e6 for p in trace.parts] == pytest.approx([times[299], times[599], times[-1]])

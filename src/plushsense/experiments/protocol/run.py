@@ -7,6 +7,7 @@ import os
 import tempfile
 from collections.abc import Collection, Sequence
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,6 @@ from plushsense.core.errors import ConfigError
 from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.layouts import Layout
-from plushsense.core.recorder_csv import Frames
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
@@ -23,19 +23,17 @@ from plushsense.experiments.protocol import score as scoring
 from plushsense.experiments.protocol.score import Heuristic
 from plushsense.experiments.protocol.sittings import (
     FIRST_STRANGER,
-    Left,
     Progress,
-    known_people,
     recorded_people,
     recorded_sittings,
     virtual_numbers,
     virtual_sittings,
 )
-from plushsense.models.bundle import Bundle
+from plushsense.models.arch import slashed
+from plushsense.models.bundle import Bundle, known_people
 from plushsense.recording.simulate import simulate
-from plushsense.runtime.classifier import GestureEvent
 from plushsense.runtime.decisions import DecideSpec
-from plushsense.tuning.rule_baseline import BaselineSettings, baseline_events, fit_rule_baseline
+from plushsense.tuning.rule_baseline import baseline_events, fit_rule_baseline
 from plushsense.workflow.reporting import check_folder
 
 OTHERS = 4
@@ -43,32 +41,27 @@ _ELSEWHERE = 1_000_003  # added to the seed: another population
 
 
 def virtual_rules(seed: int, layout: Layout, gestures: GestureSet, people: int = OTHERS) -> tuple[Heuristic, str]:
-    """Return the rule baseline tuned on virtual people of another population, and a sentence that says so."""
+    """Return the rule baseline tuned on virtual people of another population, and a sentence on it."""
     with tempfile.TemporaryDirectory() as work:
         raw, folder = Path(work) / "raw", Path(work) / "ds"
         simulate(raw, people, (seed + _ELSEWHERE) % 2**31, 2, at_rest=0, layout=layout)
         dataset = import_recordings(raw, folder, layout=layout, gestures=gestures, name="others").dataset
         plan, _ = fit_rule_baseline(dataset, gestures, dataset.subjects)
-    return _asks(plan, layout), f"Tuned on {people} other virtual people, of another population."
+    heuristic = partial(baseline_events, layout=layout, plan=plan)
+    return heuristic, f"Tuned on {people} other virtual people, of another population."
 
 
 def recorded_rules(dataset: Dataset, gestures: GestureSet, scored: Collection[str]) -> tuple[Heuristic | None, str]:
     """Return the rule baseline tuned on the people who are not scored, or None, and a sentence on it."""
     others: Sequence[str] = [code for code in dataset.subjects if code not in scored]
     if not others:
-        return None, "Everybody is scored here, so nobody is left to tune the old rules on: there are no rules only."
+        return None, "Everybody is scored here, so nobody is left to tune the old rules on: they are left out."
     try:
         plan, _ = fit_rule_baseline(dataset, gestures, others)
     except ConfigError as cause:
         return None, f"The old rules cannot be tuned: {cause}"
-    return _asks(plan, dataset.layout), f"Tuned on people who are not scored here: {len(others)}."
-
-
-def _asks(plan: BaselineSettings, layout: Layout) -> Heuristic:
-    def ask(frames: Frames) -> Sequence[GestureEvent]:
-        return baseline_events(frames, layout, plan)
-
-    return ask
+    heuristic = partial(baseline_events, layout=dataset.layout, plan=plan)
+    return heuristic, f"Tuned on people who are not scored here: {len(others)}."
 
 
 RESULT, TRIALS, TABLE, PAGE = "protocol.json", "trials.csv", "table.csv", "protocol.html"
@@ -78,7 +71,7 @@ NO_GATE = (
     "This bundle has no gate, so there is no hybrid: network and hybrid would be the same. Blows wait for the network."
 )
 NO_AFFECT = "These gestures have no affect: any event counts as an answer, and nothing can be called negative."
-NO_RULES = "The old heuristic was not asked: there are no figures of rules only."
+NO_RULES = "The old heuristic was not run: there are no figures of rules only."
 _ANSWERED = (
     "Answered: an event of the gesture's affect began between 0.3 s before the hand touched and 2 s after it left. "
     "Named: an event of the trial, also one that began before it, was called rightly. Shares are of all trials, times "
@@ -199,7 +192,7 @@ def _recorded(
         "heading": f"The paper's real-time protocol on {what}: {dataset.head.name}",
         "simulated": virtual,
         "codes": people,
-        "left": [_left(entry) for entry in left],
+        "left": left,
         "people_said": f"{len({s.who.partition(',')[0] for s in sittings})} of {len(dataset.subjects)}: "
         + ", ".join(s.who for s in sittings),
         "rules_said": tuned,
@@ -208,12 +201,8 @@ def _recorded(
     }
 
 
-def _left(entry: Left) -> dict[str, str]:
-    return {"who": entry.who, "why": entry.why}
-
-
 def _with_notes(made: dict[str, Any], bundle: Bundle, engine: str) -> dict[str, Any]:
-    """Return the result with what a reader has to know of the network and the settings."""
+    """Return the result with notes on the network and the settings."""
     settings = DecideSpec.from_dict(bundle.decision)
     provenance = bundle.provenance
     said = []
@@ -227,9 +216,10 @@ def _with_notes(made: dict[str, Any], bundle: Bundle, engine: str) -> dict[str, 
         said.append(NO_AFFECT)
     if not settings.fitted:
         said.append("The event settings of this bundle were not fitted: they are the defaults.")
-    if not known_people(provenance):
-        said.append("This bundle does not say on whom it was trained: that it never met these people is not known.")
-    known = known_people(provenance) | ({bundle.adapted_to} if bundle.adapted_to is not None else set())
+    known = known_people(provenance)
+    if not known:
+        said.append("This bundle does not say on whom it was trained: it may have been on these people.")
+    known |= {bundle.adapted_to} if bundle.adapted_to is not None else set()
     met = sorted(known & set(made.pop("codes", ())))
     if met:
         said.append(
@@ -239,15 +229,15 @@ def _with_notes(made: dict[str, Any], bundle: Bundle, engine: str) -> dict[str, 
     if provenance.get("simulated") is True and not made["simulated"]:
         said.append("This network was trained on a virtual toy: on a real one its figures mean nothing yet.")
     said += [f"{entry['who']} {entry['why']}, and was left out." for entry in made["left"]]
-    filters = "/".join(map(str, bundle.arch.filters))
+    filters, span_s = slashed(bundle.arch.filters), bundle.arch.span / bundle.layout.rate_hz
     subjects = provenance.get("subjects", ())
     who = subjects if isinstance(subjects, int) else len(set(subjects) - {NOBODY})
-    trained = f"{provenance['dataset']}, {who} people" if provenance.get("dataset") else "not told by the bundle"
+    trained = f"{provenance['dataset']}, {who} people" if provenance.get("dataset") else "unknown to the bundle"
     times = [o["repetition"] for o in made["outcomes"]]
     about = [
         ["People", made.pop("people_said")],
         ["Trials", f"{made['trials']}: {made['gestures']} gestures, up to {max(times, default=0)} times each a person"],
-        ["Network", f"{bundle.arch.symbol}, filters {filters}, {bundle.arch.padding}; span {_span(bundle):.2f} s"],
+        ["Network", f"{bundle.arch.symbol}, filters {filters}, {bundle.arch.padding}; span {span_s:.2f} s"],
         ["Trained on", trained],
         ["Arithmetic", "8 bits, the toy's own" if engine == "int8" else "floating point"],
         ["Gate", {0: "none", 1: "1 rule"}.get(len(settings.gate.rules), f"{len(settings.gate.rules)} rules")],
@@ -256,10 +246,6 @@ def _with_notes(made: dict[str, Any], bundle: Bundle, engine: str) -> dict[str, 
     if ruled:
         about.append(["Old rules", tuned])
     return made | {"said": said, "about": about, "engine": engine}
-
-
-def _span(bundle: Bundle) -> float:
-    return bundle.arch.span / bundle.layout.rate_hz
 
 
 def _place(out: Path) -> Path:

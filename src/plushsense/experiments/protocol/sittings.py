@@ -1,4 +1,4 @@
-"""Streams with known gestures on which the real-time protocol runs, of virtual people or recorded."""
+"""Sessions with known gestures for the real-time protocol, of virtual people or recorded."""
 
 from __future__ import annotations
 
@@ -8,16 +8,17 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, DatasetError, nearest
-from plushsense.core.gestures import NOBODY, GestureSet
+from plushsense.core.gestures import GestureSet
 from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import Frames
-from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
-from plushsense.devices.virtual.session import GESTURES, GestureMark, VirtualSession
+from plushsense.dataset.store import Dataset
+from plushsense.devices.virtual.session import GESTURES, VirtualSession
 from plushsense.devices.virtual.stream import channel_columns
 from plushsense.devices.virtual.world import WORLD, World, draw_person
+from plushsense.models.bundle import known_people
+from plushsense.windows.clock import row_times_us
 
 FIRST_STRANGER = 1001
 """Number of the first virtual person; data sets of virtual people count from 1."""
@@ -55,8 +56,8 @@ class Sitting:
 def virtual_numbers(people: int, first: int, provenance: Mapping[str, Any]) -> list[int]:
     """Return numbers of virtual people who are not among those that a network was trained on.
 
-    A bundle does not say which seed its virtual people came from, so a number that it was trained, or stopped, on is
-    refused whatever the seed.
+    A bundle does not say which seed its virtual people came from, so a number among its training or validation people
+    is refused for every seed.
 
     Raises:
         ConfigError: for a number that is out of range or known to the bundle.
@@ -70,17 +71,10 @@ def virtual_numbers(people: int, first: int, provenance: Mapping[str, Any]) -> l
     met = {int(m[1]) for code in known_people(provenance) if (m := _VIRTUAL_CODE.fullmatch(code)) is not None}
     if known := [n for n in numbers if n in met]:
         raise ConfigError(
-            f"Virtual person {known[0]} is one of the {len(met)} that this network was trained on or chosen by: take "
-            f"strangers, for instance --first {max(met) + 1}."
+            f"Virtual person {known[0]} is one of the {len(met)} that this network was trained on or chosen by: use "
+            f"other people, for instance --first {max(met) + 1}."
         )
     return numbers
-
-
-def known_people(provenance: Mapping[str, Any]) -> set[str]:
-    """Return the codes of the people that a bundle was trained on or chosen by, without nobody."""
-    listed = [provenance.get(key) for key in ("subjects", "validation_subjects")]
-    codes = {str(code) for each in listed if isinstance(each, list | tuple) for code in each}
-    return codes - {NOBODY, UNKNOWN_SUBJECT}
 
 
 def virtual_sittings(
@@ -94,8 +88,8 @@ def virtual_sittings(
 ) -> Iterator[Sitting]:
     """Play the paper's protocol with virtual people: 17 gestures, each some times in a row.
 
-    Between two gestures the toy stands idle, is taken up and turned by somebody who means nothing by it, and stands
-    idle again; between two repetitions the person waits for the recorder's countdown.
+    Between two gestures the toy stands idle, is picked up and turned without a gesture, and stands idle again;
+    between two repetitions the person waits for the recorder's countdown.
 
     Raises:
         ConfigError: for a size that cannot be, or a layout that the virtual toy does not speak.
@@ -123,41 +117,22 @@ def _play(
         kept = rng.random(len(values)) >= world.lost + world.garbled
         frames = Frames(values[kept], device_ms[kept])
         first_ms = int(frames.device_ms[0])
-        marks = [m for e in episodes for m in e.marks]
-        yield Sitting(f"virtual {number}", frames, tuple(_trials(marks, device_ms, first_ms, repetitions)))
-
-
-def _trials(
-    marks: Sequence[GestureMark], device_ms: NDArray[np.int64], first_ms: int, repetitions: int
-) -> Iterator[GestureTrial]:
-    def at(sample: int) -> float:
-        return (int(device_ms[min(sample, len(device_ms) - 1)]) - first_ms) / 1000.0
-
-    for n, mark in enumerate(marks):
-        onset = mark.start if mark.struck is None else mark.struck
-        yield GestureTrial(mark.label, n % repetitions + 1, at(mark.start), at(onset), at(mark.stop))
-
-
-def row_times_s(frames: Frames, layout: Layout) -> NDArray[np.float64]:
-    """Return the seconds (T,) of each row since the first; over a clock reset time goes on."""
-    steps = np.diff(frames.device_ms.astype(np.int64))
-    steps = np.where(steps < 0, layout.period_us // 1000, steps)
-    return np.concatenate(([0.0], np.cumsum(steps) / 1000.0))
-
-
-@dataclass(frozen=True)
-class Left:
-    """Somebody who could not be scored, and why."""
-
-    who: str
-    why: str
+        trials = []
+        for n, mark in enumerate(m for e in episodes for m in e.marks):
+            onset = mark.start if mark.struck is None else mark.struck
+            start_s, onset_s, stop_s = (
+                (int(device_ms[min(sample, len(device_ms) - 1)]) - first_ms) / 1000.0
+                for sample in (mark.start, onset, mark.stop)
+            )
+            trials.append(GestureTrial(mark.label, n % repetitions + 1, start_s, onset_s, stop_s))
+        yield Sitting(f"virtual {number}", frames, tuple(trials))
 
 
 def recorded_people(dataset: Dataset, asked: Sequence[str] | None, provenance: Mapping[str, Any]) -> list[str]:
-    """People of a data set whom a network never met: those asked for, or all of them.
+    """Return people of a data set on whom a network was neither trained nor chosen: those asked for, or all.
 
     Raises:
-        ConfigError: for somebody who is not in the data set, or on whom the network was trained or chosen.
+        ConfigError: for a person who is not in the data set, or on whom the network was trained or chosen.
     """
     same = provenance.get("dataset_hash") == dataset.hash or provenance.get("dataset") == dataset.head.name
     met = known_people(provenance) if same else set()
@@ -184,31 +159,33 @@ def recorded_people(dataset: Dataset, asked: Sequence[str] | None, provenance: M
 
 def recorded_sittings(
     dataset: Dataset, people: Sequence[str], gestures: GestureSet
-) -> tuple[list[Sitting], list[Left]]:
+) -> tuple[list[Sitting], list[dict[str, str]]]:
     """Return each person's streams with the located recordings of ``gestures``, onset at the start mark.
 
-    The toy at rest is no trial. A person with several streams has a sitting for each. Who has none, or none with such
-    a recording in it, is left out with a reason.
+    The toy at rest is no trial. A person with several streams has a sitting for each.
+
+    Returns:
+        the sittings, and the people left out (``who``): without a stream that holds such a recording (``why``).
 
     Raises:
         DatasetError: when nobody is left.
     """
     sittings: list[Sitting] = []
-    left: list[Left] = []
+    left: list[dict[str, str]] = []
     for who in people:
         streams = [s for s in dataset.streams if s.subject == who]
         if not streams:
-            left.append(Left(who, "has no session stream, only single recordings"))
+            left.append({"who": who, "why": "has no session stream, only single recordings"})
             continue
         found = 0
         for stream in streams:
-            mine = [r for r in dataset.used if r.stream == stream.id and r.stream_row >= 0]
-            known = [r for r in mine if (g := gestures.find(r.gesture)) is not None and not g.idle]
+            located = [r for r in dataset.used if r.stream == stream.id and r.stream_row >= 0]
+            known = [r for r in located if (g := gestures.find(r.gesture)) is not None and not g.idle]
             mine = sorted(known, key=lambda r: r.stream_row)
             if not mine:
                 continue
             frames = dataset.read_stream(stream.id)
-            times = row_times_s(frames, dataset.layout)
+            times = row_times_us(frames, dataset.layout.period_us) / 1e6
             made: dict[str, int] = {}
             trials = []
             for r in mine:
@@ -222,9 +199,9 @@ def recorded_sittings(
             name = who if len(streams) == 1 else f"{who}, {stream.session}"
             sittings.append(Sitting(name, frames, tuple(trials)))
         if not found:
-            left.append(Left(who, "has a session stream, but none of the recordings was found in it"))
+            left.append({"who": who, "why": "has a session stream, but none of the recordings was found in it"})
     if not sittings:
-        why = f" ('{left[0].who}' {left[0].why})" if left else ""
+        why = f" ('{left[0]['who']}' {left[0]['why']})" if left else ""
         raise DatasetError(
             f"Nobody in '{dataset.head.name}' has a session stream with recordings in it{why}: the protocol needs "
             "fulldatastream.csv beside the recordings, from the recorder or from  plushsense record."

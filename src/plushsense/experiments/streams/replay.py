@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.recorder_csv import Frames
@@ -32,6 +31,7 @@ from plushsense.scoring.events import (
     tally,
     uncovered_s,
 )
+from plushsense.windows.clock import row_times_us
 
 Stretch = tuple[float, float]
 
@@ -52,17 +52,6 @@ class StreamTruth:
     doubtful: tuple[Stretch, ...]
 
 
-def row_times_s(frames: Frames, period_us: int) -> NDArray[np.float64]:
-    """Return the seconds (T,) of every row as a `plushsense.runtime.trace.Trace` counts them."""
-    ms = frames.device_ms.astype(np.int64)
-    if not len(ms):
-        return np.zeros(0)
-    step = np.diff(ms)
-    # The clock that was set back goes on one sample after the last.
-    step_us = np.where(step < 0, period_us, step * 1000)
-    return np.asarray(np.concatenate([[0], np.cumsum(step_us)]) / 1e6)
-
-
 def usual_rows(dataset: Dataset) -> dict[str, float]:
     """Return the median number of rows of each gesture, by which `truth_of` finds recordings nobody stopped."""
     rows: dict[str, list[int]] = {}
@@ -75,7 +64,7 @@ def truth_of(
     dataset: Dataset, stream: StreamInfo, frames: Frames, gestures: GestureSet, usual: dict[str, float]
 ) -> StreamTruth:
     """Return the true gestures in ``stream``, whose rows are ``frames``, by the labels of a model's ``gestures``."""
-    times = row_times_s(frames, dataset.layout.period_us)
+    times = row_times_us(frames, dataset.layout.period_us) / 1e6
     truths: list[Interval] = []
     rest: list[Stretch] = []
     other: list[Stretch] = []

@@ -37,7 +37,7 @@ from plushsense.experiments.streams.systems import ANYWHERE, SYSTEMS, WINDOWS
 from plushsense.jobs.journal import job_id
 from plushsense.jobs.progress import JobProgress
 from plushsense.models.arch import Arch
-from plushsense.models.bundle import Bundle
+from plushsense.models.bundle import Bundle, known_people
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.scoring.events import LATE_S
 from plushsense.training.spec import TrainSpec
@@ -238,12 +238,12 @@ def stream_eval(
         met = [p for p in wanted if p in trained]
         if met:
             warn(f"TRAINED ON: the model has met {', '.join(met)}; their figures flatter and are no result")
-        if alike := [p for p in wanted if p not in trained and p in _codes(bundle)]:
+        if alike := [p for p in wanted if p not in trained and p in known_people(bundle.provenance)]:
             warn(
                 f"the model was trained on people of the same codes in '{bundle.provenance.get('dataset')}': if "
                 f"{', '.join(alike)} are the same people, their figures flatter"
             )
-        if not _codes(bundle):
+        if not known_people(bundle.provenance):
             warn("the bundle does not say on whom it was trained: if on these people, the figures flatter")
         spec = DecideSpec.from_dict(bundle.decision)
         scores = scored_people(dataset, bundle, wanted, spec, Settings((), late_s=late_s))
@@ -270,15 +270,7 @@ def trained_people(bundle: Bundle, dataset: Dataset) -> set[str]:
     known = told.get("dataset") is None or told.get("dataset") == dataset.head.name
     known = known or told.get("dataset_hash") == dataset.hash
     adapted = set() if bundle.adapted_to is None else {bundle.adapted_to}
-    return adapted | (_codes(bundle) if known else set())
-
-
-def _codes(bundle: Bundle) -> set[str]:
-    people: set[str] = set()
-    for key in ("subjects", "validation_subjects"):
-        if isinstance(each := bundle.provenance.get(key, ()), list | tuple):
-            people |= set(map(str, each))
-    return people - {NOBODY}
+    return adapted | (known_people(bundle.provenance) if known else set())
 
 
 def _same_sensors(dataset: Dataset, bundle: Bundle) -> None:
