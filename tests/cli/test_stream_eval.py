@@ -74,7 +74,7 @@ def test_nobody_left_is_refused(cli: Cli, dataset: Dataset, bundle: Path, tmp_pa
     whole.provenance["subjects"] = dataset.subjects
     whole.save(everybody)
     ran = cli("stream-eval", dataset.path, "--model", everybody)
-    assert ran.status == 2 and ran.out == "" and "would only flatter" in ran.err
+    assert ran.status == 2 and ran.out == "" and "would be too high" in ran.err
 
 
 def test_a_folder_of_the_recorder_gives_what_its_data_set_gives(

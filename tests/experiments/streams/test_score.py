@@ -28,7 +28,6 @@ from plushsense.experiments.streams.replay import (
     rate,
     score,
     truth_of,
-    usual_rows,
 )
 from plushsense.experiments.streams.score import (
     Fitted,
@@ -300,7 +299,7 @@ def test_truth_lies_where_it_was_recorded(dataset: Dataset) -> None:
     stream = next(s for s in dataset.streams if s.subject == "P1")
     recording = next(r for r in dataset.recordings if r.subject == "P1" and r.gesture == "Hug")
     frames = dataset.read_stream(stream.id)
-    found = truth_of(dataset, stream, frames, GESTURES, usual_rows(dataset))
+    found = truth_of(dataset, stream, frames, GESTURES)
     assert [(t.label, t.start_s, t.stop_s) for t in found.truths] == [
         ("Hug", pytest.approx(1.0), pytest.approx(2.49)),
         ("Hit", pytest.approx(7.0), pytest.approx(7.59)),  # the clock was set back before it
@@ -309,11 +308,11 @@ def test_truth_lies_where_it_was_recorded(dataset: Dataset) -> None:
     assert found.other == (pytest.approx((9.0, 9.99)),)
     append_marks(dataset.path, [Mark(recording.id, "trim", "K", "", start=30, stop=150)])
     trimmed = open_dataset(dataset.path)
-    again = truth_of(trimmed, stream, frames, GESTURES, usual_rows(trimmed))
+    again = truth_of(trimmed, stream, frames, GESTURES)
     assert again.truths[0].start_s == pytest.approx(1.3) and again.truths[0].stop_s == pytest.approx(2.49)
     append_marks(dataset.path, [Mark(recording.id, "exclude", "K", "")])
     excluded = open_dataset(dataset.path)
-    left = truth_of(excluded, stream, frames, GESTURES, usual_rows(excluded))
+    left = truth_of(excluded, stream, frames, GESTURES)
     assert [t.label for t in left.truths] == ["Hit"] and left.doubtful == (pytest.approx((1.3, 2.49)),)
 
 

@@ -1,4 +1,4 @@
-"""One person's streams as a model reads them, beside the true gestures, so that any setting can be scored."""
+"""Streams as a model reads them, with the true gestures, to score any decision settings on them."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ import numpy as np
 
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.recorder_csv import Frames
-from plushsense.dataset.quality.measurements import NEVER_STOPPED_FACTOR
-from plushsense.dataset.store import RECORDINGS, UNKNOWN_SUBJECT, Dataset, RecordingInfo, StreamInfo
+from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset, RecordingInfo, StreamInfo
 from plushsense.models.bundle import Bundle
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.runtime.events import AFFECTS, NO_GESTURE
@@ -32,15 +31,18 @@ from plushsense.scoring.events import (
     uncovered_s,
 )
 from plushsense.windows.clock import row_times_us
+from plushsense.windows.cut import recordings_in_time
 
 Stretch = tuple[float, float]
 
 
 @dataclass(frozen=True)
 class StreamTruth:
-    """One stream: ``truths`` are its gestures, idle ones are ``rest``, gestures that the model does not know
-    ``other``. ``doubtful`` are recordings that a mark excludes or that nobody stopped: what happens there is not
-    counted at all. ``labelled``: every sample has a label, so that nothing happened unseen.
+    """The true intervals of one stream.
+
+    ``truths`` are its gestures, ``rest`` idle ones, ``other`` gestures that the model does not know. ``doubtful`` are
+    excluded recordings and those that were not stopped in time: events there are not counted. ``labelled``: every
+    sample of the stream has a label.
     """
 
     stream: str
@@ -52,18 +54,9 @@ class StreamTruth:
     doubtful: tuple[Stretch, ...]
 
 
-def usual_rows(dataset: Dataset) -> dict[str, float]:
-    """Return the median number of rows of each gesture, by which `truth_of` finds recordings nobody stopped."""
-    rows: dict[str, list[int]] = {}
-    for r in dataset.used:
-        rows.setdefault(r.gesture, []).append(r.stop - r.start)
-    return {gesture: float(np.median(found)) for gesture, found in rows.items()}
-
-
-def truth_of(
-    dataset: Dataset, stream: StreamInfo, frames: Frames, gestures: GestureSet, usual: dict[str, float]
-) -> StreamTruth:
+def truth_of(dataset: Dataset, stream: StreamInfo, frames: Frames, gestures: GestureSet) -> StreamTruth:
     """Return the true gestures in ``stream``, whose rows are ``frames``, by the labels of a model's ``gestures``."""
+    in_time = {r.id for r in recordings_in_time(dataset.used)}
     times = row_times_us(frames, dataset.layout.period_us) / 1e6
     truths: list[Interval] = []
     rest: list[Stretch] = []
@@ -76,7 +69,7 @@ def truth_of(
             continue
         stretch = (float(times[first]), float(times[last]))
         gesture = gestures.find(r.gesture)
-        if r.excluded or _never_stopped(r, usual):
+        if r.id not in in_time:
             doubtful.append(stretch)
         elif gesture is None:
             known = dataset.gestures.find(r.gesture)
@@ -96,33 +89,21 @@ def located(dataset: Dataset, stream: StreamInfo) -> list[RecordingInfo]:
     return sorted(mine, key=lambda r: r.stream_row)
 
 
-def streams_of(dataset: Dataset, subjects: Sequence[str]) -> list[StreamInfo]:
-    """Return the streams of some people in which there is any recording."""
-    with_truth = {r.stream for r in dataset.recordings if r.stream_row >= 0}
-    return [s for s in dataset.streams if s.subject in subjects and s.id in with_truth]
-
-
 def people_with_streams(dataset: Dataset) -> list[str]:
     """Return the people whose streams can be scored, sorted, without nobody and the unknown."""
     with_truth = {r.stream for r in dataset.recordings if r.stream_row >= 0}
     return sorted({s.subject for s in dataset.streams if s.id in with_truth} - {NOBODY, UNKNOWN_SUBJECT})
 
 
-def _never_stopped(r: RecordingInfo, usual: dict[str, float]) -> bool:
-    # Runs of labels are as long as they are.
-    own_file = r.file.startswith(f"{RECORDINGS}/")
-    return own_file and r.stop - r.start > NEVER_STOPPED_FACTOR * usual.get(r.gesture, float("inf"))
-
-
-# Of what an event is asked: its gesture, the family, the affect, and whether anything was said at all.
+# What an event is scored by: its gesture, the family, the affect, or that there is any event.
 LEVELS = ("gesture", "family", "affect", "anything")
 PLACES = ("rest", "other", "unmarked")
 
 
 @dataclass(frozen=True, eq=False)
 class StreamTrace:
-    """One stream with its truth. ``hours`` that the model heard; ``free_hours`` of these without any truth;
-    ``rest_hours`` in recordings of rest.
+    """One stream with its truth: its ``hours``, the ``free_hours`` among them without any truth, and the ``rest_hours``
+    in recordings of rest.
     """
 
     truth: StreamTruth
@@ -134,12 +115,13 @@ class StreamTrace:
 
 def hear(dataset: Dataset, model: Bundle | IntegerModel, subjects: Sequence[str]) -> list[StreamTrace]:
     """Read every stream of some people once."""
-    usual = usual_rows(dataset)
     found = []
-    for stream in streams_of(dataset, subjects):
+    for stream in dataset.streams:
+        if stream.subject not in subjects or not located(dataset, stream):
+            continue
         frames = dataset.read_stream(stream.id)
         trace = trace_of(frames, model)
-        truth = truth_of(dataset, stream, frames, model.gestures, usual)
+        truth = truth_of(dataset, stream, frames, model.gestures)
         parts = [(p.start_us / 1e6, p.ends_us / 1e6) for p in trace.parts]
         marked = [(t.start_s, t.stop_s) for t in truth.truths]
         left = uncovered_s(parts, truth.doubtful)

@@ -24,6 +24,7 @@ from plushsense.dataset.store import HEAD, Dataset
 from plushsense.deploy.quantize import calibration
 from plushsense.experiments.streams.replay import people_with_streams
 from plushsense.experiments.streams.score import (
+    EpochReport,
     Fitted,
     PeopleFold,
     Settings,
@@ -48,12 +49,10 @@ from plushsense.workflow.config import RunConfig, from_settings
 from plushsense.workflow.preparation import Warn, choose_classes, classes_for, outside_streams, silent, windows_for
 from plushsense.workflow.reporting import check_results, journal_of
 
-EpochProgress = Callable[[int, int, dict[str, Any]], None]
-
 
 @dataclass(frozen=True)
 class Recipe:
-    """One of a fold's networks: how it is trained, on which windows."""
+    """Settings to train one of a fold's networks, and of its windows."""
 
     arch: Arch
     training: TrainSpec
@@ -62,7 +61,7 @@ class Recipe:
     anywhere: AnywhereSpec | None = None
 
     def key(self) -> dict[str, Any]:
-        """Return what a network depends on, beside the data and the fold."""
+        """Return what a network depends on besides the data and the fold."""
         return {
             "arch": self.arch.to_dict(),
             "training": self.training.key(),
@@ -74,20 +73,20 @@ class Recipe:
 
 @dataclass(frozen=True)
 class TrainStreams:
-    """Fits what a fold of the benchmark needs; a network that was trained once is kept in ``folder``."""
+    """Fits the networks and the gate of a fold; a trained network is kept in ``folder``."""
 
     recipes: Mapping[str, Recipe]
     gate: bool
     folder: Path
 
-    def __call__(self, dataset: Dataset, fold: PeopleFold, progress: EpochProgress, /) -> Fitted:
+    def __call__(self, dataset: Dataset, fold: PeopleFold, progress: EpochReport, /) -> Fitted:
         networks = {name: self._network(recipe, dataset, fold, progress) for name, recipe in self.recipes.items()}
         if not self.gate:
             return Fitted(networks)
         fitted = fit_gate(dataset, next(iter(networks.values())).gestures, fold.train)
         return Fitted(networks, fitted.plan, {"gate": fitted.report, "plan": asdict(fitted.plan)})
 
-    def _network(self, recipe: Recipe, dataset: Dataset, fold: PeopleFold, progress: EpochProgress) -> Bundle:
+    def _network(self, recipe: Recipe, dataset: Dataset, fold: PeopleFold, progress: EpochReport) -> Bundle:
         path = self.folder / f"{job_id({**recipe.key(), 'data': dataset.hash, 'fold': vars(fold)})}.plush"
         if path.is_file():
             return Bundle.load(path)
@@ -97,16 +96,16 @@ class TrainStreams:
         cut = scored = windows_for(dataset, arch, recipe.windows, gestures, anywhere=recipe.anywhere)
         if recipe.anywhere is not None:
             scored = windows_for(dataset, arch, replace(recipe.windows, context="stream"), gestures)
-        # What nobody made (the toy at rest) belongs to no fold, and is trained on in every one.
+        # The toy at rest belongs to no person, and is trained on in every fold.
         mine = np.isin(cut.subject, [*fold.train, NOBODY])
         train = cut.take(np.flatnonzero(mine & outside_streams(cut, dataset, {*fold.validation, *fold.test})))
         watch = scored.take(np.flatnonzero(np.isin(scored.subject, fold.validation)))
         fitted = fit(train, watch, arch, recipe.training, progress)
         kept = calibration(arch, fitted.weights, fitted.scaler, train.x)
         people = {"subjects": list(fold.train), "validation_subjects": list(fold.validation)}
-        told = {"dataset": dataset.head.name, "dataset_hash": dataset.hash, "code_version": __version__, **people}
+        origin = {"dataset": dataset.head.name, "dataset_hash": dataset.hash, "code_version": __version__, **people}
         bundle = Bundle(
-            arch, fitted.weights, dataset.layout, fitted.scaler, gestures, dict(vars(recipe.windows)), {}, told, kept
+            arch, fitted.weights, dataset.layout, fitted.scaler, gestures, dict(vars(recipe.windows)), {}, origin, kept
         )
         with dataset.generation.writing():
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -114,7 +113,7 @@ class TrainStreams:
         return bundle
 
     def key(self) -> dict[str, Any]:
-        """Return what all networks depend on, beside the data and the fold."""
+        """Return what all networks depend on besides the data and the fold."""
         return {
             "gate": str(GateSpec()) if self.gate else None,
             **{name: recipe.key() for name, recipe in self.recipes.items()},
@@ -124,9 +123,9 @@ class TrainStreams:
 def recipes_for(
     dataset: Dataset, config: RunConfig, networks: Collection[str], anywhere_pool_s: float | None, warn: Warn = silent
 ) -> dict[str, Recipe]:
-    """Return how each network is trained: alike but for the windows, the epochs and, where it is given, the pool.
+    """Return how each network is trained: alike except for the windows, the epochs and, where given, the pool.
 
-    There are several times as many windows anywhere in a stream, so half the epochs are more steps all the same.
+    There are several times as many windows anywhere in a stream, so that half the epochs are still more steps.
     """
     from plushsense.training.fit import resolve_device
 
@@ -161,14 +160,14 @@ UPPER_BOUND = (
     "also practised and handled the device. Stretches at rest are where an event was certainly for no reason."
 )
 TRUE_RATES = "Every sample of these streams is labelled, so the false events are true ones."
-DONE_AS_TOLD = (
-    "The people of these streams are simulated and do only what is recorded, so the false events are true ones."
+SIMULATED_RATES = (
+    "The people of these streams are simulated and make only the recorded gestures, so the false events are true ones."
 )
 
 
-def truth_words(dataset: Dataset) -> str:
+def describe_false_events(dataset: Dataset) -> str:
     """Explain what a false event means on this data."""
-    return TRUE_RATES if dataset.layout.is_labelled else DONE_AS_TOLD if dataset.head.simulated else UPPER_BOUND
+    return TRUE_RATES if dataset.layout.is_labelled else SIMULATED_RATES if dataset.head.simulated else UPPER_BOUND
 
 
 @contextmanager
@@ -191,26 +190,29 @@ def stream_eval(
     late_s: float = LATE_S,
     warn: Warn = silent,
 ) -> dict[str, Any]:
-    """Replay whole streams through one bundle with its own decision settings, against what really happened.
+    """Replay whole streams through one bundle with its own decision settings, and score its events.
 
     Args:
         path: a data set, or a folder of recordings with their stream.
-        subjects: whose; by default everybody on whom the bundle was not trained. Somebody on whom it was is scored
-            when named here, and marked.
+        subjects: by default everybody on whom the bundle was not trained. A person on whom it was trained is scored
+            only when named here, and marked.
         late_s: how long after its end a gesture may be answered.
-        warn: called with one sentence for everybody who is left out or was trained on.
+        warn: called with a sentence on the people who are left out or were trained on.
 
     Returns:
         ``events, hits, deletions, insertions, fragmentations, merges, false_events_per_hour, latency_s`` and more of
-        all together (see `plushsense.experiments.streams.replay.StreamScore`), ``per_class``, ``people``,
-        ``trained_on``.
+        all together (see `replay.StreamScore`), ``per_class``, ``people``, ``trained_on``.
 
     Raises:
         DatasetError, BadInput: where there is no stream with a recording in it, or nobody is left to score.
     """
     bundle = model if isinstance(model, Bundle) else Bundle.load(Path(model))
     with streams_at(path, bundle) as dataset:
-        _same_sensors(dataset, bundle)
+        if dataset.layout.inputs != bundle.layout.inputs:
+            raise BundleError(
+                f"The model reads {', '.join(bundle.layout.inputs)}, and '{dataset.head.name}' has "
+                f"{', '.join(dataset.layout.inputs)}: give streams of the same sensors."
+            )
         there = people_with_streams(dataset)
         if not there:
             raise DatasetError(
@@ -232,19 +234,19 @@ def stream_eval(
                 warn(f"left out, since the model was TRAINED ON them: {', '.join(left_out)}")
             if not wanted:
                 raise BadInput(
-                    "The model was trained on everybody who has a stream here, so a score would only flatter: use "
-                    "--split by-subject:5, or name people with --subjects to see it all the same."
+                    "The model was trained on everybody who has a stream here, so the scores would be too high: use "
+                    "--split by-subject:5, or name people with --subjects to score them anyway."
                 )
         met = [p for p in wanted if p in trained]
         if met:
-            warn(f"TRAINED ON: the model has met {', '.join(met)}; their figures flatter and are no result")
+            warn(f"TRAINED ON: the model was trained on {', '.join(met)}; their scores are too high and are no result")
         if alike := [p for p in wanted if p not in trained and p in known_people(bundle.provenance)]:
             warn(
                 f"the model was trained on people of the same codes in '{bundle.provenance.get('dataset')}': if "
-                f"{', '.join(alike)} are the same people, their figures flatter"
+                f"{', '.join(alike)} are the same people, their scores are too high"
             )
         if not known_people(bundle.provenance):
-            warn("the bundle does not say on whom it was trained: if on these people, the figures flatter")
+            warn("the bundle does not say on whom it was trained: if on these people, the scores are too high")
         spec = DecideSpec.from_dict(bundle.decision)
         scores = scored_people(dataset, bundle, wanted, spec, Settings((), late_s=late_s))
         table = pooled_scores(scores)
@@ -258,27 +260,20 @@ def stream_eval(
             "settings": {k: v for k, v in spec.to_dict().items() if k not in ("gate", "health", "fitted")},
             "gate_rules": len(spec.gate.rules),
             "late_s": late_s,
-            "note": truth_words(dataset),
+            "note": describe_false_events(dataset),
         }
 
 
 def trained_people(bundle: Bundle, dataset: Dataset) -> set[str]:
-    """Codes on whom a bundle was trained, or who were held back and tuned it, or to whom it was adapted. Those of
-    another data set, of another name and other content, are other people; what it was adapted to, it does not say.
+    """Return the people of a data set on whom a bundle was trained or tuned, or to whom it was adapted.
+
+    Codes of another data set (another name and other content) stand for other people. The person that a bundle was
+    adapted to always counts, as it does not name the data set.
     """
-    told = bundle.provenance
-    known = told.get("dataset") is None or told.get("dataset") == dataset.head.name
-    known = known or told.get("dataset_hash") == dataset.hash
+    origin = bundle.provenance
+    same = origin.get("dataset") in (None, dataset.head.name) or origin.get("dataset_hash") == dataset.hash
     adapted = set() if bundle.adapted_to is None else {bundle.adapted_to}
-    return adapted | (known_people(bundle.provenance) if known else set())
-
-
-def _same_sensors(dataset: Dataset, bundle: Bundle) -> None:
-    if dataset.layout.inputs != bundle.layout.inputs:
-        raise BundleError(
-            f"The model reads {', '.join(bundle.layout.inputs)}, and '{dataset.head.name}' has "
-            f"{', '.join(dataset.layout.inputs)}: give streams of the same sensors."
-        )
+    return adapted | (known_people(origin) if same else set())
 
 
 def stream_benchmark(
@@ -297,8 +292,8 @@ def stream_benchmark(
 ) -> dict[str, Any]:
     """Score every system on the streams of people left out, with settings tuned on other people.
 
-    In each fold networks are trained on its training people; its validation people tune every system; those who are
-    left are scored. Finished folds and networks are kept in the data set's ``cache`` folder.
+    In each fold, networks are trained on its training people, every system is tuned on its validation people, and the
+    others are scored. Finished folds and networks are kept in the data set's ``cache`` folder.
 
     Args:
         config, settings, warn: as for `train`, and ``workers``.
@@ -309,8 +304,7 @@ def stream_benchmark(
         anywhere_pool_s: over how long the networks of stream training pool (default: as the others).
 
     Returns:
-        what `plushsense.experiments.streams.score.summed` returns, with ``dataset``, ``simulated``,
-        ``split``, ``note``.
+        what `score.summed` returns, with ``dataset``, ``simulated``, ``split``, ``note``.
     """
     dataset = as_dataset(dataset)
     config = config or from_settings(**settings)
@@ -319,23 +313,32 @@ def stream_benchmark(
         need("matplotlib", extra="reports")
         need("jinja2", extra="reports")
         check_results(Path(out), "A benchmark", TABLE, replace=overwrite)
-    people_folds(dataset, split, config.evaluation.seed)  # refused before anything is trained
+    people_folds(dataset, split, config.evaluation.seed)  # raises before anything is trained
     recipes = recipes_for(dataset, config, {SYSTEMS[n].network for n in names}, anywhere_pool_s, warn)
     networks = dataset.path / CACHE / "stream-networks"
     fit = TrainStreams(recipes, any(SYSTEMS[n].gate_to for n in names), networks)
-    asked = Settings(names, late_s=late_s)
     folds = crossvalidated_streams(
         dataset,
         split,
         fit,
-        settings=asked,
+        settings=Settings(names, late_s=late_s),
         journal=journal_of(dataset, "streams"),
         key=fit.key(),
         workers=config.evaluation.processes,
         seed=config.evaluation.seed,
         progress=progress,
     )
-    table = benchmark_table(dataset, folds, split, late_s) | {
+    table = {
+        "split": split,
+        "dataset": dataset.head.name,
+        "dataset_hash": dataset.hash,
+        "simulated": dataset.head.simulated,
+        "labelled": dataset.layout.is_labelled,
+        "note": describe_false_events(dataset),
+        "late_s": late_s,
+        "subjects": sorted({person for fold in folds for person in fold["test"]} & set(people_with_streams(dataset))),
+        "code_version": __version__,
+        **summed(folds),
         "seed": config.evaluation.seed,
         "networks": {name: recipe.arch.title for name, recipe in recipes.items()},
         "anywhere": {"pool_s": anywhere_pool_s, **vars(config.anywhere)},
@@ -346,23 +349,6 @@ def stream_benchmark(
         with dataset.generation.writing():
             save_benchmark(table, Path(out))
     return table
-
-
-def benchmark_table(dataset: Dataset, folds: Sequence[dict[str, Any]], split: str, late_s: float) -> dict[str, Any]:
-    """Return finished folds as the table that is printed and kept."""
-    people = sorted({person for fold in folds for person in fold["test"]} & set(people_with_streams(dataset)))
-    return {
-        "split": split,
-        "dataset": dataset.head.name,
-        "dataset_hash": dataset.hash,
-        "simulated": dataset.head.simulated,
-        "labelled": dataset.layout.is_labelled,
-        "note": truth_words(dataset),
-        "late_s": late_s,
-        "subjects": people,
-        "code_version": __version__,
-        **summed(folds),
-    }
 
 
 def _named(systems: Sequence[str] | None) -> tuple[str, ...]:

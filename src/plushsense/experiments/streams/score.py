@@ -1,7 +1,7 @@
-"""The continuous benchmark: whole streams of people left out, systems tuned on others, everything pooled.
+"""The continuous benchmark: tune systems on some people, score them on whole streams of others, and pool the counts.
 
-What fits is handed in: a picklable callable that gives a fold its networks and its gate, so that this room needs no
-PyTorch. A finished fold is kept in the journal as counts, some kilobytes; streams and traces are not.
+The function that fits the networks and the gate of a fold is passed in as a picklable callable, so that this module
+needs no PyTorch. A finished fold is kept in the journal as counts (some kilobytes), without streams and traces.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,7 +51,7 @@ SMOOTHING_S = 0.3
 
 @dataclass(frozen=True)
 class PeopleFold:
-    """People of a fold: who trains, who tunes (and stops the training, where anybody does), who is scored."""
+    """The people of a fold: to train on, to tune on (and to stop the training by), to score."""
 
     name: str
     train: tuple[str, ...]
@@ -63,24 +63,21 @@ class PeopleFold:
 class Fitted:
     """Models of a fold's training people: ``networks`` by name (`WINDOWS`, `ANYWHERE`) and a gate.
 
-    A gate of None was not asked for: the systems that have one are left out.
+    Without a gate the systems that have one are left out. ``report`` describes the fit, as plain values.
     """
 
     networks: Mapping[str, Bundle]
     gate: GateSettings | None = None
-    said: Mapping[str, Any] = field(default_factory=dict)
+    report: Mapping[str, Any] = field(default_factory=dict)
 
 
-class FitStreams(Protocol):
-    """Fits networks and gate to ``train``; ``validation`` may stop the training. Picklable, the same for the same
-    input; ``test`` is for it to leave alone.
-    """
+EpochReport = Callable[[int, int, dict[str, Any]], None]
+FitStreams = Callable[[Dataset, PeopleFold, EpochReport], Fitted]
+"""Fits networks and gate to the training people of a fold; its validation people may stop the training.
 
-    def __call__(
-        self, dataset: Dataset, fold: PeopleFold, progress: Callable[[int, int, dict[str, Any]], None], /
-    ) -> Fitted:
-        """Fit the networks and the gate; ``progress`` gets (epoch, epochs at most, the epoch's row)."""
-        ...
+It is picklable and deterministic, does not use the test people, and calls its last argument with (epoch, epochs at
+most, the epoch's row).
+"""
 
 
 def people_folds(dataset: Dataset, split: str, seed: int = 0) -> list[PeopleFold]:
@@ -109,8 +106,8 @@ def people_folds(dataset: Dataset, split: str, seed: int = 0) -> list[PeopleFold
             continue
         if not with_streams & set(validation):
             raise BadInput(
-                f"In {fold.name} nobody of those who tune ({', '.join(validation)}) has a stream: use another --seed, "
-                "or fewer folds."
+                f"In {fold.name} none of the people to tune on ({', '.join(validation)}) has a stream: use another "
+                "--seed, or fewer folds."
             )
         folds.append(PeopleFold(fold.name, train, validation, test))
     return folds
@@ -126,7 +123,7 @@ class Settings:
     weights: ErrorCosts = field(default_factory=ErrorCosts)
 
     def key(self, gestures: GestureSet) -> dict[str, Any]:
-        """Return what a stored fold depends on, the settings that are tried among it."""
+        """Return what a stored fold depends on, including the settings that are tried."""
         grids = {}
         for name in self.systems:
             system = SYSTEMS[name]
@@ -147,13 +144,12 @@ def crossvalidated_streams(
     seed: int = 0,
     progress: Callable[[JobProgress], None] | None = None,
 ) -> list[dict[str, Any]]:
-    """Fit, tune and score once a fold; what `plushsense.experiments.streams.score.summary` makes figures of.
+    """Fit, tune and score each fold; return its counts, from which `summed` makes the table.
 
     Args:
         split: "by-subject:5", "leave-one-subject-out".
         journal: where finished folds are kept, and looked for first.
-        key: with a journal, everything that ``fit`` depends on. Data, folds and settings go into a job's id by
-            themselves.
+        key: with a journal, everything that ``fit`` depends on besides data, folds and settings.
         workers: folds at a time, each in a process of its own.
 
     Raises:
@@ -161,7 +157,7 @@ def crossvalidated_streams(
     """
     if journal is not None and key is None:
         raise ConfigError(
-            "A journal needs a key that says what was fitted: give crossvalidated_streams(..., key={...})."
+            "A journal needs a key that identifies what is fitted: give crossvalidated_streams(..., key={...})."
         )
     settings = settings or Settings(tuple(SYSTEMS))
     folds = people_folds(dataset, split, seed)
@@ -203,7 +199,7 @@ class _FoldWork:
         fitted_s = time.perf_counter() - began
         table = scored_fold(shared, task, fitted, self.settings)
         seconds = {"fit": round(fitted_s, 1), "score": round(time.perf_counter() - began - fitted_s, 1)}
-        return {**table, "fitted": dict(fitted.said), "seconds": seconds}
+        return {**table, "fitted": dict(fitted.report), "seconds": seconds}
 
 
 def scored_fold(dataset: Dataset, fold: PeopleFold, fitted: Fitted, settings: Settings) -> dict[str, Any]:
@@ -239,7 +235,7 @@ def _scored(
     testing: Sequence[StreamTrace],
     settings: Settings,
 ) -> dict[str, Any]:
-    """Return one system of one fold, with the settings that were tried on the people who tune."""
+    """Return the counts of one system in one fold; ``points`` are the settings tried on the tuning people."""
     late_s = settings.late_s
     by_person: dict[str, list[StreamTrace]] = {}
     for h in testing:
@@ -253,7 +249,11 @@ def _scored(
     for target in settings.targets:
         point = fewest(points, target)
         if id(point) not in of_spec:
-            of_spec[id(point)] = _curve_counts(by_person, point.spec, settings)
+            of_spec[id(point)] = {
+                person: [n.hits, n.truths, n.insertions, n.hours]
+                for person, heard in by_person.items()
+                for n in [quick(heard, point.spec, late_s)]
+            }
         curve.append({"target": target, "tuned": _tuned_setting(point), "people": of_spec[id(point)]})
     chosen = {"balanced": balanced(points), "cheapest": cheapest(tuning, points, settings.weights, late_s)}
     table: dict[str, Any] = {
@@ -263,7 +263,7 @@ def _scored(
         **{how: {"tuned": _tuned_setting(point), "people": outcome(point.spec)} for how, point in chosen.items()},
     }
     if not system.rounds:
-        # As it is without any threshold; smoothed as a bundle is by default.
+        # Without any threshold, and with the default smoothing of a bundle.
         smoothing_s = SMOOTHING_S if any(p.spec.smoothing_s in SMOOTHINGS for p in points) else 0.0
         table["plain"] = {"tuned": None, "people": outcome(argmax_spec(smoothing_s))}
     for h in (*tuning, *testing):
@@ -271,19 +271,8 @@ def _scored(
     return table
 
 
-def _curve_counts(
-    by_person: Mapping[str, Sequence[StreamTrace]], spec: DecideSpec, settings: Settings
-) -> dict[str, Any]:
-    """Return hits, truths, insertions and hours of one setting for each person."""
-    found = {}
-    for person, heard in by_person.items():
-        n = quick(heard, spec, settings.late_s)
-        found[person] = [n.hits, n.truths, n.insertions, n.hours]
-    return found
-
-
 def _tuned_setting(point: TunedPoint) -> dict[str, Any]:
-    """Return a chosen setting and its scores on the people who tune; the gate stands in ``fitted``."""
+    """Return a chosen setting and its scores on the tuning people; the gate is part of ``fitted``."""
     spec = {k: v for k, v in vars(point.spec).items() if k not in ("gate", "health", "fitted")}
     return {"spec": spec, "recall": point.recall, "false_events_per_hour": point.false_per_hour, "f1": point.f1}
 
@@ -313,7 +302,7 @@ def summed(folds: Folds) -> dict[str, Any]:
     """Return the benchmark's table, ready for JSON.
 
     ``systems``: of each the ``curve`` (a point a target: recall and false events an hour over all people left out),
-    ``balanced`` and ``cheapest`` (the setting of the highest F1, and of the lowest cost, on those who tune) with all
+    ``balanced`` and ``cheapest`` (the settings of highest F1 and of lowest cost on the tuning people) with all
     figures, ``plain`` where there is one, ``people``; ``at_recall``: false events an hour of every system at the same
     recall, and the ratio to smoothed argmax with a 95 % bootstrap interval over people.
     """
@@ -358,7 +347,7 @@ def _points(counts: NDArray[np.float64]) -> list[tuple[float, float]]:
 
 
 def _curve(folds: Folds, name: str, counts: NDArray[np.float64]) -> list[dict[str, Any]]:
-    """Return the points of a curve; targets that no fold's tuning people reach are left out."""
+    """Return the points of a curve, without targets that the tuning people of no fold reach."""
     found = []
     targets = [point["target"] for point in folds[0]["systems"][name]["curve"]]
     reach = max(fold["systems"][name]["reach"] for fold in folds)
@@ -381,19 +370,17 @@ def _outcome(folds: Folds, name: str, how: str) -> dict[str, Any]:
                 | {k: said[k] for k in ("truths", "events", "recall", "precision", "f1", "false_events_per_hour")}
                 | {"latency_s": said["latency_s"]["median"]}
             )
-    latencies = {level: _shares(whole.total(level).latencies) for level in whole.levels if whole.levels[level]}
+    latencies = {level: whole.total(level).latencies for level, tallies in whole.levels.items() if tallies}
     return {
         **whole.to_dict(),
-        "latency_shares": latencies,
+        "latency_shares": {
+            level: [round(float(q), 3) for q in np.quantile(values, LATENCY_SHARES)] if values else []
+            for level, values in latencies.items()
+        },
         "f1_people": summary([p["f1"] for p in people if p["f1"] is not None]),
         "recall_people": summary([p["recall"] for p in people if p["recall"] is not None]),
         "people": sorted(people, key=lambda p: p["subject"]),
     }
-
-
-def _shares(latencies: Sequence[float]) -> list[float]:
-    """Return the latencies' quantiles at `LATENCY_SHARES`."""
-    return [round(float(q), 3) for q in np.quantile(latencies, LATENCY_SHARES)] if latencies else []
 
 
 def _at_recall(counts: Mapping[str, NDArray[np.float64]]) -> list[dict[str, Any]]:
@@ -416,7 +403,7 @@ def _at_recall(counts: Mapping[str, NDArray[np.float64]]) -> list[dict[str, Any]
                     one, other = at_recall(mine, recall), at_recall(reference, recall)
                     if one is not None and other:
                         ratios.append(one / other)
-                # Of too few resamples that reach the recall an interval would say too little.
+                # No interval where too few resamples reach the recall.
                 if len(ratios) >= 0.9 * _RESAMPLES:
                     ci = [float(q) for q in np.percentile(ratios, [2.5, 97.5])]
             row["systems"][name] = {"false_events_per_hour": false, "ratio": ratio, "ci95": ci}

@@ -1,7 +1,7 @@
-"""The systems that the continuous benchmark compares, the settings that each may choose from, and how it chooses.
+"""The systems of the continuous benchmark, the settings to choose from, and the choice.
 
-Every choice is made on people on whom nothing is scored: for a recall the setting with the fewest false events that
-reaches it there, and for a single figure the one whose errors cost least.
+Settings are chosen on people who are not scored: for a recall, the setting with the fewest false events that reaches
+it, and for a single figure, the one whose errors cost least.
 """
 
 from __future__ import annotations
@@ -20,29 +20,29 @@ from plushsense.scoring.events import LATE_S, ErrorCosts, front
 WINDOWS, ANYWHERE = "windows", "anywhere"
 ENTERS = (0.0, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98)
 SMOOTHINGS = (0.15, 0.3, 0.6, 1.0)
-# Recalls that are asked of the people who tune; on those who are scored another one may come out.
+# Recalls to reach on the tuning people; the recall on the scored people may differ.
 TARGETS = tuple(round(0.2 + 0.05 * n, 2) for n in range(16))
 
 Grid = Callable[[GestureSet], list[DecideSpec]]
 
 
-def _argmax(_: GestureSet) -> list[DecideSpec]:
-    """Return each step's best class where its share is at least ``enter``; 0 takes every step."""
-    return [replace(argmax_spec(), enter=enter, leave=enter) for enter in ENTERS]
+def _thresholds(*smoothings: float) -> Grid:
+    """Return the grid of each step's best class where its share is at least ``enter``; 0 takes every step."""
 
+    def grid(_: GestureSet) -> list[DecideSpec]:
+        return [replace(argmax_spec(s), enter=enter, leave=enter) for s in smoothings for enter in ENTERS]
 
-def _smoothed(_: GestureSet) -> list[DecideSpec]:
-    return [replace(argmax_spec(s), enter=enter, leave=enter) for s in SMOOTHINGS for enter in ENTERS]
+    return grid
 
 
 def _hysteresis(gestures: GestureSet) -> list[DecideSpec]:
-    """Enter above leave, an end that waits: where the search for the rest begins."""
+    """Return settings that enter above the leave threshold and delay the end, to start the search of the others."""
     return [
         DecideSpec(
             smoothing_s=smoothing_s,
             enter=enter,
             leave=enter / 2,
-            # Where gestures tell an affect, it may be said before the gesture.
+            # If gestures have an affect, it may be reported before the gesture.
             enter_affect=max(enter, 0.8) if gestures.has_affect else 2.0,
             leave_affect=enter / 2,
             least_s=0.0,
@@ -58,15 +58,13 @@ def _hysteresis(gestures: GestureSet) -> list[DecideSpec]:
     ]
 
 
-# One setting at a time is changed, from the best that were found so far.
+# Values to try for one setting at a time, starting from the best settings found so far.
 _STEPS: dict[str, tuple[Any, ...]] = {
     "least_s": (0.0, 0.2, 0.5),
     "switch_s": (0.3, 0.6, 1.0),
     "end_s": (0.3, 0.8, 1.5),
     "rest_s": (0.2, 1.0, 2.0),
 }
-
-
 _WAITS = (0.5, 1.5)
 
 
@@ -79,8 +77,11 @@ def _beside(spec: DecideSpec) -> list[DecideSpec]:
 
 @dataclass(frozen=True)
 class System:
-    """``network``: which of a fold's networks it listens with; ``rounds`` of looking beside the best settings of the
-    ``grid``; ``gate_to``: the system to whose best settings a gate is added instead.
+    """A system of the benchmark.
+
+    ``network`` names the network of a fold that it uses. The settings of ``grid`` are tried, then ``rounds`` times
+    those that differ from the best in one value. Instead, ``gate_to`` names the system to whose best settings a gate
+    is added.
     """
 
     title: str
@@ -91,11 +92,11 @@ class System:
 
 
 SYSTEMS: dict[str, System] = {
-    "argmax": System("plain argmax", WINDOWS, _argmax),
-    "smoothed": System("smoothed argmax", WINDOWS, _smoothed),
+    "argmax": System("plain argmax", WINDOWS, _thresholds(0.0)),
+    "smoothed": System("smoothed argmax", WINDOWS, _thresholds(*SMOOTHINGS)),
     "hysteresis": System("hysteresis", WINDOWS, _hysteresis, 1),
     "hybrid": System("hybrid (with gate)", WINDOWS, _hysteresis, 1, "hysteresis"),
-    "anywhere-smoothed": System("stream training, smoothed argmax", ANYWHERE, _smoothed),
+    "anywhere-smoothed": System("stream training, smoothed argmax", ANYWHERE, _thresholds(*SMOOTHINGS)),
     "anywhere": System("stream training, hysteresis", ANYWHERE, _hysteresis, 1),
     "full": System("stream training, hybrid", ANYWHERE, _hysteresis, 1, "anywhere"),
 }
@@ -104,7 +105,7 @@ REFERENCE = "smoothed"
 
 @dataclass(frozen=True)
 class TunedPoint:
-    """A setting, and the recall, false events an hour and F1 that it had where it was tried."""
+    """A setting with its recall, false events an hour and F1 on the tuning people."""
 
     spec: DecideSpec
     recall: float
@@ -113,7 +114,7 @@ class TunedPoint:
 
 
 def tried(heard: Sequence[StreamTrace], specs: Sequence[DecideSpec], late_s: float = LATE_S) -> list[TunedPoint]:
-    """Return every setting on these streams, those of one smoothing together."""
+    """Score every setting on these streams, grouped by smoothing to save memory."""
     points: dict[int, TunedPoint] = {}
     order = sorted(range(len(specs)), key=lambda i: specs[i].smoothing_s)
     for _, group in itertools.groupby(order, key=lambda i: specs[i].smoothing_s):
@@ -144,7 +145,7 @@ def gated(
     """
     if not gate.rules:
         return list(points)
-    # All that a choice without the gate could fall on: else the two would differ by more than the gate.
+    # Every setting that could be chosen without the gate, so that the two systems differ by the gate only.
     base = {_key(spec): spec for spec in (*_best_specs(points), *(p.spec for p in best_of(points)))}
     specs = [replace(spec, gate=gate, wait_s=wait_s) for spec in base.values() for wait_s in _WAITS]
     return tried(heard, specs, late_s)
@@ -178,11 +179,7 @@ def cheapest(
     late_s: float = LATE_S,
 ) -> TunedPoint:
     """Return the setting of the lowest cost, the first of equal ones."""
-
-    def price(point: TunedPoint) -> float:
-        return sum(score(h, point.spec, weights, late_s).cost for h in heard)
-
-    return min(best_of(points), key=price)
+    return min(best_of(points), key=lambda point: sum(score(h, point.spec, weights, late_s).cost for h in heard))
 
 
 def balanced(points: Sequence[TunedPoint]) -> TunedPoint:
