@@ -1,6 +1,6 @@
-"""Selective prediction of a network on people left out: when its confidence tells that it does not know.
+"""Abstention: whether the confidence of a network on people left out shows that its answer is wrong.
 
-One answer a recording, that of the last step in it: a person's steps within one are hardly more than one witness.
+Each recording counts with one answer, that of its last step, as the steps within a recording are hardly independent.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import BadInput, ConfigError, DatasetError
+from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.dataset.index import as_dataset, open_dataset
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
@@ -26,7 +27,7 @@ from plushsense.jobs.pool import run_jobs
 from plushsense.jobs.progress import JobInfo, JobProgress, JobsReporter
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
-from plushsense.reports.figures import new_figure
+from plushsense.reports.figures import new_figure, png
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.runtime.events import ONE
 from plushsense.runtime.fixed import smoothing_weight
@@ -55,46 +56,36 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False)
-class Ends:
-    """The last answer in each of n recordings.
+def last_answers(
+    bundle: Bundle, dataset: Dataset, subjects: Iterable[str], spec: DecideSpec, gestures: GestureSet
+) -> dict[str, NDArray[Any]]:
+    """Return the last answer in each of the n recordings of ``gestures`` in some people's streams.
 
-    ``logits`` (n, K) of that step and ``shares`` (n, K) smoothed, of the network's K classes; ``highest`` (n,) smoothed
-    logit; ``label`` (n,) the gesture that was made, of the network's or not; ``person`` (n,).
+    Returns:
+        ``logits`` (n, K) of the last step and smoothed ``shares`` (n, K) of the network's K classes; ``highest`` (n,)
+        smoothed logit; ``label`` (n,) the gesture that was made, known to the network or not; ``person`` (n,).
     """
-
-    logits: Floats
-    shares: Floats
-    highest: Floats
-    label: NDArray[np.str_]
-    person: NDArray[np.str_]
-
-
-def ends(bundle: Bundle, dataset: Dataset, subjects: Iterable[str], spec: DecideSpec, gestures: GestureSet) -> Ends:
-    """Return the answers at the ends of the recordings of ``gestures`` in some people's streams."""
     weight = smoothing_weight(spec.smoothing_s, bundle.arch.step * bundle.layout.period_us / 1e6)
     rows: list[tuple[NDArray[Any], NDArray[Any], Any, str, str]] = []
-    for heard in marked_streams(bundle, dataset, subjects, spec, gestures):
-        parts = heard.trace.parts
-        smoothed = TraceReplayer(heard.trace).smoothed(weight)
-        for truth in heard.truths:
+    for stream in marked_streams(bundle, dataset, subjects, spec, gestures):
+        smoothed = TraceReplayer(stream.trace).smoothed(weight)
+        for truth in stream.truths:
             if truth.gesture < 0:
                 continue
-            for part, after in zip(parts, smoothed, strict=True):
-                times = heard.trace.step_times_us(part)
+            for part, after in zip(stream.trace.parts, smoothed, strict=True):
+                times = stream.trace.step_times_us(part)
                 at = int(np.searchsorted(times, truth.stop_us, side="right")) - 1
                 if at >= 0 and times[at] > truth.start_us:
                     label = gestures.labels[truth.gesture]
-                    rows.append((part.logits[at], after.shares[at], after.highest[at], label, heard.person))
+                    rows.append((part.logits[at], after.shares[at], after.highest[at], label, stream.person))
     k = len(bundle.gestures)
-    logits = np.array([r[0] for r in rows], dtype=np.float64).reshape(len(rows), k) / 256
-    return Ends(
-        logits,
-        np.array([r[1] for r in rows], dtype=np.int64).reshape(len(rows), k) / ONE,
-        np.array([r[2] for r in rows], dtype=np.int64) / 256,
-        np.array([r[3] for r in rows], dtype=np.str_),
-        np.array([r[4] for r in rows], dtype=np.str_),
-    )
+    return {
+        "logits": np.array([r[0] for r in rows], dtype=np.float64).reshape(len(rows), k) / 256,
+        "shares": np.array([r[1] for r in rows], dtype=np.int64).reshape(len(rows), k) / ONE,
+        "highest": np.array([r[2] for r in rows], dtype=np.int64) / 256,
+        "label": np.array([r[3] for r in rows], dtype=np.str_),
+        "person": np.array([r[4] for r in rows], dtype=np.str_),
+    }
 
 
 def fold_answers(
@@ -106,11 +97,12 @@ def fold_answers(
     coverage: float,
     known_share: float,
 ) -> dict[str, Any]:
-    """Return the answers of one fold's network on people left out, with thresholds of the validation people."""
+    """Return the answers of a fold's network on the test people, with thresholds from the validation people."""
     spec = DecideSpec()
     calibration = labelled_steps(bundle, marked_streams(bundle, dataset, validation, spec), spec)
     if not len(calibration.truth):
-        return {"people": [], "covered": [], "size": [], "sure": 1.0, "known": None, **_arrays(None)}
+        empty = {name: np.zeros(0) for name in ("logits", "shares", "highest", "label", "person")}
+        return {"people": [], "covered": [], "size": [], "sure": 1.0, "known": None, **empty}
     sure, known = sure_threshold(calibration, coverage), known_threshold(calibration, known_share)
     steps = labelled_steps(bundle, marked_streams(bundle, dataset, test, spec), spec)
     people = sorted(set(steps.person.tolist()))
@@ -121,18 +113,13 @@ def fold_answers(
         "size": [float((mine.shares >= sure * ONE).sum(axis=1).mean()) for mine in each],
         "sure": sure,
         "known": known,
-        **_arrays(ends(bundle, dataset, test, spec, dataset.gestures)),
+        **last_answers(bundle, dataset, test, spec, dataset.gestures),
     }
-
-
-def _arrays(found: Ends | None) -> dict[str, Any]:
-    names = ("logits", "shares", "highest", "label", "person")
-    return {name: np.zeros(0) if found is None else getattr(found, name) for name in names}
 
 
 @dataclass(frozen=True)
 class FoldAnswers:
-    """A fold's answers as kept: with the labels of its network, and the one that was withheld from it or ""."""
+    """Answers of a fold, the labels of its network, and the label that was withheld from it (or "")."""
 
     fold: str
     withheld: str
@@ -152,14 +139,14 @@ class FoldAnswers:
 
     @property
     def right(self) -> NDArray[np.bool_]:
-        """(n,) recordings whose most likely class, smoothed, is what was made."""
+        """(n,) recordings whose most likely class, smoothed, is the gesture that was made."""
         best = np.array(self.labels, dtype=np.str_)[self.result["shares"].argmax(axis=1)]
         return np.asarray(best == self.result["label"])
 
 
 @dataclass(frozen=True)
 class Abstaining:
-    """The outcome: ``table`` as ``--json`` shows it, and the pooled ``curves`` by confidence."""
+    """The outcome of `abstaining`: ``table`` as ``--json`` prints it, and the pooled ``curves`` by confidence."""
 
     table: dict[str, Any]
     curves: dict[str, RiskCoverage]
@@ -221,7 +208,7 @@ def summarise(folds: Sequence[FoldAnswers], coverage: float, known_share: float)
 
 
 def _against(folds: Sequence[FoldAnswers], known_share: float) -> dict[str, Any]:
-    """Known against unknown: AUROC by confidence over folds, and what the fitted threshold calls unknown."""
+    """Return the AUROC of known against unknown by confidence, and the shares above and below the fitted threshold."""
     auc: dict[str, list[float]] = {}
     passed, caught, count = [], [], 0
     for t in folds:
@@ -244,7 +231,7 @@ def _against(folds: Sequence[FoldAnswers], known_share: float) -> dict[str, Any]
 
 
 def _spread(values: Sequence[float]) -> dict[str, float | None]:
-    """Mean and standard deviation of what is a number."""
+    """Return mean and standard deviation of the finite values."""
     real = [v for v in values if np.isfinite(v)]
     return {
         "mean": float(np.mean(real)) if real else None,
@@ -266,7 +253,7 @@ _STYLES = (
 
 
 def curves(found: Mapping[str, RiskCoverage], *, title: str = "") -> Figure:
-    """Draw one curve for each confidence between those of the oracle and of chance, the best first in the legend."""
+    """Draw a risk-coverage curve for each confidence, with those of chance and of an oracle."""
     figure = new_figure(6.4, 4.2)
     axes = figure.add_subplot()
     ranked = sorted(found.items(), key=lambda item: item[1].area)
@@ -296,14 +283,14 @@ def curves(found: Mapping[str, RiskCoverage], *, title: str = "") -> Figure:
     return figure
 
 
-# Raise it when the meaning of what is kept changes, that of the default smoothing included.
+# Raise it when the meaning of a stored fold changes, also through the default smoothing.
 _VERSION = 1
 FIGURE, TABLE = "risk-coverage.png", "abstaining.json"
 
 
 @dataclass(frozen=True)
 class _AnswerWork:
-    """Trains without ``withheld`` (a task is a fold and that label, or ""), and hears the people left out."""
+    """Trains without one label (a task is a fold and that label, or "") and returns the answers on the test people."""
 
     dataset: str
     arch: Arch
@@ -337,8 +324,8 @@ def _opened(path: str) -> Dataset:
 
 def _without_other_people(fold: Fold, windows: WindowSet, dataset: Dataset) -> Fold:
     """Return the fold without training windows from the streams of validation and test people."""
-    heard = set(windows.subject[np.concatenate([fold.validation, fold.test])].tolist()) - {NOBODY}
-    return replace(fold, train=fold.train[outside_streams(windows, dataset, heard)[fold.train]])
+    people = set(windows.subject[np.concatenate([fold.validation, fold.test])].tolist()) - {NOBODY}
+    return replace(fold, train=fold.train[outside_streams(windows, dataset, people)[fold.train]])
 
 
 def _without(windows: WindowSet, label: str) -> WindowSet:
@@ -347,17 +334,8 @@ def _without(windows: WindowSet, label: str) -> WindowSet:
         return windows
     at = windows.labels.index(label)
     mine = windows.take(np.flatnonzero(windows.y != at))
-
-    def rest(names: tuple[str, ...]) -> tuple[str, ...]:
-        return names[:at] + names[at + 1 :]
-
-    return replace(
-        mine,
-        y=mine.y - (mine.y > at),
-        labels=rest(mine.labels),
-        affects=rest(mine.affects),
-        families=rest(mine.families),
-    )
+    names = {key: getattr(mine, key)[:at] + getattr(mine, key)[at + 1 :] for key in ("labels", "affects", "families")}
+    return replace(mine, y=mine.y - (mine.y > at), **names)
 
 
 def abstaining(
@@ -375,14 +353,13 @@ def abstaining(
 ) -> Abstaining:
     """Evaluate abstention: risk against coverage, stated coverage, known against unknown gestures.
 
-    Networks are trained by folds of people; thresholds come from those who validate, and every figure from the streams
-    of those left out. Finished trainings are kept in the data set's ``cache`` folder.
+    A network is trained for each fold of people. Thresholds are fitted on its validation people, and all scores are
+    from the streams of its test people. Finished trainings are kept in the data set's ``cache`` folder.
 
     Args:
-        split: whole people only: "by-subject:5", "leave-one-subject-out".
-        withhold: also train without each gesture in turn, and ask whether it is taken for unknown: as many
-            trainings again for each gesture.
-        coverage: at which the conformal sets are fitted; known_share: of known gestures that pass as known.
+        split: by whole people: "by-subject:5", "leave-one-subject-out".
+        withhold: also train without each gesture in turn, and measure whether it is recognised as unknown.
+        coverage: of the conformal sets; known_share: share of known gestures above the threshold for known.
         out: a folder for ``abstaining.json`` and the figure.
         progress: called when a training is done.
 
@@ -391,21 +368,21 @@ def abstaining(
     """
     dataset = as_dataset(dataset)
     config = config or from_settings(**settings)
-    asked = parse_split(split)
-    if not asked.apart:
+    parsed = parse_split(split)
+    if not parsed.apart:
         raise ConfigError(
             f"The split '{split}' does not keep people apart: accepted are by-subject:K and leave-one-subject-out."
         )
     if not any(r.stream_row >= 0 for r in dataset.used):
         raise DatasetError(
-            f"No recording of '{dataset.head.name}' lies in a stream: what is sure is asked there, as a toy hears it."
+            f"No recording of '{dataset.head.name}' lies in a stream: import the recorder's fulldatastream.csv as well."
         )
     gestures = choose_classes(dataset, config.evaluation.classes, warn)
     arch = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
     windows = windows_for(dataset, arch, config.windows, gestures, warn)
     folds = [
         _without_other_people(fold, windows, dataset)
-        for fold in fold_windows(windows, windows, asked, config.evaluation.seed)
+        for fold in fold_windows(windows, windows, parsed, config.evaluation.seed)
     ]
     from plushsense.training.fit import resolve_device
 
@@ -417,7 +394,7 @@ def abstaining(
         "training": resolve_device(config.training).key(),
         "shares": [coverage, known_share],
     }
-    # Fold by fold, so that a run that is stopped has heard of every gesture.
+    # Fold by fold, so that a run that is stopped has results for every gesture.
     without = [(fold, label) for fold in folds for label in gestures.labels if withhold and len(gestures) > 2]
     jobs = [
         Job(job_id({**key, "fold": fold_fingerprint(fold), "withheld": label}), (fold, label))
@@ -440,22 +417,21 @@ def abstaining(
     ]
     if not any(len(t.result["label"]) for t in answers if not t.withheld):
         raise BadInput(
-            "Nobody who was left out has a stream with recordings in it, or nobody to set thresholds on has."
+            "None of the test people, or none of the validation people, has a stream with recordings in it: use other "
+            "folds."
         )
     found = summarise(answers, coverage, known_share)
-    found.table.update(split=asked.text, simulated=dataset.head.simulated, dataset=dataset.head.name)
+    found.table.update(split=parsed.text, simulated=dataset.head.simulated, dataset=dataset.head.name)
     if out is not None:
         with dataset.generation.writing():
             save(found, Path(out))
     return found
 
 
-def save(found: Abstaining, out: Path) -> None:
-    """Write the figures as JSON and the curves as a picture."""
-    from plushsense.reports.figures import png
-
+def save(done: Abstaining, out: Path) -> None:
+    """Write the table as JSON and the curves as a picture."""
     out.mkdir(parents=True, exist_ok=True)
-    (out / TABLE).write_text(json.dumps(found.table, indent=1, ensure_ascii=False), encoding="utf-8", newline="\n")
-    title = f"{found.table['dataset']}, {found.table['people']} people left out ({found.table['split']})"
-    title += "  [SIMULATION]" if found.table["simulated"] else ""
-    (out / FIGURE).write_bytes(png(curves(found.curves, title=title), dpi=110))
+    write_file(out / TABLE, json.dumps(done.table, indent=1, ensure_ascii=False))
+    title = f"{done.table['dataset']}, {done.table['people']} people left out ({done.table['split']})"
+    title += "  [SIMULATION]" if done.table["simulated"] else ""
+    write_file(out / FIGURE, png(curves(done.curves, title=title), dpi=110))
