@@ -1,8 +1,8 @@
-"""Decision settings from people whose data the network's weights were not fitted on.
+"""Fit decision settings on people to whom the network's weights were not fitted.
 
-Everything that stands between the network and what a toy says is fitted here, and on the training side only: event
-settings by a search over traces (`plushsense.tuning.events`), the conformal threshold and what counts as known from the
-same people's recordings, the sensors' limits (`fit_health`).
+All settings between the network and the events are fitted here, on training people only: event settings by a search
+over traces (`plushsense.tuning.events`), the conformal threshold and the threshold for known gestures on the same
+people's recordings, and the limits of the sensors (`fit_health`).
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.gestures import GestureSet
-from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import Frames
 from plushsense.dataset.store import Dataset, RecordingInfo
 from plushsense.models.bundle import Bundle
@@ -25,13 +24,13 @@ from plushsense.runtime.events import ONE
 from plushsense.runtime.fixed import Ints, integer_logits, smoothing_weight, softmax
 from plushsense.runtime.health import MOST_MS, HealthSettings
 from plushsense.runtime.trace import TraceReplayer, trace_of
-from plushsense.tuning.events import OTHER, EventCosts, MarkedStream, Truth, tune
+from plushsense.tuning.events import OTHER, MarkedStream, Truth, tune
 from plushsense.tuning.gate import fit_gate
 from plushsense.windows.clock import row_times_us
 from plushsense.windows.cut import cut_windows, whole_gestures
 
-_MARGIN = 0.1  # of what people showed
-_SAFETY = 2  # nothing seen may last longer than this part of what makes a fault
+_MARGIN = 0.1  # of the range of the data
+_SAFETY = 2  # the time limits of a fault are at least so many times what the data hold
 _STILL_MS = 500
 _STILL_MOST_MS = 10_000
 _INT32 = -(1 << 31), (1 << 31) - 1
@@ -42,7 +41,7 @@ IntsLimits = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class HealthFit:
-    """Fitted ``plan`` with limits from data."""
+    """Fitted ``plan`` with limits from ``seconds`` of data; ``widened`` names channels with an end stop."""
 
     plan: HealthSettings
     frames: int
@@ -52,7 +51,7 @@ class HealthFit:
 
 
 def frames_of(dataset: Dataset, subjects: Iterable[str]) -> Iterator[Frames]:
-    """Yield the streams of some people; of those who have none, their recordings."""
+    """Yield the streams of some people, and the recordings of those who have none."""
     people = set(subjects)
     streams = [s for s in dataset.streams if s.subject in people]
     with_stream = {s.subject for s in streams}
@@ -66,15 +65,14 @@ def frames_of(dataset: Dataset, subjects: Iterable[str]) -> Iterator[Frames]:
 def fit_health(dataset: Dataset, subjects: Iterable[str], plan: HealthSettings | None = None) -> HealthFit:
     """Fit limits with which the sensors of ``subjects`` are never at fault.
 
-    A channel's limits are the lowest and the highest valid value that anybody showed, and a tenth of the range between
-    further out, for people who touch harder. Where that is no longer within what the sensor can send, people reach its
-    end stop, and the limit is one step inside what they showed: touch stays there for a frame or two, a broken sensor
-    for good. Where somebody's values repeated beyond them for half of ``fault_ms``, they are moved to hold them.
-    ``still_ms`` is twice the longest time in which every channel repeated, at least 500 ms; when that is more than
-    10 s, the toy really is still, and the rule is off.
+    A channel's limits are the lowest and the highest valid value in the data, moved outwards by a tenth of the range
+    between them. If that is beyond what the sensor can send, people reach its end stop, and the limit is one step
+    inside their extreme value: touch stays there for a frame or two, a broken sensor permanently. If values beyond the
+    limits were repeated for half of ``fault_ms``, the limits are moved to include them. ``still_ms`` is twice the
+    longest time in which every channel repeated, at least 500 ms; above 10 s the rule is switched off.
 
     Args:
-        plan: the times to keep (``fault_ms``, ``recover_ms``); the defaults when left out.
+        plan: times to keep (``fault_ms``, ``recover_ms``); by default the defaults.
     """
     plan = plan or HealthSettings()
     layout = dataset.layout
@@ -101,7 +99,7 @@ def fit_health(dataset: Dataset, subjects: Iterable[str], plan: HealthSettings |
             high = np.maximum(high, np.where(wrong, rows, high).max(axis=0))
     moved = (low != usual[0]) | (high != usual[1])
     widened = [name for name, other in zip(layout.names, moved.tolist(), strict=True) if other]
-    still = max(_longest(f.device_ms, _repeats(f.values, f.device_ms, layout.gap_ms)) for f in parts)
+    still = max(_longest_still_ms(f, layout.gap_ms) for f in parts)
     still_ms = max(_STILL_MS, _SAFETY * still)
     fitted = replace(
         plan,
@@ -109,20 +107,9 @@ def fit_health(dataset: Dataset, subjects: Iterable[str], plan: HealthSettings |
         high=tuple(high.tolist()),
         still_ms=still_ms if still_ms <= min(_STILL_MOST_MS, MOST_MS) else 0,
     )
-    return HealthFit(fitted, len(values), _seconds(parts, layout), tuple(widened), still)
-
-
-def _seconds(parts: Iterable[Frames], layout: Layout) -> float:
     steps = [np.diff(f.device_ms) for f in parts]
-    return float(sum(int(s[(s > 0) & (s <= layout.gap_ms)].sum()) for s in steps)) / 1000
-
-
-def _repeats(values: NDArray[np.int64], ms: NDArray[np.int64], gap_ms: int) -> Bools:
-    """Return which frames (T,) repeat the one before in every channel of ``values``; none over a gap or a reset."""
-    out = np.zeros(len(values), dtype=bool)
-    step = np.diff(ms)
-    out[1:] = (values[1:] == values[:-1]).all(axis=1) & (step >= 0) & (step <= gap_ms)
-    return out
+    passed_ms = sum(int(s[(s > 0) & (s <= layout.gap_ms)].sum()) for s in steps)
+    return HealthFit(fitted, len(values), passed_ms / 1000, tuple(widened), still)
 
 
 def _runs(at: Bools) -> list[tuple[int, int]]:
@@ -131,16 +118,21 @@ def _runs(at: Bools) -> list[tuple[int, int]]:
     return [(int(a), int(b) - 1) for a, b in edges.reshape(-1, 2)]
 
 
-def _longest(ms: NDArray[np.int64], repeats: Bools) -> int:
-    """Return the longest duration of a run of repeats, counted from the frame that they repeat."""
+def _longest_still_ms(frames: Frames, gap_ms: int) -> int:
+    """Return the longest time in which frames repeated in every channel, from the first of them."""
+    x, ms = frames.values, frames.device_ms
+    repeats, step = np.zeros(len(x), dtype=bool), np.diff(ms)
+    repeats[1:] = (x[1:] == x[:-1]).all(axis=1) & (step >= 0) & (step <= gap_ms)
     return max((int(ms[b] - ms[a - 1]) for a, b in _runs(repeats)), default=0)
 
 
 def _held(
     frames: Frames, usual: tuple[IntsLimits, IntsLimits], valid: IntsLimits, longest_ms: float, gap_ms: int
 ) -> Iterator[tuple[IntsLimits, NDArray[np.bool_]]]:
-    """Yield the frames (n, C) of each stretch of ``longest_ms`` with some channel wrong all along, and where in
-    them a channel repeated a valid value beyond the ``usual``.
+    """Yield stretches of at least ``longest_ms`` in which some channel is wrong throughout.
+
+    Yields:
+        the frames (n, C) of a stretch, and where in them a channel repeated a valid value beyond the ``usual`` limits.
     """
     x, ms = frames.values, frames.device_ms
     step = np.diff(ms, prepend=ms[:1])
@@ -155,7 +147,7 @@ def _held(
 
 COVERAGE = 0.9
 KNOWN_SHARE = 0.95
-# The search hears at most so much, people alike: it takes about 15 s then.
+# The search uses at most so much of the streams, which takes about 15 s.
 MOST_SEARCHED_S = 3600.0
 
 
@@ -163,8 +155,7 @@ MOST_SEARCHED_S = 3600.0
 class LabelledSteps:
     """Steps (or windows) of known truth, (n,) each.
 
-    ``shares`` (n, K) in steps of 2^-15, ``highest`` logit in steps of 1/256, both smoothed; ``truth`` the class;
-    ``person`` and ``recording`` who and what it was.
+    ``shares`` (n, K) in steps of 2^-15, ``highest`` logit in steps of 1/256, both smoothed; ``truth`` the class.
     """
 
     shares: Ints
@@ -194,37 +185,34 @@ def fit_decisions(
     training: Iterable[str] = (),
     spec: DecideSpec | None = None,
     keep: Collection[str] = (),
-    prices: EventCosts | None = None,
 ) -> DecideSpec:
-    """Fit all decision settings, with ``fitted`` saying on what.
+    """Fit all decision settings; ``fitted`` of the result describes the data and the outcome.
 
-    - Events: those that cost least in the streams of ``subjects`` (`tuning.tune`).
+    - Events: the settings of least cost in the streams of ``subjects`` (`events.tune`).
     - ``sure``: the split-conformal threshold at which the set of classes holds the true one in ``coverage`` of the
       labelled steps (least ambiguous sets: Sadinle, Lei and Wasserman 2019), people and their recordings counting
-      alike; the finite-sample correction counts recordings, since steps of one are no new evidence.
+      alike; the finite-sample correction counts recordings, as steps of one recording are not independent.
     - ``known``: the smoothed highest logit that ``known_share`` of the same steps reach.
-    - Gate: thresholds that fire so often on all that is not energetic (`plushsense.tuning.gate`), on everybody's
-      streams.
-    - Health: limits with which no sensor of anybody on the training side is at fault.
+    - Gate: thresholds at a rate of false alarms on all that is not energetic (`gate.fit_gate`), on everybody's streams.
+    - Health: limits with which no sensor of the training people is at fault.
 
-    A labelled step stands in the second half of its recording: before, the network mostly sees something else.
+    A labelled step is in the second half of its recording: before, the network mostly sees something else.
 
     Args:
-        subjects: people on the training side whom the weights were not fitted on.
-        training: people whom they were fitted on: with the others they show what sensors can reach.
-        spec: where the search begins; ``keep`` names its settings that stay.
-        prices: what an event costs that should not have been, or was late.
+        subjects: training people to whom the weights were not fitted.
+        training: people to whom they were fitted, for the gate and the limits of the sensors.
+        spec: start of the search; ``keep`` names its settings that stay.
 
     Raises:
-        ConfigError: for a coverage or a share that is none.
-        DatasetError: when ``subjects`` is nobody.
+        ConfigError: for a coverage or a share out of range.
+        DatasetError: when ``subjects`` is empty.
     """
     for name, value in (("coverage", coverage), ("known_share", known_share)):
         if not 0.5 <= value < 1.0:
             raise ConfigError(f"{name} is {value!r}; accepted are shares from 0.5 to under 1.")
     spec, people = spec or DecideSpec(), sorted(set(subjects))
     if not people:
-        raise DatasetError("Decision settings are fitted on people who were held back, and there is none.")
+        raise DatasetError("Decision settings are fitted on people who were held back, and there are none.")
     everybody = sorted({*people, *training})
     health = fit_health(dataset, everybody, spec.health)
     if "health" not in keep:
@@ -244,7 +232,7 @@ def fit_decisions(
     if streams:
         if "known" not in keep:
             spec = replace(spec, known=known_threshold(labelled_steps(bundle, streams, spec), known_share))
-        tuned = tune(streams, spec, bundle.gestures, prices, keep)
+        tuned = tune(streams, spec, bundle.gestures, keep=keep)
         spec = tuned.spec
         labelled = labelled_steps(bundle, streams, spec)
         report["events"] = {
@@ -291,10 +279,10 @@ def _answers(
         "on": "steps in the second half of a recording" if steps else "windows, not smoothed",
         "coverage": coverage,
         "recordings": len(np.unique(labelled.recording)),
-        # What other people's threshold gave each of them: the figure to expect of a new person.
+        # Coverage of each person with the threshold of the others: what to expect of a new person.
         "coverage_left_out": _round(float(np.mean(by_person))) if by_person else None,
         "coverage_left_out_worst": _round(min(by_person)) if by_person else None,
-        # A share of new people that so few can vouch for, whatever the threshold: n / (n + 1).
+        # Largest share of new people for which n people can give a guarantee: n / (n + 1).
         "people_bound": _round(people / (people + 1)),
         "classes_in_set": _round(float((labelled.shares >= spec.sure * ONE).sum(axis=1).mean())),
         "known_share": known_share,
@@ -310,10 +298,10 @@ def marked_streams(
 ) -> list[MarkedStream]:
     """Return the streams of some people as the network reads them, with their marked recordings.
 
-    Streams without a marked recording are left out. Of more than an hour, people get an equal share.
+    Streams without a marked recording are left out. Above an hour in all, people get equal shares of an hour.
 
     Args:
-        gestures: those whose indices the truths are; the network's own when left out.
+        gestures: the set to which the indices of the truths refer; by default the network's own.
     """
     people = set(subjects)
     marked: dict[str, list[RecordingInfo]] = {}
@@ -337,10 +325,7 @@ def marked_streams(
 def truths_of(
     frames: Frames, recordings: Sequence[RecordingInfo], gestures: GestureSet, period_us: int
 ) -> tuple[Truth, ...]:
-    """Return the marked stretches of a stream in order of time.
-
-    Excluded recordings, and other gestures, are `OTHER`.
-    """
+    """Return the marked stretches of a stream in order of time; excluded recordings and other gestures are `OTHER`."""
     times = row_times_us(frames, period_us)
     out = []
     for r in recordings:
@@ -353,7 +338,7 @@ def truths_of(
 
 
 def labelled_steps(bundle: Bundle, streams: Sequence[MarkedStream], spec: DecideSpec) -> LabelledSteps:
-    """Return the steps in the second half of each recording that the network knows, smoothed as ``spec`` has it."""
+    """Return the steps in the second half of each recording of a known gesture, smoothed as in ``spec``."""
     weight = smoothing_weight(spec.smoothing_s, bundle.arch.step * bundle.layout.period_us / 1e6)
     shares = [np.zeros((0, len(bundle.gestures)), dtype=np.int64)]
     highest = [_ints(())]
@@ -382,7 +367,7 @@ def labelled_steps(bundle: Bundle, streams: Sequence[MarkedStream], spec: Decide
 
 
 def labelled_windows(bundle: Bundle, dataset: Dataset, subjects: Iterable[str]) -> LabelledSteps:
-    """Return the windows of some people's recordings; for data without streams."""
+    """Return the windows of some people's recordings, for data without streams."""
     people = set(subjects)
     mine = [r for r in dataset.recordings if r.subject in people]
     spec = whole_gestures(bundle.windowing)

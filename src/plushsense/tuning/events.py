@@ -1,7 +1,7 @@
-"""Search of event settings over traces, by what wrong, late and missing events cost.
+"""Search of event settings over traces, by the cost of wrong, late and missing events.
 
-A stream is read by the network once (`plushsense.runtime.trace`); its events are replayed for every setting that is
-tried, by the event machine of the toy.
+The network reads a stream once (`plushsense.runtime.trace`); the event machine of the toy then replays the events of
+the stream for every setting.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ OTHER = -1
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """Known stretch of a stream: a class index, or `OTHER` for what the network does not know."""
+    """Marked stretch of a stream: a class index, or `OTHER` for a gesture that the network does not know."""
 
     start_us: int
     stop_us: int
@@ -32,7 +32,7 @@ class Truth:
 
 @dataclass(frozen=True, eq=False)
 class MarkedStream:
-    """Stream of one person as the network reads it, with its known stretches."""
+    """Stream of one person as the network reads it, with its marked stretches."""
 
     person: str
     trace: Trace
@@ -43,11 +43,11 @@ class MarkedStream:
 class EventCosts:
     """Costs of errors, in missed gestures.
 
-    A gesture costs its best event: ``missed`` without one; ``late_s`` for every second until it was named, at most 3;
-    ``unnamed`` when only its affect was reported; when it was taken for another, ``family`` for one of its family,
-    ``same`` for one of its affect, ``other`` where it has no affect, ``affect`` for one of another affect. Every
-    further event of it costs ``again``, and half its error. An event where nothing was going on costs ``idle``, one in
-    a stretch of which nobody knows what went on ``unmarked``: people also practise.
+    A gesture costs as much as its best event: ``missed`` without one; ``late_s`` for every second until it was named,
+    at most 3; ``unnamed`` if only its affect was reported; if it was taken for another gesture, ``family`` for one of
+    its family, ``same`` for one of its affect, ``other`` where it has no affect, ``affect`` for one of another affect.
+    Every further event costs ``again`` and half its error. An event during rest costs ``idle``, and one in an unmarked
+    stretch ``unmarked``: people may have practised there.
     """
 
     missed: float = 1.0
@@ -91,9 +91,9 @@ def timed_events(updates: Sequence[Update]) -> list[TimedEvent]:
 def event_costs(
     stream: MarkedStream, events: Sequence[TimedEvent], gestures: GestureSet, prices: EventCosts
 ) -> NDArray[np.float64]:
-    """Return the costs (n,) of the events of a stream, a number for each of its n gestures, in order of time.
+    """Return the cost (n,) of each of the n gestures of a stream, in order of time.
 
-    An event where there was no gesture counts with the nearest.
+    An event where there was no gesture counts with the nearest gesture.
     """
     idle = [g.idle for g in gestures.gestures]
     mine = [t for t in stream.truths if t.gesture != OTHER and not idle[t.gesture]]
@@ -115,7 +115,7 @@ def event_costs(
         elif not _within(event, others, prices.early_us, prices.grace_us):
             total[nearest] += prices.unmarked
     for at, (truth, reported) in enumerate(zip(mine, answers, strict=True)):
-        # An event that goes on from before and is right needs no other one.
+        # A correct event that began before and continues needs no other one.
         going_on = [
             e
             for e in events
@@ -142,7 +142,7 @@ def _within(event: TimedEvent, truths: Sequence[Truth], early_us: int, grace_us:
 
 
 def _place(event: TimedEvent, truths: Sequence[Truth], prices: EventCosts) -> int | None:
-    """Return the gesture that an event belongs to: of those around its beginning its own, else the latest."""
+    """Return the gesture that an event belongs to: among those at its beginning the same gesture, else the latest."""
     around = [
         i for i, t in enumerate(truths) if t.start_us - prices.early_us <= event.begun_us <= t.stop_us + prices.grace_us
     ]
@@ -168,7 +168,7 @@ def _price(event: TimedEvent, truth: Truth, gestures: GestureSet, prices: EventC
     return False, (prices.other if real.affect == "none" else prices.same) + late
 
 
-# What is tried, in this order, twice. The first are those that matter most.
+# Values to try, in this order, twice. Settings with the largest effect come first.
 TRIED: dict[str, tuple[float, ...]] = {
     "enter": (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9),
     "least_s": (0.05, 0.1, 0.2, 0.3, 0.5),
@@ -184,12 +184,12 @@ TRIED_AFFECT: dict[str, tuple[float, ...]] = {
     "leave_affect": (0.2, 0.4, 0.6),
 }
 TRIED_GATE: dict[str, tuple[float, ...]] = {"wait_s": (0.5, 1.0, 1.5, 2.5)}
-_BLOCK = 10  # gestures in a row whose costs are taken for one number
+_BLOCK = 10  # consecutive gestures whose mean cost is one sample of the standard error
 
 
 @dataclass(frozen=True)
 class TunedEvents:
-    """``spec`` and what it costs a gesture, beside the settings that the search began with; ``tried`` settings."""
+    """``spec`` with its cost per gesture, that of the initial settings, and the number of settings ``tried``."""
 
     spec: DecideSpec
     cost: float
@@ -205,14 +205,13 @@ def tune(
     prices: EventCosts | None = None,
     keep: Collection[str] = (),
 ) -> TunedEvents:
-    """Return the event settings that cost the least a gesture, people counting alike.
+    """Return the event settings with the least cost per gesture, people counting alike.
 
-    One setting after the other is moved to its best value, twice over all, and only where the gain is more than its
-    standard error over blocks of 10 gestures and at least half of the people gain: of few people one learns little,
-    and what they cannot tell stays as it is.
+    One setting after the other is moved to its best value, twice over all, and only if the gain is more than its
+    standard error over blocks of 10 gestures and at least half of the people gain.
 
     Args:
-        spec: where the search begins; gate, health, ``known`` and ``sure`` are kept.
+        spec: start of the search; gate, health, ``known`` and ``sure`` are kept.
         keep: settings that are not tried.
     """
     prices = prices or EventCosts()
@@ -240,7 +239,10 @@ def tune(
             for value in values:
                 if value == getattr(spec, name) or (name == "leave" and value > spec.enter):
                     continue
-                candidate = with_setting(spec, name, value)
+                changes: dict[str, Any] = {name: value}
+                if name == "enter":
+                    changes["leave"] = min(spec.leave, value)
+                candidate = replace(spec, **changes)
                 gain, error, share = compare_costs(now, cost(candidate), people)
                 if gain > max(best_gain, error) and share >= 0.5:
                     best, best_gain = candidate, gain
@@ -250,14 +252,6 @@ def tune(
         if not changed:
             break
     return TunedEvents(spec, _mean(now, people), _mean(before, people), len(known), moved)
-
-
-def with_setting(spec: DecideSpec, name: str, value: float) -> DecideSpec:
-    """Return the spec with one setting changed; ``leave`` is never above ``enter``."""
-    values: dict[str, Any] = {name: value}
-    if name == "enter":
-        values["leave"] = min(spec.leave, value)
-    return replace(spec, **values)
 
 
 def _mean(each: Sequence[NDArray[np.float64]], people: Sequence[str]) -> float:
@@ -273,8 +267,10 @@ def _by_person(each: Sequence[NDArray[np.float64]], people: Sequence[str]) -> li
 def compare_costs(
     before: Sequence[NDArray[np.float64]], after: Sequence[NDArray[np.float64]], people: Sequence[str]
 ) -> tuple[float, float, float]:
-    """Return the mean gain a gesture of ``after`` over ``before`` (costs of each stream), its standard error over
-    blocks of gestures, and the share of people who do not lose by it.
+    """Compare the costs ``before`` and ``after`` of each stream.
+
+    Returns:
+        the mean gain per gesture, its standard error over blocks of gestures, and the share of people without a loss.
     """
     gains = [a - b for a, b in zip(_by_person(before, people), _by_person(after, people), strict=True)]
     if not gains:

@@ -1,9 +1,9 @@
-"""Fitting the gate: which signals, terms and thresholds notice the energetic gestures of some people, and little else.
+"""Fit the gate: choose signals, terms and thresholds that detect the energetic gestures of some people.
 
-What is tried: each input's level, each input's jerk and the jerk of all inputs of a kind, at several lags and floors;
-rules of one or two terms. A rule's thresholds are chosen so that on everything that is not energetic it would have
-fired at most so often an hour; of the rules that then notice most, the quickest is taken. A further rule is added while
-it finds energetic recordings that those before it miss.
+Candidates are each input's level, each input's jerk and the jerk of all inputs of a kind, at several lags and floors;
+rules have one or two terms. The thresholds of a rule are chosen so that it fires at most so often an hour on everything
+that is not energetic; of the rules that then detect most, the quickest is taken. Further rules are added as long as
+they detect energetic recordings that the earlier ones miss.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from plushsense.tuning.gate_rules import BETWEEN, CALM, LEFT_OUT, FoundRule, Hei
 LEAD = 1200
 """Samples read before a piece, in which a baseline settles."""
 PIECE = 4800
-_CELLS = 12_000  # pieces times signals that go side by side: more no longer fit the cache
+_CELLS = 12_000  # pieces times signals that are computed together: more do not fit the cache
 
 
 def raw_signal(x: NDArray[np.int64], signal: Signal) -> NDArray[np.int64]:
@@ -57,9 +57,9 @@ def signal_sizes(
 ) -> list[NDArray[np.int32]]:
     """Return the sizes of the signals, with the deviation's sign: an array (T, S) of each stretch (T, I).
 
-    As `plushsense.runtime.gate.Gate` computes them, but for two things: stretches are read in pieces that each begin
-    `LEAD` samples early, and samples that repeat the one before count like others. Then many pieces go side by side.
-    With ``deviations`` these are given instead.
+    Computed as by `plushsense.runtime.gate.Gate`, with two differences that allow many pieces to be computed together:
+    each piece of a stretch begins `LEAD` samples early, and samples that repeat the one before count like others.
+    With ``deviations`` the deviations are returned instead.
     """
     out = [np.zeros((len(x), len(signals)), dtype=np.int32) for x in xs]
     pieces = [(n, at, max(0, at - LEAD)) for n, x in enumerate(xs) for at in range(0, len(x), PIECE)]
@@ -68,7 +68,7 @@ def signal_sizes(
     for first in range(0, len(pieces), per):
         some = pieces[first : first + per]
         stops = [min(at + PIECE, len(xs[n])) for n, at, _ in some]
-        # A jerk looks back behind the piece, so that signals are made with the samples before.
+        # A jerk depends on samples before the piece.
         block = np.zeros((stops[0] - some[0][2], len(some), len(signals)), dtype=np.int32)
         for column, ((n, _, begin), stop) in enumerate(zip(some, stops, strict=True)):
             back = max(0, begin - 16)
@@ -100,8 +100,8 @@ def _follow_block(block: NDArray[np.int32], signals: Sequence[Signal], deviation
 
 Ints32 = NDArray[np.int32]
 
-_TOGETHER = 6  # stretches whose every candidate is in memory at a time
-_MOST, _FLOORS = 24, 2  # candidates kept, and how many of them may differ in their floor only
+_TOGETHER = 6  # stretches with all candidates in memory at a time
+_MOST, _FLOORS = 24, 2  # candidates to keep, and how many of them may differ in their floor only
 
 
 @dataclass(frozen=True)
@@ -109,14 +109,14 @@ class GateSpec:
     """Settings of the fit of a gate; times in seconds.
 
     Attributes:
-        false_alarms_per_hour: how often it may fire on what is not energetic.
-        lags_s: of jerk; floors: as quantiles of a signal's deviation in all that was recorded.
-        times_s: for how long a term must hold; within_s: how long it is remembered.
-        deaf_s: after firing.
+        false_alarms_per_hour: limit on what is not energetic.
+        lags_s: of jerk; floors: quantiles of a signal's deviation over all recorded data.
+        times_s: for how long a term must hold; within_s: for how long it then counts.
+        deaf_s: dead time after firing.
         rules: most rules of one affect.
-        least: a first rule must find this share of the energetic recordings, else there is no gate.
-        gain: a further rule must find this share, at least two recordings.
-        worth: what goes on between recordings is calm, unless that costs this share of them.
+        least: share of the energetic recordings that a first rule must detect, else there is no gate.
+        gain: share that a further rule must add, at least two recordings.
+        worth: time between recordings counts as calm, unless that costs this share of the recordings.
     """
 
     false_alarms_per_hour: float = 1.0
@@ -147,17 +147,16 @@ def fit_gate(
     subjects: Collection[str],
     *,
     false_alarms_per_hour: float = 1.0,
-    spec: GateSpec | None = None,
 ) -> GateFit:
-    """Fit a gate on ``subjects``' streams, and on their recordings where there is no stream.
+    """Fit a gate on the streams of ``subjects``, and on their recordings where there is no stream.
+
+    Where there is nothing energetic to detect, the plan is empty and the report says why.
 
     Args:
-        gestures: the classes of the model that the gate stands beside; they say what is energetic, and its affect.
-        false_alarms_per_hour: how often it may fire on all that is not energetic.
-
-    An empty plan, with the reason in the report, where nothing energetic is to be noticed.
+        gestures: the classes of the model beside the gate; they define which gestures are energetic, and their affect.
+        false_alarms_per_hour: limit on everything that is not energetic.
     """
-    spec = spec or GateSpec(false_alarms_per_hour)
+    spec = GateSpec(false_alarms_per_hour)
     figures = {"people": len(set(subjects)), "false_alarms_per_hour_allowed": spec.false_alarms_per_hour}
     names = [g.label for g in gestures.gestures if g.energetic]
     if not names:
@@ -188,16 +187,16 @@ def fit_gate(
             )
     plan = GateSettings(tuple(signals), tuple(rules))
     if not rules:
-        return GateFit(plan, {**figures, "reason": "no rule finds enough of them at so few false alarms"})
+        return GateFit(plan, {**figures, "reason": "no rule detects enough of them at so few false alarms"})
     return GateFit(
         plan, {**figures, "between_recordings_believed": believed, **measure_gate(plan, material, dataset.layout)}
     )
 
 
 def _rules_of(candidates: _Candidates, labels: list[str], spec: GateSpec) -> tuple[list[FoundRule], bool]:
-    """Return rules for some gestures, and whether what went on between the recordings was counted as calm.
+    """Return rules for some gestures, and whether the time between recordings was counted as calm.
 
-    It is, unless that costs recall: where people practised between their recordings, nobody knows what is calm.
+    It is, unless that costs recall, as where people practised between their recordings.
     """
     best: tuple[int, list[FoundRule], bool] = (-1, [], True)
     for believed in (True, False):
@@ -222,7 +221,7 @@ def _rules_of(candidates: _Candidates, labels: list[str], spec: GateSpec) -> tup
 
 
 class _Candidates:
-    """Candidates for terms, and their sizes in all of the material."""
+    """Candidates for terms, with their sizes in the material."""
 
     def __init__(self, layout: Layout, material: Material, spec: GateSpec) -> None:
         self.layout, self.material = layout, material
@@ -284,7 +283,7 @@ class _Candidates:
         return [(signal, sign[k]) for k, signal in enumerate(signals)]
 
     def _promising(self, candidates: list[tuple[Signal, int]], spec: GateSpec) -> list[int]:
-        """Return the candidates that separate best on their own."""
+        """Return the candidates that separate calm and energetic samples best on their own."""
         calm, rough = [], []
         for first in range(0, len(self._xs), _TOGETHER):
             some = self.material.stretches[first : first + _TOGETHER]
@@ -309,7 +308,7 @@ class _Candidates:
         return kept
 
     def heights(self, labels: list[str], between: bool) -> tuple[Heights, float]:
-        """Return the sizes that rules for ``labels`` are chosen on, and how many hours of it are calm."""
+        """Return the sizes on which rules for ``labels`` are chosen, and the hours of calm samples among them."""
         chosen = np.array([label in labels for _, label in self.material.trials])
         calm, chunks, rough, trials, delays = [], [], [], [], []
         first_chunk = 0
@@ -336,9 +335,9 @@ class _Candidates:
         return heights, sum(map(len, calm)) / self.layout.rate_hz / 3600
 
     def _apart(self) -> NDArray[np.bool_]:
-        """Return which candidates may be combined.
+        """Return which candidates may be combined: of different sensors, if the layout has several kinds.
 
-        With several kinds of sensors, a rule reads two, so that no broken one fires the gate alone.
+        So a broken sensor cannot fire the gate alone.
         """
         n = len(self.candidates)
         if len({c.kind for c in self.layout.channels}) == 1:
@@ -369,8 +368,8 @@ def signals_of(layout: Layout, spec: GateSpec) -> list[Signal]:
 def measure_gate(plan: GateSettings, material: Material, layout: Layout) -> dict[str, Any]:
     """Measure a gate on some people's material, by the integer `Gate` itself.
 
-    Recall by gesture; false alarms an hour in calm recordings and between recordings (a gate is deaf for a while after
-    each); the median time from a recording's first sample to the first firing in it.
+    The report has recall by gesture, false alarms an hour in calm recordings and between recordings, and the median
+    time from a recording's first sample to the first firing in it.
     """
     first: dict[int, int] = {}
     wrong = {CALM: 0, BETWEEN: 0}

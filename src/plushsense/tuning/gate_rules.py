@@ -1,4 +1,4 @@
-"""Choice of a gate's rules: two terms and their thresholds, by recall and false alarms."""
+"""The material to fit a gate on, and the choice of its rules: two terms with thresholds, by recall and false alarms."""
 
 from __future__ import annotations
 
@@ -15,17 +15,18 @@ from plushsense.windows.cut import recordings_in_time
 from plushsense.windows.features import network_inputs
 
 BETWEEN, CALM, LEFT_OUT = -1, -2, -3
-"""Of a sample: between recordings; in one of a gesture that is not energetic; what nobody can tell."""
+"""Kinds of samples: between recordings; in a recording of a gesture that is not energetic; unknown."""
 
 GUARD_S = 0.7
-"""So long before and after an energetic recording nobody can tell: the hand may begin early and end late."""
+"""Time before and after an energetic recording that is unknown: the gesture may begin early and end late."""
 
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """Even samples without a break: ``x`` (T, I) raw inputs, ``what`` (T,) an index of `Material.trials` or one of
-    `BETWEEN`, `CALM`, `LEFT_OUT`, ``calm`` (T,) the recording of a calm sample (an index into ``Material.calm``), else
-    -1.
+    """Even samples without a break.
+
+    ``x`` (T, I) raw inputs; ``what`` (T,) an index into `Material.trials`, or `BETWEEN`, `CALM` or `LEFT_OUT`; ``calm``
+    (T,) the recording of a calm sample (an index into `Material.calm`), else -1.
     """
 
     subject: str
@@ -51,8 +52,8 @@ class Material:
 def material_of(dataset: Dataset, gestures: GestureSet, subjects: Collection[str]) -> Material:
     """Return the streams of ``subjects``, and their recordings that lie in no stream.
 
-    What is energetic ``gestures`` say. Free choice, labels that are not among them, excluded recordings and those
-    that nobody stopped in time are left out: nobody knows what they hold.
+    ``gestures`` define what is energetic. Free choice, other labels, excluded recordings and those that were not
+    stopped in time are left out, as their content is unknown.
     """
     layout = dataset.layout
     people = set(subjects)
@@ -110,26 +111,26 @@ Ints32 = NDArray[np.int32]
 Whole = NDArray[np.int64]
 
 _SHARES = (0.5, 1, 2, 4, 7, 10, 15, 20, 30, 40, 50, 65, 80)
-"""Thresholds of the first term that are tried: percentiles of the trials' heights."""
+"""Percentiles of the trials' heights to try as thresholds of the first term."""
 _COMMON = 0.05
-"""A first term that holds in more of the calm samples than this is no term."""
+"""Largest share of the calm samples in which a first term may hold."""
 _SHORTLIST = 60
 _NEARBY = (0.85, 1.0, 1.18)
-"""Other people are a little different: a rule's recall is the mean of that with its thresholds times these."""
+"""As people differ, a rule's recall is the mean with its thresholds multiplied by each of these."""
 _CARELESS = 2
-"""At the lowest of them a rule may be wrong so many times as often as allowed, and once more."""
+"""At the lowest of them a rule may have so many times the allowed false alarms, and one more."""
 _PER_SECOND = 0.1
-"""What an answer a second sooner is worth, as a share of the trials."""
+"""Value of an answer that comes a second sooner, as a share of the trials."""
 
 
 @dataclass(frozen=True, eq=False)
 class Heights:
-    """Sizes of candidates, as a term counts them: rows of samples, a column for each candidate.
+    """Sizes of candidates as a term counts them: a row for each sample, a column for each candidate.
 
-    ``calm`` (n, S) of what is not energetic, in ``chunks`` (n,), stretches of one alarm at most; ``rough`` (m, S) of
-    the ``trials`` (m,), ``delays`` (m,) samples after each trial's begin. Both sorted by chunk and trial. ``least``
-    (S,) is the lowest threshold of a first term; calm samples below all of them are not here. ``apart`` (S, S):
-    which two candidates may be the terms of one rule.
+    ``calm`` (n, S) of samples that are not energetic, in ``chunks`` (n,) of at most one alarm; ``rough`` (m, S) of the
+    ``trials`` (m,), ``delays`` (m,) samples after the beginning of the trial. Both are sorted by chunk and trial.
+    ``least`` (S,) is the lowest threshold of a first term; calm samples below all of them are dropped. ``apart``
+    (S, S): which two candidates may be the terms of one rule.
     """
 
     calm: Ints32
@@ -144,7 +145,7 @@ class Heights:
     def of(
         cls, calm: Ints32, chunks: Whole, rough: Ints32, trials: Whole, delays: Whole, apart: NDArray[np.bool_]
     ) -> Heights:
-        """Return the calm samples in which a rule could fire, beside all energetic ones."""
+        """Return the heights of all energetic samples and of the calm ones in which a rule could fire."""
         least = np.ones(rough.shape[1], dtype=np.int64)
         if len(calm):
             rank = min(len(calm) - 1, int(len(calm) * (1.0 - _COMMON)))
@@ -156,7 +157,7 @@ class Heights:
         return cls(calm[loud], chunks[loud], rough, trials, delays, least, apart)
 
     def without(self, found: FoundRule) -> Heights:
-        """Return what is left where a rule does not already fire."""
+        """Return the heights without the chunks and trials in which a rule fires already."""
         calm = ~np.isin(self.chunks, self.chunks[found.holds(self.calm)])
         rough = ~np.isin(self.trials, self.trials[found.holds(self.rough)])
         left = self.rough[rough], self.trials[rough], self.delays[rough]
@@ -165,8 +166,9 @@ class Heights:
 
 @dataclass(frozen=True)
 class FoundRule:
-    """A rule: columns and their thresholds (one or two), and what it does to the trials it was chosen on: ``hits``,
-    ``near`` (the mean with thresholds a little higher and lower), ``alarms``, the median ``delay`` in samples.
+    """A rule of one or two ``terms`` (column, threshold), with its results on the trials it was chosen on.
+
+    ``hits``; ``near``, their mean with thresholds a little higher and lower; ``alarms``; median ``delay`` in samples.
     """
 
     terms: tuple[tuple[int, int], ...]
@@ -192,9 +194,10 @@ class FoundRule:
 
 
 def best_rule(heights: Heights, alarms: int, rate_hz: float) -> FoundRule | None:
-    """Return the rule that finds most trials, and soonest, with at most ``alarms`` chunks in which it is wrong.
+    """Return the rule that detects most trials, and soonest, with false alarms in at most ``alarms`` chunks.
 
-    Thresholds stand in the middle (in decibels) between what the alarms ask for and what would begin to cost trials.
+    Thresholds lie in the middle (in decibels) between the lowest that keeps that limit and the highest without a loss
+    of trials.
     """
     n_trials = len(np.unique(heights.trials))
     if n_trials == 0:
