@@ -99,7 +99,7 @@ def fit_health(dataset: Dataset, subjects: Iterable[str], plan: HealthSettings |
             high = np.maximum(high, np.where(wrong, rows, high).max(axis=0))
     moved = (low != usual[0]) | (high != usual[1])
     widened = [name for name, other in zip(layout.names, moved.tolist(), strict=True) if other]
-    still = max(_longest_still_ms(f, layout.gap_ms) for f in parts)
+    still = max(_longest(f.device_ms, _repeats(f.values, f.device_ms, layout.gap_ms)) for f in parts)
     still_ms = max(_STILL_MS, _SAFETY * still)
     fitted = replace(
         plan,
@@ -118,11 +118,16 @@ def _runs(at: Bools) -> list[tuple[int, int]]:
     return [(int(a), int(b) - 1) for a, b in edges.reshape(-1, 2)]
 
 
-def _longest_still_ms(frames: Frames, gap_ms: int) -> int:
-    """Return the longest time in which frames repeated in every channel, from the first of them."""
-    x, ms = frames.values, frames.device_ms
-    repeats, step = np.zeros(len(x), dtype=bool), np.diff(ms)
-    repeats[1:] = (x[1:] == x[:-1]).all(axis=1) & (step >= 0) & (step <= gap_ms)
+def _repeats(values: NDArray[np.int64], ms: NDArray[np.int64], gap_ms: int) -> Bools:
+    """Return which frames (T,) repeat the one before in every channel of ``values``; none over a gap or a reset."""
+    out = np.zeros(len(values), dtype=bool)
+    step = np.diff(ms)
+    out[1:] = (values[1:] == values[:-1]).all(axis=1) & (step >= 0) & (step <= gap_ms)
+    return out
+
+
+def _longest(ms: NDArray[np.int64], repeats: Bools) -> int:
+    """Return the longest duration of a run of repeats, counted from the frame that they repeat."""
     return max((int(ms[b] - ms[a - 1]) for a, b in _runs(repeats)), default=0)
 
 

@@ -141,7 +141,7 @@ def test_a_killed_comparison_goes_on_and_ends_the_same(tmp_path: Path) -> None:
 def test_what_is_refused(tmp_path: Path) -> None:
     windows = study()
     one = known(tmp_path)
-    with pytest.raises(ConfigError, match="asked for twice"):
+    with pytest.raises(ConfigError, match="given twice"):
         compare(windows, [one], ["windows:4", "windows:4"])
     with pytest.raises(ConfigError, match="No split"):
         compare(windows, [one], [])
