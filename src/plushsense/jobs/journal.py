@@ -1,7 +1,7 @@
-"""Jobs, and their results on disk, one file for each: a result that is there is not computed again.
+"""Jobs, and a journal of their results on disk, so that a finished job is not computed again.
 
 A job's id is the hash of what it depends on, so that a changed setting is another job. Files are replaced atomically: a
-run that is killed leaves whole results or none.
+run that is killed leaves complete results or none.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class JobEvent(NamedTuple):
     what: Any = None
 
 
-# Gives the next job that is still to be done, None when there is no more; called only when it can start at once.
+# Returns the next job to start, or None when there are no more; called only when the job can start at once.
 Take = Callable[[], Job | None]
 Engine = Iterator[JobEvent]
 
@@ -79,7 +79,7 @@ def portable(error: Exception) -> Exception:
     return error
 
 
-# A result: arrays, and values that JSON can hold.
+# Arrays, and values that JSON can hold.
 Result = Mapping[str, Any]
 
 _JSON = "json"
@@ -93,24 +93,24 @@ def job_id(job: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class Claim:
-    """A run's word that it is at a job. It ends with the process at the latest, however that ends."""
+    """A lock on a job for the process that works on it; it ends with the process at the latest."""
 
     _lock: BaseFileLock | None
 
     def release(self) -> None:
         if self._lock is not None:
-            # Whoever opened the file before it went looks in the journal before it begins.
+            # A process that opened the file before looks in the journal before it begins.
             with suppress(OSError):
                 Path(self._lock.lock_file).unlink(missing_ok=True)
             self._lock.release()
 
 
 class Journal:
-    """A folder of results. It is made with the first result; deleting it forgets them all.
+    """A folder of results, made with the first one; it may be deleted at any time.
 
     Args:
-        writing: makes the context in which anything is written there; it raises PlushSenseError where nothing may be
-            any more. It is pickled with the journal.
+        writing: returns the context in which files are written; entering it raises PlushSenseError when that is no
+            longer allowed. It is pickled with the journal.
     """
 
     def __init__(self, folder: str | Path, writing: Callable[[], AbstractContextManager[object]] = nullcontext) -> None:
@@ -125,7 +125,7 @@ class Journal:
         return self.folder / f"{job}.npz"
 
     def has(self, job: str) -> bool:
-        """Tell whether the job is done: its file is there and whole."""
+        """Return whether the job is done: its file exists and is complete."""
         return self.find(job) is not None
 
     def load(self, job: str) -> dict[str, Any]:
@@ -141,7 +141,7 @@ class Journal:
             with np.load(self.path(job), allow_pickle=False) as file:
                 result = {name: file[name] for name in file.files}
             values = json.loads(result.pop(_JSON).tobytes())
-        # zipfile checks a CRC of every member; what a damaged header raises depends on the byte.
+        # zipfile checks a CRC of every member; the exception for a damaged header depends on the byte.
         except (OSError, EOFError, KeyError, ValueError, NotImplementedError, zipfile.BadZipFile):
             return None
         return result | values if isinstance(values, dict) else None
@@ -149,10 +149,10 @@ class Journal:
     def claim(self, job: str) -> Claim | None:
         """Claim a job for this process; None when another process has it.
 
-        A file system without locks gives it to all.
+        On a file system without locks every process gets the job.
 
         Raises:
-            PlushSenseError: when nothing may be written there any more, so that its result would be lost.
+            PlushSenseError: when the result could not be saved, as nothing may be written any more.
         """
         lock = FileLock(self.folder / f".{job}.lock", timeout=0, thread_local=False)
         try:
@@ -166,11 +166,11 @@ class Journal:
         return Claim(lock)
 
     def save(self, job: str, result: Result) -> None:
-        """Keep the result of a job, whole or not at all. Arrays stay arrays; all else must fit JSON.
+        """Save the result of a job in one step. Arrays stay arrays; other values must fit JSON.
 
         Raises:
             PlushSenseError: when the folder cannot be written to, or nothing may be written there any more;
-            TypeError, ValueError: for what cannot be kept.
+            TypeError, ValueError: for values that cannot be saved.
         """
         arrays = {name: value for name, value in result.items() if isinstance(value, np.ndarray)}
         values = {name: value for name, value in result.items() if name not in arrays}
@@ -181,7 +181,7 @@ class Journal:
                 with replacing_file(self.path(job)) as part, part.open("wb") as file:
                     np.savez(file, allow_pickle=False, **{_JSON: packed}, **arrays)
         except OSError as cause:
-            # Windows refuses to replace a file that is being read: then it is there already.
+            # Windows does not replace a file that is being read: then the result exists already.
             if self.find(job) is None:
                 raise PlushSenseError(
                     f"A result cannot be kept in {self.folder} ({cause.strerror or cause}): make room or the folder "
@@ -189,7 +189,7 @@ class Journal:
                 ) from cause
 
     def prune(self, older_s: float) -> None:
-        """Discard what nobody has touched for so many seconds, also unfinished writes of those that were killed."""
+        """Delete results, and files left by killed processes, that are older than so many seconds."""
         with suppress(OSError):
             for path in [*self.folder.glob("*.npz"), *self.folder.glob(f".*{PART}")]:
                 with suppress(OSError):
@@ -197,7 +197,7 @@ class Journal:
                         path.unlink()
 
     def discard(self, job: str) -> None:
-        """Delete the result of a job, if there is one and it can be removed (Windows: nobody reads it)."""
+        """Delete the result of a job, if there is one; on Windows only if no process reads it."""
         with suppress(OSError):
             self.path(job).unlink()
 
@@ -207,10 +207,10 @@ JOURNAL, UNFINISHED = "sweeps", "unfinished"
 
 
 def keep_if_possible(journal: Journal, job: str, state: Result) -> None:
-    """Keep how far a training is. A full disk is passed over: it costs time if the training is stopped now.
+    """Save the state of a training; without space on the disk it is not saved, which only costs time later.
 
     Raises:
-        ForgottenError: when a person whom it is trained on was taken out of the data set.
+        ForgottenError: when one of its people was removed from the data set.
     """
     try:
         journal.save(job, state)

@@ -1,8 +1,8 @@
-"""A sweep before it runs: the windows, the folds, every trial and every training with its id.
+"""The plan of a sweep (windows, folds, trials and trainings with their ids), its trainings and their scores.
 
-A *trial* is a network with a number of epochs and a batch: a row of the grid. A *training* is what is trained in one
-go, the trials that differ in their epochs only, with one seed on one fold: a `Job` of the journal, whose `Task` says
-what to do. A *run* is a trial's part of one training.
+A *trial* is a network with a number of epochs and a batch: a row of the grid. A *training* covers the trials that
+differ in their epochs only, with one seed on one fold: a `Job` of the journal with a `Task`. A *run* is a trial's part
+of one training.
 """
 
 from __future__ import annotations
@@ -51,11 +51,10 @@ class GridProblems(ConfigError):
 
 @dataclass(frozen=True)
 class Task:
-    """One training of one fold: ``epochs`` are those after which it is scored; ``span`` picks the windows; ``id`` the
-    job's.
+    """One training on one fold, scored after each of ``epochs``; ``span`` selects the windows, ``id`` is the job's.
 
-    ``start`` (a `FitState`) and the ``spent_s`` seconds of training before it change nothing in what comes out;
-    ``stateful``: the result holds its state as well, so that another training can go on from there.
+    ``start`` (a `FitState`), after ``spent_s`` seconds of training, does not change the result. If ``stateful``, the
+    result holds the final state as well, from which another training can continue.
     """
 
     arch: Arch
@@ -70,13 +69,13 @@ class Task:
 
     @property
     def nested(self) -> bool:
-        """Whether the weights after an epoch are what a training of that many epochs ends with."""
+        """Whether the weights after an epoch equal the final weights of a training of that many epochs."""
         return self.spec.patience is None
 
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """One trial with one seed on one fold: which job holds it. ``batch`` in windows."""
+    """One trial with one seed on one fold, and the job that trains it; ``batch`` in windows."""
 
     job: str
     seed: int
@@ -97,7 +96,7 @@ class PlannedTrial:
 
 @dataclass(frozen=True)
 class Plan:
-    """Everything that a sweep will do. Windows are held once for each span that its networks need."""
+    """The trials and trainings of a sweep, with the windows for each span that its networks need."""
 
     grid: GridSpec
     split: Split
@@ -113,63 +112,59 @@ class Plan:
         return job_id({"trials": sorted(t.id for t in self.trials), "runs": sorted(job.id for job in self.jobs)})
 
     def macs(self, job: Job, nested: bool = True) -> int:
-        """Multiply-accumulates of a training, about; ``nested`` False: of its trials one by one."""
+        """Return about how many multiply-accumulates a training takes; ``nested`` False: its trials one by one."""
         task: Task = job.task
         epochs = task.epochs[-1] if nested else sum(task.epochs)
         return PASSES * task.arch.macs_per_window * len(self.folds[task.span][task.fold].train) * epochs
 
 
-def plan(dataset: Dataset, grid: GridSpec, told: Sequence[str] = (), warn: Warn = silent) -> Plan:
+def plan(dataset: Dataset, grid: GridSpec, unreadable: Sequence[str] = (), warn: Warn = silent) -> Plan:
     """Plan a sweep.
 
     Args:
-        told: what was wrong with the grid before (see `load_grid`): said together with the rest.
+        unreadable: problems that were found in reading the grid (see `load_grid`), to be reported with the others.
 
     Raises:
         GridProblems: with all problems of the grid on this data set at once, one a line.
     """
-    return _planned(dataset, grid, _cut(dataset, grid, told, warn))
+    return _planned(dataset, grid, _cut(dataset, grid, unreadable, warn))
 
 
 def plans_by_epochs(
     dataset: Dataset,
     grid: GridSpec,
-    told: Sequence[str] = (),
+    unreadable: Sequence[str] = (),
     warn: Warn = silent,
     fits: Callable[[Arch], bool] = lambda arch: True,
 ) -> list[Plan]:
-    """Return a plan for each number of epochs of a grid, all on the same windows.
+    """Return a plan for each number of epochs of a grid, all on the same windows; see `plan`.
 
-    ``fits``: which networks to plan for; all plans hold the same ones in the same order.
+    ``fits`` returns whether to include a network; all plans hold the same networks in the same order.
     """
-    cut = _cut(dataset, grid, told, warn)
+    cut = _cut(dataset, grid, unreadable, warn)
     return [_planned(dataset, replace(grid, epochs=(epochs,)), cut, fits) for epochs in grid.epochs]
 
 
-def _cut(dataset: Dataset, grid: GridSpec, told: Sequence[str], warn: Warn) -> _Cut:
-    past, found = _past(dataset), list[str]()
-    cut, fewest = None, None
+def _cut(dataset: Dataset, grid: GridSpec, unreadable: Sequence[str], warn: Warn) -> _Cut:
+    rate = dataset.layout.rate_hz
+    # Samples up to the end of each recording, in its stream where it lies in one.
+    reaches = [
+        (max(r.stream_row, 0) + r.stop - r.start) * (rate / r.rate_hz if r.rate_hz > 0 else 1.0) for r in dataset.used
+    ]
+    past = int(median(reaches)) if reaches else 0
+    cut, fewest, found = None, None, list[str]()
     try:
         cut = _Cut.of(dataset, grid, warn)
         fewest = len(cut.windows)
         fewest = min(len(fold.train) for fold in cut.folds())
     except BadInput as cause:
         found.append(first_line(cause))
-    # What is wrong with the grid may also keep windows from being cut, in the same words.
-    found = list(dict.fromkeys([*told, *problems(grid, dataset.layout, past, fewest), *found]))
+    # A problem of the grid may have the same message as the failure to cut windows.
+    found = list(dict.fromkeys([*unreadable, *problems(grid, dataset.layout, past, fewest), *found]))
     if found or cut is None:
         raise GridProblems(found)
     _warn_of_rare(dataset, cut, warn)
     return cut
-
-
-def _past(dataset: Dataset) -> int:
-    """Return the samples that half of the recordings have up to their end, in their stream where they lie in one."""
-    rate = dataset.layout.rate_hz
-    reaches = [
-        (max(r.stream_row, 0) + r.stop - r.start) * (rate / r.rate_hz if r.rate_hz > 0 else 1.0) for r in dataset.used
-    ]
-    return int(median(reaches)) if reaches else 0
 
 
 def _warn_of_rare(dataset: Dataset, cut: _Cut, warn: Warn) -> None:
@@ -177,9 +172,9 @@ def _warn_of_rare(dataset: Dataset, cut: _Cut, warn: Warn) -> None:
         rare = set(cut.gestures.labels) - set(shared_gestures(dataset)[0].labels)
         if rare:
             warn(
-                f"{len(rare)} of the {len(cut.gestures)} classes are no gesture that 90 % of the people share "
-                f"({', '.join(sorted(rare))}): who is tested may be the only one who made them; "
-                "leave them out with --classes shared"
+                f"{len(rare)} of the {len(cut.gestures)} classes are gestures that fewer than 90 % of the people made "
+                f"({', '.join(sorted(rare))}): the tested person may be the only one with a class; leave these classes "
+                "out with --classes shared"
             )
 
 
@@ -196,7 +191,7 @@ class _Cut:
 
     @classmethod
     def of(cls, dataset: Dataset, grid: GridSpec, warn: Warn) -> _Cut:
-        """Cut for a window without more past, which tells of every grid how many windows there are."""
+        """Cut windows without further past, whose number is that of every grid."""
         gestures = choose_classes(dataset, grid.classes, warn)
         window = Arch.parse(
             "1", "1", channels=dataset.layout.n_inputs, padding="mirror", window=dataset.layout.samples(grid.window_s)
@@ -212,7 +207,7 @@ class _Cut:
 
     @property
     def windows(self) -> WindowSet:
-        """Windows without more past."""
+        """Windows without further past."""
         return self.sets[self.window.span]
 
     def folds(self) -> list[Fold]:
@@ -221,7 +216,7 @@ class _Cut:
 
     def at(self, arch: Arch) -> tuple[WindowSet, list[Fold]]:
         """Return the windows that a network needs, and their folds."""
-        # A network that reads no more than a window reads the end of that window.
+        # A network with a span below a window reads the end of that window.
         span = max(arch.span, arch.window)
         if span not in self.sets:
             self.sets[span] = windows_for(self.dataset, arch, self.grid.windows, self.gestures)
@@ -234,7 +229,7 @@ class _Cut:
 def _planned(dataset: Dataset, grid: GridSpec, cut: _Cut, fits: Callable[[Arch], bool] = lambda arch: True) -> Plan:
     from plushsense.training.fit import resolve_device
 
-    # Where it is trained, settled once: it belongs to the id, and every worker must mean the same.
+    # Resolve the device here: it is part of the id and must be the same in every worker.
     spec = resolve_device(grid.training)
     prints: dict[int, tuple[str, list[str]]] = {}
     trials: list[PlannedTrial] = []
@@ -258,27 +253,18 @@ def _planned(dataset: Dataset, grid: GridSpec, cut: _Cut, fits: Callable[[Arch],
                 size = len(fold.train) if batch == FULL else int(batch)
                 task = Task(arch, replace(spec, epochs=training.epochs[-1], batch=size, seed=seed), training.epochs,
                             span, i)  # fmt: skip
-                known = job_id({**base, **_settings(task), "fold": of_folds[i]})
+                known = job_id({**base, "training": task.spec.key(), "epochs": list(task.epochs), "fold": of_folds[i]})
                 jobs[known] = Job(known, replace(task, id=known))
                 runs.append(PlannedRun(known, seed, fold.name, span, i, size))
-        trials += [
-            PlannedTrial(_trial_id(base, trial, spec, of_folds), trial, tuple(runs)) for trial in training.trials
-        ]
+        settings = {k: v for k, v in spec.key().items() if k not in ("seed", "batch", "epochs")}
+        for trial in training.trials:
+            own = {"training": settings, "epochs": trial.epochs, "batch": trial.batch, "folds": of_folds}
+            trials.append(PlannedTrial(job_id({**base, **own}), trial, tuple(runs)))
     sets = {span: windows for span, windows in cut.sets.items() if span in used}
     made = Plan(grid, cut.split, cut.gestures, sets, {s: cut.by_span[s] for s in sets}, tuple(trials), ())
-    # The longest first: at the end only short ones are left, and all workers finish at about the same time.
+    # The longest first, so that all workers finish at about the same time.
     ordered = sorted(jobs.values(), key=made.macs, reverse=True)
     return replace(made, jobs=tuple(ordered))
-
-
-def _settings(task: Task) -> dict[str, Any]:
-    """Return what a training depends on beside its data and network."""
-    return {"training": task.spec.key(), "epochs": list(task.epochs)}
-
-
-def _trial_id(base: dict[str, Any], trial: Trial, spec: TrainSpec, folds: list[str]) -> str:
-    settings = {k: v for k, v in spec.key().items() if k not in ("seed", "batch", "epochs")}
-    return job_id({**base, "training": settings, "epochs": trial.epochs, "batch": trial.batch, "folds": folds})
 
 
 def processes(workers: int, threads: int) -> int:
@@ -288,7 +274,7 @@ def processes(workers: int, threads: int) -> int:
     return workers or max(1, (os.cpu_count() or 1) // threads)
 
 
-# The columns of a training's curve, as its result holds them; the epoch is the row.
+# The columns of a training's curve, which has a row for each epoch.
 CURVE = ("train_loss", "train_accuracy", "validation_loss", "validation_accuracy", "learning_rate")
 
 
@@ -304,7 +290,7 @@ def train_all(
     on_report: Callable[[Job, Any], None] | None = None,
     on_failed: Callable[[Job, Exception], None] | None = None,
 ) -> dict[str, Result]:
-    """Do those ``jobs`` on the windows of a plan that the data set's journal does not hold; as `run_jobs` else."""
+    """Train the ``jobs`` of a plan that the data set's journal does not hold; see `run_jobs`."""
     unfinished = journal_of(dataset, UNFINISHED)
 
     def done(job: Job, result: Result, resumed: bool) -> None:
@@ -313,7 +299,7 @@ def train_all(
 
     return run_jobs(
         jobs,
-        # Nodes of a cluster do not share a disk: there a training is done whole.
+        # Nodes of a cluster may not share a disk, so that they keep no unfinished states.
         TrainAndScore(unfinished if cluster is None else None),
         shared=(planned.sets, planned.folds),
         workers=workers,
@@ -332,9 +318,9 @@ def train_all(
 class TrainAndScore:
     """One training as a job: probabilities of the tested windows after each number of epochs that is scored.
 
-    A training whose loss is no longer a number is no reason to stop the others: it is trained up to the longest that
-    goes well, and says why not further. ``at`` is the epoch whose weights are scored. In ``unfinished`` a long training
-    keeps where it stands, once a minute, and goes on from there.
+    A training that diverges does not stop the others: it is scored after the largest number of epochs that succeeds,
+    and ``failed`` holds the reason for the others. ``at`` is the epoch whose weights are scored. A long training saves
+    its state in ``unfinished`` once a minute, and continues from there after an interruption.
     """
 
     unfinished: Journal | None = None
@@ -373,15 +359,15 @@ class TrainAndScore:
         for epochs in wanted:
             weights = fitted.kept[epochs] if task.nested else fitted.weights
             tested.append(predict(task.arch, weights, fitted.scaler, test, task.spec.device))
-            watched.append(
-                _watched(predict(task.arch, weights, fitted.scaler, validation, task.spec.device), validation)
-            )
+            read = predict(task.arch, weights, fitted.scaler, validation, task.spec.device).argmax(axis=1)
+            counts = metrics.confusion(validation.y, read.astype(np.int64), len(validation.labels))
+            watched.append((metrics.accuracy(counts), metrics.macro_f1(counts)))
         curve = np.array([[row[name] for name in CURVE] for row in fitted.history], dtype=np.float64)
         at = list(wanted) if task.nested else [fitted.best_epoch]
         seconds = task.spent_s + fitted.seconds
         result = _result(wanted, np.stack(tested), watched, at, curve, seconds, failed)
         state = fitted.state if task.stateful and not failed else None
-        # Weights that were scored on the way are of no more use.
+        # The weights that were scored on the way are no longer needed.
         return result if state is None else {**result, **replace(state, kept={}).to_arrays()}
 
 
@@ -406,14 +392,9 @@ def _result(
     }
 
 
-def _watched(probabilities: NDArray[Any], windows: WindowSet) -> tuple[float, float]:
-    counts = metrics.confusion(windows.y, np.argmax(probabilities, axis=1).astype(np.int64), len(windows.labels))
-    return metrics.accuracy(counts), metrics.macro_f1(counts)
-
-
 @dataclass(frozen=True)
 class Scored:
-    """A trial's part of one training: its figures, and confusions of all windows that were tested."""
+    """A trial's part of one training: its scores, and the confusion matrix of all tested windows."""
 
     figures: dict[str, float | None]
     counts: Counts
@@ -423,7 +404,7 @@ class Scored:
 
 @dataclass(frozen=True)
 class TrainingOutcome:
-    """Outcome of one training of a sweep: a score for each number of epochs, its curve, and what went wrong."""
+    """Outcome of one training: scores by number of epochs, the curve, and the reason for each number that failed."""
 
     scored: dict[int, Scored]
     curve: NDArray[np.float64]
@@ -432,7 +413,7 @@ class TrainingOutcome:
 
 
 def outcome(plan: Plan, run: PlannedRun, result: Mapping[str, Any]) -> TrainingOutcome:
-    """Score one training's probabilities. Where people are kept apart, the toy at rest with nobody is not counted."""
+    """Score the probabilities of a training; in splits by person, recordings of nobody do not count."""
     windows, fold = plan.sets[run.span], plan.folds[run.span][run.fold_index]
     truth, classes = windows.y[fold.test], len(windows.labels)
     counted = windows.subject[fold.test] != NOBODY if plan.split.apart else np.ones(len(truth), dtype=np.bool_)
@@ -447,7 +428,7 @@ def outcome(plan: Plan, run: PlannedRun, result: Mapping[str, Any]) -> TrainingO
             "validation_macro_f1": float(f1),
             "train_loss": float(result["curve"][result["at"][i] - 1, 0]),
         }
-        # A training that contains others is paid for once: each number of epochs its own stretch.
+        # The time of a training is shared among its trials, so that their sum is the time of the training.
         share = seconds * (epochs - before) / result["epochs"][-1]
         before = epochs
         scored[epochs] = Scored(
