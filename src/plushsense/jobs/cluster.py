@@ -22,7 +22,7 @@ from plushsense.jobs.journal import Engine, Job, JobEvent, Take, portable, threa
 
 # How often a task whose process or node was lost is started again.
 _RETRIES = 3
-# Tasks sent beyond those that can run at once, so that no processor waits for the next.
+# Tasks sent beyond those that can run at once, so that no processor waits.
 _SPARE = 2
 _LOOK_S = 0.5
 _ANSWER_S = 4.0
@@ -52,13 +52,13 @@ def on_cluster(take: Take, work_and_shared: tuple[Any, Any], address: str, *, th
 
 @contextmanager
 def _connected(ray: Any, address: str) -> Iterator[None]:
-    """Connect to the cluster for the time of the context; an existing connection is used and kept open."""
+    """Connect to the cluster during the context; an existing connection is used and kept open."""
     if ray.is_initialized():
         yield
         return
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     if address == "local":
-        # Some 100 MB a processor would do; Ray would take a third of the memory.
+        # By default Ray takes a third of the memory; about 100 MB for each processor suffice.
         quiet |= {"include_dashboard": False, "object_store_memory": 200 * 2**20}
     else:
         _knock(address)
@@ -66,7 +66,7 @@ def _connected(ray: Any, address: str) -> Iterator[None]:
         ray.init(address, **quiet)
     except (Exception, SystemExit) as cause:
         raise _no_connection(address, cause) from cause
-    # Ray prints pages on standard output when a node is lost, whatever its settings for logs.
+    # Ray prints long messages on standard output when a node is lost, whatever its settings for logs.
     inner: Any = need("ray._private.worker", extra="cluster")
     loud = getattr(inner, "print_to_stdstream", None)
     inner.print_to_stdstream = lambda *_, **__: None
@@ -79,7 +79,7 @@ def _connected(ray: Any, address: str) -> Iterator[None]:
 
 
 def _knock(address: str) -> None:
-    """Refuse an address where nothing answers: Ray itself would try for a minute."""
+    """Refuse an address where nothing answers; Ray itself would try for a minute."""
     if address == "auto" or os.environ.get("RAY_USE_TLS") == "1":
         return
     found = re.fullmatch(r"(?:ray://)?(?:\[([^]]+)\]|([^:/\s\[\]]+)):(\d{1,5})", address)
@@ -113,7 +113,7 @@ def _no_connection(address: str, cause: BaseException) -> PlushSenseError:
         reason = cause.strerror
     return ConfigError(
         f"No cluster can be reached at '{address}' ({_first_line(reason)}): start one with  ray start --head  and give "
-        "the address that it prints; from a machine that is no node of it give ray://HOST:10001."
+        "the address that it prints; from a machine outside the cluster give ray://HOST:10001."
     )
 
 
@@ -125,8 +125,8 @@ def _conduct(ray: Any, take: Take, work_and_shared: tuple[Any, Any], threads: in
     if _slots(ray, threads, gpus) == 0:
         resources = f"{threads} processors" + (f" and {gpus:g} graphics processors" if gpus else "")
         raise ConfigError(f"No node of the cluster has {resources}, which each job asks for: give fewer threads.")
-    # Ray's own pickle also carries what a script defines itself. Packed once; a process unpacks it once and may write
-    # in it, as in the pool (what Ray would unpack is read-only).
+    # Ray's pickle also includes what a script defines itself. It is packed once; each process unpacks it once and may
+    # write to it, as in the pool (an object that Ray unpacks is read-only).
     packed = ray.put(ray.cloudpickle.dumps(work_and_shared))
     run = secrets.token_hex(8)
     board = ray.remote(_Board).options(num_cpus=0, max_restarts=-1, **_beside(ray)).remote()
@@ -191,7 +191,7 @@ def _messages(ray: Any, pending: Any, out: dict[Any, Job]) -> Iterator[JobEvent]
         return
     at = {job.id: job for job in out.values()}
     for job, kind, packed in messages:
-        # A report of a job that is done meanwhile is dropped.
+        # A report of a job that has finished in the meantime is dropped.
         if job in at:
             with suppress(Exception):
                 yield JobEvent(at[job], kind, pickle.loads(packed))
@@ -230,7 +230,7 @@ def _unfit(reason: str) -> PlushSenseError:
 
 
 class _Board:
-    """The messages since the driver last asked: which jobs started, and the latest report of each."""
+    """The messages since the driver's last request: the jobs that started, and the latest report of each job."""
 
     def __init__(self) -> None:
         self._begun: list[str] = []
@@ -250,12 +250,12 @@ class _Board:
         return messages
 
 
-# What this process unpacked last: (of which run, work, shared).
+# The last unpacked (run, work, shared) of this process.
 _unpacked: tuple[str, Any, Any] | None = None
 
 
 def _task(run: str, expected: str, packed: list[Any], board: Any, job: str, task: Any) -> tuple[str, bytes]:
-    """Run one job on a node: ("done", result), ("failed", exception) or ("lost", why no job can run here)."""
+    """Run one job on a node; return ("done", result), ("failed", exception) or ("lost", why no job can run here)."""
     global _unpacked
     ray = need("ray", extra="cluster")
     if expected != _version():

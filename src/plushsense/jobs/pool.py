@@ -1,7 +1,7 @@
-"""Jobs in several processes of this machine, each started fresh (the same on every system).
+"""Run jobs in several processes of this machine, spawned alike on every system.
 
-A worker writes its result to the journal before it reports it, so that a run killed at any moment continues from
-there. A worker whose parent is gone ends at its next message. One that dies is replaced and its job is tried again.
+A worker writes its result to the journal before it reports it, so that a run killed at any moment can be continued. A
+worker whose parent has ended ends at its next message. One that dies is replaced, and its job is tried again.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from plushsense.jobs.journal import (
 
 __all__ = ["Job", "JobWork", "Report", "run_jobs"]
 
-# How often a job is started in all when its worker dies.
+# Number of times that a job is started if its worker dies.
 _TRIES = 2
 
 
@@ -60,24 +60,24 @@ def run_jobs(
     """Run every job that the journal does not hold yet. Every callback is called in the caller's thread.
 
     Args:
-        shared: given to every job, and sent to each process once. A job must leave it as it is.
-        workers: processes at a time; 1 works in this one. A cluster does as many as its processors hold.
-        threads: that each process computes on; has no effect on this one (``workers=1``).
-        cluster: do the jobs as Ray tasks there: "auto", "host:6379", "ray://host:10001", or "local" to start Ray here.
-        gpus: of a cluster, the share of a graphics processor that each job takes.
-        on_start: called with the job when it is begun; twice for one whose process or node was lost.
-        on_report: called with (job, what its work reported); on a cluster some reports may be left out.
+        shared: passed to every job, and sent to each process once. A job must not change it.
+        workers: processes at a time; 1 runs the jobs in this process. A cluster runs as many as it has processors for.
+        threads: number for each process; has no effect on this one (``workers=1``).
+        cluster: run the jobs as Ray tasks: "auto", "host:6379", "ray://host:10001", or "local" to start Ray here.
+        gpus: share of a graphics processor that each job of a cluster takes.
+        on_start: called with each job that starts; twice if its process or node was lost.
+        on_report: called with (job, message of its work); a cluster may leave out messages.
         on_done: called with (job, result, whether it came from the journal), in the order of completion.
-        on_failed: called with (job, the exception that it raised); the other jobs go on, and this one is in neither
-            the journal nor the answer. Without it the first failure ends the run.
+        on_failed: called with (job, its exception), and the other jobs continue; the job is in neither the journal nor
+            the returned results. By default the first failure ends the run.
 
     Returns:
         the result of each job by its id.
 
     Raises:
-        PlushSenseError: what the work raised, as itself; or a process that died twice at the same job; a result that
-            cannot be kept; a cluster that does not answer. Finished jobs are kept.
-        KeyboardInterrupt: on Ctrl-C, after the workers have been ended. Finished jobs are kept.
+        PlushSenseError: an exception of the work; a process that died twice at the same job; a result that cannot be
+            saved; a cluster that does not answer. Finished jobs are kept.
+        KeyboardInterrupt: on Ctrl-C, after the workers have ended. Finished jobs are kept.
     """
     if workers < 1:
         raise ConfigError(f"{workers} workers cannot do anything: give 1 or more.")
@@ -102,11 +102,11 @@ def run_jobs(
         elif workers == 1:
             engine = _here(left.take, work, shared, on_report)
         else:
-            # Also for a single job: what it computes may depend on the threads of its process.
+            # Also for a single job, whose result may depend on the number of threads.
             setup = pickle.dumps((work, shared, journal))
             engine = in_processes(left.take, setup, min(workers, len(left.jobs)), threads)
         saved = cluster is None and workers > 1
-        # Closed at once, not when it is collected: an engine ends its processes.
+        # Closed explicitly, as an engine ends its processes then.
         with closing(engine):  # type: ignore[type-var]
             for job, kind, what in engine:
                 if kind == "started" and on_start is not None:
@@ -144,7 +144,7 @@ def _here(take: Take, work: JobWork, shared: Any, on_report: Callable[[Job, Any]
 
 
 class _Left:
-    """The jobs still to be handed out, and the claims on those that are."""
+    """The jobs that have not been started, and the claims on those that have."""
 
     def __init__(
         self,
@@ -163,7 +163,7 @@ class _Left:
                 self.jobs.append(job)
 
     def take(self) -> Job | None:
-        """Return the next job that is neither done nor claimed; when others claimed all that are left, one of these."""
+        """Return the next job that is neither done nor claimed, or else one that another process has claimed."""
         elsewhere: deque[Job] = deque()
         try:
             while self.jobs:
@@ -172,7 +172,7 @@ class _Left:
                 if self._journal is not None and claim is None:
                     elsewhere.append(job)
                     continue
-                # Checked again after the claim: the process that had it before may have done the job.
+                # Check again after the claim, as another process may have finished the job.
                 if self._found(job):
                     if claim is not None:
                         claim.release()
@@ -182,7 +182,7 @@ class _Left:
                 return job
             while elsewhere:
                 job = elsewhere.popleft()
-                # Not waited for: the other run may take long, may stop, and the result is the same.
+                # Do not wait for the other process: it may take long or stop, and the result is the same.
                 if not self._found(job):
                     return job
             return None
@@ -208,7 +208,7 @@ class _Left:
 
 @dataclass
 class _Worker:
-    """A process, the pipe to it, and its current job; it is ready once it has read what all jobs share."""
+    """A process, the pipe to it, and its current job; ``ready`` once it has read the shared data."""
 
     process: BaseProcess
     pipe: Connection
@@ -217,13 +217,13 @@ class _Worker:
 
 
 def in_processes(take: Take, setup: bytes, workers: int, threads: int) -> Engine:
-    """Run the jobs that ``take`` gives in so many processes, each on so many threads.
+    """Run the jobs that ``take`` returns in so many processes, each with so many threads.
 
     Args:
         setup: the pickled (work, shared, journal or None).
 
     Raises:
-        PlushSenseError: a worker that dies before it can begin, or a result that cannot be kept.
+        PlushSenseError: a worker that dies before it can begin, or a result that cannot be saved.
     """
     pool: list[_Worker] = []
     try:
@@ -249,14 +249,14 @@ def _start(threads: int) -> _Worker:
     process = spawn.Process(target=_serve, args=(there,), daemon=True)
     with _inherited(threads):
         process.start()
-    # Only the worker may hold its end: then each side notices when the other is gone.
+    # Close this copy of the worker's end, so that each side notices when the other ends.
     there.close()
     return _Worker(process, here)
 
 
 @contextmanager
 def _inherited(threads: int) -> Iterator[None]:
-    """Set what a process started in this context inherits: its number of threads, and that it ignores Ctrl-C."""
+    """Let processes started in this context inherit their number of threads, and ignore Ctrl-C."""
     settings = thread_settings(threads)
     before = {name: os.environ.get(name) for name in settings}
     # Only the main thread may set a signal's handler.
@@ -275,7 +275,7 @@ def _inherited(threads: int) -> Iterator[None]:
 
 
 def _conduct(pool: list[_Worker], take: Take, setup: bytes, threads: int) -> Engine:
-    """Hand out the jobs and pass on what comes back, until nothing is left and nobody is busy."""
+    """Send jobs to the workers and yield their messages, until no job is left and no worker is busy."""
     again: list[Job] = []
     tries: Counter[str] = Counter()
     finished = False
@@ -299,16 +299,25 @@ def _conduct(pool: list[_Worker], take: Take, setup: bytes, threads: int) -> Eng
                 kind, message = worker.pipe.recv()
             except (EOFError, OSError):
                 worker.process.join(5)
+                code = worker.process.exitcode
                 if job is None or not worker.ready:
-                    raise _stillborn(worker.process.exitcode) from None
+                    raise PlushSenseError(
+                        f"A worker process ended unexpectedly while it started (exit code {code}), perhaps for lack of "
+                        "memory: run again, finished jobs are kept; try fewer workers. In a script of your own, more "
+                        "than one worker needs the code under  if __name__ == '__main__':"
+                    ) from None
                 worker.pipe.close()
-                # In the same place, so that whoever ends the pool ends this one too.
+                # In the same place of the pool, so that it is ended with the pool.
                 pool[pool.index(worker)] = replaced = _start(threads)
                 _send(replaced, setup)
                 if tries[job.id] < _TRIES:
                     again.append(job)
                 else:
-                    yield JobEvent(job, "failed", _gone(worker.process.exitcode))
+                    given_up = PlushSenseError(
+                        f"This job was given up: the worker process at it ended unexpectedly {_TRIES} times (exit code "
+                        f"{code}), perhaps for lack of memory: run again, finished jobs are kept; try fewer workers."
+                    )
+                    yield JobEvent(job, "failed", given_up)
                 continue
             if kind == "ready":
                 worker.ready = True
@@ -322,29 +331,14 @@ def _conduct(pool: list[_Worker], take: Take, setup: bytes, threads: int) -> Eng
 
 
 def _send(worker: _Worker, message: Any) -> None:
-    # Reading from the pipe shows that the worker is gone.
+    # If the worker has ended, reading from the pipe will show it.
     with suppress(OSError):
         worker.pipe.send(message)
 
 
-def _stillborn(code: int | None) -> PlushSenseError:
-    return PlushSenseError(
-        f"A worker process ended unexpectedly while it started (exit code {code}), perhaps for lack of memory: "
-        "run again, finished jobs are kept; try fewer workers. In a script of your own, more than one worker needs "
-        "the code under  if __name__ == '__main__':"
-    )
-
-
-def _gone(code: int | None) -> PlushSenseError:
-    return PlushSenseError(
-        f"This job was given up: the worker process at it ended unexpectedly {_TRIES} times (exit code {code}), "
-        "perhaps for lack of memory: run again, finished jobs are kept; try fewer workers."
-    )
-
-
 def _serve(pipe: Connection) -> None:
-    """Run jobs in a worker until it is sent None or the other side is gone."""
-    # Ctrl-C reaches every process of the terminal: the parent decides.
+    """Run jobs in a worker until it is sent None or the parent ends."""
+    # Ctrl-C reaches every process of the terminal; the parent handles it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     journal: Journal | None
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):

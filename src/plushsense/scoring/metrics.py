@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 
 
 def confidences(logits: ArrayLike, smoothed: ArrayLike, highest: ArrayLike, sure: float) -> dict[str, Floats]:
-    """Return the confidences that are compared, (n,) each.
+    """Return several confidences of n answers, (n,) each.
 
     Args:
         logits: (n, K) of the step itself.
@@ -68,7 +68,7 @@ class RiskCoverage:
 
 
 def risk_coverage(confidence: ArrayLike, right: ArrayLike) -> RiskCoverage:
-    """Compute risk against coverage of answers ``right`` (n,) or not.
+    """Compute the risk-coverage curve of n answers from their confidence and whether each is ``right``.
 
     The area is the mean of the risk over the coverages 1/n to 1 (Geifman, Uziel and El-Yaniv 2019).
     """
@@ -275,11 +275,9 @@ def _mean(values: NDArray[np.float64]) -> float:
 
 
 def pareto_front(rows: Sequence[tuple[float, ...]]) -> list[bool]:
-    """Tell for each row (score, cost, cost, …) whether it is on the Pareto front.
+    """Return for each row (score, cost, cost, …) whether it is on the Pareto front.
 
-    No other row is at least as good in all and better in one.
-
-    Equal rows do not beat each other: both stay.
+    A row is on it if no other is at least as good in every value and better in one. Equal rows are both on it.
     """
 
     def beats(a: tuple[float, ...], b: tuple[float, ...]) -> bool:

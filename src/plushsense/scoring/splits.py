@@ -1,8 +1,7 @@
 """Splits of recordings (or, leaky, windows) into training, validation and test: functions on arrays.
 
-A unit is a recording, in splits over windows a window. A split by subject keeps whole people apart: those tested, those
-who validate (they decide when training stops), those trained on. Units of nobody (subject "none": the toy at rest) are
-spread over the folds.
+A unit is a recording, or a window in splits over windows. A split by subject keeps test, validation (which decides when
+training stops) and training people apart. Units of nobody (subject "none": the toy at rest) are spread over the folds.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ HOLDOUT_SHARE = 0.15
 class Fold:
     """One fold: three disjoint index arrays into the units, each in ascending order.
 
-    ``subjects`` are the people tested (without nobody); where people are not kept apart they also train.
+    ``subjects`` are the test people (without nobody); unless people are kept apart, they are also trained on.
     """
 
     name: str
@@ -56,7 +55,7 @@ class Split:
 
     @property
     def leaky(self) -> bool:
-        """True if windows of one recording, which overlap, can be on both sides."""
+        """Whether windows of one recording, which overlap, can be on both sides."""
         return self.kind == "windows"
 
     @property
@@ -66,7 +65,7 @@ class Split:
 
     @property
     def apart(self) -> bool:
-        """True if nobody is both tested and trained on."""
+        """Whether no person is both tested and trained on."""
         return self.kind in ("leave-one-subject-out", "by-subject")
 
 
@@ -77,7 +76,7 @@ def parse_split(text: str) -> Split:
     """Return the split of a name.
 
     Raises:
-        ConfigError: quoting the string, with the accepted forms and the nearest of them.
+        ConfigError: for an unknown name, with the accepted forms and the nearest of them.
     """
     kind, colon, number = text.strip().partition(":")
     if kind == "leave-one-subject-out" and not colon:
@@ -97,12 +96,14 @@ def make_folds(split: Split, subject: NDArray[np.str_], label: Index, seed: int 
     """Return the folds of ``split`` over units of these people and classes, both (n,); equal seeds give equal folds.
 
     Raises:
-        BadInput: when there are too few people or units, or people whom nobody named, for the split.
+        BadInput: when there are too few people or units for the split, or units of unknown people.
     """
     if len(subject) != len(label):
         raise BadInput(f"A split needs one class for each unit: got {len(subject)} people and {len(label)} classes.")
     if split.kind == "leave-one-subject-out":
-        return leave_one_subject_out(subject, seed)
+        people = _people(subject, split.kind, 3)
+        # In the order of their codes; 15 % of the others, at least one, validate.
+        return _by_people(subject, [(person,) for person in people], people, seed)
     if split.kind == "by-subject":
         return by_subject(subject, split.k or 5, seed)
     if split.kind == "by-recording":
@@ -110,12 +111,6 @@ def make_folds(split: Split, subject: NDArray[np.str_], label: Index, seed: int 
     if split.k is None:
         return holdout(subject, label, seed)
     return windows(subject, label, split.k, seed)
-
-
-def leave_one_subject_out(subject: NDArray[np.str_], seed: int = 0) -> list[Fold]:
-    """Test each person once, in the order of their codes; 15 % of the others, at least one, validate."""
-    people = _people(subject, "leave-one-subject-out", 3)
-    return _by_people(subject, [(person,) for person in people], people, seed)
 
 
 def by_subject(subject: NDArray[np.str_], k: int, seed: int = 0) -> list[Fold]:
@@ -154,7 +149,7 @@ def holdout(subject: NDArray[np.str_], label: Index, seed: int = 0) -> list[Fold
 def purge(
     stream: NDArray[np.str_], rows: Index, tested_stream: NDArray[np.str_], tested_rows: Index
 ) -> NDArray[np.bool_]:
-    """Tell which windows (n,) may be trained on: those whose stream rows touch no tested recording.
+    """Return which windows (n,) may be trained on: those whose stream rows touch no tested recording.
 
     Args:
         stream, rows: stream id (n,) and rows (n, 2), the last exclusive, of each window; "" or −1: none.
@@ -230,6 +225,6 @@ def _stratified_share(units: Index, label: Index, share: float, rng: np.random.G
     """Draw about ``share`` of ``units``, at least one, evenly over classes; ascending."""
     order = units[np.lexsort((rng.random(len(units)), label[units]))]
     count = max(1, round(share * len(units)))
-    # Evenly spaced in class order from a random offset: each class gives its share to within one.
+    # Evenly spaced in class order from a random offset, so that each class gives its share to within one.
     places = (np.arange(count) + rng.random()) * len(units) / count
     return np.sort(order[places.astype(np.int64)])

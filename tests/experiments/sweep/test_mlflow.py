@@ -32,7 +32,7 @@ def test_each_finished_trial_is_logged_once(tmp_path: Path, mlflow_here: None) -
     import mlflow
 
     client = mlflow.MlflowClient(tracking_uri=first["uri"])
-    experiment = client.get_experiment_by_name(first.experiment)
+    experiment = client.get_experiment_by_name(first["experiment"])
     last = whole["trial"][0]
     half = client.create_run(experiment.experiment_id, tags={TRIAL: last})
     grown = export_trials(read_sweep(folder), tmp_path / "store")

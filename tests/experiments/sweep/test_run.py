@@ -220,13 +220,13 @@ def test_a_grid_in_another_order_is_the_same_sweep(dataset: Dataset, tmp_path: P
 def test_of_equals_on_validation_the_test_part_does_not_choose(
     dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = sweep_tables.trial_row
+    real = sweep_tables.Tables._row
 
     def alike(*given: Any) -> dict[str, Any]:
         row = real(*given)
         return row | {"validation_macro_f1": 0.5, "accuracy": row["parameters"] / 1e6}
 
-    monkeypatch.setattr(sweep_tables, "trial_row", alike)
+    monkeypatch.setattr(sweep_tables.Tables, "_row", alike)
     summary = sweep(dataset, epochs=(1,), out=tmp_path, **SMALL).summary
     smallest = min(row["parameters"] for row in summary["best"])
     assert summary["best"][0]["parameters"] > smallest
