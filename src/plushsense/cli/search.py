@@ -44,7 +44,9 @@ def add(parser: argparse.ArgumentParser) -> None:
         metavar="X",
         help="largest share of the cost of the whole grid (0.25; more if only few networks fit)",
     )
-    parser.add_argument("--eta", type=float, metavar="X", help="one in X continues after each rung, if the cost allows (2)")
+    parser.add_argument(
+        "--eta", type=float, metavar="X", help="one in X continues after each rung, if the cost allows (2)"
+    )
     defaults = {"batches": "64", "padding": "stream", "norm": "batch", "context": "stream", "classes": "shared"}
     add_grid(parser, {**defaults, "device": "auto", "seeds": "1"})
     default = "DATASET/evaluations/search-GRID-…"
@@ -136,12 +138,12 @@ def lines(s: dict[str, Any]) -> list[str]:
     )
     out.append(
         f"\nBest: {best['arch']} with {best['filters']}, macro-F1 {figure(best['macro_f1'])}{mark} over "
-        f"{best['folds']} folds. It is the best of {s['chosen_among']} on these people, so its score is slightly too high."
+        f"{best['folds']} folds. It is the best of {s['chosen_among']} on these people: slightly too high."
     )
     small = s["smallest_equal"]
     if small["trial"] != best["trial"]:
         out.append(
-            f"Smallest within one standard error of it: {small['arch']} with {small['filters']}, {small['parameters']:,} "
+            f"Smallest within one standard error: {small['arch']} with {small['filters']}, {small['parameters']:,} "
             f"parameters, macro-F1 {figure(small['macro_f1'])}{mark}."
         )
     out.append(
