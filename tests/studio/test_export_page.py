@@ -76,8 +76,8 @@ def test_export_verify_and_break(
     only(page, "cortex-m4")
     marked(page, "verify").click()
     page.get_by_text("plush_model.c in").first.wait_for(timeout=90_000)
-    assert "is not what this PlushSense writes" in marked(page, "ended").inner_text()
-    marked(page, "proof").get_by_text("More choices").click()
+    assert "is not what this version of PlushSense writes" in marked(page, "ended").inner_text()
+    marked(page, "proof").get_by_text("More settings").click()
     marked(page, "trust").click()
     marked(page, "verify").click()
     page.get_by_text("✗ not equal").first.wait_for(timeout=90_000)
@@ -88,7 +88,7 @@ def test_export_verify_and_break(
 
     # What takes minutes is still there after a reload, for another browser too, and can be stopped.
     only(page, "cortex-m4")
-    marked(page, "proof").get_by_text("More choices").click()
+    marked(page, "proof").get_by_text("More settings").click()
     marked(page, "faults").click()
     flip(home / "exports" / "one" / "plush_model.c")
     marked(page, "verify").click()
@@ -152,5 +152,5 @@ def test_each_refusal_is_a_sentence(studio: Fixture, look: Fixture, shots: Fixtu
 
 def test_an_empty_studio_says_what_to_do(studio: Fixture, look: Fixture) -> None:
     page = look(dark=True).open(f"{studio().url}/export")
-    assert "train one first" in marked(page, "no-bundle").inner_text()
+    assert "Train one first" in marked(page, "no-bundle").inner_text()
     assert axe(page) == []

@@ -50,7 +50,7 @@ def test_from_nothing_to_a_data_set_by_one_click(studio: Fixture, look: Fixture,
     assert "Simulation" in row.inner_text()
     assert "virtual://?person=7" in marked(page, "chosen").inner_text()
     row.get_by_role("button", name="Check").click()
-    row.get_by_text("Checked: to decide").wait_for(timeout=LONG_MS)
+    row.get_by_text("Checked:").wait_for(timeout=LONG_MS)
     assert axe(page) == []
     with page.expect_navigation():
         row.get_by_role("link", name="Review").click()
@@ -77,7 +77,7 @@ def test_sessions_become_a_data_set_and_what_is_new_is_added(studio: Fixture, lo
     url = studio().url
     browser = look(TABLET)
     page = browser.open(url)
-    assert "Sessions that are in no data set yet: 1" in marked(page, "next-sentence").inner_text()
+    assert "Some sessions are not in a data set yet: 1" in marked(page, "next-sentence").inner_text()
     marked(page, "next-button").click()
     marked(page, "make").click()
     marked(page, "message").get_by_text("cannot be a name").wait_for()
@@ -89,7 +89,7 @@ def test_sessions_become_a_data_set_and_what_is_new_is_added(studio: Fixture, lo
     marked(page, "make").click()
     marked(page, "dataset").get_by_text("recordings: 4").wait_for()
     assert marked(page, "message").count() == 0
-    marked(page, "sessions").get_by_text("in the data set “autumn”").wait_for()
+    marked(page, "sessions").get_by_text("in the data sets “autumn”").wait_for()
     record(workspace, "S02")
     page.reload()
     marked(page, "add").click()
@@ -109,7 +109,7 @@ def test_the_toy_is_chosen_and_tested(studio: Fixture, look: Fixture) -> None:
     page = browser.open(one.url)
     page.get_by_text("Looking for toys").wait_for(state="detached")
     assert "No toy is chosen yet." in marked(page, "toy").inner_text()
-    page.get_by_role("combobox", name="Person at the virtual toy").click()
+    page.get_by_role("combobox", name="Person who uses the virtual toy").click()
     page.get_by_role("option", name="Person 12").click()
     marked(page, "virtual").click()
     marked(page, "chosen").get_by_text("virtual://?person=12").wait_for()
@@ -148,7 +148,7 @@ def test_recordings_come_in_as_a_zip(studio: Fixture, look: Fixture, tmp_path: P
     with zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("P01/Tail pull_1700000000000_300.csv", b"0" * 20_000_000)
         archive.writestr("../../outside.csv", b"1")
-    page.get_by_role("combobox", name="Layout of the toy").click()
+    page.get_by_role("combobox", name="Sensor layout of the toy").click()
     page.get_by_role("option", name="plush-15").click()
     send(page, "bomb.zip", bomb.getvalue())
     marked(page, "job-refused").get_by_text("holds no recording").wait_for()
@@ -172,7 +172,7 @@ def test_the_button_opens_the_file_chooser(studio: Fixture, look: Fixture, furni
     with page.expect_file_chooser() as choosing:
         page.get_by_role("button", name="Choose a .zip or .plush file").click()
     choosing.value.set_files(furniture / "bundles" / "little.plush")
-    marked(page, "message").get_by_text("is here").wait_for()
+    marked(page, "message").get_by_text("is added").wait_for()
     assert [p.name for p in (tmp_path / "home" / "bundles").iterdir()] == ["little.plush"]
     assert browser.complaints == []
 
@@ -192,7 +192,7 @@ def test_a_bundle_comes_in(studio: Fixture, look: Fixture, furniture: Path, tmp_
     send(page, "bad.plush", b"nothing")
     page.get_by_role("alert").get_by_text("bad.plush").wait_for()
     send(page, "../../good one!.plush", (furniture / "bundles" / "little.plush").read_bytes())
-    marked(page, "message").get_by_text("is here").wait_for()
+    marked(page, "message").get_by_text("is added").wait_for()
     assert "gestures: 18" in marked(page, "bundle").inner_text()
     assert [p.name for p in (tmp_path / "home" / "bundles").iterdir()] == ["good one.plush"]
     marked(page, "next-sentence").get_by_text("is trained").wait_for()
@@ -230,7 +230,7 @@ def test_everything_is_within_reach_of_the_keyboard(what: str, studio: Fixture, 
                 ".trim())(document.activeElement)"
             )
         )
-    assert reached[0] == "To the content"
+    assert reached[0] == "Skip to the content"
     if what == "pages":
         assert reached[1:8] == ["Home", "Record", "Review", "Train", "Live", "Export", "Publish"]
     else:

@@ -79,9 +79,11 @@ def test_what_the_toy_feels_is_seen(studio: Fixture, look: Fixture, shots: Fixtu
     row = marked(page, "events").locator("li[data-id]").last
     assert row.locator(".lv-badge").inner_text().split()[1] == row.get_attribute("data-affect")
     assert "%" in marked(page, "network").inner_text()
-    assert "The gate says" in marked(page, "gate").inner_text()
+    assert "Answer of the gate" in marked(page, "gate").inner_text()
     marked(page, "latency").get_by_text("to this page").wait_for()
-    assert page.locator('[data-test="signals"] canvas').get_attribute("aria-label").startswith("The toy's 13 signals")
+    assert (
+        page.locator('[data-test="signals"] canvas').get_attribute("aria-label").startswith("The 13 signals of the toy")
+    )
     assert page.locator('[data-test="now"] [aria-live="polite"]').count() == 1
     assert axe(page) == []
     shots(page, "live-en-light")
@@ -129,13 +131,13 @@ def test_another_bundle_while_it_runs_and_one_that_does_not_fit(studio: Fixture,
         "Tail pull",
     ]
     marked(page, "state").get_by_text("Reading").wait_for()
-    choose(page, "Computed", "as the chip does (int8)")
+    choose(page, "Arithmetic", "as on the chip (int8)")
     marked(page, "message").get_by_text("calibration").wait_for()
     choose(page, "Network", "little")
     marked(page, "bars").locator("li").nth(17).wait_for()
-    choose(page, "Computed", "as the chip does (int8)")
+    choose(page, "Arithmetic", "as on the chip (int8)")
     page.wait_for_function("(n) => window.plushsenseLive.scenes > n + 2", arg=scenes)
-    choose(page, "The toy's reactions", "none")
+    choose(page, "Reactions of the toy", "none")
     marked(page, "state").get_by_text("Reading").wait_for()
     assert browser.complaints == []
 
@@ -229,12 +231,12 @@ def test_a_hard_case_is_kept_labelled_and_in_the_data_set(
     page = started(browser, url)
     page.wait_for_function("() => window.plushsenseLive.samples > 1000")
     marked(page, "keep").click()
-    marked(page, "message").get_by_text("First say whose touch this is").wait_for()
-    page.wait_for_function("document.activeElement.getAttribute('aria-label') === \"The person's code\"")
+    marked(page, "message").get_by_text("First enter the code of the person").wait_for()
+    page.wait_for_function("document.activeElement.getAttribute('aria-label') === \"Code of the person\"")
     page.keyboard.type("Anna")
     marked(page, "keep").click()
     marked(page, "message").get_by_text("no code for a person").wait_for()
-    page.get_by_label("The person's code").fill("S77")
+    page.get_by_label("Code of the person").fill("S77")
     marked(page, "keep").click()
     page.get_by_role("button", name="Open S77/live-1").click()
     over = marked(page, "clip-plot").locator(".u-over")
@@ -260,7 +262,7 @@ def test_a_hard_case_is_kept_labelled_and_in_the_data_set(
     first, last = (int(np.abs(seconds - s).argmin()) for s in (begin, end))
     marked(page, "clip-rows").get_by_text(f"{last + 1 - first} samples").wait_for()
     marked(page, "clip-label").click()
-    marked(page, "message").get_by_text("Say which gesture").wait_for()
+    marked(page, "message").get_by_text("First choose the gesture").wait_for()
     gesture = page.get_by_role("combobox", name="Gesture (choose, or type a new one and press Enter)")
     gesture.click()
     page.get_by_role("option", name="Tail hit 1", exact=True).click()
@@ -271,7 +273,7 @@ def test_a_hard_case_is_kept_labelled_and_in_the_data_set(
     shots(page, "live-clip")
     marked(page, "clip-add").click()
     marked(page, "message").get_by_text("1 new recordings").wait_for()
-    marked(page, "clip-S77/live-1").get_by_text("in the data set virtual").wait_for()
+    marked(page, "clip-S77/live-1").get_by_text("in the data sets virtual").wait_for()
     there = open_dataset(home / "datasets" / "virtual")
     (made,) = [r for r in there.recordings if r.subject == "S77"]
     assert (made.gesture, made.session, made.rows) == ("Tail hit 1", "live-1", last + 1 - first)
@@ -284,7 +286,7 @@ def test_a_hard_case_is_kept_labelled_and_in_the_data_set(
 def test_the_server_is_killed_while_a_clip_is_recorded(studio: Fixture, look: Fixture, home: Path) -> None:
     server: Studio = studio(*VIRTUAL, home=home)
     page = started(look(), server.url)
-    page.get_by_label("The person's code").fill("S05")
+    page.get_by_label("Code of the person").fill("S05")
     marked(page, "record").click()
     marked(page, "record-end").wait_for()
     stream = home / "recordings" / "S05" / "live-1" / "fulldatastream.csv"

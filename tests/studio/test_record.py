@@ -135,7 +135,7 @@ def test_redo_skip_back_pause_and_going_to_a_step(studio: Fixture, look: Fixture
     # A pause breaks off what is running, and going on asks for it again.
     page.keyboard.press("Space")
     showing(page, "recording.2.")
-    assert marked(page, "pause").inner_text() == "Break off and pause"
+    assert marked(page, "pause").inner_text() == "Discard and pause"
     marked(page, "pause").click()
     showing(page, "paused.2.2.0.0")
     assert "record it again" in marked(page, "recorder-message").inner_text()
@@ -251,7 +251,7 @@ def test_a_studio_that_is_gone_is_not_shown_as_recording(studio: Fixture, look: 
     assert axe(page) == []
     # One that stands still keeps the connection open and answers nothing.
     server.process.send_signal(signal.SIGSTOP)
-    lost = page.get_by_role("alert").get_by_text("It is not known whether it is still recording")
+    lost = page.get_by_role("alert").get_by_text("The recording may still be running")
     lost.wait_for()
     server.process.send_signal(signal.SIGCONT)
     lost.wait_for(state="detached")
@@ -283,7 +283,7 @@ def test_it_speaks_latvian_and_fits_a_tablet(studio: Fixture, look: Fixture, sho
         assert "no code for a person" in marked(page, "message").inner_text()
         assert axe(page) == []
         marked(page, "code").fill(code)
-        choose(page, "protocol", "Izmēģināšanai" if language == "lv" else "To try it")
+        choose(page, "protocol", "Izmēģināšanai" if language == "lv" else "Short trial")
         marked(page, "begin").click()
         sat(page, f"{code}/1")
         said = "Glaudi rotaļlietai muguru; rotaļlieta stāv uz galda"

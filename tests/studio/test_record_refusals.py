@@ -115,7 +115,7 @@ def test_another_layout(studio: Fixture, look: Fixture, tmp_path: Path, shots: F
         page.wait_for_selector('[data-signal="unreadable"]')
         connected(page)
         assert "CANNOT BE READ" in marked(page, "state").inner_text()
-        assert "No consent reference" in marked(page, "notice").inner_text()
+        assert "There is no consent number" in marked(page, "notice").inner_text()
         page.keyboard.press("Space")
         page.get_by_text("none is a frame of plush-15").wait_for()
         assert axe(page) == []
@@ -127,7 +127,7 @@ def test_another_layout(studio: Fixture, look: Fixture, tmp_path: Path, shots: F
         # The session keeps its layout; with the right one, a new session.
         page.get_by_text("More settings").click()
         choose(page, "layout", "plush-14")
-        page.get_by_text("Begin another session even if").click()
+        page.get_by_text("Begin a new session even if").click()
         fill(page, "S01")
         sat(page, "S01/2")
         assert browser.complaints == []

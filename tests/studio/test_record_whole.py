@@ -41,7 +41,7 @@ def test_51_recordings_by_the_space_bar(studio: Fixture, look: Fixture, shots: F
         page = browser.open(server.url + "/record")
         marked(page, "code").fill("S01")
         page.get_by_text("More settings").click()
-        page.get_by_text("This toy is a virtual one").click()
+        page.get_by_text("This is a virtual toy").click()
         marked(page, "begin").click()
         page.wait_for_url("**/record?session=S01/1")
         connected(page)

@@ -196,7 +196,7 @@ def test_twenty_recordings_by_keyboard_alone(waves: Path, studio: Fixture, look:
     assert not any(s.trimmed or s.excluded for s in read_marks(waves).values())
     assert raw_hash(waves) == before
     page.keyboard.press("u")
-    page.get_by_text("Nothing of this visit is left").wait_for()
+    page.get_by_text("There is nothing left to undo").wait_for()
     assert browser.complaints == []
 
 
@@ -261,7 +261,7 @@ def test_excluding_needs_a_reason_and_is_taken_back(
     checked(page)
     page.keyboard.press("x")
     marked(page, "reason-go").click()
-    page.get_by_text("This needs a reason").wait_for()
+    page.get_by_text("A reason is missing").wait_for()
     assert axe(page) == []
     shots(page, "review-dialog-en-light")
     marked(page, "own-reason").fill("a dog barked")
@@ -297,12 +297,12 @@ def test_a_finding_is_accepted_with_a_reason(waves: Path, studio: Fixture, look:
     assert "more than the mean" in found.inner_text()
     found.get_by_role("button").click()
     page.get_by_role("button", name="this person's way").click()
-    page.wait_for_selector("[data-check=duration]:has-text('accepted as no fault')")
+    page.wait_for_selector("[data-check=duration]:has-text('accepted as harmless')")
     assert [(m["recording"], m["action"], m["check"], m["why"]) for m in marks(waves)] == [
         (odd, "accept", "duration", "this person's way")
     ]
     page.locator("[data-check=duration]").get_by_role("button").click()
-    page.wait_for_selector("[data-check=duration]:has-text('No fault')")
+    page.wait_for_selector("[data-check=duration]:has-text('Harmless …')")
     assert marks(waves)[-1]["action"] == "unaccept"
     assert browser.complaints == []
 
@@ -465,7 +465,7 @@ def test_two_tabs_show_the_same_and_do_not_fight(waves: Path, studio: Fixture, l
     assert pressed(right, "Enter") == second
     assert [m["recording"] for m in marks(waves)] == [first]
     right.keyboard.press("u")
-    right.get_by_text("Nothing of this visit is left").wait_for()
+    right.get_by_text("There is nothing left to undo").wait_for()
     left.keyboard.press("u")
     left.wait_for_function("([plot, was]) => document.querySelector(plot).dataset.recording === was", arg=[PLOT, first])
     # Another program's mark is seen by itself.
@@ -511,7 +511,7 @@ def test_labelled_recordings_need_no_trimming(real_data: Path, tmp_path: Path, s
     page = browser.open(studio(home=tmp_path / "home").url + "/review?view=one")
     first = opened(page)
     checked(page)
-    assert "no reaction time to trim" in marked(page, "labelled").inner_text()
+    assert "cannot be trimmed" in marked(page, "labelled").inner_text()
     assert marked(page, "ends").count() == 0
     page.keyboard.press("ArrowRight")
     second = pressed(page, "Enter")

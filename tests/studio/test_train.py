@@ -127,9 +127,9 @@ def test_a_proof_its_table_and_the_recordings_of_a_cell(
     here = studio(home=home)
     browser = look()
     page = browser.open(f"{here.url}/train")
-    kind(page, "Prove it on people left out")
+    kind(page, "Evaluate on people left out")
     choose(page, "split", "windows in 5 groups")
-    marked(page, "split-about").get_by_text("so the score flatters").wait_for()
+    marked(page, "split-about").get_by_text("so the score is too good").wait_for()
     choose(page, "split", "people in 5 groups")
     fill(page, "epochs", "2")
     marked(page, "split-about").get_by_text("flatters").wait_for(state="detached")
@@ -278,7 +278,7 @@ def test_a_sweep_shows_its_cost_first_and_its_front_in_the_end(
     assert marked(page, "pareto-marks").inner_text().split() == ["simulation", "leaky"]
     done.locator('[data-test="open-result"]').click()
     marked(page, "confusion").wait_for()
-    assert page.get_by_text("A sweep keeps counts only").is_visible()
+    assert page.get_by_text("A sweep stores only the counts").is_visible()
     assert page.locator("[data-cell]").count() == 0
     assert axe(page) == []
     shots(page, "train-sweep")
@@ -319,7 +319,7 @@ def test_what_is_wrong_is_a_sentence_and_nothing_is_lost(
     page.locator('[data-test="quantize_aware"]').wait_for()
     page.wait_for_timeout(400)  # until it has unfolded
     assert axe(page) == []
-    kind(page, "Prove it on people left out")
+    kind(page, "Evaluate on people left out")
     marked(page, "start").click()
     refused = state(page, "refused").locator('[data-test="refused"]')
     assert "'evaluations' is a file; give a folder" in refused.inner_text().replace(f"{folder}/", "")
@@ -338,6 +338,6 @@ def test_a_house_without_data_says_what_to_do(studio: Fixture, look: Fixture) ->
     browser = look()
     page = browser.open(f"{studio().url}/train")
     page.get_by_text("There is no data set yet").wait_for()
-    page.get_by_text("No result yet").wait_for()
+    page.get_by_text("There are no results yet").wait_for()
     assert axe(page) == []
     assert browser.complaints == []

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import ast
+import re
 import string
 import tomllib
 from importlib import resources
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -46,3 +49,31 @@ def test_a_gesture_without_a_name_reads_as_its_label() -> None:
 def test_values_are_filled_in() -> None:
     said = Words("en")("shell.system_refused", where=" 'x'", why="no room")
     assert said == "The computer refused 'x': no room."
+
+
+def constant_keys(module: Path) -> set[str]:
+    """Return the keys of all texts that a module names literally, as in ``words("home.next")``."""
+    calls = [node for node in ast.walk(ast.parse(module.read_text(encoding="utf-8"))) if isinstance(node, ast.Call)]
+    named = {"words", "_words", "w"}
+    return {
+        str(call.args[0].value)
+        for call in calls
+        if (call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")) in named
+        and call.args
+        and isinstance(call.args[0], ast.Constant)
+    }
+
+
+def test_every_key_that_the_source_names_has_a_text() -> None:
+    folder = Path(str(resources.files("plushsense.studio")))
+    words = Words("en")
+    keys = {key: module.name for module in folder.rglob("*.py") for key in constant_keys(module)}
+    assert len(keys) > 300
+    assert {key: module for key, module in keys.items() if not words.has(key)} == {}
+
+
+def test_every_text_that_the_live_view_names_is_there() -> None:
+    script = resources.files("plushsense.studio.pages.live").joinpath("live_view.js").read_text(encoding="utf-8")
+    names = set(re.findall(r"\b(?:w|this\.words)\.([a-z_]+)\b", script))
+    assert len(names) > 20
+    assert names <= set(Words("en").table("live"))

@@ -39,7 +39,7 @@ def begun(page: Page, url: str, code: str, protocol: str = "quick") -> Page:
     connected(page)
     marked(page, "code").fill(code)
     if protocol != "plush-17":
-        choose(page, "protocol", "To try it" if protocol == "quick" else protocol)
+        choose(page, "protocol", "Short trial" if protocol == "quick" else protocol)
     marked(page, "begin").click()
     sat(page, f"{code}/1")
     return page
