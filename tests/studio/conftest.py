@@ -14,6 +14,7 @@ import pytest
 
 from support.browsing import CHROMIUM, DESK, Look, Studio, is_own
 from support.requirements import missing
+from support.sharing import built_once
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -95,17 +96,18 @@ def shots() -> Callable[[Page, str], None]:
 
 @pytest.fixture(scope="session")
 def furniture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A studio's folder with a data set of six virtual people and a little trained bundle; read only: take a `copy`."""
+    """A studio's folder with a data set of six virtual people and a small trained bundle; read only: take a `copy`."""
     import plushsense as ps
     from plushsense.workflow.api import simulate
 
-    home = tmp_path_factory.mktemp("furniture") / "home"
-    simulate(home / "made", people=6, repetitions=1, dataset=home / "datasets" / "virtual")
-    shutil.rmtree(home / "made")
-    trained = ps.train(home / "datasets" / "virtual", preset="loso", epochs=12, context="anywhere")
-    (home / "bundles").mkdir()
-    trained.save(home / "bundles" / "little.plush")
-    return home
+    def build(home: Path) -> None:
+        dataset = home / "datasets" / "virtual"
+        simulate(home / "made", people=6, repetitions=1, dataset=dataset)
+        shutil.rmtree(home / "made")
+        (home / "bundles").mkdir()
+        ps.train(dataset, preset="loso", epochs=12, context="anywhere").save(home / "bundles" / "little.plush")
+
+    return built_once(tmp_path_factory, "furniture", build)
 
 
 @pytest.fixture

@@ -81,9 +81,8 @@ def test_what_the_toy_feels_is_seen(studio: Fixture, look: Fixture, shots: Fixtu
     assert "%" in marked(page, "network").inner_text()
     assert "Answer of the gate" in marked(page, "gate").inner_text()
     marked(page, "latency").get_by_text("to this page").wait_for()
-    assert (
-        page.locator('[data-test="signals"] canvas').get_attribute("aria-label").startswith("The 13 signals of the toy")
-    )
+    label = page.locator('[data-test="signals"] canvas').get_attribute("aria-label")
+    assert label.startswith("The 13 signals of the toy")
     assert page.locator('[data-test="now"] [aria-live="polite"]').count() == 1
     assert axe(page) == []
     shots(page, "live-en-light")

@@ -23,6 +23,7 @@ from support.browsing import DESK, TABLET, Look, Studio, axe, connected, marked
 from support.recorded import record
 from support.recording_pages import begun, sat, showing
 from support.requirements import missing
+from support.sharing import built_once
 
 Fixture = Callable[..., Any]
 KEPT = os.environ.get("PLUSHSENSE_SHOTS", "")
@@ -149,13 +150,16 @@ _CUT = """() => {
 @pytest.fixture(scope="module")
 def furnished(furniture: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Studio]:
     """One studio for all pictures: a data set, a bundle, a session, a toy at ten times the speed."""
-    home = Path(shutil.copytree(furniture, tmp_path_factory.mktemp("pictures") / "home"))
-    record(Workspace(home), "S01")
-    data = home / "datasets" / "virtual"
-    ps.evaluate(
-        data, split="by-subject:3", preset="loso", epochs=8, workers=1, out=data / "evaluations" / "by-subject-3"
-    )
-    one = Studio(home, ("--speed", "10")).start()
+
+    def build(folder: Path) -> None:
+        home = Path(shutil.copytree(furniture, folder / "home"))
+        record(Workspace(home), "S01")
+        data = home / "datasets" / "virtual"
+        out = data / "evaluations" / "by-subject-3"
+        ps.evaluate(data, split="by-subject:3", preset="loso", epochs=8, workers=1, out=out)
+
+    home = built_once(tmp_path_factory, "pictures", build) / "home"
+    one = Studio(Path(shutil.copytree(home, tmp_path_factory.mktemp("pictures") / "home")), ("--speed", "10")).start()
     yield one
     one.stop()
 

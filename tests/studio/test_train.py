@@ -132,7 +132,7 @@ def test_a_proof_its_table_and_the_recordings_of_a_cell(
     marked(page, "split-about").get_by_text("so the score is too good").wait_for()
     choose(page, "split", "people in 5 groups")
     fill(page, "epochs", "2")
-    marked(page, "split-about").get_by_text("flatters").wait_for(state="detached")
+    marked(page, "split-about").get_by_text("too good").wait_for(state="detached")
     marked(page, "start").click()
     done = state(page, "done")
     assert "mean ± standard deviation over 6 people; split by-subject:5, context stream" in done.inner_text()

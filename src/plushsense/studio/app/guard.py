@@ -394,28 +394,20 @@ def router(workspace: Workspace) -> APIRouter:
     """Return the routes for the addresses of `download_address`."""
     routes = APIRouter()
 
-    @routes.get(f"/download/{EXPORTS}/{{name}}.zip", include_in_schema=False)
-    def export(name: str) -> Response:
+    @routes.get("/download/{kind}/{name}.zip", include_in_schema=False)
+    def download(kind: str, name: str) -> Response:
+        if kind not in (EXPORTS, PACKAGES):
+            return PlainTextResponse("Not found\n", 404)
         try:
-            folder = path_in(workspace, EXPORTS, name)
+            path = path_in(workspace, kind, name if kind == EXPORTS else f"{name}.zip")
         except ConfigError as refusal:
             return PlainTextResponse(f"{refusal}\n", 404)
-        if not (folder / FACTS).is_file():
-            return PlainTextResponse(f"There is no export '{name}' in this studio.\n", 404)
-        disposition = f"attachment; filename*=UTF-8''{quote(folder.name, safe='')}.zip"
-        return StreamingResponse(
-            zip_chunks(folder), media_type="application/zip", headers={"content-disposition": disposition}
-        )
-
-    @routes.get(f"/download/{PACKAGES}/{{name}}.zip", include_in_schema=False)
-    def package(name: str) -> Response:
-        try:
-            file = path_in(workspace, PACKAGES, f"{name}.zip")
-        except ConfigError as refusal:
-            return PlainTextResponse(f"{refusal}\n", 404)
-        if not file.is_file():
-            return PlainTextResponse(f"There is no package '{name}' in this studio.\n", 404)
-        return FileResponse(file, media_type="application/zip", filename=file.name)
+        if kind == EXPORTS and (path / FACTS).is_file():
+            headers = {"content-disposition": f"attachment; filename*=UTF-8''{quote(path.name, safe='')}.zip"}
+            return StreamingResponse(zip_chunks(path), media_type="application/zip", headers=headers)
+        if kind == PACKAGES and path.is_file():
+            return FileResponse(path, media_type="application/zip", filename=path.name)
+        return PlainTextResponse(f"There is no {kind.removesuffix('s')} '{name}' in this studio.\n", 404)
 
     return routes
 

@@ -96,11 +96,7 @@ class Jobs:
             return [job for job in reversed(self._jobs.values()) if not tasks or job.task in tasks]
 
     def get(self, identity: str) -> StudioJob:
-        """Return the job with this id.
-
-        Raises:
-            ConfigError: for an unknown id.
-        """
+        """Return the job with this id; raise ConfigError for an unknown id."""
         try:
             return self._jobs[identity]
         except KeyError:

@@ -311,10 +311,3 @@ def scroll_region(label: str) -> ui.element:
 def focus(element: ui.element) -> None:
     """Move the keyboard focus to an element as soon as it is displayed."""
     ui.run_javascript(f"setTimeout(() => getHtmlElement({element.id})?.focus())")
-
-
-def affect_badge(words: Words, affect: str | None) -> ui.label:
-    """Return a label that shows an affect as sign, word and colour."""
-    key = affect or "none"
-    badge = ui.label(f"{AFFECT_SIGNS[key]} {words.affect(affect)}").classes("q-px-sm rounded-borders")
-    return badge.style(f"background: {AFFECT_COLOURS[key]}; color: #fff; font-weight: 600")

@@ -1,7 +1,7 @@
-"""Clips kept from the live page: sessions that are written at once and labelled later.
+"""Clips of the live page: sessions that are written immediately and labelled later.
 
-A clip lies in ``recordings/<subject>/live-<n>/`` with its stream, as the recorder leaves a session; a label cuts rows
-of the stream into a recording beside it. The stream itself never changes.
+A clip is a session folder ``recordings/<subject>/live-<n>/`` with a stream, as the recorder writes it. A label copies
+rows of the stream into a recording beside it; the stream never changes.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ from plushsense.studio.app.workspace import ChangeSignal, Workspace
 from plushsense.studio.pages.live.reader import LiveReader
 
 PROTOCOL = "live"
-"""What the sessions of clips name as their protocol: nobody was asked for anything."""
+"""Name of the protocol in the sessions of clips; nobody was asked to perform anything."""
 
 
 @dataclass(frozen=True)
 class Label:
-    """A recording cut from a clip: rows ``first`` to before ``last`` of its stream."""
+    """A recording cut from a clip: the rows from ``first`` to before ``last`` of its stream."""
 
     file: str
     gesture: str
@@ -49,11 +49,11 @@ class Label:
 
 @dataclass(frozen=True)
 class Clip:
-    """A clip as stored on disk.
+    """A clip on disk.
 
     Attributes:
-        seconds: length by the toy's clock, or from the rate if a crash ended it.
-        added: names of the data sets that hold all its recordings.
+        seconds: length by the clock of the toy, or from the rate if a crash ended the clip.
+        added: names of the data sets that contain all its recordings.
     """
 
     folder: Path
@@ -65,20 +65,20 @@ class Clip:
 
     @property
     def key(self) -> str:
-        """A name for pages: subject/session."""
-        return f"{self.folder.parent.name}/{self.folder.name}"
+        """Name for pages: subject/session."""
+        return _key(self.folder)
 
     @property
     def layout(self) -> Layout:
-        """The layout of the clip's rows."""
-        return Layout.from_dict(self.head.layout, f"layout of '{self.folder}'")
+        """The layout of the rows."""
+        return _layout(self.head, self.folder)
 
 
 def read_clip(folder: Path) -> Clip | None:
-    """Return the clip in a session's folder; None if it holds another session, or none.
+    """Return the clip in a folder; None if there is another session, or none.
 
     Raises:
-        DatasetError: for a head that cannot be read.
+        DatasetError: if the head of the session cannot be read.
     """
     head = SessionHead.read(folder)
     if head is None or head.protocol.get("name") != PROTOCOL:
@@ -87,26 +87,26 @@ def read_clip(folder: Path) -> Clip | None:
     added: list[str] = []
     seconds: float | None = None
     for event in read_events(folder):
-        more = event.details
-        if event.what == "close" and isinstance(more.get("seconds"), int | float):
-            seconds = float(more["seconds"])
+        details = event.details
+        if event.what == "close" and isinstance(details.get("seconds"), int | float):
+            seconds = float(details["seconds"])
         if event.what == "take":
-            file, first = str(more.get("file")), _first_row(folder / str(more.get("file")))
-            held = more.get("rows")
-            last = first + (held if isinstance(held, int) else 0)
-            labels[file] = Label(file, str(more.get("gesture")), first, last)
+            file, count = str(details.get("file")), details.get("rows")
+            first = _first_row(folder / file)
+            last = first + (count if isinstance(count, int) else 0)
+            labels[file] = Label(file, str(details.get("gesture")), first, last)
             added = []
-        elif event.what == "added" and more.get("dataset") not in added:
-            added.append(str(more.get("dataset")))
+        elif event.what == "added" and details.get("dataset") not in added:
+            added.append(str(details.get("dataset")))
     stream = folder / STREAM_NAME
     rows = stream.read_bytes().count(b"\n") if stream.is_file() else 0
     if seconds is None:
-        seconds = rows / Layout.from_dict(head.layout, f"layout of '{folder}'").rate_hz
+        seconds = rows / _layout(head, folder).rate_hz
     return Clip(folder, head, rows, seconds, tuple(labels.values()), tuple(added))
 
 
 def _first_row(recording: Path) -> int:
-    """Return the row of the session's stream at which a recording begins, as its sidecar says."""
+    """Return the row of the stream at which a recording begins, from its sidecar; 0 if it is unknown."""
     try:
         return int(json.loads(recording.with_suffix(SIDECAR).read_text(encoding="utf-8"))["stream_row"])
     except (OSError, ValueError, KeyError, TypeError):
@@ -114,7 +114,7 @@ def _first_row(recording: Path) -> int:
 
 
 LONGEST_S = 600.0
-"""A clip that nobody ends does so by itself, by the toy's clock."""
+"""Length after which a clip ends by itself, by the clock of the toy."""
 _SOFTWARE = f"plushsense {__version__}"
 
 
@@ -123,16 +123,20 @@ class _Running:
     """The clip that is being recorded."""
 
     session: OpenSession
-    intake: FrameReceiver
+    receiver: FrameReceiver
     device: TappedDevice
-    keeper: BackgroundWriter | None = None
+    writer: BackgroundWriter | None = None
     failed: str = ""
-    over: bool = False
+    ended: bool = False
     lock: Any = field(default_factory=threading.Lock)
+
+    @property
+    def key(self) -> str:
+        return _key(self.session.folder)
 
 
 class Clips:
-    """Service that records clips. `changed` is notified when a clip is added or changed."""
+    """Service that records and labels clips; `changed` is notified when a clip is added or changed."""
 
     def __init__(self, workspace: Workspace) -> None:
         self.changed = ChangeSignal()
@@ -141,51 +145,49 @@ class Clips:
         self._running: _Running | None = None
         self.failed = ""
 
-    # Keeping --------------------------------------------------------------------------------------------------
+    # Recording ------------------------------------------------------------------------------------------------
 
     @property
     def recording(self) -> str:
         """Key of the clip that is being recorded, or ""."""
         running = self._running
-        return "" if running is None else _key(running.session.folder)
+        return "" if running is None else running.key
 
     @property
     def recorded_s(self) -> float:
-        """Length of the clip that is being recorded, by the toy's clock."""
+        """Length of the clip that is being recorded, by the clock of the toy."""
         running = self._running
-        return running.intake.toy_ms / 1000.0 if running is not None else 0.0
+        return running.receiver.toy_ms / 1000.0 if running is not None else 0.0
 
     def keep(self, reader: LiveReader, seconds: float, subject: str) -> str:
         """Write the last ``seconds`` as a clip; return its key.
 
         Raises:
-            ConfigError: when nothing was heard. DatasetError: for a code that is none, or a disk that refuses.
+            ConfigError: if nothing was received. DatasetError: for an invalid code of a person, or if the disk refuses.
         """
         device, bundle = reader.device, reader.bundle
         frames = device.buffer.frames(seconds) if device is not None else []
         if device is None or bundle is None or not frames:
-            raise ConfigError("Nothing was heard yet that could be kept: start a toy first.")
+            raise ConfigError("No data were received yet: start a toy first.")
         with self._lock:
             running = self._open(reader, device, bundle, subject)
         try:
             stream = StreamFile(running.session.folder / STREAM_NAME, running.session.layout)
             with contextlib.closing(stream):
-                stream.write([running.intake.receive(frame).frame for frame in frames])
-                running.session.log.write([_closing(running.intake)])
+                stream.write([running.receiver.receive(frame).frame for frame in frames])
+                running.session.log.write([_close_event(running.receiver)])
         except OSError as cause:
-            raise _refused(running.session.folder, cause) from None
+            raise _write_error(running.session.folder, cause) from None
         finally:
             running.session.close()
         self.changed.notify()
-        return _key(running.session.folder)
+        return running.key
 
     def begin(self, reader: LiveReader, subject: str) -> str:
-        """Start to record a clip; return its key.
-
-        Samples are on the disk half a second after they arrive.
+        """Start to record a clip, whose samples are on the disk after half a second; return its key.
 
         Raises:
-            ConfigError: when nothing is read, or a clip is being recorded already. DatasetError: as for `keep`.
+            ConfigError: if no toy is being read, or a clip is being recorded already. DatasetError: as for `keep`.
         """
         with self._lock:
             device, bundle = reader.device, reader.bundle
@@ -199,14 +201,14 @@ class Clips:
                 stream = StreamFile(running.session.folder / STREAM_NAME, running.session.layout)
             except OSError as cause:
                 running.session.close()
-                raise _refused(running.session.folder, cause) from None
-            running.keeper = BackgroundWriter(
+                raise _write_error(running.session.folder, cause) from None
+            running.writer = BackgroundWriter(
                 stream, running.session.log, synchronous=False, on_fail=lambda cause: self._fail(running, cause)
             )
             self._running = running
             device.taps.append(self._tap)
         self.changed.notify()
-        return _key(running.session.folder)
+        return running.key
 
     def end(self, only: _Running | None = None) -> str:
         """End the clip that is being recorded, or only if it is ``only``; return its key, or ""."""
@@ -217,40 +219,40 @@ class Clips:
             self._running = None
             with contextlib.suppress(ValueError):
                 running.device.taps.remove(self._tap)
-            running.over = True
-            assert running.keeper is not None
+            running.ended = True
+            assert running.writer is not None
             with running.lock:
-                running.keeper.submit(_closing(running.intake))
-            running.keeper.close()
+                running.writer.submit(_close_event(running.receiver))
+            running.writer.close()
             running.session.close()
             self.failed = running.failed
         self.changed.notify()
-        return _key(running.session.folder)
+        return running.key
 
     def close(self) -> None:
         """End the clip when the studio ends."""
         self.end()
 
     def _tap(self, frames: list[Frame]) -> None:
-        """Record new frames; called in the reader's thread."""
+        """Record new frames; called in the thread of the reader."""
         running = self._running
-        if running is None or running.keeper is None:
+        if running is None or running.writer is None:
             return
         with running.lock:
-            if running.over:
+            if running.ended:
                 return
-            came = [running.intake.receive(frame) for frame in frames]
-            running.keeper.add_frames([c.frame for c in came], running.intake.toy_ms)
-            for gap in (c.gap for c in came):
+            received = [running.receiver.receive(frame) for frame in frames]
+            running.writer.add_frames([r.frame for r in received], running.receiver.toy_ms)
+            for gap in (r.gap for r in received):
                 if gap is not None:
-                    running.keeper.submit(_event("gap", **gap))
-            running.over = running.intake.toy_ms >= 1000.0 * LONGEST_S
-        if running.over:
+                    running.writer.submit(_event("gap", **gap))
+            running.ended = running.receiver.toy_ms >= 1000.0 * LONGEST_S
+        if running.ended:
             threading.Thread(target=self.end, args=(running,), daemon=True).start()
 
     def _fail(self, running: _Running, cause: Exception) -> None:
-        running.failed = str(_refused(running.session.folder, cause))
-        running.over = True
+        running.failed = str(_write_error(running.session.folder, cause))
+        running.ended = True
         threading.Thread(target=self.end, args=(running,), daemon=True).start()
 
     def _open(self, reader: LiveReader, device: TappedDevice, bundle: Bundle, subject: str) -> _Running:
@@ -274,37 +276,31 @@ class Clips:
         session = OpenSession(person / head.session, head)
         speed = speed_of(with_speed(choice.toy, self._workspace.speed))
         try:
-            # At once finished: a recorder that takes up the person's last session must not take this one.
+            # Marked as finished, so that the recorder does not resume it as the last session of the person.
             session.log.write(
                 [_event("open", software=_SOFTWARE, device=device.url, speed=speed, row=0), _event("finished")]
             )
         except OSError as cause:
             session.close()
-            raise _refused(session.folder, cause) from None
+            raise _write_error(session.folder, cause) from None
         return _Running(session, FrameReceiver(device, device.layout, speed, 0, 0), device)
 
-    # What there is --------------------------------------------------------------------------------------------
+    # Listing --------------------------------------------------------------------------------------------------
 
     def all(self) -> list[Clip]:
-        """Return every clip on disk, the newest first. Reads files: not for the event loop."""
-        found = []
+        """Return every clip on disk, the newest first; reads files, so do not call it in the event loop."""
+        clips = []
         for folder in self._workspace.sessions():
             if folder.name.startswith("live-"):
-                # A damaged one must not hide the others; `plushsense import` names it.
+                # A damaged clip must not hide the others; `plushsense import` reports it.
                 with contextlib.suppress(BadInput, OSError):
-                    clip = read_clip(folder)
-                    if clip is not None:
-                        found.append(clip)
-        return sorted(found, key=lambda clip: -clip.head.started_ms)
+                    if (clip := read_clip(folder)) is not None:
+                        clips.append(clip)
+        return sorted(clips, key=lambda clip: -clip.head.started_ms)
 
     def get(self, key: str) -> Clip:
-        """Return the clip with this key.
-
-        Raises:
-            ConfigError: where there is none.
-        """
-        folder = self._workspace.inside(self._workspace.recordings / key)
-        clip = read_clip(folder)
+        """Return the clip with this key; raise ConfigError for an unknown key."""
+        clip = read_clip(self._workspace.inside(self._workspace.recordings / key))
         if clip is None:
             raise ConfigError(f"There is no clip '{key}': it may have been moved.")
         return clip
@@ -316,25 +312,25 @@ class Clips:
     # Labelling ------------------------------------------------------------------------------------------------
 
     def label(self, key: str, gesture: str, first: int, last: int) -> Label:
-        """Make rows ``first`` up to but not ``last`` of a clip a recording of ``gesture``, beside its stream.
+        """Save the rows from ``first`` to before ``last`` of a clip as a recording of ``gesture``.
 
         Raises:
-            ConfigError: for rows or a label that cannot be. DatasetError: when the disk refuses.
+            ConfigError: for an invalid label or range of rows. DatasetError: if the disk refuses.
         """
         clip = self.get(key)
         if key == self.recording:
             raise ConfigError(f"The clip '{key}' is still being recorded: end it first.")
         gesture = " ".join(gesture.split())
-        named = parse_name(recording_filename(gesture, 0, 0))
-        if not gesture or named is None or plain_label(named.label) != plain_label(gesture):
+        parsed = parse_name(recording_filename(gesture, 0, 0))
+        if not gesture or parsed is None or plain_label(parsed.label) != plain_label(gesture):
             raise ConfigError(
-                f"'{gesture}' cannot be a gesture's label: give a word or two without  \\ / : * ? \" < > | ( )  ."
+                f"'{gesture}' cannot be the label of a gesture: give a word or two without  \\ / : * ? \" < > | ( )  ."
             )
         frames = self.rows(clip)
         if not 0 <= first < last <= len(frames) or last - first < 2:
             raise ConfigError(
-                f"Rows {first} to {last} are no part of the clip '{key}', which has {len(frames)}: choose an end "
-                "after the start."
+                f"Rows {first} to {last} are not a part of the clip '{key}', which has {len(frames)} rows: choose an "
+                "end after the start."
             )
         part = frames.slice(first, last)
         host = part.host_ms if part.host_ms is not None else part.device_ms
@@ -351,7 +347,7 @@ class Clips:
                     session, take, Counters(), "cut", now_ms(), "", device=clip.head.device, software=_SOFTWARE
                 )
             except OSError as cause:
-                raise _refused(clip.folder, cause) from None
+                raise _write_error(clip.folder, cause) from None
         self.changed.notify()
         return Label(file, gesture, first, last)
 
@@ -359,28 +355,32 @@ class Clips:
         """Import the recordings of a clip into a data set, as ``plushsense import --add`` does.
 
         Raises:
-            ConfigError: without a label. DatasetError: as for `import_recordings`.
+            ConfigError: if it has no label. DatasetError: as for `import_recordings`.
         """
         clip = self.get(key)
         if not clip.labels:
-            raise ConfigError(f"The clip '{key}' has no label yet: choose a part of it and say what it is.")
-        done = import_recordings(clip.folder, self._workspace.inside(dataset), add_to=True)
+            raise ConfigError(f"The clip '{key}' has no label yet: choose a part of it and its gesture.")
+        summary = import_recordings(clip.folder, self._workspace.inside(dataset), add_to=True)
         with contextlib.closing(OpenSession(clip.folder)) as session, contextlib.suppress(OSError):
-            session.log.write([_event("added", dataset=dataset.name, recordings=done.added["recordings"])])
+            session.log.write([_event("added", dataset=dataset.name, recordings=summary.added["recordings"])])
         self.changed.notify()
-        return done
-
-
-def _closing(intake: FrameReceiver) -> SessionEvent:
-    return _event("close", rows=intake.rows, lost=intake.lost, seconds=round(intake.toy_ms / 1000.0, 2))
+        return summary
 
 
 def _key(folder: Path) -> str:
     return f"{folder.parent.name}/{folder.name}"
 
 
-def _event(what: str, **more: Any) -> SessionEvent:
-    return SessionEvent(what, now_ms(), more)
+def _layout(head: SessionHead, folder: Path) -> Layout:
+    return Layout.from_dict(head.layout, f"layout of '{folder}'")
+
+
+def _close_event(receiver: FrameReceiver) -> SessionEvent:
+    return _event("close", rows=receiver.rows, lost=receiver.lost, seconds=round(receiver.toy_ms / 1000.0, 2))
+
+
+def _event(what: str, **details: Any) -> SessionEvent:
+    return SessionEvent(what, now_ms(), details)
 
 
 def _protocol(bundle: Bundle) -> Protocol:
@@ -396,7 +396,7 @@ def _protocol(bundle: Bundle) -> Protocol:
 
 
 def _count_losses(take: RecordingTake, layout: Layout) -> None:
-    """Count lost frames and gaps from the rows' device clock."""
+    """Count lost frames and gaps from the device clock of the rows."""
     loss = LossCounter()
     last: Frame | None = None
     for at, frame in enumerate(take.frames):
@@ -409,6 +409,6 @@ def _count_losses(take: RecordingTake, layout: Layout) -> None:
         last = frame
 
 
-def _refused(folder: Path, cause: Exception) -> DatasetError:
+def _write_error(folder: Path, cause: Exception) -> DatasetError:
     why = getattr(cause, "strerror", None) or cause
-    return DatasetError(f"'{folder}' cannot be written ({why}): what was written until then is kept; make room.")
+    return DatasetError(f"'{folder}' cannot be written ({why}): free some space; what was written before is kept.")

@@ -125,20 +125,20 @@ class PackageFacts:
     def of(cls, workspace: Workspace, name: str) -> PackageFacts:
         """Read a package; leave empty what cannot be read, because the validators report it."""
         folder, packed = workspace.folder / PACKAGES / name, workspace.folder / PACKAGES / f"{name}.zip"
-        there = folder if (folder / CHECKSUMS).is_file() else None
+        existing = folder if (folder / CHECKSUMS).is_file() else None
         zipped = packed if packed.is_file() else None
-        croissant = _load(there, zipped, CROISSANT_FILE)
-        made = [p.stat().st_mtime for p in (there, zipped) if p is not None]
+        root = existing or _zip_root(zipped)
+        croissant = _load(root, CROISSANT_FILE)
         return cls(
             name,
-            there,
+            existing,
             zipped,
             str(croissant.get("citeAs", "")),
             str(croissant.get("name", "")),
-            _has(there, zipped, SIMULATION_MARK),
-            _load(there, zipped, REIDENTIFICATION_JSON),
-            _contents(there, zipped),
-            max(made, default=0.0),
+            root is not None and (root / SIMULATION_MARK).is_file(),
+            _load(root, REIDENTIFICATION_JSON),
+            _contents(existing, zipped),
+            max((p.stat().st_mtime for p in (existing, zipped) if p is not None), default=0.0),
         )
 
 
@@ -172,7 +172,7 @@ def _contents(folder: Path | None, packed: Path | None) -> dict[str, tuple[int, 
     grouped: dict[str, tuple[int, int]] = {}
     for path, bytes_ in _files(folder, packed).items():
         parts = path.split("/")
-        # Folders in the data folder are listed one by one.
+        # Folders in the data folder are listed separately.
         depth = min(len(parts) - 1, 2)
         top = "/".join(parts[:depth]) + "/" if depth else path
         files, total = grouped.get(top, (0, 0))
@@ -180,21 +180,18 @@ def _contents(folder: Path | None, packed: Path | None) -> dict[str, tuple[int, 
     return dict(sorted(grouped.items(), key=lambda item: (not item[0].endswith("/"), item[0])))
 
 
-def _has(folder: Path | None, packed: Path | None, file: str) -> bool:
-    return (folder / file).is_file() if folder is not None else file in _files(None, packed)
-
-
-def _load(folder: Path | None, packed: Path | None, file: str) -> dict[str, Any]:
+def _zip_root(packed: Path | None) -> zipfile.Path | None:
+    """Return the only folder in a zip, or None if the zip cannot be read."""
     try:
-        if folder is not None:
-            content = json.loads((folder / file).read_text(encoding="utf-8"))
-        elif packed is not None:
-            with zipfile.ZipFile(packed) as archive:
-                name = next(n for n in archive.namelist() if n.partition("/")[2] == file)
-                content = json.loads(archive.read(name))
-        else:
-            return {}
-    except (OSError, ValueError, StopIteration, zipfile.BadZipFile):
+        return next(zipfile.Path(packed).iterdir()) if packed is not None else None
+    except (OSError, StopIteration, zipfile.BadZipFile):
+        return None
+
+
+def _load(root: Path | zipfile.Path | None, file: str) -> dict[str, Any]:
+    try:
+        content = json.loads((root / file).read_text(encoding="utf-8")) if root is not None else {}
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile):
         return {}
     return content if isinstance(content, dict) else {}
 

@@ -257,11 +257,7 @@ class ReviewController:
 
     @property
     def name(self) -> str:
-        """Name of the person who decides.
-
-        Raises:
-            ConfigError: if neither the field nor the login gives a name.
-        """
+        """Name of the person who decides; raise ConfigError if neither the field nor the login gives a name."""
         return author_name((self.who.value or "").strip() or None)
 
     # Views and navigation -----------------------------------------------------------------------------------------

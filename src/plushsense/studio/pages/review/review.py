@@ -251,11 +251,7 @@ class Review:
         return [*known, *sorted(present - set(known))]
 
     def info(self, identity: str) -> RecordingInfo:
-        """Return the index entry of a recording.
-
-        Raises:
-            DatasetError: for an unknown id.
-        """
+        """Return the index entry of a recording; raise DatasetError for an unknown id."""
         try:
             return self.infos[identity]
         except KeyError:
@@ -517,11 +513,7 @@ class Reviews:
         return f"/review?{urlencode({'dataset': str(dataset), 'selection': key})}"
 
     def selection(self, key: str) -> tuple[str, list[str]]:
-        """Read a stored selection: its title and the ids.
-
-        Raises:
-            ConfigError: for an unknown key.
-        """
+        """Read a stored selection: its title and the ids; raise ConfigError for an unknown key."""
         try:
             if not key.isalnum():
                 raise ValueError

@@ -235,11 +235,7 @@ def over_trainings(trial: Mapping[str, Any]) -> tuple[str, int]:
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file.
-
-    Raises:
-        BadInput: if it cannot be read.
-    """
+    """Read a JSON file; raise BadInput if it cannot be read."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as cause:
@@ -322,22 +318,14 @@ class StoredResults:
         return {self._workspace.title(path): str(path) for path in reversed(self._workspace.datasets())}
 
     def row(self, identity: str) -> ResultRow:
-        """Return the result with an id.
-
-        Raises:
-            BadInput: if there is none.
-        """
+        """Return the result with an id; raise BadInput if there is none."""
         for row in self._rows():
             if row.id == identity:
                 return row
         raise BadInput("This result does not exist any more: its folder was moved or deleted.")
 
     def details(self, row: ResultRow) -> ResultDetails:
-        """Read the details of a result.
-
-        Raises:
-            PlushSenseError: if its files cannot be read.
-        """
+        """Read the details of a result; raise PlushSenseError if its files cannot be read."""
         if row.kind == EVALUATION:
             table = read_json(row.path / SCORES)
             affects = {one["label"]: one["affect"] for one in table["per_class"]}
