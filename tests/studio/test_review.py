@@ -299,7 +299,7 @@ def test_a_finding_is_accepted_with_a_reason(waves: Path, studio: Fixture, look:
     page.get_by_role("button", name="this person's way").click()
     page.wait_for_selector("[data-check=duration]:has-text('accepted as harmless')")
     assert [(m["recording"], m["action"], m["check"], m["why"]) for m in marks(waves)] == [
-        (odd, "accept", "duration", "this person's way")
+        (odd, "accept", "duration", "this person's way of doing it")
     ]
     page.locator("[data-check=duration]").get_by_role("button").click()
     page.wait_for_selector("[data-check=duration]:has-text('Harmless …')")

@@ -240,7 +240,7 @@ def on_change(signal: ChangeSignal, callback: Callable[[], Any]) -> None:
 def address(page: str, **query: str | Path) -> str:
     """Return the address of a page with a query, such as ``address("review", dataset=path)``; skip empty values."""
     values = {key: str(value) for key, value in query.items() if str(value)}
-    return PAGES[page] + (f"?{urlencode(values)}" if values else "")
+    return PAGES[page] + (f"?{urlencode(values, safe='/')}" if values else "")
 
 
 def query() -> dict[str, str]:

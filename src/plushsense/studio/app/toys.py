@@ -1,4 +1,4 @@
-"""The toys that can be reached, and a test of the chosen one."""
+"""Toys: the search for them, the choice of one, a test of its connection, and a buffer of its samples."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import ConfigError, DeviceError, PlushSenseError
+from plushsense.core.errors import ConfigError, DeviceError
 from plushsense.core.layouts import layout_names
 from plushsense.devices.base import Device, Frame
 from plushsense.devices.opening import SCAN_S, DeviceListing, list_devices, open_device, parse_url
@@ -23,8 +23,8 @@ KEPT_S = 60.0
 
 
 class Samples(NamedTuple):
-    """Samples after a place in the stream: ``seconds`` (N,) on the toy's clock, ``values`` (N, C) in integer steps;
-    ``end``: the position after them.
+    """Samples of a stream: ``seconds`` (N,) by the clock of the toy, ``values`` (N, C) in integer steps, and the
+    position ``end`` after them.
     """
 
     seconds: NDArray[np.float64]
@@ -51,7 +51,7 @@ class SampleBuffer:
         return self._count
 
     def add(self, frames: list[Frame]) -> None:
-        """Append frames; a device clock that was reset continues from where it stood."""
+        """Append frames; after a reset of the device clock, the time continues from its last value."""
         with self._lock:
             size = len(self._seconds)
             for frame in frames:
@@ -87,9 +87,9 @@ class SampleBuffer:
 
 
 class TappedDevice(Device):
-    """A device whose frames also go into a `SampleBuffer`, for pages beside the reader.
+    """A device whose frames are also stored in a `SampleBuffer`, for pages.
 
-    ``taps``: called with the frames of every reading that brought some, in the thread that reads; they must not wait.
+    ``taps`` are called with new frames, in the thread that reads; they must not block.
     """
 
     def __init__(self, device: Device) -> None:
@@ -103,12 +103,12 @@ class TappedDevice(Device):
 
     @property
     def inner(self) -> Device:
-        """The device beneath all that is wrapped around it."""
+        """The innermost device."""
         return getattr(self.device, "inner", self.device)
 
     @property
     def state(self) -> str:
-        """The connection's state, as of a `plushsense.devices.reconnect.ReconnectingDevice`."""
+        """State of the connection, see `plushsense.devices.reconnect.ReconnectingDevice`."""
         return str(getattr(self.device, "state", "connected"))
 
     @property
@@ -142,30 +142,27 @@ _SLOW, _FAST = 0.8, 1.25
 
 @dataclass(frozen=True)
 class ConnectionTest:
-    """Result of a connection test: ``frames`` in ``seconds`` of device time, unreadable lines, and the layout's rate.
+    """Result of a connection test: frames and malformed lines in ``seconds`` of device time, and the layout."""
 
-    ``fits``: enough of the lines were frames. ``on_time``: the frame rate is near that of the layout.
-    """
-
-    url: str
     layout: str
     frames: int
     malformed: int
-    garbage: int
     seconds: float
     rate_hz: float
 
     @property
     def fits(self) -> bool:
+        """True if enough of the lines were frames."""
         return self.frames > 0 and self.malformed <= _MAX_MALFORMED * (self.frames + self.malformed)
 
     @property
     def on_time(self) -> bool:
+        """True if the frame rate is near that of the layout."""
         return _SLOW <= self.frames / (self.seconds * self.rate_hz) <= _FAST
 
 
 class Toys:
-    """The list of toys, searched in the background; `changed` is notified when it changed."""
+    """The list of toys, found by a search in the background; `changed` is notified of each change."""
 
     def __init__(self, workspace: Workspace) -> None:
         self.changed = ChangeSignal()
@@ -176,7 +173,7 @@ class Toys:
         self._lock = threading.Lock()
 
     def search(self, scan_s: float = SCAN_S) -> None:
-        """Start to search for toys, unless a search is running; does not wait."""
+        """Start a search in the background, unless one is running."""
         with self._lock:
             if self.searching:
                 return
@@ -192,10 +189,10 @@ class Toys:
             self.changed.notify()
 
     def choose(self, url: str) -> str:
-        """Make this the toy of all pages; return its URL.
+        """Choose a toy for all pages; return its URL.
 
         Raises:
-            ConfigError: for a URL that no toy can have, and for files outside the studio's folders.
+            ConfigError: for an invalid URL, or a file outside the folders of the studio.
         """
         url = url.strip()
         if url not in self._workspace.devices:
@@ -221,10 +218,10 @@ class Toys:
         return bool(self._workspace.toy) and is_virtual(self._workspace.toy)
 
     def test(self, url: str = "") -> ConnectionTest:
-        """Read a toy (the chosen one) for a second; blocks for some seconds.
+        """Read a toy, by default the chosen one, for a second; blocks for some seconds.
 
         Raises:
-            DeviceError: when it cannot be reached, or sends nothing.
+            DeviceError: if it cannot be reached, or sends nothing.
         """
         url = url or self._workspace.toy
         if not url:
@@ -252,9 +249,4 @@ class Toys:
                 )
             raise DeviceError(f"'{url}' sent nothing within {_TIMEOUT_S:g} s: check that the toy is switched on.")
         seconds = max(last - first, 1.0 / layout.rate_hz) * speed
-        return ConnectionTest(url, layout.name, frames, counters.malformed, counters.garbage, seconds, layout.rate_hz)
-
-
-def error_text(cause: BaseException) -> str:
-    """Return the message for a connection test that failed."""
-    return str(cause) if isinstance(cause, PlushSenseError) else " ".join(str(cause).split()) or type(cause).__name__
+        return ConnectionTest(layout.name, frames, counters.malformed, seconds, layout.rate_hz)

@@ -33,9 +33,9 @@ class Words:
         """Return all texts of a table, without its name in the keys."""
         return {key.removeprefix(f"{name}."): text for key, text in self._texts.items() if key.startswith(f"{name}.")}
 
-    def has(self, key: str) -> bool:
-        """Return whether there is a text with this key."""
-        return key in self._texts
+    def get(self, key: str, default: str = "") -> str:
+        """Return the text with this key, or ``default`` if there is none."""
+        return self._texts.get(key, default)
 
     def gesture(self, label: str) -> str:
         """Return a gesture's name in this language, or the label itself."""

@@ -9,13 +9,13 @@ from typing import Any
 
 from nicegui import context, events, run, ui
 
-from plushsense.core.errors import BundleError, ConfigError
+from plushsense.core.errors import BundleError, ConfigError, PlushSenseError
 from plushsense.core.layouts import layout_names
 from plushsense.models.bundle import Bundle
 from plushsense.studio.app.guard import UPLOAD_BYTES
 from plushsense.studio.app.jobs import INCOMING, RUNNING, Jobs
 from plushsense.studio.app.shell import Page, address, html, named, on_change, tag
-from plushsense.studio.app.toys import PERSONS, Toys, error_text
+from plushsense.studio.app.toys import PERSONS, Toys
 from plushsense.studio.app.workspace import BUNDLES, DATASETS, WORK
 from plushsense.studio.pages.home.overview import NextStep, Overview, WorkspaceSummary, next_step
 from plushsense.studio.pages.home.sections import (
@@ -75,7 +75,8 @@ def toy_section(page: Page, toys: Toys) -> None:  # noqa: C901
         try:
             result = await run.io_bound(toys.test)
         except Exception as cause:  # noqa: BLE001, RUF100
-            page.say(error_text(cause), "error")
+            text = str(cause) if isinstance(cause, PlushSenseError) else " ".join(str(cause).split())
+            page.say(text or type(cause).__name__, "error")
             return
         finally:
             testing = False
@@ -339,8 +340,8 @@ class NextStepCard:
             html(words("home.next"), "h2")
             with ui.row().classes("items-center w-full"):
                 tag(ui.label(words(f"home.next_{step.key}", **step.values)), "next-sentence").classes("text-lg")
-                if words.has(f"home.next_{step.key}_button"):
-                    button = ui.button(words(f"home.next_{step.key}_button"), on_click=lambda: self._do(step))
+                if text := words.get(f"home.next_{step.key}_button"):
+                    button = ui.button(text, on_click=lambda: self._do(step))
                     tag(button.props("unelevated size=lg color=primary no-caps"), "next-button")
                 if second := {"try": "record", "live": "export"}.get(step.key):
                     button = ui.button(words(f"home.next_{second}_button"))

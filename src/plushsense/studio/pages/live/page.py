@@ -304,10 +304,8 @@ def _controls(page: Page, reader: LiveReader) -> None:  # noqa: C901
         bundle = tag(ui.select(bundles, value=chosen, label=words("live.bundle")), "bundle")
         engines = {"float": words("live.engine_float"), "int8": words("live.engine_int8")}
         engine = tag(ui.select(engines, value=choice.engine, label=words("live.engine")), "engine")
-        names = {"": words("live.reactions_none")} | {
-            name: words(f"live.reactions_{name}") if words.has(f"live.reactions_{name}") else name
-            for name in reaction_names()
-        }
+        names = {"": words("live.reactions_none")}
+        names |= {name: words.get(f"live.reactions_{name}", name) for name in reaction_names()}
         reactions = tag(ui.select(names, value=choice.reactions, label=words("live.reactions")), "reactions")
     with ui.row().classes("w-full items-center ps-small-gap"):
         start = tag(ui.button(words("live.start"), icon="play_arrow").props("unelevated no-caps"), "start")

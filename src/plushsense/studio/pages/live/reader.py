@@ -399,9 +399,8 @@ class LiveReader:
 
 def _problem(device: TappedDevice, before: str) -> str:
     """Return why no frame arrives; ``before``, the last reason, applies until one does."""
-    if getattr(device.device, "state", "connected") == "waiting":
-        gaps = getattr(device.device, "gaps", ())
-        return str(gaps[-1].reason) if gaps else before
+    if device.state == "waiting":
+        return str(device.gaps[-1].reason) if device.gaps else before
     if device.buffer.count == 0 and device.counters.malformed >= _UNREADABLE:
         return (
             f"The toy sends lines, but none is a frame of the layout '{device.layout.name}' of the bundle "

@@ -21,7 +21,7 @@ from plushsense.dataset.publishing.contents import PUBLIC_COLUMNS
 from plushsense.dataset.publishing.croissant import CROISSANT_FILE
 from plushsense.dataset.publishing.description import CHECKSUMS, REIDENTIFICATION_JSON
 from plushsense.dataset.publishing.tables import list_package_files
-from plushsense.dataset.store import read_people
+from plushsense.dataset.store import Dataset, read_people
 from plushsense.studio.app.guard import download_address
 from plushsense.studio.app.jobs import DONE, Jobs, StudioJob
 from plushsense.studio.app.shell import Page, address, html, moment, set_address, tag
@@ -44,24 +44,15 @@ class DatasetFacts:
     """Facts of a data set before publication.
 
     Attributes:
-        problem: why it cannot be read, or "".
+        dataset: None if it cannot be read; ``problem`` says why.
+        columns: columns of the table of people that are not always published.
         own_codes: people whose codes were not drawn by ``pseudonymise``.
         own_dates: whether the dates may be the true ones.
     """
 
     path: Path
+    dataset: Dataset | None = None
     problem: str = ""
-    name: str = ""
-    version: str = ""
-    simulated: bool = False
-    people: int = 0
-    recordings: int = 0
-    excluded: int = 0
-    streams: int = 0
-    licence: str = ""
-    contact_name: str = ""
-    contact_mail: str = ""
-    consent: str = ""
     columns: tuple[str, ...] = ()
     own_codes: tuple[str, ...] = ()
     own_dates: bool = False
@@ -74,21 +65,10 @@ class DatasetFacts:
             people = read_people(path)
         except PlushSenseError as refusal:
             return cls(path, problem=str(refusal))
-        head = dataset.head
         columns = {c for p in people.values() for c in p.more} - set(PUBLIC_COLUMNS)
         return cls(
             path,
-            name=head.name,
-            version=head.version,
-            simulated=head.simulated,
-            people=len(dataset.subjects),
-            recordings=len(dataset.recordings),
-            excluded=len(dataset.recordings) - len(dataset.used),
-            streams=len(dataset.streams),
-            licence=head.licence,
-            contact_name=head.about.contact.name,
-            contact_mail=head.about.contact.email,
-            consent=head.consent,
+            dataset,
             columns=tuple(sorted(columns)),
             own_codes=tuple(s for s in dataset.subjects if not is_drawn(s)),
             own_dates=any(0 < r.epoch_ms < _MOVED_MS for r in dataset.recordings),

@@ -11,7 +11,7 @@ from nicegui import run, ui
 from plushsense.core.errors import ConfigError
 from plushsense.dataset.publishing.description import LICENCES
 from plushsense.dataset.publishing.package import complete_head
-from plushsense.dataset.store import DatasetHead
+from plushsense.dataset.store import Dataset, DatasetHead
 from plushsense.studio.app.jobs import Jobs, StudioJob
 from plushsense.studio.app.shell import Page, address, query, tag
 from plushsense.studio.app.workspace import DATASETS, PACKAGES, plain_name
@@ -24,21 +24,18 @@ _MAX_CODES = 5
 class StatementsForm:
     """Fields for licence, contact and consent, filled from the data set or the last publication."""
 
-    def __init__(self, page: Page, found: DatasetFacts) -> None:
-        self.page, self.words, self.found = page, page.words, found
-
-    def build(self) -> None:
-        words, found = self.words, self.found
-        jobs = self.page.workspace.part(Jobs).all("publish")
-        last = next((j.spec for j in jobs if j.spec["dataset"] == str(found.path)), {})
+    def __init__(self, page: Page, path: Path, head: DatasetHead) -> None:
+        words, contact = page.words, head.about.contact
+        jobs = page.workspace.part(Jobs).all("publish")
+        last = next((j.spec for j in jobs if j.spec["dataset"] == str(path)), {})
         name, _, mail = str(last.get("contact", "")).rstrip(">").partition(" <")
         text(words("publish.statements"), "h3")
-        given = {"licence": found.licence, "contact": found.contact_mail, "consent": found.consent}
+        given = {"licence": head.licence, "contact": contact.email, "consent": head.consent}
         missing = [words(f"publish.lacks_{key}") for key, value in given.items() if not value]
         message = words("publish.lacks", what=", ".join(missing)) if missing else words("publish.lacks_nothing")
         tag(text(message), "lacks")
         licences = {s: s if s == each.title else f"{s}: {each.title}" for s, each in LICENCES.items()}
-        value = found.licence or last.get("licence") or None
+        value = head.licence or last.get("licence") or None
         if value is not None:
             # A licence that the library refuses stays visible.
             licences.setdefault(value, value)
@@ -46,12 +43,12 @@ class StatementsForm:
         self._licence = tag(licence, "licence")
         text(words("publish.licence_about"), classes="ps-dim")
         with ui.row().classes("w-full"):
-            who = ui.input(words("publish.contact_name"), value=found.contact_name or name).classes("col-grow")
+            who = ui.input(words("publish.contact_name"), value=contact.name or name).classes("col-grow")
             self._name = tag(who, "contact-name")
-            where = ui.input(words("publish.contact_mail"), value=found.contact_mail or mail).classes("col-grow")
+            where = ui.input(words("publish.contact_mail"), value=contact.email or mail).classes("col-grow")
             self._mail = tag(where.props("type=email"), "contact-mail")
         text(words("publish.contact_about"), classes="ps-dim")
-        consent = ui.textarea(words("publish.consent"), value=found.consent or last.get("consent", ""))
+        consent = ui.textarea(words("publish.consent"), value=head.consent or last.get("consent", ""))
         self._consent = tag(consent.props("autogrow").classes("w-full"), "consent")
         text(words("publish.consent_about"), classes="ps-dim")
         self._save = tag(ui.checkbox(words("publish.save")), "save")
@@ -77,25 +74,23 @@ class PseudonymsForm:
     def __init__(
         self, page: Page, found: DatasetFacts, start: Callable[[str, str, list[str], bool], Awaitable[None]]
     ) -> None:
-        self.page, self.words, self.found, self._start = page, page.words, found, start
-
-    def build(self) -> None:
-        words, found = self.words, self.found
+        words, self._start = page.words, start
+        simulated = found.dataset is not None and found.dataset.head.simulated
         if not found.own_codes and not found.own_dates:
             tag(text(words("publish.renamed_already"), classes="ps-dim"), "renamed-already")
             return
         codes = ", ".join(found.own_codes[:_MAX_CODES]) + (" …" if len(found.own_codes) > _MAX_CODES else "")
         with tag(ui.column().classes("w-full"), "advice"):
-            notice(words("publish.advice", codes=codes or "–"), "info" if found.simulated else "warning")
+            notice(words("publish.advice", codes=codes or "–"), "info" if simulated else "warning")
         with tag(ui.expansion(words("publish.rename")).classes("w-full"), "rename"):
             text(words("publish.rename_about"))
-            name = self.page.workspace.free_name(DATASETS, f"{found.path.name}-shared")
+            name = page.workspace.free_name(DATASETS, f"{found.path.name}-shared")
             self._name = tag(ui.input(words("publish.rename_name"), value=name).props("maxlength=64"), "rename-name")
             key = ui.input(words("publish.rename_key"), value=f"{found.path.name}-people.csv").props("maxlength=64")
             self._key = tag(key, "rename-key")
             for field in (self._name, self._key):
                 field.classes("w-full")
-            text(words("publish.key_place", folder=str(self.page.workspace.folder / KEYS)), classes="ps-dim")
+            text(words("publish.key_place", folder=str(page.workspace.folder / KEYS)), classes="ps-dim")
             self._listed = tag(ui.textarea(words("publish.rename_words")).props("autogrow").classes("w-full"), "words")
             self._drop = tag(ui.checkbox(words("publish.rename_drop")), "drop-notes")
             notice(words("publish.rename_safe"))
@@ -166,15 +161,14 @@ class _Publishing:
         self.dataset = found
         self._rest.clear()
         with self._rest:
-            if found.problem:
+            if found.dataset is None:
                 tag(notice(found.problem, "error"), "dataset-problem")
                 return
-            if found.simulated:
+            if found.dataset.head.simulated:
                 notice(words("shell.simulation"))
-            tag(facts(self._facts_of(found)), "dataset-facts")
-            PseudonymsForm(self.page, found, self._pseudonymise).build()
-            self.statements = StatementsForm(self.page, found)
-            self.statements.build()
+            tag(facts(self._facts_of(found.dataset)), "dataset-facts")
+            PseudonymsForm(self.page, found, self._pseudonymise)
+            self.statements = StatementsForm(self.page, found.path, found.dataset.head)
             self._choices(found)
             name = ui.input(words("publish.name"), value=self._free_name(found.path.name)).props("maxlength=64")
             self._name = tag(name.classes("w-full"), "name")
@@ -182,15 +176,16 @@ class _Publishing:
             self._button = tag(button, "do")
         self._allow()
 
-    def _facts_of(self, found: DatasetFacts) -> list[tuple[str, str]]:
-        words = self.words
+    def _facts_of(self, dataset: Dataset) -> list[tuple[str, str]]:
+        words, recordings = self.words, len(dataset.recordings)
+        counts = words("publish.recordings_value", n=recordings, x=recordings - len(dataset.used))
         return [
-            (words("publish.dataset_name"), found.name),
-            (words("publish.version"), found.version),
-            (words("publish.people"), str(found.people)),
-            (words("publish.recordings"), words("publish.recordings_value", n=found.recordings, x=found.excluded)),
-            (words("publish.streams_count"), str(found.streams)),
-            (words("publish.place"), str(found.path)),
+            (words("publish.dataset_name"), dataset.head.name),
+            (words("publish.version"), dataset.head.version),
+            (words("publish.people"), str(len(dataset.subjects))),
+            (words("publish.recordings"), counts),
+            (words("publish.streams_count"), str(len(dataset.streams))),
+            (words("publish.place"), str(dataset.path)),
         ]
 
     def _choices(self, found: DatasetFacts) -> None:

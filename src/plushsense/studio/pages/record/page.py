@@ -12,10 +12,10 @@ from plushsense.devices.opening import list_devices
 from plushsense.recording.plan import DEFAULT, wordings
 from plushsense.recording.session import SessionSummary
 from plushsense.recording.setup import PROTOCOL, SessionRequest, is_virtual
-from plushsense.studio.app.shell import Page, html, named, query, tag
+from plushsense.studio.app.shell import Page, address, html, named, query, tag
 from plushsense.studio.app.words import Words
 from plushsense.studio.pages.record.controller import ActiveSession, RecordController
-from plushsense.studio.pages.record.session import address, protocol_title, show_session, summary
+from plushsense.studio.pages.record.session import show_session, summary
 
 _LISTED = 8
 _SCAN_S = 3.0
@@ -78,7 +78,7 @@ def _open_ones(page: Page, controller: RecordController) -> None:
         with tag(ui.row().classes("ps-card w-full items-center"), "open-session"):
             ui.label(page.words("record.open_now", name=session.name)).classes("flex-grow text-bold")
             there = page.words("record.show")
-            button = ui.button(there, on_click=lambda s=session: ui.navigate.to(address(s.name)))
+            button = ui.button(there, on_click=lambda s=session: ui.navigate.to(address("record", session=s.name)))
             named(button.props("no-caps unelevated"), f"{there}: {session.name}")
 
 
@@ -107,7 +107,7 @@ def _one_unfinished(page: Page, controller: RecordController, session: SessionSu
         text = words("record.so_far", name=name, done=session.done, steps=session.steps)
         with ui.column().classes("flex-grow").style("gap: 0"):
             ui.label(text).classes("text-bold")
-            title = protocol_title(words, session.protocol.name, session.protocol.title)
+            title = words.get(f"record.protocol_{session.protocol.name}", session.protocol.title)
             title += f" · {words('record.simulated')}" if session.head.simulated else ""
             ui.label(title).classes("ps-dim")
         toys = list(dict.fromkeys([session.head.device, *controller.toys()]))
@@ -127,7 +127,7 @@ async def _open_session(page: Page, button: ui.button, work: Callable[[], Active
         with page.show_errors():
             session = await run.io_bound(work)
             if session is not None:
-                ui.navigate.to(address(session.name))
+                ui.navigate.to(address("record", session=session.name))
     finally:
         button.enable()
 
@@ -146,8 +146,8 @@ class _Form:
                 self._age = self._input("age_group", "age_hint")
                 self._gender = self._input("gender", "gender_hint")
             with ui.row().classes("w-full items-start"):
-                named = {key: self._named("protocol", key, name) for key, name in protocols.items()}
-                self._protocol = self._select(named, "protocol", PROTOCOL)
+                titles = {key: words.get(f"record.protocol_{key}", name) for key, name in protocols.items()}
+                self._protocol = self._select(titles, "protocol", PROTOCOL)
                 self._protocol.on_value_change(self._choose_words)
                 self._words = self._select({DEFAULT: DEFAULT}, "wording", DEFAULT)
             with ui.row().classes("w-full items-start"):
@@ -165,10 +165,6 @@ class _Form:
             self._begin = ui.button(words("record.begin"), on_click=self._begin_session)
             tag(self._begin, "begin").props("no-caps unelevated size=lg")
         self._choose_words()
-
-    def _named(self, what: str, key: str, name: str) -> str:
-        text = f"record.{what}_{key}"
-        return self._page.words(text) if self._page.words.has(text) else name
 
     def _input(self, key: str, hint: str) -> ui.input:
         words = self._page.words
@@ -191,7 +187,7 @@ class _Form:
             known = (DEFAULT,)
         language = self._page.words.language
         value = language if language in known else DEFAULT
-        self._words.set_options({w: self._named("wording", w, w) for w in known}, value=value)
+        self._words.set_options({w: self._page.words.get(f"record.wording_{w}", w) for w in known}, value=value)
 
     async def _look_for_toys(self) -> None:
         words = self._page.words

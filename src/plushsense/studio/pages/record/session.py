@@ -6,14 +6,13 @@ import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any
-from urllib.parse import quote
 
 from markupsafe import Markup
 from nicegui import run, ui
 from nicegui.element import Element
 
 from plushsense.recording.states import RecorderStatus
-from plushsense.studio.app.shell import LINES, Keys, Page, focus, html, named, on_change, on_click, tag
+from plushsense.studio.app.shell import LINES, Keys, Page, address, focus, html, named, on_change, on_click, tag
 from plushsense.studio.app.words import Words
 from plushsense.studio.pages.record.controller import ActiveSession, RecordController
 from plushsense.studio.widgets.elements import Plot, own_picture, picture
@@ -35,17 +34,6 @@ def percent(share: float, words: Words) -> str:
     """Format a share in per cent, with one decimal place below ten."""
     text = words.number(100 * share, 1 if share < 0.1 else 0)
     return text.removesuffix(f"{words('shell.decimal_point')}0")
-
-
-def address(name: str, key: str = "session") -> str:
-    """Return the address of a session's page."""
-    return f"/record?{key}={quote(name)}"
-
-
-def protocol_title(words: Words, name: str, title: str) -> str:
-    """Return the title of a protocol, in the page's language if it is a built-in one."""
-    key = f"record.protocol_{name}"
-    return words(key) if words.has(key) else title
 
 
 def summary(text: str) -> None:
@@ -82,8 +70,7 @@ class SignalPanel:
         plots = []
         with ui.row().classes("w-full items-start").style("gap: 8px"):
             for kind, indices in kinds.items():
-                key = f"record.kind_{kind}"
-                title = words(key) if words.has(key) else kind
+                title = words.get(f"record.kind_{kind}", kind)
                 names = [channels[n].name for n in indices]
                 label = words("record.live_label", s=f"{_WINDOW_S * speed:g}", channels=", ".join(names))
                 series = [{"label": name, "stroke": LINES[i % len(LINES)]} for i, name in enumerate(names)]
@@ -248,7 +235,8 @@ class _View:
         self._keys = Keys(_KEYS, self._press, {"n": '[name="note"]'})
         with ui.row().classes("w-full items-center").style("gap: 4px 16px"):
             ui.label(words("record.session", subject=head.subject, session=head.session)).classes("text-bold")
-            ui.label(protocol_title(words, head.protocol["name"], head.protocol["title"])).classes("ps-dim")
+            title = words.get(f"record.protocol_{head.protocol['name']}", head.protocol["title"])
+            ui.label(title).classes("ps-dim")
             if head.simulated:
                 tag(ui.label(words("shell.simulation")).classes("ps-simulated"), "simulation")
         self._notices()
@@ -382,20 +370,20 @@ class _View:
         self._left = True
         with self._page.show_errors():
             await run.io_bound(self._controller.close_session, self._session.name)
-            ui.navigate.to(address(self._session.name, "ended"))
+            ui.navigate.to(address("record", ended=self._session.name))
             return
         self._left = False
 
     async def _reopen(self) -> None:
         """Resume the session; if that fails, offer the start page, where another toy can be chosen."""
         if self._left:
-            ui.navigate.to(address(self._session.name))
+            ui.navigate.to(address("record", session=self._session.name))
             return
         self._left = True
         with self._page.show_errors():
             await run.io_bound(self._controller.close_session, self._session.name)
             await run.io_bound(self._controller.resume, self._session.name, self._session.request.device)
-            ui.navigate.to(address(self._session.name))
+            ui.navigate.to(address("record", session=self._session.name))
             return
         self._main.text = self._page.words("record.all_sessions")
 
@@ -414,7 +402,7 @@ class _View:
         if self._controller.get(self._session.name) is not self._session:
             self._left = True
             reopened = self._controller.get(self._session.name) is not None
-            ui.navigate.to(address(self._session.name, "session" if reopened else "ended"))
+            ui.navigate.to(address("record", **{"session" if reopened else "ended": self._session.name}))
             return
         s = self._session.status()
         self._keys.show(s.seen)

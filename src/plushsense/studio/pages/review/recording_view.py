@@ -286,8 +286,7 @@ class RecordingView:
                 tag(button.props(f'flat round dense aria-label="{words(f"review.{key}")}"').classes("ps-act"), key)
 
     def _kind(self, kind: str) -> str:
-        key = f"review.kind_{kind}"
-        return self.desk.words(key) if self.desk.words.has(key) else kind
+        return self.desk.words.get(f"review.kind_{kind}", kind)
 
     # Drawing ------------------------------------------------------------------------------------------------------
 
