@@ -33,7 +33,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "backup": ("backup", "save a data set as one checked file, or check such a file"),
     "restore": ("backup:restore", "restore a data set from a backup"),
     "forget": ("privacy:forget", "remove a person from a data set permanently"),
-    "arch": ("arch", "count a network's parameters, receptive field, multiply-accumulates and state"),
+    "arch": ("info:arch", "count a network's parameters, receptive field, multiply-accumulates and state"),
     "train": ("train", "train one network and save it as a bundle"),
     "evaluate": ("evaluate", "cross-validate a network on people left out of the training"),
     "abstain": ("abstain", "measure how well the confidence predicts errors, on people left out"),
@@ -43,14 +43,14 @@ VERBS: dict[str, tuple[str, str]] = {
     "search": ("search", "find the best network within limits of size, at a share of the cost of a sweep"),
     "report": ("report", "write an HTML page of evaluations and bundles, or of a sweep"),
     "export": ("export", "write C for the toy that gives the same answers, bit for bit"),
-    "verify": ("verify", "prove that the C of an export gives the same answers, here and on emulated chips"),
-    "profile": ("profile", "measure what an export costs on a chip: instructions, bytes, stack, estimated time"),
+    "verify": ("export:verify", "prove that the C of an export gives the same answers, here and on emulated chips"),
+    "profile": ("export:profile", "measure what an export costs on a chip: instructions, bytes, stack, estimated time"),
     "live": ("live", "classify the touches of a toy live, 20 times a second"),
     "adapt": ("adapt", "adapt a bundle to one person, or undo it"),
     "protocol": ("protocol", "run the paper's real-time protocol: which system answers which touch, and how soon"),
     "studio": ("studio", "open the web application, by default for this machine only"),
-    "toy": ("virtual:toy", "serve a virtual toy on a pseudo terminal, a TCP port or an LSL stream"),
-    "simulate": ("virtual:simulate", "write recordings of virtual people, as the authors' recorder writes them"),
+    "toy": ("devices:toy", "serve a virtual toy on a pseudo terminal, a TCP port or an LSL stream"),
+    "simulate": ("devices:simulate", "write recordings of virtual people, as the authors' recorder writes them"),
 }
 
 _RESUMES = "finished work is kept; give the same command again to resume"

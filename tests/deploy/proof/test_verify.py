@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from plushsense.cli.export import verification_lines
 from plushsense.cli.main import main
-from plushsense.cli.verify import _text
 from plushsense.core.errors import BadInput, ToolError
 from plushsense.core.gestures import Gesture, GestureSet
 from plushsense.core.layouts import Layout, load_layout
@@ -186,7 +186,7 @@ def test_a_fault_of_the_rules_that_no_scenario_shows_is_no_defect_of_the_c(
     done = result()
     assert [f.name for f in done.mutants if not f.caught] == [seldom] == [f.name for f in done.mutants if f.silent]
     assert done.passed and done.to_dict()["passed"]
-    assert "not shown: no test scenario of this network" in "\n".join(_text(done))
+    assert "not shown: no test scenario of this network" in "\n".join(verification_lines(done))
 
 
 def test_scenarios_have_sensors_that_are_stuck_where_they_may_be(small: Path) -> None:
