@@ -1,8 +1,9 @@
-"""The page of a check: a summary, every gesture's recordings over each other, and plots of what was found."""
+"""Write the report of a check: a summary, overlays of each gesture's recordings, and plots of findings."""
 
 from __future__ import annotations
 
 import base64
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,14 +30,14 @@ if TYPE_CHECKING:
 Progress = Callable[[int, int], None]
 
 NAMED = 12
-"""Odd recordings that an overlay names; more would be a tangle."""
+"""Maximum number of recordings that an overlay names."""
 PLOTS = 12
-"""Plots a check."""
+"""Maximum number of plots for each check."""
 PICTURE_BYTES = 10_000_000
-"""What all pictures of a page may weigh; written as text they take a third more."""
-_ODD = ("never-stopped", "duration", "no-onset", "several-gestures", "stuck", "flat")
-_CLOCK = ("clock-reset", "gaps", "lost-frames", "jitter", "resumed", "rate")
-_SIGNAL = (
+"""Maximum size of all pictures of a page; as text they take a third more."""
+_NAMED_CHECKS = ("never-stopped", "duration", "no-onset", "several-gestures", "stuck", "flat")
+_CLOCK_CHECKS = ("clock-reset", "gaps", "lost-frames", "jitter", "resumed", "rate")
+_SIGNAL_CHECKS = (
     *("never-stopped", "duration", "no-onset", "several-gestures", "overlap", "clock-reset", "gaps"),
     *("garbage", "blank-rows", "spikes", "flat", "stuck", "saturated"),
 )
@@ -45,34 +46,39 @@ _SEVERITY = {"error": "to decide", "warning": "to look at", "info": "good to kno
 
 
 def scale_of(dataset: Dataset, sample: int = 200) -> NDArray[np.float64]:
-    """Return the usual spread of each channel within a recording, (C,), from a sample of the recordings."""
+    """Return the typical spread of each channel within a recording, (C,), from a sample of the recordings."""
     used = dataset.used
-    taken = used[:: max(1, len(used) // sample)]
-    spreads = [summarize(r, frames, dataset.layout).spread for r in taken if len(frames := dataset.read(r))]
+    sampled = used[:: max(1, len(used) // sample)]
+    spreads = [summarize(r, frames, dataset.layout).spread for r in sampled if len(frames := dataset.read(r))]
     high = np.percentile(spreads, 75, axis=0) if spreads else np.ones(dataset.layout.n_channels)
-    scale: NDArray[np.float64] = np.where(high > 0, high, 1.0)
-    return scale
+    return np.asarray(np.where(high > 0, high, 1.0))
 
 
-def _names_of_odd(result: CheckReport, gesture: str) -> dict[str, str]:
-    """Return the recordings that an overlay names: id and reason; errors and warnings, the most urgent first."""
-    odd: dict[str, list[str]] = {}
+def _names(result: CheckReport, gesture: str) -> dict[str, str]:
+    """Return the names, with reasons, of the recordings of a gesture that have findings, the most urgent first."""
+    checks: dict[str, list[str]] = {}
     for f in result.findings:
-        if f.recording and f.gesture == gesture and f.check in _ODD and f.severity != "info" and not f.accepted:
-            odd.setdefault(f.recording, []).append(f.check)
-    return {name: f"{name}: {', '.join(odd[name])}" for name in list(odd)[:NAMED]}
+        if (
+            f.recording
+            and f.gesture == gesture
+            and f.check in _NAMED_CHECKS
+            and f.severity != "info"
+            and not f.accepted
+        ):
+            checks.setdefault(f.recording, []).append(f.check)
+    return {name: f"{name}: {', '.join(checks[name])}" for name in list(checks)[:NAMED]}
 
 
 def gesture_figure(result: CheckReport, gesture: str, scale: NDArray[np.float64] | None = None) -> Figure:
-    """Draw all used recordings of a gesture over each other, and how long each lasts."""
+    """Draw all used recordings of a gesture over each other, and their durations."""
     dataset = result.dataset
     scale = scale_of(dataset) if scale is None else scale
-    odd = _names_of_odd(result, gesture)
+    names = _names(result, gesture)
     lines = []
     for r in dataset.used:
         if r.gesture == gesture and r.stop > r.start:
             frames = dataset.read(r)
-            lines.append(figures.line(frames, dataset.layout, scale, duration_s(frames), odd.get(r.id, "")))
+            lines.append(figures.line(frames, dataset.layout, scale, duration_s(frames), names.get(r.id, "")))
     seconds = np.array([one.lasts for one in lines]) if lines else np.ones(1)
     mean = float(seconds[seconds <= NEVER_STOPPED_FACTOR * np.median(seconds)].mean())
     return figures.overlay(gesture, lines, mean, result.limits.duration)
@@ -80,60 +86,54 @@ def gesture_figure(result: CheckReport, gesture: str, scale: NDArray[np.float64]
 
 @dataclass
 class _Pictures:
-    """Pictures as data URIs until they weigh too much; ``left_out`` counts the rest."""
+    """Convert pictures to data URIs up to a total size; ``left_out`` counts the others."""
 
     limit: int
-    weight: int = 0
+    size: int = 0
     left_out: int = 0
-    made: int = 0
+    added: int = 0
 
     def add(self, figure: Figure) -> str | None:
         data = png(figure)
-        if self.weight + len(data) > self.limit:
+        if self.size + len(data) > self.limit:
             self.left_out += 1
             return None
-        self.weight += len(data)
-        self.made += 1
+        self.size += len(data)
+        self.added += 1
         return "data:image/png;base64," + base64.b64encode(data).decode("ascii")
 
 
 def write_report(path: Path, result: CheckReport, progress: Progress | None = None) -> Path:
-    """Write the page; an older page of PlushSense is replaced in one step, another file never.
+    """Write the page; only an earlier report is replaced.
 
     Raises:
-        ConfigError: when the place is taken by something else, or cannot be written.
-        MissingExtraError: when jinja2 or matplotlib is not installed.
+        ConfigError: when ``path`` is another file, or cannot be written.
+        MissingExtraError: when matplotlib is not installed.
     """
     target = check_page_path(path)
     return write_page(target, render(result, progress))
 
 
 def render(result: CheckReport, progress: Progress | None = None) -> str:
-    """Return the page as one HTML text; files are read again only where they are drawn."""
+    """Return the page as HTML."""
     dataset = result.dataset
     pictures = _Pictures(PICTURE_BYTES)
     gestures = [g.label for g in dataset.gestures.gestures if any(r.gesture == g.label for r in dataset.used)]
     by_check = {name: result.findings_of(name) for name in CHECKS}
-    by_check = {name: found for name, found in by_check.items() if found}
-    total, done = len(gestures) + len(by_check), 0
-
-    def step() -> None:
-        nonlocal done
-        done += 1
-        if progress is not None:
-            progress(done, total)
-
+    by_check = {name: findings for name, findings in by_check.items() if findings}
     scale = scale_of(dataset)
-    places = _Places(dataset, scale)
-    # Findings first: where pictures must be left out, the places of faults matter more.
+    plotter = _Plotter(dataset, scale)
+    report = progress or (lambda done, total: None)
+    total = len(by_check) + len(gestures)
+    # Findings come first: if pictures must be left out, they are more important than overlays.
     sections = []
-    for name, found in by_check.items():
-        sections.append(_section(name, found, places, pictures))
-        step()
+    for name, findings in by_check.items():
+        sections.append(_section(name, findings, plotter, pictures))
+        report(len(sections), total)
     overlays = []
     for gesture in gestures:
         overlays.append({"label": gesture, "picture": pictures.add(gesture_figure(result, gesture, scale))})
-        step()
+        report(len(sections) + len(overlays), total)
     counts = result.counts()
     return render_page(
         "quality.html.j2",
@@ -157,7 +157,7 @@ def render(result: CheckReport, progress: Progress | None = None) -> str:
         severities=[_SEVERITY[s] for s in SEVERITIES],
         left_out=pictures.left_out,
         plots=PLOTS,
-        pictures=pictures.made,
+        pictures=pictures.added,
         clean=[name for name in result.checks if name not in by_check],
     )
 
@@ -173,35 +173,32 @@ def _row(f: Finding) -> dict[str, Any]:
     }
 
 
-def _section(name: str, found: list[Finding], places: _Places, pictures: _Pictures) -> dict[str, Any]:
-    drawn = []
-    wanted = [f for f in _spread(found) if not f.accepted and places.can_draw(f)]
-    for f in wanted[:PLOTS]:
-        drawn += [uri for figure in places.draw(f) if (uri := pictures.add(figure)) is not None]
+def _section(name: str, findings: list[Finding], plotter: _Plotter, pictures: _Pictures) -> dict[str, Any]:
+    plottable = [f for f in _spread(findings) if not f.accepted and plotter.can_draw(f)]
+    added = [pictures.add(figure) for f in plottable[:PLOTS] for figure in plotter.draw(f)]
     return {
         "name": name,
-        "count": len(found),
-        "counts": [sum(f.severity == s and not f.accepted for f in found) for s in SEVERITIES],
+        "count": len(findings),
+        "counts": [sum(f.severity == s and not f.accepted for f in findings) for s in SEVERITIES],
         "action": CHECKS[name].action,
-        "rows": [_row(f) for f in found],
-        "pictures": drawn,
-        "more": max(0, len(wanted) - PLOTS),
+        "rows": [_row(f) for f in findings],
+        "pictures": [uri for uri in added if uri is not None],
+        "more": max(0, len(plottable) - PLOTS),
     }
 
 
-def _spread(found: list[Finding]) -> Iterator[Finding]:
-    """Yield the findings in turn over the people, so that the plots differ; the most urgent first."""
-    turns: dict[tuple[int, str], int] = {}
+def _spread(findings: list[Finding]) -> list[Finding]:
+    """Return the findings by severity, each person's first finding before second ones, so that the plots differ."""
+    turns: Counter[tuple[str, str]] = Counter()
     order = []
-    for i, f in enumerate(found):
-        severity = SEVERITIES.index(f.severity)
-        turn = turns[severity, f.subject] = turns.get((severity, f.subject), -1) + 1
-        order.append((severity, not f.recording, turn, i, f))
-    yield from (entry[4] for entry in sorted(order, key=lambda entry: entry[:4]))
+    for f in findings:
+        order.append((SEVERITIES.index(f.severity), not f.recording, turns[f.severity, f.subject]))
+        turns[f.severity, f.subject] += 1
+    return [f for _, f in sorted(zip(order, findings, strict=True), key=lambda pair: pair[0])]
 
 
-class _Places:
-    """Where findings are, drawn; the last file read is kept."""
+class _Plotter:
+    """Draws the places of findings; caches the frames that were read last."""
 
     def __init__(self, dataset: Dataset, scale: NDArray[np.float64]) -> None:
         self._dataset = dataset
@@ -217,11 +214,11 @@ class _Places:
         """Return whether a plot helps to judge this finding."""
         if f.recording:
             info = self._recordings[f.recording]
-            return info.stop - info.start >= _DRAWN_ROWS and (f.check in _SIGNAL or f.check in _CLOCK)
-        return bool(f.stream) and f.check in (*_CLOCK, "stuck", "flat", "drift", "garbage")
+            return info.stop - info.start >= _DRAWN_ROWS and (f.check in _SIGNAL_CHECKS or f.check in _CLOCK_CHECKS)
+        return bool(f.stream) and f.check in (*_CLOCK_CHECKS, "stuck", "flat", "drift", "garbage")
 
     def draw(self, f: Finding) -> Iterator[Figure]:
-        """Yield one or two figures: the clock for findings about time, the channels with the place marked."""
+        """Yield one or two figures: the clock for findings about time, and the channels with the place marked."""
         frames = self._frames(f)
         if not len(frames):
             return
@@ -234,10 +231,10 @@ class _Places:
             if lows is not None:
                 yield figures.baselines(lows, self._layout, f.channels, title=title)
             return
-        if f.check in _CLOCK:
+        if f.check in _CLOCK_CHECKS:
             yield figures.clock(frames, f.rows, first_row=first, title=title)
             title = ""
-        if f.check in _SIGNAL and (f.recording or f.check not in _CLOCK):
+        if f.check in _SIGNAL_CHECKS and (f.recording or f.check not in _CLOCK_CHECKS):
             marked = () if f.check in ("never-stopped", "flat") else f.rows
             yield figures.signals(
                 frames, self._layout, marked, f.channels, first_row=first, title=title, scale=self._scale

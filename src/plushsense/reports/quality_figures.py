@@ -1,4 +1,4 @@
-"""Figures of a check: a gesture's recordings over each other, and the place in a recording that a finding means."""
+"""Draw the recordings of a gesture over each other, the places of findings, and trims."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# Okabe and Ito's colours, told apart with any colour vision; grey is what is usual.
+# Okabe and Ito's colours, for any colour vision; grey is for recordings without findings.
 COLOURS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 GREY, BAND, MARK = "#9aa0a6", "#e8f0fa", "#d55e00"
 _POINTS = 1500
@@ -34,7 +34,7 @@ _FEW = 40
 
 @dataclass(frozen=True)
 class Line:
-    """A recording in an overlay: ``seconds`` and ``size`` (T,) of its deviation; ``name`` where it is odd."""
+    """A recording in an overlay: ``seconds`` and ``size`` (T,) of its deviation, and a ``name`` if it has findings."""
 
     seconds: NDArray[np.float64]
     size: NDArray[np.float64]
@@ -42,26 +42,25 @@ class Line:
     name: str = ""
 
 
-def away(frames: Frames, layout: Layout, scale: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return how far each channel is from its rest in the recording, (T, C), in units of ``scale``.
+def from_rest(frames: Frames, layout: Layout, scale: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the difference of each channel from its rest in the recording, (T, C), in units of ``scale``.
 
-    Rest is the low of channels that have a baseline, and the median of others; garbage is drawn to the valid range.
+    Rest is the 10th percentile of channels with a baseline, and the median of others. Values are clipped to the valid
+    range.
     """
     values = np.clip(frames.values, layout.valid_min_int, layout.valid_max_int)
     level = np.array([c.kind in LEVEL_KINDS for c in layout.channels])
     low, middle = np.percentile(values, (10, 50), axis=0)
-    found: NDArray[np.float64] = (values - np.where(level, low, middle)) / scale
-    return found
+    return np.asarray((values - np.where(level, low, middle)) / scale)
 
 
 def deviation(frames: Frames, layout: Layout, scale: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the distance of all channels together from their rest, (T,): root of the summed squares."""
-    size: NDArray[np.float64] = np.sqrt(np.square(away(frames, layout, scale)).sum(axis=1))
-    return size
+    """Return the Euclidean distance of all channels from their rest, (T,), in units of ``scale``."""
+    return np.asarray(np.sqrt(np.square(from_rest(frames, layout, scale)).sum(axis=1)))
 
 
 def line(frames: Frames, layout: Layout, scale: NDArray[np.float64], lasts: float, name: str = "") -> Line:
-    """Return a recording for an overlay, thinned to the highest value of each stretch."""
+    """Return a recording for an overlay, reduced to the maximum of each section."""
     size = deviation(frames, layout, scale)
     seconds = np.linspace(0.0, lasts, len(size))
     step = -(-len(size) // _LINE_POINTS)
@@ -72,13 +71,12 @@ def line(frames: Frames, layout: Layout, scale: NDArray[np.float64], lasts: floa
 
 
 def overlay(gesture: str, lines: Sequence[Line], mean_s: float, tolerance: float) -> Figure:
-    """Draw all recordings of a gesture over each other, odd ones in colour and named; below, how long each lasts."""
+    """Draw all recordings of a gesture over each other, those with a name in colour, and below their durations."""
     figure = new_figure(9.2, 4.3)
     top, strip = figure.subplots(2, 1, height_ratios=(3.2, 1), sharex=True)
     named = [one for one in lines if one.name]
-    # One that never stopped would squeeze all others to the left.
+    # A recording that never stopped would compress all others.
     end = max([1.8 * mean_s, *(one.lasts for one in lines if one.lasts < 4 * mean_s)], default=1.0)
-    # Few lines are to be seen each, of many the mass.
     few = len(lines) <= _FEW
     for one in lines:
         if not one.name:
@@ -87,29 +85,23 @@ def overlay(gesture: str, lines: Sequence[Line], mean_s: float, tolerance: float
         style = "-" if i < len(COLOURS) else "--"
         top.plot(one.seconds, one.size, style, color=COLOURS[i % len(COLOURS)], linewidth=1.4, label=one.name)
     heights = [s for one in lines for s in (np.percentile(one.size, 99.5),) if one.size.size]
-    # A recording of one row has neither height nor length.
+    # Recordings of one row have no height and no length.
     top.set_ylim(0, (1.25 * float(np.percentile(heights, 98)) if heights else 0.0) or 1.0)
     top.set_ylabel("deviation from rest\n(1 = usual)", fontsize=9)
     top.set_title(f"{gesture}: {len(lines)} recordings", fontsize=10, parse_math=False)
     if named:
-        shown = top.legend(fontsize=7.5, frameon=True, framealpha=0.85, loc="upper right")
-        for text in shown.get_texts():
+        legend = top.legend(fontsize=7.5, frameon=True, framealpha=0.85, loc="upper right")
+        for text in legend.get_texts():
             text.set_parse_math(False)
     strip.axvspan((1 - tolerance) * mean_s, (1 + tolerance) * mean_s, color=BAND, zorder=0)
     strip.axvline(mean_s, color=COLOURS[1], linewidth=1.0)
-    # A fixed spread, so that dots do not hide each other and the same data give the same picture.
+    # A fixed vertical offset separates the dots, and gives the same picture each time.
     rest = [one.lasts for one in lines if not one.name]
     strip.plot(rest, (np.arange(len(rest)) * 0.618) % 1.0, "o", color=GREY, markersize=2.6, alpha=0.7)
     for i, one in enumerate(named):
-        at = min(one.lasts, end)
-        strip.plot(
-            at,
-            0.2 + 0.6 * ((i * 0.618) % 1.0),
-            ">" if one.lasts > end else "D",
-            color=COLOURS[i % len(COLOURS)],
-            markersize=5,
-            zorder=3,
-        )
+        marker, colour = ">" if one.lasts > end else "D", COLOURS[i % len(COLOURS)]
+        offset = 0.2 + 0.6 * ((i * 0.618) % 1.0)
+        strip.plot(min(one.lasts, end), offset, marker, color=colour, markersize=5, zorder=3)
     strip.set_yticks([])
     strip.set_ylim(-0.15, 1.15)
     strip.set_xlim(0, end * 1.01 or 1.0)
@@ -137,43 +129,37 @@ def signals(
     title: str = "",
     scale: NDArray[np.float64] | None = None,
 ) -> Figure:
-    """Draw the channels of a recording by row, with places marked; only ``channels`` where they are named.
+    """Draw channels of a recording (default: all) by row, and mark ``rows``.
 
-    Channels of several kinds are drawn from their rest, each divided by its ``scale``.
+    Channels of several kinds are drawn as differences from their rest, each divided by its ``scale``.
     """
     figure = new_figure(7.4, 2.2)
     axes = figure.add_subplot()
-    shown = list(channels) or list(range(layout.n_channels))
-    kinds = {layout.channels[c].unit for c in shown} | {layout.channels[c].kind for c in shown}
+    drawn = list(channels) or list(range(layout.n_channels))
+    kinds = {layout.channels[c].unit for c in drawn} | {layout.channels[c].kind for c in drawn}
     at = _thinned(len(frames))
     mixed = scale is not None and len(kinds) > 2
     values: NDArray[Any] = np.clip(frames.values, layout.valid_min_int, layout.valid_max_int)
-    values = away(frames, layout, scale) if mixed and scale is not None else values * [c.step for c in layout.channels]
-    for i, c in enumerate(shown[:_CHANNELS]):
-        y = values[:, c]
-        style = ("-", "--", ":")[i // len(COLOURS)]
-        axes.plot(
-            at + first_row + 1,
-            y[at],
-            style,
-            color=COLOURS[(i + 1) % len(COLOURS)],
-            linewidth=0.9,
-            label=layout.names[c],
-        )
+    values = (
+        from_rest(frames, layout, scale) if mixed and scale is not None else values * [c.step for c in layout.channels]
+    )
+    for i, c in enumerate(drawn[:_CHANNELS]):
+        style, colour = ("-", "--", ":")[i // len(COLOURS)], COLOURS[(i + 1) % len(COLOURS)]
+        axes.plot(at + first_row + 1, values[at, c], style, color=colour, linewidth=0.9, label=layout.names[c])
     _mark(axes, rows)
-    axes.set_ylabel("from rest (1 = usual)" if mixed else layout.channels[shown[0]].unit, fontsize=8)
+    axes.set_ylabel("from rest (1 = usual)" if mixed else layout.channels[drawn[0]].unit, fontsize=8)
     axes.legend(
-        fontsize=6.5, ncols=1 if len(shown) < 7 else 2, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5)
+        fontsize=6.5, ncols=1 if len(drawn) < 7 else 2, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5)
     )
     return _finished(figure, axes, title)
 
 
 def clock(frames: Frames, rows: Sequence[tuple[int, int]] = (), *, first_row: int = 0, title: str = "") -> Figure:
-    """Draw the time from each row to the next by the device clock, with places marked."""
+    """Draw the difference of the device clock between rows, and mark ``rows``."""
     figure = new_figure(7.4, 2.2)
     axes = figure.add_subplot()
     steps = np.diff(frames.device_ms)
-    # The far ones must not be thinned away.
+    # Always draw the most deviating ones.
     far = np.argsort(np.abs(steps - np.median(steps)))[-200:] if len(steps) else np.empty(0, dtype=np.int64)
     at = np.unique(np.concatenate([_thinned(len(steps)), far])) if len(steps) else far
     axes.plot(at + first_row + 2, steps[at], color=COLOURS[1], linewidth=0.8)
@@ -184,12 +170,12 @@ def clock(frames: Frames, rows: Sequence[tuple[int, int]] = (), *, first_row: in
         powers = range(2, far_power + 1, 1 + far_power // 5)
         axes.set_yticks([-(10.0**p) for p in powers if steps.min() < -100] + [0.0] + [10.0**p for p in powers])
         axes.minorticks_off()
-    axes.set_ylabel("ms since row before", fontsize=8)
+    axes.set_ylabel("ms since previous row", fontsize=8)
     return _finished(figure, axes, title)
 
 
 def baselines(lows: NDArray[np.float64], layout: Layout, channels: Sequence[int], *, title: str = "") -> Figure:
-    """Draw the low level of channels over a session, one value for every 10 s."""
+    """Draw the baseline of channels over a session, one value for every 10 s."""
     figure = new_figure(7.4, 2.2)
     axes = figure.add_subplot()
     minutes = np.arange(len(lows)) / 6
@@ -224,14 +210,13 @@ _MARK, _SUGGESTION = "#d55e00", "#000000"
 
 
 def trim_page(dataset: Dataset, trims: Sequence[Trim], offset: bool = True) -> Figure:
-    """Draw one page of recordings: every channel over the device clock, with suggested and marked edges.
+    """Draw one page of recordings: every channel over the device clock, with suggested and marked trims.
 
-    A dotted line stands where an edge is suggested, a solid one where it is marked; what a mark cuts off is shaded.
-
-    Channels of one kind share a lane and a scale: each is drawn off its median, in shares of the kind's largest swing.
+    Suggested edges are dotted lines, marked edges solid lines, and trimmed parts are shaded. Channels of one kind share
+    a lane, each drawn as the difference from its median, relative to the largest difference of the kind.
 
     Args:
-        trims: at most `PER_PAGE` of `plushsense.dataset.trimming.suggest_trims`.
+        trims: at most `PER_PAGE` results of `plushsense.dataset.trimming.suggest_trims`.
         offset: whether to draw the suggested end.
     """
     rows = max(1, -(-len(trims) // _COLUMNS))
@@ -246,12 +231,11 @@ def trim_page(dataset: Dataset, trims: Sequence[Trim], offset: bool = True) -> F
         values = _off_median(frames.values, dataset.layout)
         at = trim.seconds[: len(frames)]
         for lane, kind in enumerate(kinds):
-            mine = [i for i, c in enumerate(channels) if c.kind == kind]
-            swing = max(1.0, float(np.nanmax(np.abs(values[:, mine]))))
-            for i in mine:
-                axes.plot(
-                    at, values[:, i] / swing - 2.1 * lane, linewidth=0.8, color=colours(i), label=channels[i].name
-                )
+            same_kind = [i for i, c in enumerate(channels) if c.kind == kind]
+            largest = max(1.0, float(np.nanmax(np.abs(values[:, same_kind]))))
+            for i in same_kind:
+                y = values[:, i] / largest - 2.1 * lane
+                axes.plot(at, y, linewidth=0.8, color=colours(i), label=channels[i].name)
         edges = [(s.start, s.onset_visible), (s.stop, s.offset_visible and offset)]
         for edge in (row for row, visible in edges if visible):
             axes.axvline(trim.seconds[edge], color=_SUGGESTION, linestyle=":", linewidth=1.6)
@@ -261,8 +245,8 @@ def trim_page(dataset: Dataset, trims: Sequence[Trim], offset: bool = True) -> F
                 if edge != whole:
                     axes.axvline(trim.seconds[edge], color=_MARK, linewidth=1.8)
                     axes.axvspan(trim.seconds[cut[0]], trim.seconds[cut[1]], color=_MARK, alpha=0.12, linewidth=0)
-        said = f"{trim.state}, confidence {s.onset_confidence:.2f}" + (f"; {s.why}" if s.why else "")
-        axes.set_title(f"{info.id}\n{said}", fontsize=7.5, parse_math=False)
+        state = f"{trim.state}, confidence {s.onset_confidence:.2f}" + (f"; {s.why}" if s.why else "")
+        axes.set_title(f"{info.id}\n{state}", fontsize=7.5, parse_math=False)
         axes.set_xlim(0.0, float(trim.seconds[-1]) or 1.0)
         axes.set_ylim(-1.08 - 2.1 * (len(kinds) - 1), 1.08)
         axes.set_yticks([-2.1 * lane for lane in range(len(kinds))], kinds, rotation=90, va="center")
@@ -281,34 +265,31 @@ def trim_page(dataset: Dataset, trims: Sequence[Trim], offset: bool = True) -> F
 
 
 def _off_median(raw: NDArray[np.int64], layout: Layout) -> NDArray[np.float64]:
-    """Return values (T, C) less their channel's median; invalid values are NaN."""
+    """Return the differences (T, C) from each channel's median; invalid values are NaN."""
     valid = (raw >= layout.valid_min_int) & (raw <= layout.valid_max_int)
     values = np.where(valid | ~valid.any(axis=0), raw, np.nan)
     return np.asarray(values - np.nanmedian(values, axis=0))
 
 
 def check_picture_path(out: Path) -> None:
-    """Refuse a place that `save_trims` could not write to, before anything is marked.
+    """Check that `save_trims` can write to ``out``, before anything is marked.
 
     Raises:
-        ConfigError: for a file that is no .png, or a folder that cannot be made.
+        ConfigError: for a file that is not a .png, or a folder that cannot be created.
         MissingExtraError: when matplotlib is not installed.
     """
     need("matplotlib", "reports")
     single = out.suffix.lower() == ".png"
     if out.is_dir() if single else out.is_file():
-        raise ConfigError(f"'{out}' is a {'folder' if single else 'file'}: name a new .png for one page, or a folder.")
+        raise ConfigError(f"'{out}' is a {'folder' if single else 'file'}: give a new .png for one page, or a folder.")
     try:
         (out.parent if single else out).mkdir(parents=True, exist_ok=True)
     except OSError as cause:
-        raise ConfigError(f"'{out}' cannot be drawn to ({cause.strerror or cause}): name another place.") from None
+        raise ConfigError(f"'{out}' cannot be written ({cause.strerror or cause}): give another path.") from None
 
 
 def save_trims(dataset: Dataset, trims: Sequence[Trim], out: Path, offset: bool = True) -> list[Path]:
-    """Draw recordings into ``out``: a file that ends in .png holds the first page, a folder all pages.
-
-    Pictures of that name are replaced.
-    """
+    """Draw recordings, the first page into a .png file or all pages into a folder; existing pictures are replaced."""
     single = out.suffix.lower() == ".png"
     pages = [trims[at : at + PER_PAGE] for at in range(0, len(trims), PER_PAGE)][: 1 if single else None]
     (out.parent if single else out).mkdir(parents=True, exist_ok=True)
