@@ -7,16 +7,16 @@
     │   ├── GestureError        a gesture set
     │   ├── FileFormatError     a recording file
     │   ├── DatasetError        a data set folder
-    │   │   └── ForgottenError  a person was taken out of it meanwhile
+    │   │   └── ForgottenError  a person was removed meanwhile
     │   ├── BundleError         a model bundle
     │   ├── ArrayError          arrays given from Python; also a ValueError
     │   └── ConfigError         a setting, a flag, a configuration file
-    ├── DeviceError             a toy that cannot be opened or went away
-    ├── TrainingError           a training run that cannot start or go on
-    │   └── DivergedError       its loss is no longer a number: the same settings will end so again
+    ├── DeviceError             a toy that cannot be opened or disconnected
+    ├── TrainingError           a training that cannot start or continue
+    │   └── DivergedError       its loss is not a number
     ├── ToolError               a compiler or emulator that is missing or fails
-    │   ├── BuildError          a compiler or linker that refuses a program
-    │   └── ProgramError        a program that was built and does not end well
+    │   ├── BuildError          a compiler or linker that rejects a program
+    │   └── ProgramError        a program that was built and fails
     └── MissingExtraError       an optional package that is not installed
 
 Every message is one sentence: what is wrong, where, what is accepted, what to do.
@@ -56,11 +56,11 @@ class FileFormatError(BadInput):
 
 
 class DatasetError(BadInput):
-    """A data set folder that cannot be opened, made or used as asked."""
+    """A data set folder that cannot be opened, created or changed."""
 
 
 class ForgottenError(DatasetError):
-    """A person was taken out of the data set since it was opened: results may hold that person."""
+    """A person was removed from the data set since it was opened, so that results may contain their data."""
 
 
 class BundleError(BadInput):
@@ -76,15 +76,15 @@ class ConfigError(BadInput):
 
 
 class DeviceError(PlushSenseError):
-    """A toy that cannot be opened, or that went away."""
+    """A toy that cannot be opened, or that disconnected."""
 
 
 class TrainingError(PlushSenseError):
-    """A training run that cannot start or cannot go on."""
+    """A training that cannot start or continue."""
 
 
 class DivergedError(TrainingError):
-    """A training whose loss is no longer a number; the same settings end so on every machine."""
+    """A training whose loss is not a number, which the same settings give on every machine."""
 
 
 class ToolError(PlushSenseError):
@@ -97,11 +97,11 @@ class ToolError(PlushSenseError):
 
 
 class BuildError(ToolError):
-    """A compiler or linker that refuses a program."""
+    """A compiler or linker that rejects a program."""
 
 
 class ProgramError(ToolError):
-    """A program that was built and crashes, ends with another status than 0, or does not end."""
+    """A program that was built and crashes, exits with a status other than 0, or does not end."""
 
 
 class MissingExtraError(PlushSenseError):

@@ -34,7 +34,7 @@ def separator_of(line: bytes) -> str | None:
 
 
 def _cells(line: bytes, separator: str | None, width: int) -> list[bytes]:
-    """Split a line into its fields, ignoring extra separators at its end; return none for one that is too long."""
+    """Split a line into fields, ignoring extra separators at its end; a line that is too long has none."""
     if len(line) > LONGEST_LINE:
         return []
     if separator is None:
@@ -48,7 +48,7 @@ def _cells(line: bytes, separator: str | None, width: int) -> list[bytes]:
 def _parse_slowly(
     lines: list[bytes], separator: str | None, width: int, label_at: int | None
 ) -> tuple[list[list[float]], list[str], int]:
-    """Parse lines that the fast reader refuses; return rows, labels and the number of malformed lines."""
+    """Parse lines that NumPy refuses; return rows, labels and the number of malformed lines."""
     rows, labels, malformed = [], [], 0
     for line in lines:
         if not line.strip():
@@ -71,9 +71,9 @@ def _parse_slowly(
 
 
 def _parse_fast(data: bytes, separator: str | None, skip: int, width: int) -> NDArray[Any] | None:
-    """Parse numbers (T, width), int64 where all are whole, else float; return None when any line does not fit."""
+    """Parse numbers (T, width) as int64 or float64; return None when any line does not fit."""
     begin = data.find(b"\n") + 1 if skip else 0
-    # Integers are read faster; some versions of NumPy truncate fractions silently.
+    # Integers are parsed faster, but some versions of NumPy truncate fractions silently.
     whole = not any(data.find(sign, begin) >= 0 for sign in (b".", b"e", b"E"))
     for dtype in (np.int64, np.float64) if whole else (np.float64,):
         try:
@@ -89,7 +89,7 @@ def _parse_fast(data: bytes, separator: str | None, skip: int, width: int) -> ND
 
 
 def _parse_in_blocks(lines: list[bytes], separator: str | None, width: int) -> tuple[list[NDArray[Any]], int]:
-    """Parse lines in blocks, so that a malformed line slows down its own block only, and count the malformed ones."""
+    """Parse lines in blocks, so that a malformed line only slows down its block; count malformed lines."""
     blocks, malformed = [], 0
     for at in range(0, len(lines), _BLOCK):
         block = lines[at : at + _BLOCK]
@@ -107,7 +107,7 @@ def _parse_in_blocks(lines: list[bytes], separator: str | None, width: int) -> t
 def parse_table(
     data: bytes, keys: list[str], skip: int, path: Path
 ) -> tuple[NDArray[Any], NDArray[np.str_] | None, int]:
-    """Return all numeric columns (T, columns), the labels if there are any, and the number of malformed lines."""
+    """Return all numeric columns (T, columns), the labels or None, and the number of malformed lines."""
     label_at = keys.index("label") if "label" in keys else None
     row = _FULL_LINE.search(data, data.find(b"\n") + 1 if skip else 0)
     separator = separator_of(row[0]) if row else None
@@ -138,10 +138,10 @@ def parse_table(
 
 
 STREAM_NAME = "fulldatastream.csv"
-# Marks a folder of simulated recordings, so that a score on them cannot pass for a result.
+# Marks a folder of simulated recordings, so that scores on them are marked too.
 SIMULATION_MARK = "SIMULATION.txt"
 _NAME = re.compile(r"^(?P<label>.+)_(?P<epoch>\d{1,18})_(?P<rows>\d{1,12})\.csv$", re.IGNORECASE)
-# Layouts have at least 1 frame a second: a longer column value is no delay.
+# Layouts have at least 1 frame a second: larger values are not delays.
 _SLOWEST_MS = 2000
 _PAUSE_MS = 60_000
 
@@ -150,8 +150,10 @@ _PAUSE_MS = 60_000
 class Frames:
     """Rows of one recording or stream.
 
-    ``values`` (T, C) int64, in integer steps, layout order; ``device_ms`` and ``host_ms`` (T,) int64 (``host_ms`` None
-    where the file has no such column); ``labels`` (T,) where every row carries one.
+    Attributes:
+        values: (T, C) integer steps in layout order.
+        device_ms, host_ms: (T,) clocks; ``host_ms`` is None where the file has no such column.
+        labels: (T,) labels, where every row has one.
     """
 
     values: NDArray[np.int64]
@@ -184,10 +186,12 @@ class RecordingName:
 
 @dataclass(frozen=True)
 class ReadResult:
-    """Frames read from a file, with warnings; ``malformed`` lines were left out.
+    """Frames read from a file, with warnings.
 
-    ``integrated``: the file held delays, so ``device_ms`` is their sum and begins at 0 in every file.
-    ``cut``: the last line had no end and was left out; it counts as malformed.
+    Attributes:
+        malformed: number of lines that were left out.
+        integrated: ``device_ms`` is the sum of delays, and begins at 0 in every file.
+        cut: the last line had no end and was left out; it counts as malformed.
     """
 
     frames: Frames
@@ -199,7 +203,7 @@ class ReadResult:
 
 
 def parse_name(filename: str) -> RecordingName | None:
-    """Split a recording's file name from the right into label, time and rows; return None for another name."""
+    """Parse the file name of a recording; return None for another name."""
     match = _NAME.match(Path(filename).name)
     if match is None:
         return None
@@ -252,11 +256,10 @@ def column_keys(first: bytes, layout: Layout, path: Path) -> tuple[list[str], bo
 
 
 def _looks_like_delay(column: NDArray[np.int64], host_ms: NDArray[np.int64] | None) -> bool:
-    """Return whether the clock column holds delays, as in recordings of the 14-integer firmware.
+    """Return whether the clock column contains delays, as in recordings of the 14-integer firmware.
 
-    Delays are small, fall as often as they rise (a clock falls only where it was reset, even one that starts at 0 and
-    stamps its rows in pairs), and add up to the time that passed on the host; pauses apart, since a stream that was
-    appended to on another day has one.
+    Delays are small, decrease as often as they increase (a clock decreases only at a reset), and add up to the time on
+    the host, not counting pauses, since a stream may have been continued on another day.
     """
     if len(column) < 3 or column.min() < 0 or np.median(column) > _SLOWEST_MS:
         return False
@@ -272,11 +275,7 @@ def _looks_like_delay(column: NDArray[np.int64], host_ms: NDArray[np.int64] | No
 
 
 def read_bytes(path: Path) -> bytes:
-    """Read a file.
-
-    Raises:
-        FileFormatError: when the system refuses.
-    """
+    """Read a file; raise FileFormatError if the system refuses."""
     try:
         return path.read_bytes()
     except OSError as cause:
@@ -290,7 +289,7 @@ def _read(path: Path, layout: Layout, data: bytes | None, *, whole_lines: bool =
     if b"\r" in data:
         data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     if b"\x00" in data[:4096]:
-        raise FileFormatError(f"'{path.name}' is not a text file: a recording is CSV in UTF-8.")
+        raise FileFormatError(f"'{path.name}' is not a text file: a recording is a CSV file in UTF-8.")
     data = data.lstrip()
     cut = whole_lines and b"\n" in data and not data.endswith(b"\n")
     if cut:
@@ -300,10 +299,10 @@ def _read(path: Path, layout: Layout, data: bytes | None, *, whole_lines: bool =
     end = data.find(b"\n")
     first = data if end < 0 else data[:end]
     if len(first) > LONGEST_LINE:
-        raise FileFormatError(f"'{path.name}' begins with a line of {len(first)} characters: that is no recording.")
+        raise FileFormatError(f"'{path.name}' begins with a line of {len(first)} characters: it is not a recording.")
     keys, header = column_keys(first, layout, path)
     if header and (end < 0 or not data[end:].strip()):
-        raise FileFormatError(f"'{path.name}' holds a header and no row.")
+        raise FileFormatError(f"'{path.name}' has a header but no row.")
     table, labels, malformed = parse_table(data, keys, 1 if header else 0, path)
     numeric = [k for k in keys if k != "label"]
     warnings: list[str] = ["the last line is cut off: left out"] if cut else []
@@ -344,23 +343,23 @@ def _read(path: Path, layout: Layout, data: bytes | None, *, whole_lines: bool =
 
 
 def read_recording(path: str | os.PathLike[str], layout: Layout, data: bytes | None = None) -> ReadResult:
-    """Read one recording: ``,`` or ``;``, with or without header, any line ends.
+    """Read one recording, separated by ``,`` or ``;``, with or without header, with any line ends.
 
-    ``data`` is the file's content if it was read before.
+    Malformed lines are left out and counted. Delays in the clock column (14-integer firmware) are detected and summed.
 
-    Malformed lines are left out and counted. The clock column of the 14-integer firmware holds delays; that is
-    detected and integrated.
+    Args:
+        data: the content of the file, if it has been read.
 
     Raises:
-        FileFormatError: for a file that is empty, not text, or of another width than the layout's.
+        FileFormatError: for a file that is empty, not text, or has another number of columns than the layout.
     """
     return _read(Path(path), layout, data)
 
 
 def read_stream(path: str | os.PathLike[str], layout: Layout, data: bytes | None = None) -> ReadResult:
-    """Read a session's stream: as `read_recording`, but a last line without its end was cut off and is left out.
+    """Read a session's stream as `read_recording` does, but leave out a last line without an end.
 
-    A cut line can still have the right number of fields, with a digit of the last one missing.
+    Such a line may have the right number of fields and lack digits of the last one.
     """
     return _read(Path(path), layout, data, whole_lines=True)
 
@@ -399,11 +398,7 @@ def format_header(layout: Layout) -> str:
 
 
 def write_recording(path: str | os.PathLike[str], frames: Frames, layout: Layout) -> None:
-    """Write one recording with its header; the file appears whole or not at all, and never replaces another.
-
-    Raises:
-        FileFormatError: when a file of that name is already there.
-    """
+    """Write one recording with its header atomically; raise FileFormatError if the file exists."""
     target = Path(path)
     if target.exists():
         raise FileFormatError(f"'{target}' is already there: a recording is never overwritten.")

@@ -1,7 +1,7 @@
-"""Read TOML files and turn their tables into dataclasses, strictly: unknown keys and values of other types are refused.
+"""Read TOML files strictly: unknown keys, and values that do not have the type of a dataclass's field, are refused.
 
-The types of a dataclass's fields say what its keys accept. `cattrs` does the conversion; this module decides what fits
-(nothing is coerced, except that a whole number is a number) and writes the messages.
+`cattrs` converts the values; this module sets the rules (nothing is converted except whole numbers to numbers) and
+formats the error messages.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import is_dataclass
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from plushsense.core.errors import BadInput, nearest
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 Steps = tuple[str | int, ...]
-"""Keys and indices from a table to a value in it."""
+"""The path from a table to a value in it: keys and indices."""
 
 
 def builtin_names(folder: str) -> tuple[str, ...]:
@@ -71,10 +71,10 @@ def load_table(table: object, kind: type[T], where: str, error: type[BadInput]) 
 
     Args:
         table: keys are the fields of ``kind``; tables in it become the dataclasses of their fields, lists tuples.
-        where: to quote in messages, such as "layout 'plush-15'".
+        where: the place in messages, such as "layout 'plush-15'".
 
     Raises:
-        error: for the first key that is unknown or missing, or value that does not fit; the message has its path.
+        error: for the first key that is unknown or missing, or the first value that does not fit, with its path.
     """
     try:
         made: T = _converter().structure(table, kind)
@@ -87,7 +87,7 @@ def load_table(table: object, kind: type[T], where: str, error: type[BadInput]) 
 def check_table(table: Mapping[str, Any], kind: type[Any], where: str) -> tuple[dict[str, Any], list[str]]:
     """Return the values of a table that fit the fields of the dataclass ``kind``, and a message for each that does not.
 
-    Keys may be missing: for settings that go over others. Of a list, the items that fit are kept.
+    Keys may be missing, for settings that override others. The fitting items of a list are kept.
     """
     known = get_type_hints(kind)
     values: dict[str, Any] = {}
@@ -122,25 +122,19 @@ def refuse_unknown(table: Mapping[str, Any], known: Iterable[str], where: str, e
             raise error(unknown_key(key, known, where))
 
 
-def accepted(kind: Any) -> str:
-    """Return a type in words, as "a list of whole numbers"."""
-    return _in_words(kind, "{}")
-
-
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 _UNIONS = (Union, types.UnionType)
 _ONE = {int: "a whole number", float: "a number", str: "text", bool: "true or false", type(None): ""}
 _MANY = {int: "whole numbers", float: "numbers", str: "texts", bool: "true and false"}
 
 
-def _in_words(kind: Any, form: str, many: bool = False) -> str:
+def _describe(kind: Any, many: bool = False) -> str:
+    """Return a type in words, such as "a list of whole numbers"."""
     origin = get_origin(kind)
     if origin in _UNIONS:
-        return " or ".join(filter(None, (_in_words(one, form, many) for one in get_args(kind))))
-    if origin is Literal:
-        return " or ".join(f"'{value}'" for value in get_args(kind))
+        return " or ".join(filter(None, (_describe(one, many) for one in get_args(kind))))
     if origin is tuple:
-        return f"{'lists' if many else 'a list'} of {_in_words(get_args(kind)[0], form, many=True)}"
+        return f"{'lists' if many else 'a list'} of {_describe(get_args(kind)[0], many=True)}"
     return (_MANY if many else _ONE).get(kind, "tables" if many else "a table")
 
 
@@ -162,7 +156,7 @@ def _message(table: object, steps: Steps, cause: Exception, expected: Any, where
     except LookupError:
         return f"In {where}, the key {path} is missing: add it."
     subject = path or "what was given"
-    return f"In {where}, {subject} is {value!r}: accepted is {accepted(expected)}."
+    return f"In {where}, {subject} is {value!r}: accepted is {_describe(expected)}."
 
 
 def _value(table: object, steps: Steps) -> Any:
@@ -172,25 +166,25 @@ def _value(table: object, steps: Steps) -> Any:
 
 
 def _leaves(cause: Exception, steps: Steps, expected: Any) -> Iterator[tuple[Steps, Exception, Any]]:
-    """Yield every fault in an exception of cattrs: where it is, the exception, and the type that was expected there."""
+    """Yield every error in an exception of cattrs: its path, the exception, and the expected type."""
     from cattrs.errors import ClassValidationError, IterableValidationError
 
     if isinstance(cause, ClassValidationError):
         named, others = cause.group_exceptions()
-        faults = [(inner, (*steps, note.name), note.type) for inner, note in named]
+        errors = [(inner, (*steps, note.name), note.type) for inner, note in named]
     elif isinstance(cause, IterableValidationError):
         indexed, others = cause.group_exceptions()
-        faults = [(inner, (*steps, note.index), note.type) for inner, note in indexed]
+        errors = [(inner, (*steps, note.index), note.type) for inner, note in indexed]
     else:
         yield steps, cause, expected
         return
-    for inner, at, kind in [*((one, steps, expected) for one in others), *faults]:
+    for inner, at, kind in [*((one, steps, expected) for one in others), *errors]:
         yield from _leaves(inner, at, kind)
 
 
 @functools.cache
 def _converter() -> Converter:  # noqa: C901
-    """Return a converter that coerces nothing; imported when it is first needed, since cattrs takes a while."""
+    """Return a converter that coerces nothing. cattrs is imported only when needed, because that takes long."""
     from cattrs import Converter
     from cattrs.gen import make_dict_structure_fn
 
@@ -237,7 +231,7 @@ def _converter() -> Converter:  # noqa: C901
                     return structure(value, one)
                 except Exception as cause:  # noqa: BLE001
                     failed = cause
-            # With several options it is unknown which one was meant.
+            # With several options, the intended one is unknown.
             raise failed if len(options) == 1 else TypeError(kind)
 
         return structure_union

@@ -1,4 +1,4 @@
-"""Sentences that several reports share: splits, contexts, spread, leaks and simulations."""
+"""Describe splits, contexts, spread, leaks and simulations in the words that all reports share."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from typing import Any
 from plushsense.reports.table import DASH, count, text
 
 CONTEXT_WORDS = {
-    "stream": "real context: what the session's stream held before the gesture",
-    "loop": "looped windows: a short recording repeated until the window is full, which no toy ever sends",
-    "inside": "windows that lie wholly inside a recording",
+    "stream": "real context: what the session's stream contains before the gesture",
+    "loop": "looped windows: a short recording repeated until the window is full, which a toy never sends",
+    "inside": "windows completely inside a recording",
 }
 CONTEXT_SHORT = {"stream": "real context", "loop": "loops", "inside": "windows inside the recording"}
 
 _NO_LEAK = "No training or validation window overlaps a recording that is scored."
-_PEOPLE_VALIDATE = "Whole other people validate{role}; in that fold they are neither trained on nor scored."
-# Of each kind of split: how the data are divided, and who validates.
+_PEOPLE_VALIDATE = "Other whole people validate{role}; in that fold they are neither trained on nor scored."
+# For each kind of split: how the data are divided, and who validates.
 _SPLITS = {
     "leave-one-subject-out": (
         "Leave one subject out: each person in turn is held out, and the network is trained anew on the "
@@ -24,52 +24,52 @@ _SPLITS = {
         _PEOPLE_VALIDATE,
     ),
     "by-subject": (
-        "By subject, {k} folds: the people are dealt into groups; each group in turn is held out whole, and "
+        "By subject, {k} folds: the people are divided into groups; each group in turn is held out, and "
         "the network never saw the people it is scored on.",
         _PEOPLE_VALIDATE,
     ),
     "by-recording": (
-        "By recording, {k} folds: each recording stands whole on one side, but the people are known: other "
-        "recordings of the same person are trained on. It answers how well the network reads people it was "
+        "By recording, {k} folds: each recording is completely on one side, but the people are known: other "
+        "recordings of the same person are trained on. The scores show how well the network reads people it was "
         "trained for.",
         "Other recordings validate{role}.",
     ),
     "windows": (
-        "Random windows, {k} folds: windows are dealt at random, without regard to recording or person.",
+        "Random windows, {k} folds: windows are drawn at random, regardless of recording and person.",
         "Other random windows validate{role}.",
     ),
     "holdout": (
-        "Hold-out, as in the paper: windows are dealt at random, even over the gestures: 70 % train, 15 % validate, "
-        "15 % are scored, without regard to recording or person.",
+        "Hold-out, as in the paper: windows are drawn at random, evenly over the gestures: 70 % train, 15 % "
+        "validate, 15 % are scored, regardless of recording and person.",
         "Other random windows validate{role}.",
     ),
 }
 _ROLES = {
     True: " (they decide when training stops)",
-    False: " (they are only watched: training runs its full length)",
+    False: " (only to be observed: training runs its full length)",
     None: "",
 }
 
 LEAKY_WORDS = (
-    "Windows of the same recording, which overlap, and recordings of the same person stand on both sides of "
-    "the split. The figures tell how well the network recognises what it has partly seen; they say little "
-    "about a person it never met, and cannot be compared with a split by person."
+    "Windows of the same recording, which overlap, and recordings of the same person are on both sides of "
+    "the split. The scores show how well the network recognises what it has partly seen; they say little "
+    "about new people, and cannot be compared with a split by person."
 )
 SIMULATED_TITLE = "These scores are of a simulation."
 SIMULATED_RECORDINGS_TITLE = "These recordings are of a simulation."
 SIMULATED_WORDS = "They were made on a virtual toy with virtual people and say nothing about a real toy."
 PARTLY_SIMULATED_TITLE = "A part of this page is of a simulation."
 PARTLY_SIMULATED_WORDS = (
-    "What bears the mark SIMULATION was made on a virtual toy with virtual people and says nothing about a real toy."
+    "Parts marked SIMULATION were made on a virtual toy with virtual people and say nothing about a real toy."
 )
-# Splits by person, for evaluations that do not say what their mean is taken over.
+# Splits by person, for evaluations without the key "over".
 _SPLITS_BY_PERSON = ("leave-one-subject-out", "by-subject")
 
 
 def describe_split(split: str, folds: int | None = None, decides: bool | None = None) -> tuple[str, str]:
-    """Return two sentences: how the data were divided, and who validates. An unknown split is quoted.
+    """Describe how the data were divided, and who validates; an unknown split is quoted.
 
-    ``decides``: whether validation ends the training (True) or is only watched (False); None: not known.
+    ``decides`` is whether validation ends the training; None: unknown.
     """
     kind, _, given_folds = split.partition(":")
     if split == "windows:holdout":
@@ -82,7 +82,7 @@ def describe_split(split: str, folds: int | None = None, decides: bool | None = 
 
 
 def describe_contexts(evaluation: Mapping[str, Any]) -> tuple[str, str]:
-    """Return what came before the gesture in training and in scoring, as two texts."""
+    """Describe the context of the training windows and of the scored windows."""
     scored = evaluation.get("context")
     trained = evaluation.get("train_context") or scored
     return CONTEXT_WORDS.get(str(trained), text(trained)), CONTEXT_WORDS.get(str(scored), text(scored))
@@ -130,7 +130,7 @@ def count_of(evaluation: Mapping[str, Any], units: str) -> str:
 
 
 def describe_spread(evaluation: Mapping[str, Any]) -> str:
-    """Return what mean, deviation and interval are taken over, and how far the interval can be trusted."""
+    """Describe what mean, deviation and interval are taken over, and the limits of the interval."""
     units = averaged_over(evaluation)
     number = count_of(evaluation, units)
     pooled = "Pooled: over all windows at once."
@@ -173,7 +173,7 @@ def describe_other_data(evaluation: Mapping[str, Any], dataset: Mapping[str, Any
     if not theirs or not ours or theirs == ours:
         return None
     return (
-        f"This evaluation was made on “{text(source.get('name') if isinstance(source, Mapping) else None)}” with the "
+        f"This evaluation is of “{text(source.get('name') if isinstance(source, Mapping) else None)}” with the "
         f"hash {str(theirs)[:12]}…; the data set of this page has the hash {str(ours)[:12]}…. Its scores are not of "
         "the data described here."
     )
