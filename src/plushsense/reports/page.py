@@ -8,10 +8,9 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from plushsense.core.errors import ConfigError, need
+from plushsense.core.errors import ConfigError
 from plushsense.core.files import write_file
 from plushsense.core.templates import fill_html
-from plushsense.reports import wording
 
 ENDINGS = (".html", ".htm")
 _PACKAGE = "plushsense.reports"
@@ -25,19 +24,13 @@ def render_page(template: str, **values: Any) -> str:
 
     Args:
         template: file name of a template of this package, which extends ``base.html.j2``.
-        values: ``title`` and ``simulated`` are required; the texts of the simulation banner have defaults.
-
-    Raises:
-        MissingExtraError: when jinja2 is not installed.
+        values: ``title`` and ``simulated`` are required; ``made`` is by default the present time.
     """
+    from markupsafe import Markup
+
     style = resources.files(_PACKAGE).joinpath("page.css").read_text(encoding="utf-8")
-    defaults = {
-        "made": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
-        "simulated_title": wording.SIMULATED_TITLE,
-        "simulated_words": wording.SIMULATED_WORDS,
-        "style": need("markupsafe", "reports").Markup(style),
-    }
-    return fill_html(_PACKAGE, template, **(defaults | values))
+    made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+    return fill_html(_PACKAGE, template, **{"made": made, "style": Markup(style)} | values)
 
 
 def check_page_path(path: str | Path) -> Path:

@@ -22,7 +22,6 @@ from plushsense.reports import quality_figures as figures
 from plushsense.reports.figures import png
 from plushsense.reports.page import check_page_path, render_page, write_page
 from plushsense.reports.table import count
-from plushsense.reports.wording import SIMULATED_RECORDINGS_TITLE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -139,7 +138,6 @@ def render(result: CheckReport, progress: Progress | None = None) -> str:
         "quality.html.j2",
         title=f"Check of {dataset.head.name}",
         simulated=dataset.head.simulated,
-        simulated_title=SIMULATED_RECORDINGS_TITLE,
         summary=[
             ("Recordings looked at", count(result.recordings)),
             ("Excluded by a mark", count(result.excluded)),

@@ -50,18 +50,6 @@ _ROLES = {
     None: "",
 }
 
-LEAKY_WORDS = (
-    "Windows of the same recording, which overlap, and recordings of the same person are on both sides of "
-    "the split. The scores show how well the network recognises what it has partly seen; they say little "
-    "about new people, and cannot be compared with a split by person."
-)
-SIMULATED_TITLE = "These scores are of a simulation."
-SIMULATED_RECORDINGS_TITLE = "These recordings are of a simulation."
-SIMULATED_WORDS = "They were made on a virtual toy with virtual people and say nothing about a real toy."
-PARTLY_SIMULATED_TITLE = "A part of this page is of a simulation."
-PARTLY_SIMULATED_WORDS = (
-    "Parts marked SIMULATION were made on a virtual toy with virtual people and say nothing about a real toy."
-)
 # Splits by person, for evaluations without the key "over".
 _SPLITS_BY_PERSON = ("leave-one-subject-out", "by-subject")
 

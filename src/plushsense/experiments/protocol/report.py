@@ -336,8 +336,6 @@ def page(result: Mapping[str, Any]) -> str:
         "protocol.html.j2",
         title=result["heading"],
         simulated=result["simulated"],
-        simulated_title="This is a simulation.",
-        simulated_words="Virtual people touched a virtual toy: these figures say nothing about a real toy.",
         about=result["about"],
         remarks=result["said"],
         aims=aim_table(result),

@@ -303,7 +303,6 @@ def render(
         title=title or f"Sweep {sweep.name}: {len(sweep.done)} of {sweep.total} trials",
         simulated=sweep.simulated,
         leaky=sweep.leaky,
-        leaky_words=wording.LEAKY_WORDS,
         done=len(sweep.done),
         total=sweep.total,
         over=wording.describe_runs(sweep.trials),
