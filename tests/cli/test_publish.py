@@ -86,8 +86,8 @@ def test_saving_and_leaving_the_report_out(cli: Cli, dataset: Dataset, tmp_path:
         (("publish", "nowhere", "OUT"), "There is no folder"),
         (("publish", "DS", "OUT", *CONTACT, "--consent", "yes", "--licence", "CC BY"), "Did you mean 'CC-BY-"),
         (("publish", "DS", "OUT", "--contact", "Ada"), "write it as"),
-        (("publish", "DS", "OUT", *SAID, "--key", "DS/key"), "keep it elsewhere"),
-        (("publish", "DS", "OUT", *SAID, "--key", "bad.key"), "is no key"),
+        (("publish", "DS", "OUT", *SAID, "--key", "DS/key"), "store it elsewhere"),
+        (("publish", "DS", "OUT", *SAID, "--key", "bad.key"), "is not a key"),
         (("publish", "DS", "OUT", *SAID, "--no-reidentification", "--allow-columns", "hand"), "no column 'hand'"),
     ],
 )

@@ -116,18 +116,13 @@ def _report(args: argparse.Namespace, recorder: Recorder) -> int:
     """Print the result; return 2 where the toy or the disk ended the session."""
     status = recorder.status()
     finished = status.done + status.skipped >= status.steps
+    counts = ("skipped", "redone", "rows", "lost", "malformed", "garbage", "reconnects")
     result: dict[str, Any] = {
         "folder": status.folder,
         "subject": recorder.session.head.subject,
         "session": recorder.session.head.session,
         "recordings": status.done,
-        "skipped": status.skipped,
-        "redone": status.redone,
-        "rows": status.rows,
-        "lost": status.lost,
-        "malformed": status.malformed,
-        "garbage": status.garbage,
-        "reconnects": status.reconnects,
+        **{name: getattr(status, name) for name in counts},
         "gaps": recorder.gaps,
         "finished": finished,
         "resumed": recorder.session.progress.resumed,

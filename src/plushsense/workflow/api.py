@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -76,13 +77,10 @@ def unfinished(dataset: Dataset | str | os.PathLike[str]) -> Journal:
 class ResumableTraining:
     """The state of one training in a journal, stored under a key of everything that its outcome depends on."""
 
-    def __init__(
-        self, journal: Journal | None, network: Arch, spec: TrainSpec, train: WindowSet, watched: WindowSet
-    ) -> None:
-        self._journal, self.before_s, self._began = journal, 0.0, time.monotonic()
-        if journal is None:
-            return
+    def __init__(self, journal: Journal, network: Arch, spec: TrainSpec, train: WindowSet, watched: WindowSet) -> None:
         from plushsense.training.fit import resolve_device
+
+        self._journal, self.before_s, self._began = journal, 0.0, time.monotonic()
 
         settings = {"arch": network.to_dict(), "training": resolve_device(spec).key(), "vectors": train.vectors}
         journal.prune(_KEPT_S)
@@ -91,7 +89,7 @@ class ResumableTraining:
 
     def load(self) -> FitState | None:
         """Return the saved state; None without one."""
-        entry = None if self._journal is None else self._journal.find(self._job)
+        entry = self._journal.find(self._job)
         if entry is None:
             return None
         from plushsense.training.engine import FitState
@@ -100,15 +98,13 @@ class ResumableTraining:
         return FitState.from_arrays(entry)
 
     def save(self, state: FitState) -> None:
-        """Save the state, if there is a journal that can be written."""
-        if self._journal is not None:
-            spent = self.before_s + time.monotonic() - self._began
-            keep_if_possible(self._journal, self._job, {**state.to_arrays(), "seconds": spent})
+        """Save the state, if the journal can be written."""
+        spent = self.before_s + time.monotonic() - self._began
+        keep_if_possible(self._journal, self._job, {**state.to_arrays(), "seconds": spent})
 
     def discard(self) -> None:
         """Delete the saved state."""
-        if self._journal is not None:
-            self._journal.discard(self._job)
+        self._journal.discard(self._job)
 
 
 @dataclass(frozen=True)
@@ -216,14 +212,14 @@ def train(
     from plushsense.training.fit import fit, predict
 
     train_on, watched = windows.take(train_at), scored.take(division.watch)
-    state = ResumableTraining(journal, network, config.training, train_on, watched)
-    start = state.load()
+    state = None if journal is None else ResumableTraining(journal, network, config.training, train_on, watched)
+    start = state.load() if state else None
     if start is not None and progress is not None:
         for row in start.history:
             progress(row["epoch"], config.training.epochs, row)
     fitted = fit(
         train_on, watched, network, config.training, progress,
-        start=start, save=None if journal is None else state.save, save_every_s=_SAVE_EVERY_S,
+        start=start, save=state.save if state else None, save_every_s=_SAVE_EVERY_S,
     )  # fmt: skip
     weights, scaler = fitted.weights, fitted.scaler
     kept = calibration(network, weights, scaler, windows.x[train_at])
@@ -276,7 +272,7 @@ def train(
             "subjects": sorted({str(s) for s in windows.subject[train_at]}),
             "validation_subjects": sorted({str(s) for s in scored.subject[division.watch]}),
             "split": division.kind,
-            "context": _context_counts(windows),
+            "context": dict(sorted(Counter(windows.context.tolist()).items())),
             "preset": config.preset,
             "training": config.training.to_dict(),
             "quantize_aware": quantize_aware,
@@ -287,10 +283,11 @@ def train(
     )
     if fit_decisions:
         bundle = _with_decisions(bundle, dataset, config.live, warn)
-    state.discard()
+    if state:
+        state.discard()
     # `forget` did not see this bundle: refuse it if a person was removed meanwhile.
     dataset.generation.check()
-    return Trained(bundle, fitted.history, scores, state.before_s + fitted.seconds)
+    return Trained(bundle, fitted.history, scores, fitted.seconds + (state.before_s if state else 0.0))
 
 
 def _with_decisions(bundle: Bundle, dataset: Dataset, given: DecideSpec, warn: Warn) -> Bundle:
@@ -432,8 +429,3 @@ def import_simulation(
         consent="nobody: a simulation",
         progress=lambda at, total: progress("importing", at, total),
     ).dataset
-
-
-def _context_counts(windows: WindowSet) -> dict[str, int]:
-    kinds, counts = np.unique(windows.context, return_counts=True)
-    return {str(kind): int(n) for kind, n in zip(kinds, counts, strict=True)}
