@@ -68,7 +68,7 @@ def test_fine_tuning_for_8_bits_keeps_the_ranges_it_was_made_for(dataset: Datase
     again = Bundle.load(tuned.save(tmp_path / "m.plush"))
     assert integer_model(again).to_bytes() == integer_model(tuned.bundle).to_bytes()
     told: list[str] = []
-    assert calibrated_on(tuned.bundle, dataset, told.append) is tuned.bundle and "keeps it" in told[0]
+    assert calibrated_on(tuned.bundle, dataset, told.append) is tuned.bundle and "is kept" in told[0]
     for one in (plain, tuned):
         found = one.scores["int8"]
         assert 0.5 < found["agreement"] <= 1 and 0 <= found["macro_f1"] <= 1

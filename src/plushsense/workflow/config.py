@@ -45,7 +45,7 @@ class ModelSpec:
     def __post_init__(self) -> None:
         for name, seconds in (("step_s", self.step_s), ("pool_s", self.pool_s)):
             if seconds is not None and not 0.0 < seconds <= 60.0:
-                raise ConfigError(f"{name} is {seconds}: accepted are seconds above 0 and up to 60.")
+                raise ConfigError(f"{name} is {seconds}: accepted is above 0 and up to 60 seconds.")
 
     def build(self, layout: Layout, classes: int, window_s: float, padding: str) -> Arch:
         """Build the network for a toy's layout and a number of classes."""
