@@ -1,8 +1,8 @@
 """Machines on which an exported C program can be built and run: this computer and chips emulated by QEMU.
 
 The emulators run with ``-icount``, so that counts are the same in every run. They count instructions, not cycles, and
-are no real chips. A microcontroller is an entry of `TARGETS`; its start-up code and linker script are in ``c/runtime``.
-Package names are those of Debian 12.
+are no real chips. A microcontroller is a table of ``targets.toml``; its start-up code and linker script are in
+``c/runtime``. Package names are those of Debian 12.
 """
 
 from __future__ import annotations
@@ -13,11 +13,12 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 
 from plushsense.core.errors import BuildError, ConfigError, ProgramError, ToolError, nearest
+from plushsense.core.toml import load_table, read_toml
 
 C_FOLDER = Path(__file__).parent / "c"
 RUNTIME = C_FOLDER / "runtime"
@@ -25,12 +26,7 @@ RUNTIME = C_FOLDER / "runtime"
 
 @dataclass(frozen=True)
 class Target:
-    """A machine: how to compile for it and how to run a program there.
-
-    ``packages`` names Debian's package of each tool that must be on the path. ``libraries`` are files that the
-    compiler must find (``-print-file-name``), with their package. ``runtime`` and ``script`` are files of `RUNTIME`;
-    ``run`` is the emulator's command, to which the program's path is added.
-    """
+    """A machine, as ``targets.toml`` describes it: how to compile for it and how to run a program there."""
 
     name: str
     title: str
@@ -40,75 +36,26 @@ class Target:
     flags: tuple[str, ...] = ()
     link: tuple[str, ...] = ()
     run: tuple[str, ...] = ()
-    libraries: Mapping[str, str] | None = None
+    libraries: Mapping[str, str] = field(default_factory=dict)
     counts: bool = True
 
 
-_BARE = ("-nostdlib", "-nostartfiles", "-ffunction-sections", "-fdata-sections")
-_QUIET = ("-nographic", "-monitor", "none", "-serial", "none")
-_NATIVE = ("-semihosting-config", "enable=on,target=native")
-_MPS2 = ("qemu-system-arm", "-M", "mps2-an386", *_QUIET, *_NATIVE, "-icount", "shift=6,sleep=off", "-kernel")
+@dataclass(frozen=True)
+class _TargetsFile:
+    targets: tuple[Target, ...]
 
-TARGETS: dict[str, Target] = {
-    "host": Target(
-        name="host",
-        title="this computer",
-        compiler="gcc",
-        packages={"gcc": "gcc"},
-        runtime=("host.c",),
-        counts=False,
-    ),
-    "xtensa": Target(
-        name="xtensa",
-        title="Xtensa lx106 (the ESP32's family) on QEMU",
-        compiler="xtensa-lx106-elf-gcc",
-        packages={"xtensa-lx106-elf-gcc": "gcc-xtensa-lx106", "qemu-system-xtensa": "qemu-system-misc"},
-        runtime=("xtensa_start.S", "xtensa.c", "xtensa_libc.c", "bare.c"),
-        flags=("-mlongcalls", "-ffreestanding", "-fno-builtin", "-I", str(RUNTIME / "xtensa_libc"), *_BARE),
-        link=("-T", str(RUNTIME / "xtensa.ld"), "-lgcc"),
-        run=(
-            *("qemu-system-xtensa", "-M", "sim", "-cpu", "lx106", *_QUIET),
-            *("-semihosting", "-icount", "shift=5,sleep=off", "-kernel"),
-        ),
-    ),
-    "cortex-m4": Target(
-        name="cortex-m4",
-        title="Arm Cortex-M4 on QEMU",
-        compiler="arm-none-eabi-gcc",
-        packages={"arm-none-eabi-gcc": "gcc-arm-none-eabi", "qemu-system-arm": "qemu-system-arm"},
-        libraries={"libc.a": "libnewlib-arm-none-eabi"},
-        runtime=("cortex-m4.c", "semihosting.c", "bare.c"),
-        flags=("-mcpu=cortex-m4", "-mthumb", *_BARE),
-        link=("-T", str(RUNTIME / "cortex-m4.ld"), "-lc", "-lgcc"),
-        run=_MPS2,
-    ),
-    "cortex-m0": Target(
-        name="cortex-m0",
-        title="Arm Cortex-M0+ code (the RP2040's) on QEMU's Cortex-M4",
-        compiler="arm-none-eabi-gcc",
-        packages={"arm-none-eabi-gcc": "gcc-arm-none-eabi", "qemu-system-arm": "qemu-system-arm"},
-        libraries={"libc.a": "libnewlib-arm-none-eabi"},
-        runtime=("cortex-m4.c", "semihosting.c", "bare.c"),
-        flags=("-mcpu=cortex-m0plus", "-mthumb", *_BARE),
-        link=("-T", str(RUNTIME / "cortex-m4.ld"), "-lc", "-lgcc"),
-        run=_MPS2,
-    ),
-    "riscv32": Target(
-        name="riscv32",
-        title="RISC-V RV32IMC (the ESP32-C3's family) on QEMU",
-        compiler="riscv64-unknown-elf-gcc",
-        packages={"riscv64-unknown-elf-gcc": "gcc-riscv64-unknown-elf", "qemu-system-riscv32": "qemu-system-misc"},
-        libraries={"picolibc.specs": "picolibc-riscv64-unknown-elf"},
-        runtime=("riscv32_start.S", "riscv32.c", "semihosting.c", "bare.c"),
-        flags=("--specs=picolibc.specs", "-march=rv32imc_zicsr", "-mabi=ilp32", "-msmall-data-limit=0", *_BARE),
-        # Without _zicsr, or the compiler does not find its libraries for 32 bits.
-        link=("-march=rv32imc", "-T", str(RUNTIME / "riscv32.ld"), "-lc", "-lgcc"),
-        run=(
-            *("qemu-system-riscv32", "-M", "virt", "-bios", "none", *_QUIET),
-            *(*_NATIVE, "-icount", "shift=0,sleep=off", "-kernel"),
-        ),
-    ),
-}
+
+def _read_targets() -> dict[str, Target]:
+    path = Path(__file__).with_name("targets.toml")
+    listed = load_table(read_toml(path, "targets", ConfigError), _TargetsFile, path.name, ConfigError).targets
+
+    def placed(words: tuple[str, ...]) -> tuple[str, ...]:
+        return tuple(word.replace("{runtime}", str(RUNTIME)) for word in words)
+
+    return {t.name: replace(t, flags=placed(t.flags), link=placed(t.link)) for t in listed}
+
+
+TARGETS = _read_targets()
 
 
 @dataclass(frozen=True)
@@ -159,7 +106,7 @@ def missing_tools(target: str, *, cc: str | None = None) -> list[str]:
     if cc is not None:
         tools = {cc: Path(cc).name} | {t: p for t, p in tools.items() if t != machine.compiler}
     missing = [package for tool, package in tools.items() if shutil.which(tool) is None]
-    for file, package in (machine.libraries or {}).items():
+    for file, package in machine.libraries.items():
         if shutil.which(machine.compiler) is None or not _finds(machine.compiler, file):
             missing.append(package)
     return list(dict.fromkeys(missing))
