@@ -18,6 +18,7 @@ from functools import cache
 from pathlib import Path
 
 from plushsense.core.errors import BuildError, ConfigError, ProgramError, ToolError, nearest
+from plushsense.core.templates import fill_text
 from plushsense.core.toml import load_table, read_toml
 
 C_FOLDER = Path(__file__).parent / "c"
@@ -159,7 +160,9 @@ def build(
             _compile([*command, "-o", str(objects[-1])], Path(work), Path(source).name)
         around = [str(RUNTIME / name) for name in machine.runtime]
         if blobs:
-            (Path(work) / "blobs.S").write_text(_blobs(blobs))
+            paths = {name: str(Path(path).resolve()) for name, path in blobs.items()}
+            assembly = fill_text("plushsense.deploy", "c/runtime/blobs.S.j2", blobs=paths)
+            (Path(work) / "blobs.S").write_text(assembly)
             around.append("blobs.S")
         # Keeps the compiler from turning a loop of memset() into a call of memset().
         runtime = ["-O2", "-fno-tree-loop-distribute-patterns"] if machine.run else ["-O2"]
@@ -214,28 +217,3 @@ def _error_line(output: str) -> str:
 @cache
 def _finds(compiler: str, file: str) -> bool:
     return Path(tool_output([compiler, f"-print-file-name={file}"]).strip()).is_absolute()
-
-
-def _blobs(blobs: Mapping[str, Path]) -> str:
-    """Return assembly that includes files as bytes."""
-    lines = [
-        "#define JOIN(a, b) a##b",
-        "#define JOINED(a, b) JOIN(a, b)",
-        "#define SYMBOL(name) JOINED(__USER_LABEL_PREFIX__, name)",
-        "#if defined(__APPLE__)",
-        "    .const",
-        "#elif defined(_WIN32)",
-        '    .section .rdata, "dr"',
-        "#else",
-        '    .section .blob, "a"',
-        "#endif",
-    ]
-    for name, path in blobs.items():
-        quoted = str(Path(path).resolve()).replace("\\", "\\\\").replace('"', '\\"')
-        lines += [
-            f"    .balign 16\n    .globl SYMBOL({name})\nSYMBOL({name}):",
-            f'    .incbin "{quoted}"',
-            f"    .globl SYMBOL({name}_end)\nSYMBOL({name}_end):\n    .byte 0",
-        ]
-    lines += ["#if defined(__ELF__) && defined(__linux__)", '    .section .note.GNU-stack, "", %progbits', "#endif"]
-    return "\n".join(lines) + "\n"
