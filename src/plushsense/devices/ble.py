@@ -127,7 +127,7 @@ class BleDevice(Device):
             at, host, data = received
             if wait:
                 self.arrived_s = at
-            frames += [Frame(host, line.device_ms, line.values) for line in self._parser.feed(data)]
+            frames += self._parser.frames(data, host)
             wait = False
         return None
 

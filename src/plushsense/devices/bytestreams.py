@@ -67,8 +67,7 @@ class SerialDevice(Device):
             self._parser.finish()
             raise DeviceError(f"'{self.url}' went away ({_reason(cause)}): was it unplugged or switched off?") from None
         self.arrived_s = time.perf_counter()
-        host = now_ms()
-        return [Frame(host, line.device_ms, line.values) for line in self._parser.feed(data)]
+        return self._parser.frames(data, now_ms())
 
     def _shut(self) -> None:
         with contextlib.suppress(*_FAULTS):
@@ -151,8 +150,7 @@ class TcpDevice(Device):
         if not data:
             self._parser.finish()
             return None
-        host = now_ms()
-        return [Frame(host, line.device_ms, line.values) for line in self._parser.feed(data)]
+        return self._parser.frames(data, now_ms())
 
     def _shut(self) -> None:
         with contextlib.suppress(OSError):

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from plushsense.core.layouts import DELAY_MS, DEVICE_MS, Layout
-from plushsense.devices.base import Counters, LossCounter
+from plushsense.devices.base import Counters, Frame, LossCounter
 
 _INTEGER = re.compile(rb"[+-]?[0-9]{1,18}\Z")
 _DECIMAL = re.compile(rb"[+-]?(?:[0-9]{1,18}(?:\.[0-9]{0,18})?|\.[0-9]{1,18})(?:[eE][+-]?[0-9]{1,2})?\Z")
@@ -86,6 +86,10 @@ class LineParser:
             line = self._take()
             if line is not None:
                 parsed.append(line)
+
+    def frames(self, data: bytes, host_ms: int) -> list[Frame]:
+        """Return the frames that end within these bytes, which arrived at ``host_ms``; see `feed`."""
+        return [Frame(host_ms, line.device_ms, line.values) for line in self.feed(data)]
 
     def finish(self) -> None:
         """Count an unfinished last line as malformed, at the end of the source."""

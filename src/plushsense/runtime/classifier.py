@@ -105,12 +105,7 @@ class StreamReader:
     sensors fail. A gap beyond the layout's ``gap_ms`` or a reset of the device clock gives ``no signal`` with the first
     frame after it, at the time of the last one before. In a sensor fault nothing is decided.
 
-    Args:
-        network: reads the inputs; float or integer.
-        layout: of the frames.
-        gestures: in class order.
-        rules: settings of health, gate and events.
-        smoothing: weight of a new step, in steps of 2^-15.
+    The arguments are those of `ToyMachine`.
     """
 
     def __init__(

@@ -6,9 +6,8 @@ also of negative numbers, so that nothing depends on a language's rounding of qu
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Any, TypeVar
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,7 +21,6 @@ LOGIT_LIMIT = 1 << 14  # logits are held within ±64 in steps of 1/256
 PROBABILITY_BITS = 15
 SMOOTH_EXTRA_BITS = 12
 _MULTIPLIER_BITS = 15
-_T = TypeVar("_T", bound="_Table")
 
 
 def exponentials() -> tuple[Ints, Ints]:
@@ -62,18 +60,6 @@ class _Table:
     def __len__(self) -> int:
         return len(getattr(self, next(iter(self.RANGES))))
 
-    def to_dict(self) -> dict[str, list[int]]:
-        """Return plain values, ready for JSON."""
-        return {name: getattr(self, name).tolist() for name in self.RANGES}
-
-    @classmethod
-    def from_dict(cls: type[_T], table: Mapping[str, Any]) -> _T:
-        """Return a table from plain values; raise BundleError for a column that is missing or does not fit."""
-        try:
-            return cls(**{field.name: np.asarray(table[field.name]) for field in fields(cls)})  # type: ignore[arg-type]
-        except (KeyError, ValueError, OverflowError) as cause:
-            raise BundleError(f"A fixed-point scale does not fit: {cause}. Train or export again.") from None
-
 
 @dataclass(frozen=True, eq=False)
 class InputScale(_Table):
@@ -106,44 +92,42 @@ class InputScale(_Table):
 
 
 @dataclass(frozen=True, eq=False)
-class Requantize(_Table):
+class _SumScale(_Table):
+    """Scale of sums of 32 bits, a row for each filter or class."""
+
+    before: Ints
+    multiplier: Ints
+    after: Ints
+
+    RANGES = {"before": (0, 30), "multiplier": (0, (1 << 15) - 1), "after": (0, 30)}  # noqa: RUF012, RUF100
+
+    def _scaled(self, t: Ints) -> Ints:
+        return np.asarray((t * self.multiplier + ((1 << self.after) >> 1)) >> self.after)
+
+
+class Requantize(_SumScale):
     """ReLU and sums to 8 bits, a filter each.
 
     A sum up to 0 gives 0; else ``t = sum >> before``, at most 65535; ``(t * multiplier + half) >> after``, at most
     255, where half is ``2^after >> 1``.
     """
 
-    before: Ints
-    multiplier: Ints
-    after: Ints
-
-    RANGES = {"before": (0, 30), "multiplier": (0, (1 << 15) - 1), "after": (0, 30)}  # noqa: RUF012, RUF100
-
     def apply(self, sums: Ints) -> Bytes:
         """Requantize sums (..., F) of 32 bits to activations (..., F) uint8."""
         t = np.minimum(np.maximum(sums, 0) >> self.before, 65535)
-        out: Bytes = np.minimum((t * self.multiplier + ((1 << self.after) >> 1)) >> self.after, 255).astype(np.uint8)
-        return out
+        return np.minimum(self._scaled(t), 255).astype(np.uint8)
 
 
-@dataclass(frozen=True, eq=False)
-class LogitScale(_Table):
+class LogitScale(_SumScale):
     """Sums of the dense layer to logits in steps of 1/256, a class each.
 
     ``t = sum >> before`` held within -32768 and 32767; ``(t * multiplier + half) >> after`` held within ±16384.
     """
 
-    before: Ints
-    multiplier: Ints
-    after: Ints
-
-    RANGES = {"before": (0, 30), "multiplier": (0, (1 << 15) - 1), "after": (0, 30)}  # noqa: RUF012, RUF100
-
     def apply(self, sums: Ints) -> Ints:
         """Scale sums (..., K) of 32 bits to logits (..., K)."""
         t = np.clip(sums >> self.before, -32768, 32767)
-        logits = (t * self.multiplier + ((1 << self.after) >> 1)) >> self.after
-        return np.asarray(np.clip(logits, -LOGIT_LIMIT, LOGIT_LIMIT))
+        return np.clip(self._scaled(t), -LOGIT_LIMIT, LOGIT_LIMIT)
 
 
 def split_ratio(ratio: float, highest: float, most_after: int = 30, most_before: int = 30) -> tuple[int, int, int]:

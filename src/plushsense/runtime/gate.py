@@ -90,26 +90,22 @@ class GateSettings:
         _within("signals", len(self.signals), 0, MOST_SIGNALS)
         _within("rules", len(self.rules), 0, MOST_RULES)
         for s in self.signals:
-            _within("signal kind", s.kind, LEVEL, JERK)
+            _all_within(s, kind=(LEVEL, JERK), lag=(1, MOST_LAG), shift=(0, 24), baseline=(1, 15), noise=(1, 15))
+            _all_within(s, floor=(1, HELD))
             _within("inputs of a signal", len(s.inputs), 1, 1 if s.kind == LEVEL else 255)
             for i in s.inputs:
                 _within("input", i, 0, 254)
-            _within("lag", s.lag, 1, MOST_LAG)
-            _within("shift", s.shift, 0, 24)
-            _within("baseline", s.baseline, 1, 15)
-            _within("noise", s.noise, 1, 15)
-            _within("floor", s.floor, 1, HELD)
         for rule in self.rules:
             _within("terms of a rule", len(rule.terms), 1, MOST_TERMS)
-            _within("affect", rule.affect, 0, 3)
-            _within("gesture", rule.gesture, 0, 255)
-            _within("within", rule.within, 0, 255)
-            _within("deaf", rule.deaf, 0, 65535)
+            _all_within(rule, affect=(0, 3), gesture=(0, 255), within=(0, 255), deaf=(0, 65535))
             for term in rule.terms:
                 _within("signal of a term", term.signal, 0, len(self.signals) - 1)
-                _within("threshold", term.threshold, 1, MOST_SIZE)
-                _within("sign", term.sign, -1, 1)
-                _within("times", term.times, 1, 255)
+                _all_within(term, threshold=(1, MOST_SIZE), sign=(-1, 1), times=(1, 255))
+
+
+def _all_within(part: Signal | Rule | Term, **ranges: tuple[int, int]) -> None:
+    for name, (low, high) in ranges.items():
+        _within(name, getattr(part, name), low, high)
 
 
 def _within(what: str, value: int, low: int, high: int) -> None:

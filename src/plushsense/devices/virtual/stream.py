@@ -309,9 +309,7 @@ class VirtualDevice(PacedDevice):
         if not lines and not self.closed and self._next_ms() is None:
             self._parser.finish()
             return None
-        host = now_ms()
-        data = b"".join(line.data for line in lines)
-        return [Frame(host, p.device_ms, p.values) for p in self._parser.feed(data)]
+        return self._parser.frames(b"".join(line.data for line in lines), now_ms())
 
 
 def open_virtual(address: DeviceAddress, layout: Layout) -> VirtualDevice:
