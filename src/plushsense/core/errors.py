@@ -115,6 +115,17 @@ def nearest(word: str, known: Iterable[str]) -> str:
     return f" Did you mean '{lowered[found[0]]}'?" if found else ""
 
 
+def check_known(value: object, known: Iterable[str], what: str, error: type[BadInput]) -> None:
+    """Raise ``error`` for a value that is not among the known ones, with the nearest of them.
+
+    Args:
+        what: the value, as in "Unknown preset".
+    """
+    known = tuple(known)
+    if value not in known:
+        raise error(f"Unknown {what} '{value}': accepted are {', '.join(known)}.{nearest(str(value), known)}")
+
+
 def need(module: str, extra: str) -> ModuleType:
     """Import ``module``, which the optional dependency group ``extra`` provides.
 

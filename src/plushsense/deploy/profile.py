@@ -241,20 +241,24 @@ def count(
             stages = {name: _mean(rows[:, i]) for i, name in enumerate(STAGES)}
             stages = {"clock": _mean(rows_jittered[:-1, 0]) - sum(stages.values()), **stages}
         objects = {"plushsense": whole.objects[2], "plush_model": whole.objects[1]}
+        steps = rows_jittered[:-1, 0]
+        counted = {
+            "step": _mean(steps),
+            "step_most": int(steps.max()),
+            "even": _mean(rows_even[:, 0]),
+            "gap": int(rows_jittered[-1, 1]),
+            "begin": head[2],
+            "stack_memory_bytes": head[3],
+            "stack_begin": head[4],
+            "stack_push": head[5],
+        }
         return Cost(
             target=target,
-            step=_mean(rows_jittered[:-1, 0]) if counts else None,
-            step_most=int(rows_jittered[:-1, 0].max()) if counts else None,
-            even=_mean(rows_even[:, 0]) if counts else None,
-            gap=int(rows_jittered[-1, 1]) if counts else None,
-            begin=head[2] if counts else None,
+            **{name: value if counts else None for name, value in counted.items()},
             stages=stages,
             sections={name: _sections(target, file) for name, file in objects.items()},
             toy_bytes=head[0],
             memory_bytes=head[1],
-            stack_push=head[5] if counts else None,
-            stack_begin=head[4] if counts else None,
-            stack_memory_bytes=head[3] if counts else None,
             stack_functions=_stack_usage(objects["plushsense"].with_suffix(".su")),
             needs=_needs(target, objects["plushsense"]),
         )

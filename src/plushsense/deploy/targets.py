@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 
-from plushsense.core.errors import BuildError, ConfigError, ProgramError, ToolError, nearest
+from plushsense.core.errors import BuildError, ConfigError, ProgramError, ToolError, check_known
 from plushsense.core.templates import fill_text
 from plushsense.core.toml import load_table, read_toml
 
@@ -92,8 +92,7 @@ class Program:
 
 def target_named(name: str) -> Target:
     """Return the target of this name; ConfigError for an unknown one."""
-    if name not in TARGETS:
-        raise ConfigError(f"Unknown target '{name}': accepted are {', '.join(TARGETS)}.{nearest(name, TARGETS)}")
+    check_known(name, TARGETS, "target", ConfigError)
     return TARGETS[name]
 
 

@@ -89,9 +89,6 @@ class LiveRun(Iterator[Decision]):
         self._due: deque[Decision] = deque()
         self.over = False
 
-    def __iter__(self) -> LiveRun:
-        return self
-
     def __next__(self) -> Decision:
         while not self._due:
             if self.over:
@@ -251,9 +248,6 @@ class ManyRun(Iterator[tuple[int, Decision]]):
         self.runs = tuple(runs)
         self._begun, self._cpu = time.perf_counter(), time.process_time()
         self._flow = self._turns()
-
-    def __iter__(self) -> ManyRun:
-        return self
 
     def __next__(self) -> tuple[int, Decision]:
         return next(self._flow)

@@ -13,7 +13,7 @@ from typing import Any, Literal, NoReturn, cast, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import ArchError, nearest
+from plushsense.core.errors import ArchError, check_known
 from plushsense.core.toml import refuse_unknown
 
 MAX_LAYERS = 4
@@ -179,8 +179,8 @@ class Arch:
             _in_range(f"the kernel of layer {n}", layer.kernel, 1, MAX_NUMBER)
             _in_range(f"the dilation of layer {n}", layer.dilation, 1, MAX_NUMBER)
             _in_range(f"the filter count of layer {n}", layer.filters, 1, MAX_NUMBER)
-        _one_of("padding", self.padding, PADDINGS)
-        _one_of("norm", self.norm, NORMS)
+        check_known(self.padding, PADDINGS, "padding", ArchError)
+        check_known(self.norm, NORMS, "norm", ArchError)
         _in_range("channels", self.channels, 1, MAX_NUMBER)
         _in_range("classes", self.classes, 2, MAX_NUMBER)
         _in_range("window", self.window, 2, 1_000_000)
@@ -385,8 +385,3 @@ def reflected(length: int, left: int) -> NDArray[np.intp]:
 def _in_range(what: str, value: object, low: int, high: int, of_high: str = "") -> None:
     if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
         raise ArchError(f"{what} is {value!r}: accepted are whole numbers from {low} to {high}{of_high}.")
-
-
-def _one_of(what: str, value: str, known: tuple[str, ...]) -> None:
-    if value not in known:
-        raise ArchError(f"Unknown {what} '{value}': accepted are {', '.join(known)}.{nearest(str(value), known)}")

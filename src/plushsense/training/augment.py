@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
-from plushsense.core.errors import ConfigError, nearest
+from plushsense.core.errors import ConfigError, check_known
 from plushsense.windows.features import Scaler
 
 if TYPE_CHECKING:
@@ -92,10 +92,7 @@ def parse_augmentation(text: str) -> tuple[str, float]:
         ConfigError: for an unknown name (with the nearest known one), or a strength out of range.
     """
     name, _, number = text.partition(":")
-    if name not in AUGMENTATIONS:
-        raise ConfigError(
-            f"Unknown augmentation '{name}': accepted are {', '.join(AUGMENTATIONS)}.{nearest(name, AUGMENTATIONS)}"
-        )
+    check_known(name, AUGMENTATIONS, "augmentation", ConfigError)
     known = AUGMENTATIONS[name]
     try:
         strength = float(number)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
-from plushsense.core.errors import ConfigError, nearest
+from plushsense.core.errors import ConfigError, check_known
 from plushsense.training.augment import parse_augmentation
 
 DEVICES = ("auto", "cpu", "cuda")
@@ -15,11 +15,6 @@ STOP_ON = ("loss", "accuracy")
 TRAINING_VERSION = 2
 
 _ROTATION = "random-rotation"
-
-
-def _one_of(what: str, value: str, known: tuple[str, ...]) -> None:
-    if value not in known:
-        raise ConfigError(f"Unknown {what} '{value}': accepted are {', '.join(known)}.{nearest(value, known)}")
 
 
 def _at_least(name: str, value: object, low: int) -> None:
@@ -63,8 +58,8 @@ class TrainSpec:
             raise ConfigError(f"learning_rate is {self.learning_rate}: accepted is above 0, up to 1.")
         for augmentation in self.augment:
             parse_augmentation(augmentation)
-        _one_of("device to train on", self.device, DEVICES)
-        _one_of("measure to stop on", self.stop_on, STOP_ON)
+        check_known(self.device, DEVICES, "device to train on", ConfigError)
+        check_known(self.stop_on, STOP_ON, "measure to stop on", ConfigError)
 
     def learning_rate_at(self, epoch: int) -> float:
         """Return the learning rate in an epoch, counted from 1."""
@@ -130,12 +125,8 @@ def preset(name: str, **changes: Any) -> TrainSpec:
     Raises:
         ConfigError: for an unknown preset or setting, with the nearest known one.
     """
-    if name not in PRESETS:
-        raise ConfigError(f"Unknown preset '{name}': accepted are {', '.join(PRESETS)}.{nearest(name, PRESETS)}")
+    check_known(name, PRESETS, "preset", ConfigError)
     known = [*(f.name for f in fields(TrainSpec)), "turn_deg"]
     for key in changes:
-        if key not in known:
-            raise ConfigError(
-                f"Unknown training setting '{key}': accepted are {', '.join(known)}.{nearest(key, known)}"
-            )
+        check_known(key, known, "training setting", ConfigError)
     return PRESETS[name].changed(**{key: value for key, value in changes.items() if value is not None})

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import BadInput, BundleError, ConfigError, nearest
+from plushsense.core.errors import BadInput, BundleError, ConfigError, check_known
 from plushsense.core.files import write_file
 from plushsense.models.bundle import Bundle
 from plushsense.models.reference import check_windows
@@ -86,8 +86,7 @@ CONVERTERS: dict[str, Format] = {
 
 def check_format(name: str) -> None:
     """Raise ConfigError for an unknown format."""
-    if name not in CONVERTERS:
-        raise ConfigError(f"Unknown format '{name}': accepted are {', '.join(CONVERTERS)}.{nearest(name, CONVERTERS)}")
+    check_known(name, CONVERTERS, "format", ConfigError)
 
 
 def convert(bundle: Bundle, path: str | Path, format_name: str, *, windows: NDArray[Any] | None = None) -> Converted:

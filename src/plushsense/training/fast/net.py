@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -230,28 +231,7 @@ class FastNet:
         for at, layer in enumerate(self._layers):
             ready, bias = self._folded(at, *((passes[-1].a, passes[-1].b) if passes else (None, None)))
 
-            def work(
-                i: int,
-                lane: int,
-                thread: int,
-                at: int = at,
-                layer: _Layer = layer,
-                w: Tensor = ready,
-                bias: Tensor = bias,
-            ) -> tuple[Tensor, Tensor]:
-                out = self._held(at + 1, i)
-                layer.way.forward(
-                    self._held(at, i),
-                    w,
-                    bias,
-                    self._place(at, out),
-                    self._scratch[thread],
-                    self._spectrum(at, i, thread),
-                )
-                rows = self._finish(at, out)
-                return self._sums(rows, self._scratch[thread])
-
-            sums = self._threads.each(work, chunks)
+            sums = self._threads.each(partial(self._forward_chunk, at, ready, bias), chunks)
             count = windows * layer.way.plan.after
             mean = _added([s.sum(0) for s, _ in sums]) / count
             var = (_added([q for _, q in sums]) / count - mean * mean).clamp_min_(0.0)
@@ -261,6 +241,13 @@ class FastNet:
             passes.append(_Pass(ready, mean, var, a, layer.shift - mean * a))
             pooled = [s / layer.way.plan.after for s, _ in sums]
         return passes, torch.cat(pooled)
+
+    def _forward_chunk(self, at: int, w: Tensor, bias: Tensor, i: int, lane: int, thread: int) -> tuple[Tensor, Tensor]:
+        """Compute layer ``at`` for a chunk; return the sums of its output."""
+        space, out = self._scratch[thread], self._held(at + 1, i)
+        x, spectrum = self._held(at, i), self._spectrum(at, i, thread)
+        self._layers[at].way.forward(x, w, bias, self._place(at, out), space, spectrum)
+        return self._sums(self._finish(at, out), space)
 
     def _sums(self, rows: Tensor, space: BufferPool) -> tuple[Tensor, Tensor]:
         """Return sums over time (N, F), and sums of squares over time and windows (F,)."""
@@ -284,44 +271,8 @@ class FastNet:
             beta = straight * layer.gain * inverse.pow(3) / -count
             alpha = -here.a * db / count - beta * here.mean
             totals: dict[int, Tensor] = {}
-            last = at + 1 == len(self._layers)
-
-            def work(
-                i: int,
-                lane: int,
-                thread: int,
-                at: int = at,
-                layer: _Layer = layer,
-                w: Tensor = here.w,
-                alpha: Tensor = alpha,
-                beta: Tensor = beta,
-                totals: dict[int, Tensor] = totals,
-                last: bool = last,
-            ) -> Tensor:
-                planned, space, size = layer.way.plan, self._scratch[thread], self._size(i)
-                rows = self._rows(at, self._held(at + 1, i))
-                dz = space.take("dz", planned.writes, size, planned.filters)
-                inner = dz[: planned.after]
-                if last:
-                    start, end = self._edges[i]
-                    torch.addcmul((flat[start:end] + alpha).expand(rows.shape), rows, beta, out=inner)
-                else:
-                    torch.addcmul(self._gradient(at + 1, i), rows, beta, out=inner)
-                    inner += alpha
-                torch.ops.aten.threshold_backward.grad_input(inner, rows, 0, grad_input=inner)
-                dz[planned.after :].zero_()
-                x, spectrum = self._held(at, i), self._spectrum(at, i, thread)
-                if not layer.keeps:
-                    layer.way.spectrum(x, space, spectrum)
-                fresh = lane not in totals
-                if fresh:
-                    totals[lane] = self._shared.take(("total", lane), *w.shape)
-                dx = self._slope(at, i) if at else None
-                bias = layer.way.backward(dz, x, w, totals[lane], fresh, dx, space, spectrum)
-                if dx is not None and layer.mirror is not None:
-                    dx[planned.front :].index_add_(0, layer.mirror, dx[: planned.front])
-                return bias
-
+            above = flat if at + 1 == len(self._layers) else None
+            work = partial(self._backward_chunk, at, here.w, above, alpha, beta, totals)
             bias = _added(self._threads.each(work, chunks))
             total = totals[0]
             for lane in range(1, min(LANES, chunks)):
@@ -334,6 +285,48 @@ class FastNet:
                 layer.w.grad = dw * before.a[None, :, None] + before.b[None, :, None] * bias
             else:
                 layer.w.grad = dw.clone()
+
+    def _backward_chunk(
+        self,
+        at: int,
+        w: Tensor,
+        above: Tensor | None,
+        alpha: Tensor,
+        beta: Tensor,
+        totals: dict[int, Tensor],
+        i: int,
+        lane: int,
+        thread: int,
+    ) -> Tensor:
+        """Pass the gradient of a chunk back through layer ``at``; return the gradient of the bias.
+
+        ``above`` (N, F) is the gradient of the mean over time behind the last layer. The gradient of the weights is
+        added to the lane's tensor in ``totals``.
+        """
+        layer, space, size = self._layers[at], self._scratch[thread], self._size(i)
+        planned = layer.way.plan
+        rows = self._rows(at, self._held(at + 1, i))
+        dz = space.take("dz", planned.writes, size, planned.filters)
+        inner = dz[: planned.after]
+        if above is None:
+            torch.addcmul(self._gradient(at + 1, i), rows, beta, out=inner)
+            inner += alpha
+        else:
+            start, end = self._edges[i]
+            torch.addcmul((above[start:end] + alpha).expand(rows.shape), rows, beta, out=inner)
+        torch.ops.aten.threshold_backward.grad_input(inner, rows, 0, grad_input=inner)
+        dz[planned.after :].zero_()
+        x, spectrum = self._held(at, i), self._spectrum(at, i, thread)
+        if not layer.keeps:
+            layer.way.spectrum(x, space, spectrum)
+        fresh = lane not in totals
+        if fresh:
+            totals[lane] = self._shared.take(("total", lane), *w.shape)
+        dx = self._slope(at, i) if at else None
+        bias = layer.way.backward(dz, x, w, totals[lane], fresh, dx, space, spectrum)
+        if dx is not None and layer.mirror is not None:
+            dx[planned.front :].index_add_(0, layer.mirror, dx[: planned.front])
+        return bias
 
     def _slope(self, at: int, i: int) -> Tensor:
         """Return the gradient buffer of the input rows of layer ``at`` (needs, N, C); all layers share one a chunk."""
