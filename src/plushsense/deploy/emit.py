@@ -62,9 +62,9 @@ def emit(model: IntegerModel, bundle: Bundle, out: str | Path, extras: Sequence[
 
     Args:
         model: what the toy will compute with, made from ``bundle``.
-        bundle: kept beside it, for names, scores and the float engine; who it was trained on is left out.
+        bundle: written to the folder, for names, scores and the float engine, without the people it was trained on.
         out: a folder that does not exist yet, or is empty.
-        extras: what else to write once the rest stands (packages for build systems, other formats).
+        extras: functions that add files to the finished folder (packages for build systems, other formats).
 
     Raises:
         BadInput: when the folder holds something already, or cannot be written.
@@ -84,7 +84,7 @@ def read_facts(folder: str | Path) -> dict[str, Any]:
     """Read the facts of an export folder.
 
     Raises:
-        BadInput: when it is none.
+        BadInput: when the folder is no export, or its facts cannot be read.
     """
     path = Path(folder) / FACTS
     try:

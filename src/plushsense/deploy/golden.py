@@ -1,8 +1,6 @@
-"""Generated frames for golden vectors and test scenarios, and the answers to them.
+"""Generated frames for golden vectors and test scenarios, and the expected answers to them.
 
-No recording is used.
-
-The frames are made up: an export is given away, and no person's recording belongs in it.
+No recording is used, because an export is given away and must not contain anybody's recording.
 """
 
 from __future__ import annotations
@@ -42,7 +40,7 @@ def golden_frames(
     Each part lasts longer than ``span``, so that every restart is followed by answers: touches and blows with a
     jittering clock and lost frames; values out of range (also from the start, where there is no valid one yet); gaps
     just bridged and just too long; equal stamps; a clock that starts again; channels at the ends of their range, and
-    jumping between them; sensors that fail and recover as the ``health`` settings tell it; the clock's wrap at 2^32.
+    jumping between them; sensors that fail and recover according to the ``health`` settings; the clock's wrap at 2^32.
     With the scale of the ``inputs``, also samples in the middle between two whole numbers of which one is read as the
     next 8-bit number: there a wrong rounding shows.
     """
@@ -111,8 +109,8 @@ class FrameGenerator:
     ) -> None:
         """Add ``n`` frames similar to gestures: a slow drift, a rhythm at times, noise, and decaying impacts.
 
-        ``lost``, ``garbage`` (of a channel), ``equal`` (stamps) and ``blows`` are how likely each is in a frame;
-        ``stuck`` holds channels at one value.
+        ``lost``, ``garbage`` (of a channel), ``equal`` (stamps) and ``blows`` are the probabilities in each frame;
+        ``stuck`` maps channels to the value that they keep.
         """
         rng, c = self.rng, len(self.mean)
         for k in range(n):
@@ -149,7 +147,7 @@ class FrameGenerator:
         """Add sensor failures long enough to be detected, each followed by recovery and ``after`` frames of touches.
 
         A channel out of range or stuck beyond what touches reach, first for a moment only; then all of them frozen;
-        then good frames too few to be believed, and a gap amid the failure.
+        then too few good frames for a recovery, and a gap during the failure.
         """
         few, enough = self.frames_of(health.fault_ms) // 2, self.frames_of(health.fault_ms + health.recover_ms) + 20
         back = self.frames_of(health.recover_ms) + after

@@ -172,7 +172,7 @@ class Pacer:
 
 
 class PacedDevice(Device):
-    """A device whose frames are there already, and are due by their own clock, ``speed`` times as fast as it.
+    """A source of existing frames (a file, a simulation), delivered at ``speed`` times the pace of their clock.
 
     Args:
         speed: 1 real time, 0 as fast as frames are taken.

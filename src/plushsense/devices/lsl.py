@@ -44,8 +44,8 @@ def load_pylsl() -> ModuleType:
             pylsl = need("pylsl", extra="lsl")
         except RuntimeError as cause:
             raise DeviceError(f"LSL cannot be used here: {' '.join(str(cause).split()).rstrip('.')}.") from None
-        mine = ("lsl_api.cfg", "~/lsl_api/lsl_api.cfg", "/etc/lsl_api/lsl_api.cfg")
-        configured = os.environ.get("LSLAPICFG") or any(Path(p).expanduser().exists() for p in mine)
+        paths = ("lsl_api.cfg", "~/lsl_api/lsl_api.cfg", "/etc/lsl_api/lsl_api.cfg")
+        configured = os.environ.get("LSLAPICFG") or any(Path(p).expanduser().exists() for p in paths)
         if not configured and hasattr(pylsl, "set_config_content") and not hasattr(pylsl, "_plushsense_quiet"):
             pylsl.set_config_content("[log]\nlevel = -3\n")
             pylsl._plushsense_quiet = True  # type: ignore[attr-defined]
@@ -78,7 +78,7 @@ def match_columns(layout: Layout, labels: list[str] | None, width: int, what: st
             fault = f"lacks {', '.join(missing)}" if missing else f"has {', '.join(double)} more than once"
             raise DeviceError(
                 f"{what} {fault}; it carries {', '.join(labels or ())}: "
-                f"choose the layout that fits with ?layout= (asked for was {layout.name})."
+                f"choose the layout that fits with ?layout= (the requested layout is {layout.name})."
             )
         return LslColumns(
             tuple(texts.index(key) for key in known), texts.index(DEVICE_MS) if DEVICE_MS in texts else None
@@ -360,7 +360,7 @@ def forward(device: Device, outlet: LslOutlet, stop: threading.Event | None = No
     """
     if device.layout.channels != outlet.layout.channels:
         raise ConfigError(
-            f"'{device.url}' speaks layout {device.layout.name}, and the stream '{outlet.name}' was made for "
+            f"'{device.url}' has the layout {device.layout.name}, and the stream '{outlet.name}' was made for "
             f"{outlet.layout.name}: make both with the same."
         )
     count = 0

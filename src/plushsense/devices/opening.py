@@ -58,8 +58,8 @@ class DeviceAddress:
         for key in self.query:
             if key not in accepted:
                 raise ConfigError(
-                    f"'{self.url}': {self.scheme}:// knows no setting '{key}'; "
-                    f"it knows {', '.join(accepted)}.{nearest(key, accepted)}"
+                    f"'{self.url}': unknown setting '{key}' of {self.scheme}://: "
+                    f"accepted are {', '.join(accepted)}.{nearest(key, accepted)}"
                 )
 
     def whole(self, key: str, default: int, low: int = 0, high: int = 2**31 - 1) -> int:
@@ -127,7 +127,7 @@ def _split_query(rest: str, url: str) -> tuple[str, dict[str, str]]:
     return place, query
 
 
-# Schemes whose data have an end; the others only disconnect.
+# Schemes whose data end; a device of any other scheme can only disconnect.
 _ENDING = ("replay", "virtual")
 
 

@@ -1,18 +1,18 @@
-"""A personal touch: about a minute of one person's gestures moves the last layer of a bundle, and nothing else.
+"""Adapt the last layer of a bundle to one person, from about a minute of that person's gestures.
 
-The network's layers stay as they were trained; what they make of the person's recordings (the means over time that the
-dense layer reads) is enough to move the dense layer towards that person: a logistic regression that is pulled back to
-the trained weights, ``strength`` times the square of what it moved them (the maximum a posteriori under a Gaussian
-around the trained weights). Every gesture counts as much as any other, and every recording of a gesture.
+The convolution layers stay as they were trained. The dense layer is fitted again on their features (means over time) of
+the person's recordings: a logistic regression with a penalty of ``strength`` times the squared distance from the
+trained weights (the maximum a posteriori under a Gaussian prior around them). All gestures have the same weight, and so
+have all recordings of a gesture.
 
-Gestures without recordings of the person are not moved: those with recordings are separated from each other, and then
-all of them are shifted alike, so that what speaks for them together (the logarithm of their summed exponentials) is on
-the person's recordings what it was. Without that, touches that were not recorded would be taken for those that were,
-and the logits would no longer mean what the decision settings were fitted on.
+The rows of gestures without recordings are not changed. The others are separated from each other and then shifted by
+one number, so that the logarithm of their summed exponentials stays the same on average over the person's recordings.
+Without that shift, gestures that were not recorded would be taken for recorded ones, and the decision settings would no
+longer fit the logits.
 
-How strong the pull is, and whether to move at all, is decided by the person's own recordings, each read by a layer
-that was moved without it. Unless more of them are then read right, and their log loss clearly falls, the bundle stays
-as it is; also where they cannot be separated even so (wrong labels, for one). NumPy only: this runs beside the toy.
+The strength, and whether to adapt at all, are chosen on the person's own recordings, each predicted by a layer that was
+fitted without it. The bundle stays as it is unless more of them are then predicted correctly and their log loss clearly
+falls, and where they cannot be separated (because of wrong labels, for example). Only NumPy is needed.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class PersonalSpec:
     """Settings of the adaptation of a bundle.
 
     Attributes:
-        strengths: how hard the trained weights may pull, from which the person's recordings choose. In units of one
+        strengths: penalties to choose from, in units of one
             gesture: at 1, moving a weight by 1 costs half as much as a log loss of 1 on all recordings of a gesture.
         least: a gesture with fewer recordings is left out; one is left out of two to choose the strength.
         margin: by how many standard errors the log loss must fall for the bundle to be adapted.
@@ -227,10 +227,10 @@ def _weights(examples: Examples, without: int | None = None) -> Floats:
     """Return the weight of each window: 1 for all of a gesture together, its recordings alike; one left out 0."""
     weights = np.zeros(len(examples.y))
     for k in np.unique(examples.y):
-        mine = [r for r in np.unique(examples.recording[examples.y == k]) if r != without]
-        for r in mine:
+        recordings = [r for r in np.unique(examples.recording[examples.y == k]) if r != without]
+        for r in recordings:
             at = examples.recording == r
-            weights[at] = 1.0 / (len(mine) * at.sum())
+            weights[at] = 1.0 / (len(recordings) * at.sum())
     return weights
 
 

@@ -36,7 +36,7 @@ class LiveSummary:
         late: decisions that came more than a step after the bytes.
         events: how many began.
         no_signal: how often no frame came, or the clock had a gap or was reset.
-        faults: how often sensors could not be believed.
+        faults: number of sensor faults.
     """
 
     decisions: int
@@ -63,7 +63,7 @@ class LiveRun(Iterator[Decision]):
     """Live run: iterate for decisions; `summary` gives its figures at any time.
 
     A device that sends no frame for ``silence_s`` gives one decision of the state ``no signal``, and its event ends; so
-    does an event that is going on when the device ends.
+    does an open event when the device ends.
 
     Attributes:
         over: whether it came to its end.
@@ -253,15 +253,15 @@ class ManyRun(Iterator[tuple[int, Decision]]):
         return next(self._flow)
 
     def _turns(self) -> Iterator[tuple[int, Decision]]:
-        going = list(enumerate(self.runs))
-        while going:
+        running = list(enumerate(self.runs))
+        while running:
             received = False
-            for number, one in going:
+            for number, one in running:
                 before = one.device.counters.frames
                 for decision in one.poll():
                     yield number, decision
                 received = received or one.device.counters.frames != before
-            going = [(number, one) for number, one in going if not one.over]
+            running = [(number, one) for number, one in running if not one.over]
             if not received:
                 time.sleep(_PAUSE_S)
 

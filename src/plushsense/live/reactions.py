@@ -120,7 +120,7 @@ def load_reactions(name_or_path: str | Path, gestures: GestureSet | None = None)
     """Return a built-in profile by name, or one of the user's own by the path of its TOML file.
 
     Args:
-        gestures: what the model knows; a line for another gesture is refused, since it would never be read.
+        gestures: what the model knows; a line for another gesture is refused, since it would never apply.
 
     Raises:
         ConfigError: for an unknown name or key, or a value that does not fit.
@@ -190,7 +190,7 @@ class Reactor:
         line = self.profile.answer(event.affect, event.gesture)
         if line is None or event.number <= self._answered or not _due(line, event):
             return None
-        # What is refused now is not made up for later, when nobody knows any more what it is for.
+        # A reaction that is refused now is not made up for later: it would no longer fit the event.
         self._answered = event.number
         if event.t_s < self._refractory.get(event.affect, -math.inf):
             return None

@@ -217,22 +217,22 @@ def known_people(provenance: Mapping[str, Any]) -> set[str]:
 
 def _header(data: bytes, path: str | Path) -> dict[str, Any]:
     """Return the JSON header of a bundle, after checking the length of the file."""
-    stranger = f"'{path}' is not a PlushSense bundle: give a *.plush file made by plushsense train"
+    other_file = f"'{path}' is not a PlushSense bundle: give a *.plush file made by plushsense train"
     length = int.from_bytes(data[:8], "little")
     if len(data) < 10 or data[8:9] != b"{":
-        raise BundleError(f"{stranger}." if data else f"'{path}' is empty: {_AGAIN}.")
+        raise BundleError(f"{other_file}." if data else f"'{path}' is empty: {_AGAIN}.")
     if 8 + length > len(data):
         # A file of another kind gives a length beyond any sense here.
-        raise BundleError(f"{_damaged(path)} (it ends within its header)." if length < 1 << 26 else f"{stranger}.")
+        raise BundleError(f"{_damaged(path)} (it ends within its header)." if length < 1 << 26 else f"{other_file}.")
     try:
         outer = json.loads(data[8 : 8 + length])
         ends = [v["data_offsets"][1] for name, v in outer.items() if name != "__metadata__"]
         inner = outer.get("__metadata__", {}).get("plushsense")
         if inner is None:
-            raise BundleError(f"{stranger} (this is a safetensors file of something else, or a damaged bundle).")
+            raise BundleError(f"{other_file} (this is a safetensors file of something else, or a damaged bundle).")
         head = json.loads(inner)
         if head["format"] != FORMAT or "version" not in head:
-            raise BundleError(f"{stranger}.")
+            raise BundleError(f"{other_file}.")
         missing = 8 + length + max(ends, default=0) - len(data)
     except (ValueError, TypeError, KeyError, AttributeError, IndexError, RecursionError):
         raise BundleError(f"{_damaged(path)} (its header cannot be read).") from None

@@ -133,7 +133,7 @@ class StreamReader:
 
     @property
     def in_event(self) -> bool:
-        """Whether an event is going on."""
+        """Whether an event is open."""
         return self._machine.samples.in_event
 
     @property
@@ -147,7 +147,7 @@ class StreamReader:
         self._silent = False
 
     def silence(self) -> Decision:
-        """End the event that is going on: no frame came for a while.
+        """End the open event: no frame came for a while.
 
         The next frame goes on, or restarts after a gap.
         """
@@ -248,7 +248,7 @@ class BothEngines(IntegerClassifier):
         self._clear_counts()
 
     def silence(self) -> Decision:
-        """End the event that is going on, as `StreamReader.silence` does; return the deployed model's decision."""
+        """End the open event, as `StreamReader.silence` does; return the deployed model's decision."""
         self.original.silence()
         return super().silence()
 

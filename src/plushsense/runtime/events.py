@@ -157,7 +157,7 @@ class EventMachine:
         self._resting = rest
 
     def lost(self, now: int) -> list[Update]:
-        """End the event that is going on, after a gap, a clock reset or a fault, and forget all but the count of
+        """End the open event, after a gap, a clock reset or a fault, and forget all but the count of
         events.
         """
         updates = [self._end(now, now)] if self.open else []

@@ -8,16 +8,17 @@ inputs, raw, one even sample at a time, and works from the first samples on, whi
   ago (0 while there are not so many), held within 2^20 again.
 - Its *baseline* is an exponential mean with the weight 2^-baseline, its *noise* that of the deviation from the
   baseline with the weight 2^-noise; a deviation counts there with at most 4 times noise plus floor, so that one blow
-  does not deafen the gate. Both begin with the signal's first value, and a noise of 0. They are kept with 8 more bits.
+  does not raise the noise for long. Both begin with the signal's first value, and a noise of 0. They are kept with 8
+  more bits.
 - Its *size* is 16 times the deviation, without its sign, divided by noise plus ``floor`` and rounded down.
 - A *term* of a rule holds when the size was at least ``threshold`` for ``times`` samples in a row (``sign`` 1: above
   the baseline only, -1: below only, 0: either way), and ``within`` samples longer.
-- A *rule* fires when all its terms hold. The first rule that fires speaks; then the gate is deaf for its ``deaf``
-  samples, while signals and terms go on.
+- A *rule* fires when all its terms hold. The first rule that fires is reported; then no rule fires for its ``deaf``
+  samples, while signals and terms are still updated.
 
-A sample whose inputs all repeat the one before is not read (a hung toy is not hit), nor is a suspect one (see
-`plushsense.runtime.health`); it only shortens the deafness. So a blow that holds a sensor at its end stop for a moment
-goes on counting after it. After `DOUBT` suspect samples in a row everything but the deafness begins anew: a sensor that
+A sample whose inputs all repeat the one before is not read (the toy hangs), nor is a suspect one (see
+`plushsense.runtime.health`); it only counts for ``deaf``. So a blow that holds a sensor at its end stop for a moment
+goes on counting after it. After `DOUBT` suspect samples in a row everything else begins anew: a sensor that
 jumps to its end stop and back is broken, not hit.
 """
 

@@ -3,8 +3,8 @@
 This module defines it; ``deploy/c/plushsense.c`` repeats it. It sees every frame before the clock does.
 
 - A channel is *wrong* in a frame when its value is out of its valid range, or when it repeats exactly a value beyond
-  ``low`` to ``high``, what the sensor showed people's touch to reach: a sensor at its end stop.
-- The toy is *still* while every channel repeats the frame before. Real sensors tremble; a hung one does not.
+  ``low`` to ``high``, the range that touches reached in the recordings: a sensor at its end stop.
+- The toy is *still* while every channel repeats the frame before. Real sensors are noisy; one that hangs is not.
 - A frame is *suspect* while a channel is wrong, or the toy was still for ``still_ms`` / 2. Nothing begins on it.
 - A *fault* begins when in every frame for ``fault_ms`` some channel was wrong (not always the same one), or the toy was
   still for ``still_ms``. Then frames are not read, until for ``recover_ms`` none was suspect; after that everything
@@ -28,7 +28,7 @@ _INT32 = -(1 << 31), (1 << 31) - 1
 class HealthSettings:
     """The settings of `Health`; ``low`` and ``high`` (C,) of each measured channel, empty: not known, so that a value
     may stay wherever it is valid. ``fault_ms`` or ``still_ms`` of 0 switches its rule off; with a ``recover_ms`` of 0
-    the first good frame is believed.
+    the first good frame ends a fault.
 
     Raises:
         BundleError: for a value out of its range.

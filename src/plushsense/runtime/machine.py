@@ -198,7 +198,7 @@ class SampleReader:
 
     @property
     def in_event(self) -> bool:
-        """Whether an event is going on."""
+        """Whether an event is open."""
         return self._events.open
 
     @property
@@ -216,7 +216,7 @@ class SampleReader:
                 self._restart()
 
     def lose(self, time_us: int, reason: BreakReason) -> Moment:
-        """End the event that is going on: the signal is lost."""
+        """End the open event: the signal is lost."""
         return Moment(reason, time_us, self._events.lost(time_us))
 
     def _sample(self, time_us: int, inputs: list[int], suspect: bool) -> list[Moment]:
@@ -281,7 +281,7 @@ class ToyMachine:
         return ended
 
     def silence(self) -> Moment:
-        """End the event that is going on: no frame came for a while.
+        """End the open event: no frame came for a while.
 
         The next frame goes on, or restarts after a gap.
         """

@@ -112,7 +112,7 @@ def fit(
                     (None, None) if held_out is None else _measure(net, *held_out)
                 )
                 row["learning_rate"] = spec.learning_rate_at(epoch)
-                _still_numbers(row, spec)
+                _refuse_not_finite(row, spec)
                 history.append(row)
                 if epoch in keep:
                     kept[epoch] = net.export_weights()
@@ -244,7 +244,7 @@ def _check(windows: WindowSet, arch: Arch, what: str, some: bool = True) -> None
         )
 
 
-def _still_numbers(row: dict[str, Any], spec: TrainSpec) -> None:
+def _refuse_not_finite(row: dict[str, Any], spec: TrainSpec) -> None:
     for name in ("train_loss", "validation_loss"):
         if row[name] is not None and not np.isfinite(row[name]):
             raise DivergedError(

@@ -40,10 +40,10 @@ def test_comparing_names_the_first_number_that_differs() -> None:
         kind = ("answer", "event", "health")[row]
         message = f"row {row} ({kind}, frame {16 * row + 1}): '{name}' should be {was} and is {was + 7}"
         assert seen(field) == (1, 7, message)
-    assert seen(expected[:2]) == (1, 0, "row 2 (health, frame 33) never came")
+    assert seen(expected[:2]) == (1, 0, "row 2 (health, frame 33) is missing")
     assert seen(np.concatenate([expected, expected[:1]])) == (1, 0, "row 3 (answer, frame 1) is one too many")
     assert seen(expected, b"Something.") == (1, 0, "Something")
-    assert seen(expected[:0], b"Nothing.") == (3, 0, "Nothing; row 0 (answer, frame 1) never came")
+    assert seen(expected[:0], b"Nothing.") == (3, 0, "Nothing; row 0 (answer, frame 1) is missing")
     far = expected.copy()
     far[0, 12], high = -(1 << 31), (1 << 31) - 1
     assert compare(np.full_like(far, high), far.astype("<i4").tobytes(), labels).max_abs_diff == 2**32 - 1

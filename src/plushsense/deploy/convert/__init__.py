@@ -245,7 +245,7 @@ def compared(
     same = int((logits.argmax(axis=1) == reference.argmax(axis=1)).sum())
     if exact and not largest <= TOLERANCE * max(1.0, float(np.abs(reference).max())):
         raise BundleError(
-            f"The {title} file answers otherwise than the bundle (logits differ by up to {largest:.3g}) and is not "
+            f"The {title} file gives other answers than the bundle (logits differ by up to {largest:.3g}) and is not "
             "written: please report this with the bundle."
         )
     sentence = (

@@ -35,7 +35,7 @@ _MOST = 128  # windows: esp-ppq simulates a few dozen a second
 def plain_model(bundle: Bundle) -> Any:
     """Return the folded network as an ONNX model for esp-ppq: only Conv, Relu, GlobalAveragePool, Flatten and Gemm."""
     g, arch, z = OnnxGraph("espdl"), bundle.arch, SCALED
-    # Filters keep their own sizes: made even by their ranges they agreed less with the floats on the S3.
+    # The filters are not equalised by their ranges: on the S3 that gave answers farther from the float network.
     *convolutions, dense = [tuple(v.astype(np.float32) for v in part) for part in folded(arch, bundle.weights)]
     for i, (layer, (weights, bias)) in enumerate(zip(arch.layers, convolutions, strict=True)):
         w, b = g.constant(f"w{i}", weights), g.constant(f"b{i}", bias)

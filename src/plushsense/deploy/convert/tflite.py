@@ -2,8 +2,8 @@
 
 Needs neither TensorFlow nor PyTorch.
 
-Both read ``raw`` (1, span, C) float32 — time before channels, as LiteRT has it — whole numbers as the toy measures
-them, and give ``logits`` and ``probabilities`` (1, K). Only builtin operators that the LiteRT and TensorFlow Lite
+Both read ``raw`` (1, span, C) float32 — time before channels, as LiteRT has it — integers as the toy measures them, and
+give ``logits`` and ``probabilities`` (1, K). Only builtin operators that the LiteRT and TensorFlow Lite
 Micro interpreters have.
 """
 

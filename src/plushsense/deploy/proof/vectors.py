@@ -28,11 +28,11 @@ _PAUSE_MS = 1000
 
 
 def frames_of(dataset: Dataset, layout: Layout, *, subjects: Sequence[str] = (), rows: int) -> Ints:
-    """Read frames (n, 1 + C) from a data set, at least ``rows`` of them where there are as many.
+    """Read frames (n, 1 + C) from a data set, at least ``rows`` where the data set has that many.
 
-    Session streams of each person where there are, else the person's recordings; each is begun after a pause that
-    makes a toy start again, with its own gaps and resets kept. Of many streams the same share is taken of each, from
-    its beginning. Stamps wrap at 2^32 as a toy's do; values are held within 32 bits.
+    Of each person, the session streams are read, or else the recordings. Each begins after a pause that makes a toy
+    restart, and keeps its own gaps and resets. The same number of rows is taken from the beginning of each, where it
+    is long enough. Stamps wrap at 2^32 as a toy's do; values are clipped to 32 bits.
 
     Raises:
         ConfigError: for another layout than the model's, or a person who is not there.
@@ -53,7 +53,7 @@ def frames_of(dataset: Dataset, layout: Layout, *, subjects: Sequence[str] = (),
     pieces = list(_pieces(dataset, subjects or known))
     lengths = np.array([len(p) for p in pieces], dtype=np.int64)
     takes = np.zeros_like(lengths)
-    # The shortest first: what they lack falls to the others.
+    # The shortest first: the others make up for what they lack.
     for left, at in zip(range(len(pieces), 0, -1), np.argsort(lengths, kind="stable"), strict=True):
         takes[at] = min(lengths[at], max(0, -(-(rows - int(takes.sum())) // left)))
     found: list[Ints] = []
@@ -291,7 +291,7 @@ def compare(expected: NDArray[np.int32], got: bytes, labels: Sequence[str]) -> R
             f"{int(expected[at, field])} and is {int(rows[at, field])}"
         )
     elif whole < len(expected):
-        first = f"row {whole} ({_row(expected[whole])}) never came"
+        first = f"row {whole} ({_row(expected[whole])}) is missing"
     elif whole > len(expected):
         first = f"row {both} ({_row(rows[both])}) is one too many"
     if words:

@@ -87,7 +87,7 @@ def _ignore(_: object) -> None:
 
 @dataclass
 class ToyServer:
-    """The virtual toy for other programs: how it behaves, and who is told of it.
+    """Server of the virtual toy: its settings, and functions to call.
 
     Attributes:
         spec: which toy; the default is person 1.

@@ -150,7 +150,7 @@ def channel_columns(layout: Layout) -> list[int]:
         if name not in CHANNELS:
             raise ConfigError(
                 f"The virtual toy has no sensor '{name}' of layout '{layout.name}'; "
-                "it speaks plush-15, plush-14 and accel-3."
+                "it supports plush-15, plush-14 and accel-3."
             )
         columns.append(CHANNELS.index(name))
     return columns
