@@ -196,14 +196,14 @@ def evaluate(
     seed: int = 0,
     progress: Callable[[JobProgress], None] | None = None,
 ) -> Evaluation:
-    """Train and score once a fold of ``split``.
+    """Train and score each fold of ``split``.
 
     Args:
         train_windows, score_windows: the same recordings, possibly cut with another context; one set for both is fine.
         split: "leave-one-subject-out", "by-subject:5", "by-recording:5", "windows:5", "windows:holdout".
         journal: where finished folds are kept, and looked for first.
-        key: with a journal, everything that ``fit_predict`` depends on (network, schedule, its seed). The windows
-            and the folds go into a job's id by themselves.
+        key: with a journal, everything that ``fit_predict`` depends on besides windows and folds (network, schedule,
+            its seed).
         workers: folds at a time, each in a process of its own.
         cluster: address of a Ray cluster that does the folds instead.
         seed: of the split.
@@ -214,10 +214,12 @@ def evaluate(
         BadInput: for a split that cannot be made; PlushSenseError: what ``fit_predict`` raises.
     """
     if journal is not None and key is None:
-        raise ConfigError("A journal needs a key that says what was trained: give evaluate(..., key={...}).")
+        raise ConfigError("A journal needs a key that identifies what is trained: give evaluate(..., key={...}).")
     parsed = parse_split(split)
     folds = fold_windows(train_windows, score_windows, parsed, seed)
-    base = {"version": _VERSION, "key": dict(key or {}), "windows": _prints(train_windows, score_windows)}
+    hashes = [windows_fingerprint(train_windows)]
+    hashes.append(hashes[0] if score_windows is train_windows else windows_fingerprint(score_windows))
+    base = {"version": _VERSION, "key": dict(key or {}), "windows": hashes}
     jobs = [Job(job_id({**base, "fold": fold_fingerprint(fold)}), fold) for fold in folds]
     reporter = JobsReporter({job.id: JobInfo(job.task.name, 1.0) for job in jobs}, progress=progress)
     results = run_jobs(
@@ -298,12 +300,6 @@ def context_of(windows: WindowSet) -> str:
     return next((kind for kind in ("anywhere", "stream", "loop") if kind in present), "inside")
 
 
-def _prints(train: WindowSet, score: WindowSet) -> list[str]:
-    """Return the hashes of both sets; other windows give other job ids."""
-    first = windows_fingerprint(train)
-    return [first, first if score is train else windows_fingerprint(score)]
-
-
 def windows_fingerprint(windows: WindowSet) -> str:
     """Return the hash of a set's content, for the ids of jobs on it."""
     digest = hashlib.sha256(repr((windows.x.shape, windows.labels, windows.recording_ids)).encode())
@@ -330,10 +326,10 @@ def compare_deployed(
         predictions, deployed: of the same windows, in the same order.
 
     Returns:
-        ``accuracy`` and ``macro_f1`` of the deployed network; ``loss``, the same of what each person (or fold, as
-        ``over`` says) lost, float minus int8, with the interval of its mean; ``agreement``, the share of the windows
-        on which both say the same class; ``probability_difference``, the mean over the windows of the largest one;
-        ``rows``, one a person or fold.
+        ``accuracy`` and ``macro_f1`` of the deployed network; ``loss``, the difference float minus int8 of each person
+        (or fold, see ``over``) with the interval of its mean; ``agreement``, the share of the windows with the same
+        class; ``probability_difference``, the mean over the windows of the largest difference; ``rows``, one for each
+        person or fold.
     """
     same = predictions.predicted == deployed.predicted
     people = before["over"] == "subjects"
@@ -344,24 +340,20 @@ def compare_deployed(
         mine = of == one[name]
         row = {name: one[name], "windows": int(mine.sum())}
         for score in keys:
-            row |= {score: one[score], f"{score}_int8": other[score], f"{score}_loss": _less(one, other, score)}
+            before_score, after_score = one[score], other[score]
+            loss = None if before_score is None or after_score is None else float(before_score - after_score)
+            row |= {score: before_score, f"{score}_int8": after_score, f"{score}_loss": loss}
         rows.append(row | {"agreement": float(same[mine].mean()) if mine.any() else None})
     counted = predictions.subject != NOBODY if people else np.ones(len(same), dtype=np.bool_)
     apart = np.abs(predictions.probabilities - deployed.probabilities).max(axis=1)
     return {
         **{score: after[score] for score in keys},
-        "loss": {score: metrics.summary([_number(row[f"{score}_loss"]) for row in rows]) for score in keys},
+        "loss": {
+            score: metrics.summary([loss for row in rows if (loss := row[f"{score}_loss"]) is not None])
+            for score in keys
+        },
         "over": before["over"],
         "agreement": float(same[counted].mean()) if counted.any() else None,
         "probability_difference": float(apart[counted].mean()) if counted.any() else None,
         "rows": rows,
     }
-
-
-def _less(one: Mapping[str, Any], other: Mapping[str, Any], score: str) -> float | None:
-    before, after = one[score], other[score]
-    return None if before is None or after is None else float(before - after)
-
-
-def _number(value: float | None) -> float:
-    return float("nan") if value is None else value

@@ -1,11 +1,11 @@
-"""Re-identification: how well a simple program recognises people by their touch, before data are published.
+"""Re-identification: measure how well a simple program recognises people by their touch, before data are published.
 
-The attacker is given recordings under the people's codes and one new recording, and says whose it is. It reads
-statistics of each recording (those of the paper's baselines, see ``windows/statistics``) with extremely randomised
-trees (Geurts, Ernst & Wehenkel 2006). A stronger program may do better: the figures are a lower bound of the risk,
-never a proof of anonymity.
+The program learns from recordings under the people's codes and names the person of a new recording. It uses statistics
+of each recording (those of the paper's baselines, see `windows.features.statistics`) and extremely randomised trees
+(Geurts, Ernst & Wehenkel 2006). A stronger program may do better: the scores are a lower bound of the risk, and never
+prove anonymity.
 
-Each person counts alike: top-1 and top-5 are averaged over people, so that chance is one in so many people.
+People count alike: top-1 and top-5 are averaged over people, so that chance is 1 / people and 5 / people.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ FOLDS = 5
 FEWEST_RECORDINGS = 2
 CLEARLY = 0.8
 
-# What each program sees, and what it thereby leaves out.
+# The features of each program, and what they leave out.
 SEES = {
     "everything": "statistics of every channel, and the clock's rate and jitter",
     "touch": "statistics of every channel, not the clock",
@@ -60,11 +60,11 @@ _PLAN = (
 
 @dataclass(frozen=True)
 class ReidentificationTrial:
-    """The result of one program in one design: how often it named the right person.
+    """The result of one program in one design.
 
-    ``top1`` and ``top5`` are ``{mean, sd, ci95}`` over people (bootstrap over people); ``by_person`` is each one's
-    top-1, ``precision`` how often the program is right when it says that person, ``chance`` and ``chance5`` what
-    guessing would reach.
+    ``top1`` and ``top5`` are ``{mean, sd, ci95}`` over people (bootstrap over people); ``by_person`` is the top-1 of
+    each person, ``precision`` the share of correct answers among those that name the person, ``chance`` and
+    ``chance5`` the scores of guessing.
     """
 
     design: str
@@ -80,7 +80,7 @@ class ReidentificationTrial:
 
     @property
     def clear(self) -> list[str]:
-        """People who are almost surely named, and hardly ever wrongly."""
+        """People with both a high top-1 and a high precision."""
         return [p for p, share in self.by_person.items() if min(share, self.precision[p]) >= CLEARLY]
 
     def to_dict(self) -> dict[str, Any]:
@@ -92,7 +92,7 @@ class ReidentificationTrial:
 class Reidentified:
     """The results of a re-identification; ``skipped`` holds the designs that the data do not allow, with the reason.
 
-    ``of_one_person`` are gestures that only one person made: their label alone names that person.
+    ``of_one_person`` are gestures that only one person made, so that their label identifies the person.
     """
 
     trials: tuple[ReidentificationTrial, ...]
@@ -106,7 +106,7 @@ class Reidentified:
     simulated: bool
 
     def find(self, design: str, sees: str) -> ReidentificationTrial | None:
-        """Return the trial of a design and a program; None where it was not possible."""
+        """Return the trial of a design and a program; None where there is none."""
         return next((t for t in self.trials if (t.design, t.sees) == (design, sees)), None)
 
     def under(self, codes: Mapping[str, str]) -> Reidentified:
@@ -134,12 +134,12 @@ class Reidentified:
 
 
 def reidentify(dataset: Dataset, *, seed: int = 1, trees: int = 150, progress: Progress | None = None) -> Reidentified:
-    """Measure how well the people of a data set can be told apart by their recordings.
+    """Measure how well the people of a data set can be recognised by their recordings.
 
     Excluded recordings and those of nobody or of unknown people are left out.
 
     Args:
-        seed: the same seed gives the same figures.
+        seed: the same seed gives the same scores.
         progress: called with fits done, and in all.
 
     Raises:
@@ -154,8 +154,8 @@ def reidentify(dataset: Dataset, *, seed: int = 1, trees: int = 150, progress: P
     used = [r for r in used if counts[r.subject] >= FEWEST_RECORDINGS]
     if len({r.subject for r in used}) < 2:
         raise BadInput(
-            f"Whether people can be recognised needs two people of at least {FEWEST_RECORDINGS} recordings each: "
-            "leave it out with --no-reidentification."
+            f"Re-identification needs two people with at least {FEWEST_RECORDINGS} recordings each: leave it out with "
+            "--no-reidentification."
         )
     seen = [features(dataset.read(r), dataset.layout) for r in used]
     whole = [i for i, s in enumerate(seen) if s is not None]
@@ -164,12 +164,18 @@ def reidentify(dataset: Dataset, *, seed: int = 1, trees: int = 150, progress: P
     gesture = np.array([used[i].gesture for i in whole])
     session = np.array([used[i].session for i in whole])
     rng = np.random.default_rng([seed, 0x1D])
-    groups = {
-        "recordings": _dealt(person, rng),
-        "gestures": _gesture_groups(gesture),
-        "sessions": _turns(person, session),
-    }
-    skipped = _impossible(gesture, groups["sessions"])
+    at_random = np.zeros(len(person), dtype=np.int64)
+    for name in np.unique(person):
+        mine = rng.permutation(np.flatnonzero(person == name))
+        at_random[mine] = np.arange(len(mine)) % FOLDS
+    labels, which = np.unique(gesture, return_inverse=True)
+    turns = _turns(person, session)
+    groups = {"recordings": at_random, "gestures": np.asarray(which % FOLDS, dtype=np.int64), "sessions": turns}
+    skipped = {}
+    if len(labels) < 2:
+        skipped["gestures"] = "there is only one gesture"
+    if not (turns >= 0).any():
+        skipped["sessions"] = "nobody has more than one session"
     plan = [(design, sees) for design, names in _PLAN if design not in skipped for sees in names]
     trials = []
     for done, (design, sees) in enumerate(plan):
@@ -179,7 +185,7 @@ def reidentify(dataset: Dataset, *, seed: int = 1, trees: int = 150, progress: P
     if progress is not None:
         progress(len(plan), len(plan))
     sessions = len(set(zip(person.tolist(), session.tolist(), strict=True)))
-    alone = [g for g in np.unique(gesture) if len(np.unique(person[gesture == g])) == 1]
+    alone = [g for g in labels if len(np.unique(person[gesture == g])) == 1]
     return Reidentified(
         tuple(trials),
         len(np.unique(person)),
@@ -221,22 +227,8 @@ def _clock(device_ms: NDArray[np.int64]) -> Floats:
     return np.array([steps.mean(), np.median(steps), steps.std(), float(np.mean(steps == np.median(steps)))])
 
 
-def _dealt(person: Texts, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Assign each person's recordings to folds at random."""
-    group = np.zeros(len(person), dtype=np.int64)
-    for name in np.unique(person):
-        mine = rng.permutation(np.flatnonzero(person == name))
-        group[mine] = np.arange(len(mine)) % FOLDS
-    return group
-
-
-def _gesture_groups(gesture: Texts) -> NDArray[np.int64]:
-    _, which = np.unique(gesture, return_inverse=True)
-    return np.asarray(which % FOLDS, dtype=np.int64)
-
-
 def _turns(person: Texts, session: Texts) -> NDArray[np.int64]:
-    """Return the number of the session, which is tested in turn; −1 for people with one session."""
+    """Return the number (n,) of each recording's session among the person's; −1 for people with one session."""
     group = np.full(len(person), -1, dtype=np.int64)
     for name in np.unique(person):
         mine = person == name
@@ -244,15 +236,6 @@ def _turns(person: Texts, session: Texts) -> NDArray[np.int64]:
         if len(names) > 1:
             group[mine] = which
     return group
-
-
-def _impossible(gesture: Texts, turns: NDArray[np.int64]) -> dict[str, str]:
-    skipped = {}
-    if len(np.unique(gesture)) < 2:
-        skipped["gestures"] = "there is only one gesture"
-    if not (turns >= 0).any():
-        skipped["sessions"] = "nobody has more than one session"
-    return skipped
 
 
 def _trial(
@@ -266,13 +249,13 @@ def _trial(
     for turn in np.unique(group[group >= 0]):
         test = np.flatnonzero(group == turn)
         train = np.flatnonzero(group != turn)
-        # Who left nothing to learn from cannot be named.
+        # People without training recordings cannot be named.
         test = test[np.isin(truth[test], truth[train])]
         if not len(test):
             continue
         model = forest.ExtraTreesClassifier(trees, class_weight="balanced", random_state=seed, n_jobs=1)
         model.fit(x[train], truth[train])
-        # Equal likelihoods, as of people with the same clock, are drawn by lot: else the first code would win them all.
+        # Ties, as of people with the same clock, are broken at random, not in favour of the first code.
         chances = np.round(model.predict_proba(x[test]), 9)
         likely = model.classes_[np.argsort(-(chances + 1e-10 * rng.random(chances.shape)), axis=1)]
         named[test] = likely[:, 0]
@@ -282,8 +265,8 @@ def _trial(
     tested = np.isfinite(top1)
     people = np.unique(truth[tested])
     mine = {str(names[k]): float(top1[tested & (truth == k)].mean()) for k in people}
-    said = {str(names[k]): named[tested] == k for k in people}
-    right = {p: float(top1[tested][at].mean()) if at.any() else 0.0 for p, at in said.items()}
+    answers = {str(names[k]): named[tested] == k for k in people}
+    right = {p: float(top1[tested][at].mean()) if at.any() else 0.0 for p, at in answers.items()}
     five = [float(top5[tested & (truth == k)].mean()) for k in people]
     return ReidentificationTrial(
         design,
@@ -310,7 +293,7 @@ def verdict(found: Reidentified) -> str:
 
 
 def report(found: Reidentified, command: str) -> str:
-    """Return the whole report in Markdown; ``command`` is how it was made."""
+    """Return the whole report in Markdown; ``command`` is the command that made it."""
     trial = found.find("recordings", "everything")
     by_person = None if trial is None else sorted(trial.by_person.items(), key=lambda item: (-item[1], item[0]))
     return _fill(

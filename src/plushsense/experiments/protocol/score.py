@@ -1,7 +1,4 @@
-"""Scores of rules, network and both together on the trials of recorded or virtual sessions.
-
-`evaluation/protocol` adds it up.
-"""
+"""Scores of rules, network and both together on the trials of recorded or virtual sessions."""
 
 from __future__ import annotations
 
@@ -24,6 +21,7 @@ from plushsense.runtime.fixed import smoothing_weight
 from plushsense.runtime.gate import GateSettings
 from plushsense.runtime.image import IntegerModel
 from plushsense.runtime.trace import replay, trace_of
+from plushsense.scoring.events import latency_summary
 
 SYSTEMS = {"rules": "Rules only", "cnn": "Network only", "hybrid": "Hybrid: rules and network"}
 GROUPS = {
@@ -50,11 +48,11 @@ _GROUP_OF = {
 }
 
 EARLY_S = 0.3
-"""An answer may come so long before the hand touches: it is felt when it comes near."""
+"""An answer may come so long before the touch, as the sensors detect the approaching hand."""
 LATE_S = 2.0
-"""An answer counts until so long after the hand has left: a network that looks back 2.5 s names a blow of 1 s late."""
+"""An answer counts until so long after the touch, as a network with windows of 2.5 s recognises short blows late."""
 AFTER_S = 0.3
-"""A gentle gesture that is called negative until so long after its end was called so; later it is something else."""
+"""A negative event until so long after the end of a gentle gesture counts against that gesture."""
 QUICK_S = 0.2
 """The paper's rules answered blows within 0.1 to 0.2 s."""
 
@@ -70,7 +68,7 @@ def group_of(gesture: Gesture) -> str:
 
 @dataclass(frozen=True, eq=False)
 class SystemOutput:
-    """Output of a system on a stream: ``events`` in order; a network's steps as (time in s, best class, share)."""
+    """Output of a system on a stream: ``events`` in order; the steps of a network as (time in s, best class, share)."""
 
     events: tuple[GestureEvent, ...]
     answers: tuple[tuple[float, int, float], ...] = ()
@@ -79,8 +77,8 @@ class SystemOutput:
 def hear(frames: Frames, model: Bundle | IntegerModel, heuristic: Heuristic | None = None) -> dict[str, SystemOutput]:
     """Return the events of each system on a stream, by the keys of `SYSTEMS`.
 
-    The network's settings, and the gate's, are the model's own; a model without a gate makes no hybrid. ``heuristic``
-    are the old rules; None: they are not asked.
+    Network and gate use the model's own settings; without a gate there is no hybrid. ``heuristic`` are the old rules;
+    None leaves them out.
     """
     trace = trace_of(frames, model)
     if isinstance(model, IntegerModel):
@@ -102,7 +100,7 @@ def hear(frames: Frames, model: Bundle | IntegerModel, heuristic: Heuristic | No
 
 @dataclass
 class _Spell:
-    """One event from its beginning to its end; ``gesture`` since ``named_s``."""
+    """One event from its beginning to its end, with its ``gesture`` from ``named_s``."""
 
     affect: str
     source: str
@@ -127,17 +125,17 @@ def _spells(events: Sequence[GestureEvent]) -> list[_Spell]:
 
 @dataclass(frozen=True)
 class TrialOutcome:
-    """Outcome of one trial for a system; times in seconds after the onset, None where nothing came.
+    """Outcome of one trial for a system; times in seconds after the onset, None where there was no such event.
 
     Attributes:
         reaction_s: when an event of the right affect began.
         gesture_s: when the right gesture was named, in an event that began in the trial or before.
-        called: the gesture of the first event that began, or without one of that which stood; None: it was not named.
+        called: the gesture of the first event that began, or else of the event that continued; None: it was not named.
         judged: ``right``; ``family``, another of its family; ``affect``, another of its affect; ``wrong``; ``unnamed``.
         likelihood: highest smoothed probability of ``called`` while it was the best class; of networks only.
-        negative: an event of negative affect began while the hand worked, or right after.
-        already: an event of the right affect stood when the trial began, so that none could begin.
-        source: who began the right event, ``gate`` or ``cnn``.
+        negative: an event of negative affect began during the gesture, or right after.
+        already: an event of the right affect continued when the trial began, so that none could begin.
+        source: ``gate`` or ``cnn``, which began the right event.
     """
 
     who: str
@@ -175,7 +173,7 @@ class Between:
 
 
 def windows_of(trials: Sequence[GestureTrial]) -> list[tuple[float, float]]:
-    """Return the interval in which an answer belongs to each trial; they overlap only where the gestures do."""
+    """Return the interval in which answers count for each trial; they overlap only where the gestures do."""
     found = []
     for n, trial in enumerate(trials):
         before = trials[n - 1].stop_s if n else -math.inf
@@ -220,9 +218,9 @@ def _outcome(
     begun = [s for s in here if s.begun_s >= first]
     right = next((s for s in begun if s.affect == gesture.affect), None)
     named = next((s for s in here if s.gesture == gesture.label and first <= s.named_s <= last), None)
-    # What the toy says first is what the person sees; where nothing began, what it went on saying.
-    said = begun[0] if begun else here[0] if here else None
-    called = said.gesture if said is not None and said.named_s <= last else None
+    # The first event of the trial counts; where none began, the event that continued.
+    answer = begun[0] if begun else here[0] if here else None
+    called = answer.gesture if answer is not None and answer.named_s <= last else None
     likelihood = None
     if called is not None and heard.answers:
         best = gestures.index(called)
@@ -266,14 +264,14 @@ def run(
     progress: Progress | None = None,
     of: int = 0,
 ) -> dict[str, Any]:
-    """Let every system hear every sitting, and add up.
+    """Run every system on every sitting, and summarise the outcomes.
 
     Args:
-        of: how many sittings there are, for the progress.
+        of: number of sittings, for the progress.
 
     Returns:
-        ``people``, ``trials``, ``systems``, ``rows`` (a group each, and all of them: `summary`), ``by_gesture``,
-        ``confusions`` (a system, what was done, what it was called, how often), ``between`` and ``outcomes``.
+        ``people``, ``trials``, ``systems``, ``rows`` (a `summary` of each group and of all trials), ``by_gesture``,
+        ``confusions`` (see `confusions`), ``between`` and ``outcomes``.
     """
     gestures = model.gestures
     outcomes: list[TrialOutcome] = []
@@ -317,7 +315,7 @@ def run(
 def summary(outcomes: Sequence[TrialOutcome]) -> dict[str, Any]:
     """Summarise the trials of one system; shares are of all ``trials``, times of those that were answered.
 
-    ``called`` counts what was said first, by the words of ``Outcome.judged``.
+    ``called`` counts the values of `TrialOutcome.judged`.
     """
     n = len(outcomes)
     reactions = sorted(o.reaction_s for o in outcomes if o.reaction_s is not None)
@@ -350,13 +348,11 @@ def _share(part: int, of: int) -> float | None:
 
 
 def _times(values: Sequence[float]) -> dict[str, float | None]:
-    if not values:
-        return {"median": None, "p90": None}
-    return {"median": round(median(values), 3), "p90": round(float(np.percentile(values, 90)), 3)}
+    return {name: None if value is None else round(value, 3) for name, value in latency_summary(values).items()}
 
 
 def confusions(outcomes: Sequence[TrialOutcome]) -> list[dict[str, Any]]:
-    """Return the families that each family was called, most often first: itself, another one, or none."""
+    """Return how often each family was recognised as which family (or none), most often first."""
     counts: dict[tuple[str, str | None], int] = {}
     for o in outcomes:
         counts[o.family, o.called_family] = counts.get((o.family, o.called_family), 0) + 1
@@ -382,9 +378,10 @@ def _strays(between: Sequence[Between]) -> dict[str, Any]:
 
 
 def aims(result: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return this project's aims for the protocol beside the measured values; without its system an aim is open.
+    """Return this project's aims for the protocol with the measured values.
 
-    Each has ``aim``, ``measured`` (a share, or seconds), ``part`` and ``of`` where it is a share, ``met`` (or None).
+    Each has ``aim``, ``measured`` (a share, or seconds), ``part`` and ``of`` where it is a share, and ``met``, which is
+    None where its system was not run.
     """
     outcomes = result["outcomes"]
 

@@ -1,11 +1,11 @@
-"""A search by successive halving: all networks for a few epochs, the better ones for more, the last to the end.
+"""Successive halving: train all networks for a few epochs, the better ones for more, and the last to the end.
 
-Jamieson and Talwalkar, "Non-stochastic best arm identification and hyperparameter optimization", AISTATS 2016. Theirs
-is the halving; ours that costs differ by network, that the whole cost is bounded before anything runs, and that who
-is within one standard error of the cut goes on while there is money for it. What is spent on a training is never
-lost: it goes on from where it stopped, and one that goes to the end has cost what it costs in the grid.
+After Jamieson and Talwalkar, "Non-stochastic best arm identification and hyperparameter optimization", AISTATS 2016.
+In addition, costs differ by network, the total cost is bounded before anything runs, and networks within one standard
+error of the cut continue as long as the budget allows. A training continues from where it stopped, so that one to the
+end costs the same as in the grid.
 
-Cost is in multiply-accumulates (MAC): of a window × windows × epochs, forward and backward.
+Costs are in multiply-accumulates (MAC): of a window × windows × epochs, forward and backward.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from plushsense.trials.grid import GRIDS, GridSpec, grid_tables, over
 
 Scores = NDArray[np.float64]
 
-# Of the grid's cost, where nothing is said.
+# Default share of the grid's cost.
 QUARTER = 0.25
 
-# Sums in another order differ by less.
+# Tolerance for sums in another order.
 _SLACK = 1 + 1e-9
 
-# What a search may bound: the key, the property of a network, its unit.
+# Limits of a search by key: the property of a network, and its unit.
 LIMITS: dict[str, tuple[str, str]] = {
     "max_parameters": ("parameters", "parameters"),
     "max_state_bytes": ("state_bytes_int8", "bytes of state"),
@@ -46,14 +46,14 @@ class SearchSpec:
     """Settings of a search. Nothing is checked when it is made: `problems` finds everything at once.
 
     Args:
-        rungs: epochs after which networks are compared; those of the last are trained to the end.
-        folds: how many folds the rungs before the last look at, one number each; empty: all of them.
-        share: of the cost of the whole grid (every allowed network, last rung, all folds and seeds): at most this.
-            None: a quarter; where so few networks are allowed that not even one could be paid to the end, as much as
-            the first rung and two of them take.
-        eta: of each rung one in so many goes on, and two at least, where cost allows.
-        max_parameters, max_state_bytes, max_macs_per_step: networks beyond are left out before anything runs; the
-            state is that of int8 streaming, a step 50 ms.
+        rungs: epochs after which networks are compared; the last is the end of a training.
+        folds: number of folds for each rung but the last; empty: all of them.
+        share: limit as a share of the cost of the whole grid (every allowed network, last rung, all folds and seeds).
+            None: a quarter, or if that does not suffice for one network to the end, as much as the first rung and two
+            networks to the end take.
+        eta: of each rung one in so many continues, at least two, if the cost allows.
+        max_parameters, max_state_bytes, max_macs_per_step: networks above are left out before anything runs; the state
+            is that of int8 streaming, a step 50 ms.
     """
 
     rungs: tuple[int, ...] = (4, 15, 60)
@@ -69,7 +69,7 @@ class SearchSpec:
         return asdict(self)
 
     def over(self, arch: Arch) -> dict[str, tuple[int, int]]:
-        """Return each limit that a network breaks: (its value, the limit)."""
+        """Return (value, limit) for each limit that a network exceeds."""
         found = {}
         for key, (name, _) in LIMITS.items():
             limit = getattr(self, key)
@@ -106,12 +106,12 @@ def problems(spec: SearchSpec, folds: int | None = None) -> list[str]:
 
 
 def limits_text(over: Mapping[str, tuple[int, int]]) -> str:
-    """Return the limits that a network breaks as text."""
+    """Describe the limits that a network exceeds."""
     return ", ".join(f"{has:,} {LIMITS[key][1]}, {has - may:,} over {may:,}" for key, (has, may) in over.items())
 
 
 def none_left(spec: SearchSpec, archs: Sequence[Arch]) -> str:
-    """Return why no network is left, and by how much the nearest misses."""
+    """Describe that no network is within the limits, and by how much the nearest exceeds them."""
 
     def excess(arch: Arch) -> float:
         return max(has / may for has, may in spec.over(arch).values())
@@ -124,7 +124,7 @@ def none_left(spec: SearchSpec, archs: Sequence[Arch]) -> str:
 
 
 class Rung(NamedTuple):
-    """What is to be trained next: ``entered`` (indices of networks) on the first ``folds`` folds, to ``epochs``."""
+    """A rung to train: ``entered`` (indices of networks) on the first ``folds`` folds, up to ``epochs``."""
 
     number: int
     epochs: int
@@ -135,11 +135,11 @@ class Rung(NamedTuple):
 
 @dataclass(frozen=True)
 class FinishedRung:
-    """A rung that is done.
+    """A finished rung.
 
     ``scores`` (entered, seeds × folds); ``means`` by network (NaN: its training failed); ``error`` the standard error
-    of the difference of two means, None from a single score each; ``kept`` goes on, best first (after the last rung:
-    who stands at the end); ``left`` says of each other why: below the cut, too dear, failed.
+    of the difference of two means, None for a single score each; ``kept`` are the networks that continue, best first
+    (after the last rung, all that did not fail); ``left`` is the reason for the others.
     """
 
     rung: Rung
@@ -152,7 +152,7 @@ class FinishedRung:
 
 @dataclass(frozen=True)
 class Halved:
-    """A search that is done: its rungs, the best network, those within one standard error of it, and the cost."""
+    """A finished search: its rungs, the best network, those within one standard error of it, and the cost."""
 
     rungs: tuple[FinishedRung, ...]
     best: int
@@ -163,14 +163,14 @@ class Halved:
 
 
 class Costs:
-    """What networks cost: MAC of one epoch (networks, folds), over the rungs of a search."""
+    """The costs of networks over the rungs of a search, from the MAC of one ``epoch`` (networks, folds)."""
 
     def __init__(self, epoch: Scores, spec: SearchSpec, seeds: int = 1) -> None:
         self.spec = spec
         self.epoch = epoch
         folds = [*spec.folds, *[epoch.shape[1]] * (len(spec.rungs) - len(spec.folds))]
         self.folds = tuple(folds)
-        # (networks, rungs): all that a network has cost once it is done with a rung.
+        # (networks, rungs): cost of a network up to the end of a rung.
         self.until = np.stack(
             [seeds * e * epoch[:, :f].sum(axis=1) for e, f in zip(spec.rungs, folds, strict=True)], axis=1
         )
@@ -197,7 +197,7 @@ class Costs:
 
     @property
     def least(self) -> float:
-        """The smallest share with which the first rung and any one network to the end can be paid."""
+        """The smallest share that suffices for the first rung and any one network to the end."""
         return float(self.step(0).sum() + self.rest(0).max()) / self.whole
 
     def check(self) -> None:
@@ -215,9 +215,9 @@ class Costs:
 
 
 def halving(costs: Costs, train: Callable[[Rung], Scores]) -> Halved:
-    """Search. ``train`` gives the scores (entered, seeds × folds) of a rung, more is better, NaN for what failed.
+    """Search; ``train`` returns the scores (entered, seeds × folds) of a rung, higher is better, NaN for a failure.
 
-    At no time is more spent than the bound: whoever may lead the next rung can be paid to the end.
+    The bound is never exceeded: it suffices for every network that may be the best of the next rung.
 
     Raises:
         ConfigError: when the bound does not suffice for any search; TrainingError: when every training failed.
@@ -230,7 +230,7 @@ def halving(costs: Costs, train: Callable[[Rung], Scores]) -> Halved:
         rung = Rung(level, epochs, costs.folds[level], alive, cost)
         scores = np.asarray(train(rung), dtype=np.float64)
         spent += cost
-        # A network that failed on one fold has no mean: those that are left would flatter it.
+        # A network that failed on one fold has no mean, as that of the other folds would be biased.
         means = {network: float(scores[i].mean()) for i, network in enumerate(alive)}
         well = [network for network in alive if math.isfinite(means[network])]
         if not well:
@@ -261,10 +261,10 @@ def _go_on(
     entered: int,
     left: dict[int, Literal["score", "cost", "failed"]],
 ) -> tuple[int, ...]:
-    """Return the networks that are trained for the next rung, the best first."""
+    """Return the networks that continue to the next rung, the best first, and enter the others into ``left``."""
     allowed = money / (len(costs.spec.rungs) - rung)
     step, rest = costs.step(rung), costs.rest(rung)
-    # Two at least: who comes out of the end should have beaten somebody there.
+    # At least two, so that the winner was compared in the last rung.
     wanted = max(2, math.ceil(entered / costs.spec.eta))
     cut = means[order[min(len(order), wanted) - 1]]
     kept: list[int] = []
@@ -283,9 +283,9 @@ def _go_on(
 
 
 def standard_error(scores: Scores) -> float | None:
-    """Return the standard error of the difference of two networks' means; None where it cannot be told.
+    """Return the standard error of the difference of two networks' means; None for a single network or score.
 
-    All networks were scored on the same folds with the same seeds, so that what is hard for all does not count: the
+    All networks were scored on the same folds with the same seeds, so that effects common to all do not count: the
     spread is that of the residuals of network + fold, pooled over the networks.
     """
     networks, units = scores.shape
@@ -304,17 +304,17 @@ def _listed(values: Sequence[int]) -> str:
     return ", ".join(map(str, values)) or "(none)"
 
 
-# Draws for each network that is asked for, until the space is taken as used up.
+# Draws for each network, after which the space counts as exhausted.
 _TRIES = 2000
 
 
 @dataclass(frozen=True)
 class Space:
-    """Space of networks that a search may draw from.
+    """A space of networks to draw from.
 
-    ``layers``, ``kernels`` and ``dilations`` are drawn from; dilations never fall from layer to layer, as in all of
-    the paper's networks. ``receptive_field``: the shortest and the longest, in samples; the paper keeps to about its
-    window of 250. ``networks`` are drawn with ``seed``.
+    The values of ``layers``, ``kernels`` and ``dilations`` are drawn; dilations never fall from layer to layer, as in
+    all of the paper's networks. ``receptive_field`` is the shortest and the longest, in samples (the paper's window has
+    250). ``networks`` different ones are drawn with ``seed``.
     """
 
     layers: tuple[int, ...] = (2, 3, 4)
@@ -348,7 +348,7 @@ def problems_space(space: Space) -> list[str]:
 
 
 def drawn(space: Space) -> tuple[str, ...]:
-    """Return the symbols of ``networks`` different networks, equal for equal spaces; fewer where there are no more."""
+    """Return the symbols of ``networks`` different networks, or of fewer where there are no more."""
     chance = random.Random(space.seed)
     found: dict[str, None] = {}
     for _ in range(_TRIES * space.networks):
@@ -356,14 +356,14 @@ def drawn(space: Space) -> tuple[str, ...]:
             break
         layers = chance.choice(space.layers)
         kernels = [chance.choice(space.kernels) for _ in range(layers)]
-        # A kernel of one tap has no dilation to speak of.
+        # The dilation of a kernel of one tap has no effect.
         widths = sorted(chance.choice(space.dilations) for _ in range(layers))
         dilations = [1 if k == 1 else d for k, d in zip(kernels, widths, strict=True)]
         field = 1 + sum((k - 1) * d for k, d in zip(kernels, dilations, strict=True))
         if space.receptive_field[0] <= field <= space.receptive_field[1]:
             dilated = max(dilations) > 1
-            layers_said = (f"{k}d{d}" if dilated else f"{k}" for k, d in zip(kernels, dilations, strict=True))
-            found["_".join(layers_said)] = None
+            parts = (f"{k}d{d}" if dilated else f"{k}" for k, d in zip(kernels, dilations, strict=True))
+            found["_".join(parts)] = None
     return tuple(found)
 
 
@@ -421,7 +421,9 @@ def load_search(
 
 def _symbols(space: Any, where: str) -> tuple[tuple[str, ...], list[str]]:
     if not isinstance(space, Mapping):
-        return (), [f"space of {where.replace('.space', '')} is a single value; it is a table: write  [search.space]"]
+        return (), [
+            f"space of {where.replace('.space', '')} is one value, but it is a table: write  [search.space]"
+        ]
     made, found = over(Space(), space, where)
     found += problems_space(made)
     return (() if found else drawn(made)), found

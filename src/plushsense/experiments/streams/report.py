@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from plushsense.core.errors import need
 from plushsense.reports.figures import data_uri, new_figure
 from plushsense.reports.page import render_page
-from plushsense.reports.table import DASH, Column, Table
+from plushsense.reports.table import DASH, Column, Table, number
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -27,13 +27,13 @@ _OTHER = ("#009e73", "-.", "*")
 _LONGEST_S = 4.0
 SETTINGS = {
     "plain": "no threshold",
-    "balanced": "highest F1 on those who tune",
-    "cheapest": "lowest cost on those who tune",
+    "balanced": "highest F1 on the tuning people",
+    "cheapest": "lowest cost on the tuning people",
 }
 
 
 def curves(result: Mapping[str, Any]) -> Figure:
-    """Draw recall against false events an hour of every system over all people left out; a star: no threshold."""
+    """Draw recall against false events an hour of every system; a star marks it without a threshold."""
     figure = new_figure(8.6, 6.0)
     axes = figure.add_subplot()
     for name, system in result["systems"].items():
@@ -78,7 +78,7 @@ def latencies(result: Mapping[str, Any]) -> Figure:
 
     Left: with the right gesture. Right: with any event, left out where every sample has a label.
     """
-    # Where every sample has a label, some event is always going on.
+    # If every sample has a label, there is always an event.
     panels = [("gesture", "the right gesture"), ("anything", "any event")][: 1 if result["labelled"] else 2]
     figure = new_figure(4.8 * len(panels) + 0.6, 4.8)
     grid = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
@@ -108,7 +108,9 @@ def latencies(result: Mapping[str, Any]) -> Figure:
     grid[0].set_ylabel("Share of true gestures")
     handles, labels = grid[0].get_legend_handles_labels()
     figure.legend(handles, labels, fontsize=8, frameon=False, loc="outside lower center", ncols=2 * len(panels))
-    title = f"{_title(result)}\nsettings of the highest F1 on those who tune; the line at 1 s is the aim for the median"
+    title = (
+        f"{_title(result)}\nsettings of the highest F1 on the tuning people; the line at 1 s is the aim for the median"
+    )
     figure.suptitle(title, fontsize=9).set_parse_math(False)
     return figure
 
@@ -129,16 +131,16 @@ def setting_table(result: Mapping[str, Any]) -> Table:
             rows.append(
                 {
                     **{k: s[k] for k in ("deletions", "insertions", "fragmentations", "merges")},
-                    **{k: share(s[k]) for k in ("recall", "precision", "f1", "cost_per_truth")},
+                    **{k: number(s[k], 2) for k in ("recall", "precision", "f1", "cost_per_truth")},
                     "system": system["title"],
                     "setting": setting,
                     "hits": f"{s['hits']} of {s['truths']}",
                     "false": rate(s["false_events_per_hour"]),
                     "outside": rate(s["outside_per_uncovered_hour"]),
                     "rest": f"{rate(s['at_rest_per_hour'])} ({s['outside']['rest']} in {60 * s['rest_hours']:.1f} min)",
-                    "median": seconds(s["latency_s"]["median"]),
-                    "p90": seconds(s["latency_s"]["p90"]),
-                    "any": seconds(s["levels"]["anything"]["latency_s"]["median"]),
+                    "median": number(s["latency_s"]["median"], 2),
+                    "p90": number(s["latency_s"]["p90"], 2),
+                    "any": number(s["levels"]["anything"]["latency_s"]["median"], 2),
                 }
             )
     columns = (
@@ -196,10 +198,10 @@ def class_tables(result: Mapping[str, Any], how: str = "balanced") -> list[Table
         rows = tuple(
             {
                 **{k: row[k] for k in ("truths", "insertions")},
-                **{k: share(row[k]) for k in ("recall", "precision", "f1")},
+                **{k: number(row[k], 2) for k in ("recall", "precision", "f1")},
                 "label": label,
-                "median": seconds(row["latency_s"]["median"]),
-                "p90": seconds(row["latency_s"]["p90"]),
+                "median": number(row["latency_s"]["median"], 2),
+                "p90": number(row["latency_s"]["p90"], 2),
             }
             for label, row in system[how]["per_class"].items()
         )
@@ -221,16 +223,6 @@ def point_table(result: Mapping[str, Any]) -> Table:
                 times = {"latency_median_s": latency["median"], "latency_p90_s": latency["p90"]}
                 rows.append({**head, "point": how, **row, **times})
     return Table("streams", "Points of the curves", tuple(Column(name, name) for name in names), tuple(rows))
-
-
-def share(value: float | None) -> str:
-    """Return two decimals; a dash for a missing value."""
-    return DASH if value is None else f"{value:.2f}"
-
-
-def seconds(value: float | None) -> str:
-    """Return seconds with two decimals; a dash for a missing value."""
-    return DASH if value is None else f"{value:.2f}"
 
 
 def rate(value: float | None) -> str:

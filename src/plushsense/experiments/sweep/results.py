@@ -1,4 +1,4 @@
-"""The results folder of a sweep, read for its tables and figures; a sweep that still runs is read as far as it is."""
+"""The results folder of a sweep, read for its tables and figures; the sweep may still be running."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 import math
 import os
 import statistics
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -85,12 +85,12 @@ class SweepResults:
 
     @property
     def done(self) -> list[Row]:
-        """The trials that are done wholly: all that is ranked, drawn or averaged."""
+        """The complete trials, which are ranked, drawn and averaged."""
         return [t for t in self.trials if scored(t)]
 
     @property
     def archs(self) -> list[str]:
-        return _in_order(str(t["arch"]) for t in self.trials)
+        return list(dict.fromkeys(str(t["arch"]) for t in self.trials))
 
     @property
     def filter_sets(self) -> list[str]:
@@ -113,18 +113,15 @@ class SweepResults:
         k = len(self.labels)
         return table if table and k and len(table) == k and all(len(row) == k for row in table) else None
 
-    def by_id(self, trial: str) -> Row | None:
-        return next((t for t in self.trials if t["trial"] == trial), None)
-
     def histories(self, trial: Row) -> list[list[Row]]:
-        """Return the epochs of each run of a trial; a longer training that it was taken from is cut at its epochs."""
+        """Return the epochs of each run of a trial, without those of a longer training that contains it."""
         jobs = sorted({r["run"] for r in self.runs if r["trial"] == trial["trial"]})
         path = self.folder / CURVES
         if not jobs or not path.exists():
             return []
         polars = need("polars", "tables")
         try:
-            # A whole grid has half a million rows: only those of the trial are read.
+            # A whole grid has half a million rows, so read only those of the trial.
             mine = polars.scan_parquet(path).filter(
                 polars.col("run").is_in(jobs) & (polars.col("epoch") <= trial["epochs"])
             )
@@ -166,9 +163,11 @@ def read_sweep(folder: str | os.PathLike[str]) -> SweepResults:
             f"There is no sweep at '{place}' (no {SUMMARY}): give a folder that  plushsense sweep  wrote."
         ) from None
     except (OSError, ValueError) as cause:
-        raise BadInput(f"'{place / SUMMARY}' is not a sweep ({cause}): run the sweep again, it goes on.") from None
+        raise BadInput(
+            f"'{place / SUMMARY}' is not a sweep ({cause}): run the sweep again, which rebuilds it."
+        ) from None
     if not isinstance(head, dict):
-        raise BadInput(f"'{place / SUMMARY}' is not a sweep (no object): run the sweep again, it goes on.")
+        raise BadInput(f"'{place / SUMMARY}' is not a sweep (no object): run the sweep again to rebuild it.")
     trials = _table(place / TRIALS, needed=_NEEDED)
     return SweepResults(place, head, trials, _table(place / RUNS, missing=True))
 
@@ -188,8 +187,8 @@ def _table(path: Path, needed: Sequence[str] = (), *, missing: bool = False) -> 
 
 
 def _unread(path: Path, cause: Exception) -> BadInput:
-    said = str(cause).splitlines()[0] if str(cause) else type(cause).__name__
-    return BadInput(f"'{path}' cannot be read ({said}): run the sweep again, which rebuilds it.")
+    reason = str(cause).splitlines()[0] if str(cause) else type(cause).__name__
+    return BadInput(f"'{path}' cannot be read ({reason}): run the sweep again, which rebuilds it.")
 
 
 def _networks(trials: Sequence[Row]) -> tuple[SweepNetwork, ...]:
@@ -205,10 +204,6 @@ def _networks(trials: Sequence[Row]) -> tuple[SweepNetwork, ...]:
         )
         for (arch, filters, filter_set, *more), rows in groups.items()
     )
-
-
-def _in_order(values: Iterable[str]) -> list[str]:
-    return list(dict.fromkeys(values))
 
 
 def schedule(trial: Row) -> str:
