@@ -137,9 +137,9 @@ def _answered(mark: GestureMark, events: list[GestureEvent], ms: np.ndarray) -> 
 
 
 def test_without_affects_there_is_nothing_to_tune(virtual: Dataset) -> None:
-    with pytest.raises(ConfigError, match="'makeability-11' tells no affect"):
+    with pytest.raises(ConfigError, match="'makeability-11' has no affects"):
         fit_rule_baseline(virtual, load_gestures("makeability-11"), virtual.subjects)
-    with pytest.raises(ConfigError, match="nothing to tune on"):
+    with pytest.raises(ConfigError, match="include other people"):
         fit_rule_baseline(virtual, virtual.gestures, [])
 
 

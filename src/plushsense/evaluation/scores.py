@@ -108,13 +108,12 @@ def read_predictions(path: str | Path) -> Predictions:
     """Read a file of `write_predictions`.
 
     Raises:
-        MissingExtraError: without polars (extra ``train``); BadInput: for a file that is missing, or of something else.
+        MissingExtraError: without polars (extra ``train``); BadInput: for a missing file, or one of another kind.
     """
     polars = need("polars", extra="train")
     path = Path(path)
-    again = "evaluate again"
     if not path.is_file():
-        raise BadInput(f"There are no predictions at '{path}': they were moved or deleted; {again}.")
+        raise BadInput(f"There are no predictions at '{path}': they were moved or deleted; evaluate again.")
     try:
         table = polars.read_parquet(path)
         labels = tuple(name.removeprefix(_P) for name in table.columns if name.startswith(_P))
@@ -130,7 +129,7 @@ def read_predictions(path: str | Path) -> Predictions:
             **text,
         )
     except (OSError, KeyError, polars.exceptions.PolarsError) as cause:
-        raise BadInput(f"'{path}' holds no predictions of an evaluation ({cause}): {again}.") from None
+        raise BadInput(f"'{path}' holds no predictions of an evaluation ({cause}): evaluate again.") from None
 
 
 Mask = NDArray[np.bool_]
@@ -162,7 +161,7 @@ def compute_scores(
     of_fold = [predictions.fold == fold.name for fold in folds]
     of_person = [predictions.subject == person for person in named]
     single = [scorer.figures(m) for m in (of_person if apart else [m & counted for m in of_fold])]
-    # The paper's average runs over all 18 classes, so the toy at rest with nobody counts in its fold.
+    # The paper's average is over all 18 classes, so that recordings of nobody (the toy at rest) count in their fold.
     all_classes = [metrics.macro_f1(scorer.counts(m), all_classes=True) for m in of_fold]
     everything = scorer.counts(np.ones(len(people), dtype=np.bool_))
     affect_names, by_affect = metrics.grouped(everything, affects)

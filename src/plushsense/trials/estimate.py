@@ -1,7 +1,7 @@
-"""Previews of a training or an evaluation: windows, folds, cost and about how long it takes here.
+"""Previews of a training or an evaluation: windows, folds, cost and an estimate of the time on this machine.
 
-The time is measured: a few epochs of the very network on a few of its windows, in this process. Reading and cutting
-the data and fitting decisions come on top, and a busy machine is slower.
+The speed is measured by a few epochs of the same network on a few of its windows, in this process. The estimate leaves
+out reading and cutting the data and fitting decisions.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ def preview_training(
         scored = windows_for(dataset, network, config.scored_on, gestures)
     division = divide(windows, config, scored)
     rate = _seconds_a_mac(windows, network, config.training)
-    said = {"split": division.kind, "leaky": division.split.leaky, "context": config.windows.context, "folds": 1}
-    return said | _describe(dataset, network, config, windows, [len(division.train)], rate, 1)
+    head = {"split": division.kind, "leaky": division.split.leaky, "context": config.windows.context, "folds": 1}
+    return head | _describe(dataset, network, config, windows, [len(division.train)], rate, 1)
 
 
 def preview_evaluation(
@@ -52,8 +52,8 @@ def preview_evaluation(
     """Return what `api.evaluate` would do, without training.
 
     Returns:
-        ``split``, ``leaky``, ``context``, ``simulated``, ``folds``, ``people``, ``classes``, ``windows``, ``epochs`` at
-        most, ``parameters``, ``macs`` of all training, ``seconds`` about.
+        ``split``, ``leaky``, ``context``, ``simulated``, ``folds``, ``people``, ``classes``, ``windows``, ``epochs``
+        (at most), ``parameters``, ``macs`` of all training, ``seconds`` (estimated).
     """
     dataset = as_dataset(dataset)
     gestures = classes_for(dataset, config.evaluation.classes, config.trained_on.context, warn)
@@ -65,14 +65,14 @@ def preview_evaluation(
     folds = fold_windows(fit_on, score, split, config.evaluation.seed)
     rate = _seconds_a_mac(fit_on, network, config.training)
     side_by_side = min(config.evaluation.processes, len(folds))
-    said = {"split": split.text, "leaky": split.leaky, "context": config.scored_on.context, "folds": len(folds)}
-    return said | _describe(dataset, network, config, fit_on, [len(f.train) for f in folds], rate, side_by_side)
+    head = {"split": split.text, "leaky": split.leaky, "context": config.scored_on.context, "folds": len(folds)}
+    return head | _describe(dataset, network, config, fit_on, [len(f.train) for f in folds], rate, side_by_side)
 
 
 def plan_seconds(planned: Plan, macs: float, workers: int) -> float:
-    """Return about how long ``macs`` multiply-accumulates of a plan's trainings take, ``workers`` at a time.
+    """Estimate the seconds that ``macs`` multiply-accumulates of a plan take, ``workers`` trainings at a time.
 
-    Measured on the training of the middle cost: networks differ, so that this is rough.
+    The speed is that of the training of median cost; other networks may differ.
     """
     job = sorted(planned.jobs, key=planned.macs)[len(planned.jobs) // 2]
     task: Task = job.task
@@ -103,18 +103,13 @@ def _describe(
 
 
 def _seconds_a_mac(windows: WindowSet, network: Arch, spec: TrainSpec) -> float:
-    """Measure how long a multiply-accumulate of training takes here, by the shortest of a few small epochs."""
+    """Measure the seconds for each multiply-accumulate of training, in the fastest of a few small epochs."""
     from plushsense.training.fit import fit
 
     few = max(spec.batch, 64) * _BATCHES
     part = windows.take(np.arange(0, len(windows), max(1, len(windows) // few)))
     ends: list[float] = []
-    fit(
-        part,
-        None,
-        network,
-        replace(spec, epochs=_EPOCHS, patience=None),
-        lambda *_: ends.append(time.perf_counter()),
-    )
+    quick = replace(spec, epochs=_EPOCHS, patience=None)
+    fit(part, None, network, quick, lambda *_: ends.append(time.perf_counter()))
     shortest = min(after - before for before, after in pairwise(ends))
     return shortest / (PASSES * network.macs_per_window * len(part))

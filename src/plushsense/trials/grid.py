@@ -47,12 +47,11 @@ _OF_TRAINING = ("learning_rate", "halve_every", "patience", "augment", "turn_deg
 
 @dataclass(frozen=True)
 class GridSpec:
-    """Settings of a grid. Nothing is checked when it is made: `problems` finds everything at once.
+    """Settings of a grid, not checked on construction: `problems` reports everything at once.
 
-    ``filters`` are sets of four, of which a network takes as many as it has layers. ``seeds`` are those of the
-    trainings; the split has its own, so that all trainings of a grid see the same folds. ``classes`` is "all",
-    "shared" or labels joined by commas. ``threads`` belongs to a training and to its id: in PyTorch's own layers
-    another number sums in another order (in ``training/fast`` it does not).
+    A network uses as many of each set of ``filters`` as it has layers. ``seeds`` are those of the trainings; the split
+    has its own, so that all trainings of a grid have the same folds. ``classes`` is "all", "shared" or labels joined by
+    commas. ``threads`` is part of the id of a training, as PyTorch's own layers sum in an order that depends on it.
     """
 
     name: str = "grid"
@@ -80,13 +79,13 @@ class GridSpec:
 
     @property
     def training(self) -> TrainSpec:
-        """How every network is trained; epochs, batch and seed are the trial's."""
+        """The settings of every training but epochs, batch and seed, which belong to the trial."""
         changes = {key: getattr(self, key) for key in _OF_TRAINING if getattr(self, key) is not None}
         return PRESETS[self.preset].changed(device=self.device, threads=self.threads, **changes)
 
     @property
     def windows(self) -> WindowSpec:
-        """How windows are cut."""
+        """The settings of the windows."""
         return WindowSpec(window_s=self.window_s, step_s=self.step_s, context=self.context)
 
     def to_dict(self) -> dict[str, Any]:
@@ -114,7 +113,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Training:
-    """Trials that are trained in one go: they differ in their epochs only, the shortest first."""
+    """Trials that one training covers: they differ in their epochs only, the shortest first."""
 
     trials: tuple[Trial, ...]
 
@@ -125,7 +124,7 @@ class Training:
 
 
 def trainings(grid: GridSpec, layout: Layout, classes: int) -> list[Training]:
-    """Return all trials of a grid without `problems`, as the trainings that contain them."""
+    """Return the trainings that contain all trials of a grid without `problems`."""
     found = []
     nested = grid.training.patience is None
     for symbol in grid.architectures:
@@ -157,8 +156,8 @@ def problems(
 
     Args:
         layout: of the toy, for the length of a window in samples.
-        past: samples up to the end of a recording that its stream holds, for at least half of the recordings.
-        windows: the fewest that any fold trains on, or more where the split cannot be made.
+        past: samples up to the end of a recording in its stream, for at least half of the recordings.
+        windows: smallest number of training windows of a fold, or more where the split cannot be made.
     """
     found = _of_settings(grid)
     shapes: dict[str, int] = {}
@@ -235,7 +234,7 @@ def _refused(make: Callable[[], object]) -> list[str]:
 
 
 def _twice(grid: GridSpec) -> list[str]:
-    """Return the trials that are in the grid more than once: repeated values, and names of one network."""
+    """Report trials that are in the grid more than once: repeated values, and several names of one network."""
     found = []
     for key in ("epochs", "batches", "seeds"):
         values = getattr(grid, key)
@@ -248,26 +247,25 @@ def _twice(grid: GridSpec) -> list[str]:
                 shape = parse_symbol(symbol)
             except ArchError:
                 continue
-            network, said = (shape, filters[: len(shape)]), f"{symbol} with {slashed(filters) or '(none)'}"
+            network, name = (shape, filters[: len(shape)]), f"{symbol} with {slashed(filters) or '(none)'}"
             if network in seen:
-                other = f"as {seen[network]}" if seen[network] != said else "twice"
-                found.append(f"{said} is the same network {other}: leave one out.")
-            seen.setdefault(network, said)
+                other = f"as {seen[network]}" if seen[network] != name else "twice"
+                found.append(f"{name} is the same network {other}: leave one out.")
+            seen.setdefault(network, name)
     return found
 
 
 def _too_long(grid: GridSpec, symbol: str, layout: Layout, past: int | None) -> list[str]:
-    """Return whether a network reads more than a window and its real past hold.
+    """Report a network that needs more samples than a window, or its real past, has.
 
-    Without a real past a receptive field may reach beyond the window by less than its widest dilation, as the paper's
-    126d2 does: that much is rounding.
+    Without a real past a receptive field may exceed the window by less than its widest dilation, as the paper's 126d2.
     """
-    # An unknown padding or norm is said already.
+    # An unknown padding or norm is reported already.
     known = replace(grid, padding=grid.padding if grid.padding in PADDINGS else "mirror", norm="batch")
     try:
         arch = _network(known, symbol, (1,) * 4, layout, 2)
     except BadInput as cause:
-        # Of the window, which may be said already.
+        # A problem of the window, which may be reported already.
         return [] if _of_settings(grid) else [first_line(cause)]
     field, window = arch.receptive_field, arch.window
     if grid.padding == "stream" and grid.context == "stream":
@@ -279,7 +277,7 @@ def _too_long(grid: GridSpec, symbol: str, layout: Layout, past: int | None) -> 
         ]
     if field - window < max(layer.dilation for layer in arch.layers):
         return []
-    real = "without padding 'stream' and context 'stream' there is no more"
+    real = "only padding 'stream' with context 'stream' reads more"
     return [
         f"{symbol} has a receptive field of {field} samples, longer than the window of {window} ({real}): take "
         f"shorter kernels, or a window_s of {field / layout.rate_hz:g}."
@@ -287,7 +285,7 @@ def _too_long(grid: GridSpec, symbol: str, layout: Layout, past: int | None) -> 
 
 
 def first_line(cause: Exception) -> str:
-    """Return an error message without the picture below it."""
+    """Return the first line of an error message, without the drawing below it."""
     return str(cause).splitlines()[0]
 
 
@@ -295,7 +293,7 @@ def _listed(values: Iterable[object]) -> str:
     return ", ".join(map(str, values))
 
 
-# A search of the grid's networks stands beside it in the file: see `training.searchfile`.
+# The tables of a grid's file; `search` is read by `experiments.search.halving`.
 TABLES = ("grid", "search")
 
 Spec = TypeVar("Spec", bound="DataclassInstance")
@@ -363,7 +361,7 @@ def over(spec: Spec, table: Mapping[str, Any], where: str) -> tuple[Spec, list[s
 
 
 def _from_text(key: str, value: Any, kind: Any) -> Any:
-    """Return a value of a table with its texts read as the numbers and lists that they stand for."""
+    """Return a value of a table with texts converted to numbers and lists."""
     if key == "filters":
         return _filter_sets(value)
     if key == "classes" and isinstance(value, list | tuple) and all(isinstance(item, str) for item in value):

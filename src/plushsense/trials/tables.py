@@ -65,7 +65,7 @@ _CURVE_COLUMNS: dict[str, type[Any]] = {
 
 @dataclass(frozen=True)
 class TrialScores:
-    """A planned trial with the scores of its runs; ``head`` holds what ``sweep.json`` tells of data and split."""
+    """A planned trial with the scores of its runs; ``head`` describes data and split, as in ``sweep.json``."""
 
     planned: PlannedTrial
     scored: tuple[Scored, ...]
@@ -79,7 +79,7 @@ class TrialScores:
         epochs = planned.trial.epochs
         scored = tuple(outcome.scored[epochs] for outcome in finished if epochs in outcome.scored)
         if len(scored) < len(finished):
-            # The mean of the runs that went well would flatter.
+            # The mean of the other runs would be biased.
             return cls(planned, (), "failed", head)
         if not scored:
             return cls(planned, (), "waiting", head)
@@ -98,15 +98,15 @@ class TrialScores:
 
 @dataclass(frozen=True)
 class TrialColumn:
-    """A column: the type of its values, the function that gives them, and how it is printed.
+    """A column: the type of its values, the function that returns them, and how it is printed.
 
     Args:
         type: str, int, float or bool.
-        value: called with the trial; None where it has no value yet.
+        value: called with the trial; returns None where there is no value yet.
         name: the heading in lists of trials; without one the column is in the files only.
         kind: format in lists.
-        score: whether the values depend on the split, so that a leaky one is marked.
-        terminal: whether the list of the command line has it, beside that of the page.
+        score: whether the values depend on the split, so that a leaky split is marked.
+        terminal: whether the command line lists it as well as the page.
     """
 
     type: type[Any]
@@ -181,7 +181,7 @@ TRIAL_COLUMNS: dict[str, TrialColumn] = {
 
 
 def listed_columns(*, terminal: bool = False) -> list[Column]:
-    """Return the columns of a list of trials on a page, or on a terminal; the trial's name is the last."""
+    """Return the columns of a list of trials on a page, or on a terminal; the trial's id is the last."""
     listed = {key: c for key, c in TRIAL_COLUMNS.items() if c.name and (c.terminal or not terminal)}
     return [
         Column(key, c.name[0].upper() + c.name[1:], c.kind, c.score, plain=c.name)
@@ -212,7 +212,7 @@ class Tables:
         self._began = time.monotonic()
 
     def add(self, job: str, result: Mapping[str, Any], resumed: bool) -> None:
-        """Take in a training that is done; the files follow when it is time."""
+        """Add a finished training, and update the files if they are due."""
         self.outcomes[job] = outcome(self.plan, self._of[job][0][1], result)
         for planned, _ in self._of[job]:
             row = self._row(planned)
@@ -226,7 +226,7 @@ class Tables:
                 self.write()
 
     def lose(self, job: str, why: str) -> None:
-        """Note a training that was given up; its trials wait for another run."""
+        """Record a training that was given up; its trials stay without scores."""
         self.lost[job] = why
 
     def trial_rows(self) -> list[dict[str, Any]]:
@@ -279,7 +279,7 @@ class Tables:
         }
 
     def write(self) -> dict[str, Any]:
-        """Write all files, each in one step; returns the summary."""
+        """Write all files, each in one step, and return the summary."""
         with self._writing():
             return self._write()
 
@@ -326,7 +326,7 @@ class Tables:
         }
 
     def _curves(self, polars: Any) -> Any:
-        """Return one row for each run and epoch, built by column, as there may be millions."""
+        """Return one row for each run and epoch (possibly millions), built by column."""
         parts = []
         for job in sorted(self.outcomes):
             curve = self.outcomes[job].curve
@@ -344,7 +344,7 @@ class Tables:
         return polars.concat(parts) if parts else _frame(polars, [], _CURVE_COLUMNS)
 
     def _with_confusions(self, best: Sequence[Mapping[str, Any]]) -> list[PlannedTrial]:
-        """Return the trials whose confusions are kept: the best, those of each filter set, the paper's network."""
+        """Return the trials whose confusions are kept: the best, the best of each filter set, the paper's network."""
         picked = [row["trial"] for row in best[:BEST]]
         seen: set[str] = set()
         for row in best:

@@ -1,15 +1,15 @@
-"""Rules of the old kind, the baseline to beat: amplitude and timing, positive or negative, in fixed counts.
+"""The rule baseline: positive or negative events from amplitude and timing, with thresholds in fixed counts.
 
-The paper (sections 2, 3.1, 4.6) tells what its first toys did, not how: "signal timing and amplitude analysis", a
-positive or a negative answer, none to neutral gestures, at once to an abrupt change of large amplitude, after about
-3 s to broad strokes, hardly ever to fine scratches, sensitive to humidity and hand size. This is the plainest program
-that fits that sentence, not the authors':
+The paper (sections 2, 3.1, 4.6) describes what its first toys did, but not how: "signal timing and amplitude analysis",
+a positive or a negative answer, none to neutral gestures, immediately to an abrupt change of large amplitude, after
+about 3 s to broad strokes, hardly ever to fine scratches, sensitive to humidity and hand size. This is the simplest
+program that fits this description, not the authors':
 
 - *negative*: the acceleration, or the touch of all electrodes together, changes within 50 ms by so many counts.
 - *positive*: an electrode, smoothed over 0.3 s, goes up or down by so many counts, ``swings`` times in ``window_s``.
 
-Counts are fixed: nothing follows the humidity, the hand or the person. They are tuned on training people as somebody
-would by hand (`fit_heuristic`): as sensitive as goes without answering what should not be answered.
+The thresholds do not adapt to humidity, hand or person. They are tuned on training people as if by hand
+(`fit_rule_baseline`): as sensitive as possible without answers to other gestures.
 """
 
 from __future__ import annotations
@@ -38,6 +38,8 @@ from plushsense.windows.features import network_inputs
 
 _LAG_S = 0.05
 _SLOW_S = 0.3
+# Share of other gestures that may be answered.
+_WRONG = 0.02
 _NEGATIVE, _POSITIVE = AFFECT_CODES["negative"], AFFECT_CODES["positive"]
 
 
@@ -46,9 +48,9 @@ class BaselineSettings:
     """Settings of the rule baseline, in raw counts and seconds; a count of 0 switches its rule off.
 
     Attributes:
-        shock: change of the acceleration within 50 ms that is a blow; touch_shock: the same of all electrodes.
+        shock: change of the acceleration within 50 ms for a blow; touch_shock: the same of all electrodes.
         swing: how far an electrode must go up or down; swings: how often within window_s.
-        negative_s, positive_s: an event ends so long after its rule last held.
+        negative_s, positive_s: time after the rule last held at which an event ends.
     """
 
     shock: int = 0
@@ -65,7 +67,7 @@ class BaselineSettings:
 
 
 class _Swings:
-    """Counts how often one electrode turned after going at least ``size`` one way: times of its turns."""
+    """Counts the swings of one electrode: how often it turned after going at least ``size`` one way."""
 
     def __init__(self, size: int, weight: float) -> None:
         self._size, self._weight = size, weight
@@ -75,14 +77,14 @@ class _Swings:
         self.times: list[int] = []
 
     def push(self, value: int, now: int, window: int) -> int:
-        """Return how many swings lie within the last ``window`` samples, this one included."""
+        """Return the number of swings within the last ``window`` samples, including this one."""
         slow = self._slow
         slow = float(value) if slow is None else slow + self._weight * (value - slow)
         if self._slow is None:
             self._low = self._high = slow
         self._slow = slow
         self._low, self._high = min(self._low, slow), max(self._high, slow)
-        # A swing counts when it has gone far enough; then the next one must go the other way.
+        # A swing counts once it has gone far enough; the next one must go the other way.
         if self._way <= 0 and slow - self._low >= self._size:
             self._way, self._high = 1, slow
             self.times.append(now)
@@ -141,7 +143,7 @@ class _Rules:
         return affect
 
     def push(self, row: list[int], now: int) -> list[Update]:
-        """Read one sample; return its updates. A blow replaces a caress; a caress waits until a blow is over."""
+        """Read one sample and return its updates. A blow replaces a caress; a caress waits until a blow has ended."""
         affect = self._affect_of(row)
         updates: list[Update] = []
         if affect and affect == self.affect:
@@ -155,7 +157,7 @@ class _Rules:
         return updates
 
     def end(self, now: int) -> Update:
-        """End the event that is going on."""
+        """End the current event."""
         update = Update(ENDED, self.number, self.affect, NO_GESTURE, GATE, now, now)
         self.affect = 0
         return update
@@ -164,7 +166,7 @@ class _Rules:
 def sensors_of(layout: Layout) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Return the indices of the electrodes and of the acceleration among a layout's inputs.
 
-    The proximity of a hand is no touch, and the sum of all electrodes is none of them.
+    Proximity and the sum of all electrodes do not count as electrodes.
     """
     kinds = {c.name: c.kind for c in layout.channels}
     kinds |= {d.name: kinds[d.of[0]] for d in layout.derived}
@@ -173,10 +175,7 @@ def sensors_of(layout: Layout) -> tuple[tuple[int, ...], tuple[int, ...]]:
 
 
 class BaselineReader:
-    """Reads the frames of one toy by the rule baseline: events of an affect, never of a gesture.
-
-    An event's source is ``gate``: there is no network here.
-    """
+    """Reads the frames of one toy by the rule baseline: events with an affect, no gesture and source ``gate``."""
 
     def __init__(self, layout: Layout, plan: BaselineSettings) -> None:
         self.layout, self.plan = layout, plan
@@ -200,7 +199,7 @@ class BaselineReader:
         return [_to_event(update) for update in updates]
 
     def silence(self) -> list[GestureEvent]:
-        """End the event that is going on: no frame came for a while."""
+        """End the current event, as no frames arrive."""
         return [_to_event(self._rules.end(self._frames.time_us))] if self._rules.affect else []
 
 
@@ -210,7 +209,7 @@ def _to_event(update: Update) -> GestureEvent:
 
 
 def baseline_events(frames: Frames, layout: Layout, plan: BaselineSettings) -> list[GestureEvent]:
-    """Return the events of a whole stream; what goes on at its end is ended."""
+    """Return the events of a whole stream; an event that continues at its end is ended there."""
     reader = BaselineReader(layout, plan)
     host = frames.host_ms if frames.host_ms is not None else frames.device_ms
     events: list[GestureEvent] = []
@@ -223,25 +222,23 @@ def fit_rule_baseline(
     dataset: Dataset,
     gestures: GestureSet,
     subjects: Collection[str],
-    *,
-    wrong: float = 0.02,
 ) -> tuple[BaselineSettings, dict[str, Any]]:
-    """Tune the old rules on people's recordings, as somebody would by hand.
+    """Tune the rules on people's recordings, as if by hand.
 
-    The shocks are the lowest counts at which at most a share ``wrong`` of the recordings that are not negative would
-    be answered as a blow (half of it by each rule); the swing the lowest of a few at which at most that share of the
-    neutral and of the negative recordings, each, would be answered as a caress. No stroke or scratch is looked at.
+    The shocks are the lowest counts at which at most 2 % of the recordings that are not negative would be answered as a
+    blow (half of it by each rule); the swing is the lowest of a few at which at most 2 % of the neutral and of the
+    negative recordings, each, would be answered as a caress. Strokes and scratches are not used.
 
     Returns:
         The plan, and a report of what it was tuned on.
 
     Raises:
-        ConfigError: for gestures without affects: these rules know nothing else.
+        ConfigError: for gestures without affects.
     """
     if not gestures.has_affect:
         raise ConfigError(
-            f"The gesture set '{gestures.name}' tells no affect, and the old rules know nothing else: "
-            "give each gesture an affect in its TOML file, or take another set."
+            f"The gesture set '{gestures.name}' has no affects, which the old rules need: "
+            "give each gesture an affect in its TOML file, or use another set."
         )
     layout, people = dataset.layout, set(subjects)
     touch, shock = sensors_of(layout)
@@ -261,20 +258,20 @@ def fit_rule_baseline(
             if affect in silent:
                 silent[affect].append(x)
     if not calm:
-        raise ConfigError("None of these people recorded a gesture that is not negative: there is nothing to tune on.")
-    high = np.ceil(np.quantile(np.array(calm), 1.0 - wrong / 2, axis=0)).astype(int) + 1
+        raise ConfigError("None of these people recorded a gesture that is not negative: include other people.")
+    high = np.ceil(np.quantile(np.array(calm), 1.0 - _WRONG / 2, axis=0)).astype(int) + 1
     plan = BaselineSettings(int(high[0]) if shock else 0, int(high[1]) if touch else 0)
     shares: dict[str, float] = {}
     for swing in _SWINGS if touch else ():
         tried = BaselineSettings(plan.shock, plan.touch_shock, swing)
         shares = {a: float(np.mean([_caressed(x, layout, tried) for x in xs])) for a, xs in silent.items() if xs}
-        if max(shares.values(), default=0.0) <= wrong:
+        if max(shares.values(), default=0.0) <= _WRONG:
             plan = tried
             break
     report = {
         "people": len(people),
         "recordings": len(used),
-        "wrong_allowed": wrong,
+        "wrong_allowed": _WRONG,
         "answered_as_a_caress": {a: round(s, 4) for a, s in shares.items()},
         **plan.to_dict(),
     }

@@ -421,9 +421,7 @@ def load_search(
 
 def _symbols(space: Any, where: str) -> tuple[tuple[str, ...], list[str]]:
     if not isinstance(space, Mapping):
-        return (), [
-            f"space of {where.replace('.space', '')} is one value, but it is a table: write  [search.space]"
-        ]
+        return (), [f"space of {where.replace('.space', '')} is one value, but it is a table: write  [search.space]"]
     made, found = over(Space(), space, where)
     found += problems_space(made)
     return (() if found else drawn(made)), found
