@@ -75,7 +75,7 @@ def test_refusals_are_sentences(cli: Cli, dataset: Dataset, tmp_path: Path) -> N
         (("--features", "raw"), "Unknown features 'raw': accepted are statistics, flattened."),
         (("--pca", "maybe"), "Unknown choice 'maybe' for PCA: accepted are both, no, yes."),
         (("--split", "windows"), "needs a number of folds"),
-        (("--split", "windows:3,windows:3"), "asked for twice"),
+        (("--split", "windows:3,windows:3"), "given twice"),
         (("--split", ",", "--models", "knn"), "No split is given"),
         (("--models", "boosting", "--features", "flattened", "--pca", "no"), "No program is left to compare"),
     ):
