@@ -125,7 +125,7 @@ def forgetting(folder: Path, when: Callable[..., bool]) -> Hook:
     return hook
 
 
-REFUSED = r"taken out of '.*' \(plushsense forget\) while this ran.*run it again"
+REFUSED = r"removed from '.*' \(plushsense forget\) while this ran.*run it again"
 
 
 @pytest.mark.parametrize("when", [lambda *_: True, ended], ids=["early", "late"])
