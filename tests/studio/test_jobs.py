@@ -293,7 +293,7 @@ def test_names_that_may_not_be_left_anywhere_are_not_left_in_the_work_folder(wor
     again = ended(later.resume(job.id))
     assert (again.state, again.message) == (
         REFUSED,
-        "Words that may not be left anywhere are not kept: give them again on the publish page.",
+        "The words to remove are not stored: enter them again on the publish page.",
     )
 
 

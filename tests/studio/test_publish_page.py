@@ -24,7 +24,7 @@ def test_publish_check_and_break(studio: Fixture, look: Fixture, shots: Fixture,
     browser = look()
     page = browser.open(f"{url}/publish")
     assert "Nothing is uploaded" in marked(page, "danger").inner_text()
-    assert "does not say yet: contact" in marked(page, "lacks").inner_text()
+    assert "does not state yet: contact" in marked(page, "lacks").inner_text()
     marked(page, "do").click()
     assert "cannot be published without licence, contact and consent" in marked(page, "message").inner_text()
     assert axe(page) == []

@@ -187,7 +187,7 @@ def run_pseudonymise(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, 
         ConfigError: without ``words``. They are not stored, so a job resumed after a restart lacks them.
     """
     if "words" not in spec:
-        raise ConfigError("Words that may not be left anywhere are not kept: give them again on the publish page.")
+        raise ConfigError("The words to remove are not stored: enter them again on the publish page.")
     done = pseudonymise(
         spec["dataset"],
         spec["place"],

@@ -184,22 +184,19 @@ def _stamp(path: Path, *names: str) -> tuple[tuple[int, int], ...]:
     return tuple(stamps)
 
 
-def _unreadable(path: Path, cause: Exception) -> str:
+def _error_text(path: Path, cause: Exception) -> str:
+    if isinstance(cause, PlushSenseError):
+        return str(cause)
     return f"'{path}' cannot be read: {getattr(cause, 'strerror', None) or cause}."
 
 
 def _dataset(path: Path) -> DatasetEntry:
     try:
         head = DatasetHead.read(path)
-        try:
-            rows = read_index(path / INDEX, RecordingInfo)
-        except FileNotFoundError:
-            # The index is rebuilt when the data set is opened.
-            rows = []
-    except PlushSenseError as refusal:
-        return DatasetEntry(path, path.name, str(refusal))
-    except (OSError, ValueError, csv.Error) as cause:
-        return DatasetEntry(path, path.name, _unreadable(path, cause))
+        # A missing index is rebuilt when the data set is opened.
+        rows = read_index(path / INDEX, RecordingInfo) if (path / INDEX).exists() else []
+    except (PlushSenseError, OSError, ValueError, csv.Error) as cause:
+        return DatasetEntry(path, path.name, _error_text(path, cause))
     return DatasetEntry(
         path,
         head.name,
@@ -252,19 +249,15 @@ def _session(path: Path, datasets: Iterable[DatasetEntry]) -> SessionEntry:
             str(head.layout.get("name", "")),
             datasets=names,
         )
-    except PlushSenseError as refusal:
-        return SessionEntry(path, path.parent.name, path.name, refused=str(refusal))
-    except OSError as cause:
-        return SessionEntry(path, path.parent.name, path.name, refused=_unreadable(path, cause))
+    except (PlushSenseError, OSError) as cause:
+        return SessionEntry(path, path.parent.name, path.name, refused=_error_text(path, cause))
 
 
 def _bundle(path: Path) -> BundleEntry:
     try:
         bundle = Bundle.load(path)
-    except PlushSenseError as refusal:
-        return BundleEntry(path, path.stem, refused=str(refusal))
-    except OSError as cause:
-        return BundleEntry(path, path.stem, refused=_unreadable(path, cause))
+    except (PlushSenseError, OSError) as cause:
+        return BundleEntry(path, path.stem, refused=_error_text(path, cause))
     origin = bundle.provenance
     return BundleEntry(
         path, path.stem, str(origin.get("dataset") or ""), len(bundle.gestures), bool(origin.get("simulated"))
