@@ -1,4 +1,4 @@
-// A uPlot in a Vue component. Fixed data come by `show`, live samples by `push`; clicks go out as `pick`.
+// uPlot as a Vue component: `show` sets fixed data, `push` appends live samples, and clicks are emitted as `pick`.
 import { loadResource } from "../../static/utils/resources.js";
 
 const colour = (name) => getComputedStyle(document.body).getPropertyValue(name).trim() || "#555";
@@ -24,7 +24,7 @@ export default {
     this.resizer.observe(this.$el);
     this.dark = document.body.classList.contains("body--dark");
     this.lights = new MutationObserver(() => {
-      // Other classes come and go with every key.
+      // Other classes of the body change with every key.
       const dark = document.body.classList.contains("body--dark");
       if (dark !== this.dark) {
         this.dark = dark;
@@ -104,7 +104,7 @@ export default {
       ctx.restore();
     },
     ready(call) {
-      // A call may come before the library is loaded.
+      // A method may be called before the library is loaded.
       if (this.u) return true;
       (this.late = this.late || []).push(call);
       return false;

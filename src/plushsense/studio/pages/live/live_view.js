@@ -1,5 +1,5 @@
-// Signals, bars, voices, eyes and time line of a live toy. `scene` says what there is, `update` what is new;
-// drawing waits for the next frame of the screen, so that it never falls behind.
+// Signals, probabilities, answers, eyes and time line of a live toy. `scene` sets the whole state, `update` adds changes.
+// Drawing waits for the next frame of the screen, so that it never falls behind.
 
 const el = (tag, cls, text) => {
   const e = document.createElement(tag);
@@ -12,7 +12,7 @@ const fill = (text, values) => text.replace(/\{(\w+)\}/g, (_, key) => values[key
 const SPOKEN_MS = 2500, KEPT_DELAYS = 600;
 
 const EYES = {
-  // Round and lifted; narrowed under slanted brows; closed: distinguished by shape as much as by colour.
+  // Round; narrowed under slanted brows; closed: they differ in shape as well as in colour.
   green: `<g class="lv-eye-light"><circle cx="60" cy="58" r="26" fill="#0f7a4d"/><circle cx="140" cy="58" r="26" fill="#0f7a4d"/>
     <circle cx="60" cy="58" r="16" fill="#5df2ae"/><circle cx="140" cy="58" r="16" fill="#5df2ae"/>
     <circle cx="66" cy="51" r="5" fill="#fff"/><circle cx="146" cy="51" r="5" fill="#fff"/></g>
@@ -71,12 +71,12 @@ export default {
       document.head.append(css);
     }
     this.stats = window.plushsenseLive = { updates: 0, drawn: 0, drawMs: 0, samples: 0, scenes: 0, delays: [], painted: [] };
-    // Made once: a formatter is dear.
+    // Created once, because a formatter is expensive.
     this.digits = new Intl.NumberFormat(this.locale, { maximumFractionDigits: 2 });
     this.build();
     this.scene(this.start);
     this.resizer = new ResizeObserver(() => {
-      // A canvas that changes its size is empty: it is drawn in the same frame.
+      // A canvas is cleared when its size changes: draw it in the same frame.
       if (this.n.signals.parentElement.clientWidth !== this.wide) { this.size(); this.paint(); }
     });
     this.resizer.observe(this.$el);
@@ -96,7 +96,7 @@ export default {
     this.gone = true;
   },
   methods: {
-    // What stands ------------------------------------------------------------------------------------------------
+    // Elements ---------------------------------------------------------------------------------------------------
     build() {
       const w = this.words, root = el("div", "lv"), n = (this.n = {});
       const section = (title, cls, name) => {
@@ -226,7 +226,7 @@ export default {
       return node;
     },
 
-    // What comes -------------------------------------------------------------------------------------------------
+    // Messages ---------------------------------------------------------------------------------------------------
     update(m, first) {
       if (this.gone) return;
       const clock = performance.timeOrigin + performance.now();
@@ -250,7 +250,7 @@ export default {
         const from = this.xs[this.xs.length - 1] - this.windowS;
         let cut = 0;
         while (cut < this.xs.length && this.xs[cut] < from) cut++;
-        // Rarely, and many at once: cutting a column costs as much for one as for fifty.
+        // Cut rarely and many samples at once: it costs as much for one as for fifty.
         if (cut > 50 || this.xs.length > 5000) for (const column of [this.xs, ...this.ys]) column.splice(0, cut);
       }
       this.chances = m.p || null;
@@ -309,7 +309,7 @@ export default {
       return value.toLocaleString(this.locale, { maximumFractionDigits: value < 10 ? 1 : 0 });
     },
 
-    // What is drawn ----------------------------------------------------------------------------------------------
+    // Drawing ----------------------------------------------------------------------------------------------------
     drawSignals() {
       const { width, height } = this.signalsAt, c = this.n.signals.getContext("2d"), k = this.ink;
       c.clearRect(0, 0, width, height);
@@ -358,7 +358,7 @@ export default {
         c.lineWidth = 1.5;
         c.beginPath();
         for (let j = from; j < ys.length; j++) {
-          // A hole in the toy's clock is a hole in the line.
+          // A gap in the clock of the toy is a gap in the line.
           if (j === from || this.xs[j] - this.xs[j - 1] > 0.3) c.moveTo(x(this.xs[j]), y(ys[j]));
           else c.lineTo(x(this.xs[j]), y(ys[j]));
         }
@@ -400,7 +400,7 @@ export default {
         c.fillStyle = k.ink;
         const label = `${this.signs[s.affect || "none"]} ${this.nameOf(s)}`;
         const wide = c.measureText(label).width, at = Math.min(a, width - wide);
-        // Names never stand on each other; the list has them all.
+        // Skip names that would overlap; the list has them all.
         if (at > ends[row]) {
           c.fillText(label, at, top + 27);
           ends[row] = at + wide + 6;
@@ -410,7 +410,7 @@ export default {
     showNow() {
       if (!this.net && !this.now) return;
       const w = this.words, now = this.now, net = this.net, e = now.event;
-      // The network's voice is new at every step, the rest only when it changed.
+      // The answer of the network changes at every step; the rest is drawn only after a change.
       if (net && now.running && (now.state === "tracking" || now.state === "warming")) {
         const answer = w[`answer_${net.answer || "none"}`];
         say(this.n.network, net.answer === null ? w.answer_none : fill(answer, { gesture: this.names[net.gesture] || net.gesture || "", sure: net.sure, affect: this.affectText(net.affect) }));
@@ -476,7 +476,7 @@ export default {
       this.speak(`${this.nameOf(s)}, ${this.affects[s.affect || "none"]}`);
     },
     speak(text) {
-      // At most one sentence in a while, always the newest: a voice that lags behind the toy is of no use.
+      // Announce at most one sentence at a time, always the newest, so that the speech does not lag behind the toy.
       this.speaks = text;
       if (this.speaking) return;
       const due = () => {

@@ -1,4 +1,4 @@
-// Asks the studio once a second whether it is there, and shows a sentence while it does not answer.
+// Asks the studio once a second for an answer, and displays a message while there is none.
 const ASK_MS = 1000, SILENT_MS = 5000;
 
 export default {
@@ -17,10 +17,10 @@ export default {
   },
   methods: {
     look() {
-      // The socket is made after the elements of the page.
+      // The socket is created after the elements of the page.
       if (!window.did_handshake) return;
       const now = performance.now(), connected = window.socket.connected;
-      // A computer that slept, or a tab in the background, has not asked meanwhile.
+      // A computer that slept, or a tab in the background, did not ask in the meantime.
       if (now - this.asked > 2 * ASK_MS) this.answered = Math.max(this.answered, now - SILENT_MS / 2);
       if (connected && now - this.asked >= ASK_MS) {
         this.asked = now;

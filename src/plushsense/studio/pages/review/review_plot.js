@@ -1,5 +1,5 @@
-// The plot of the review page: curves, what stands dotted, set or cut off, clicks and keys. Keys say what was on screen
-// when they were pressed, so that nothing is decided that nobody saw.
+// The plot of the review page: curves, marks, clicks and keys. Each key is sent with the recording that was displayed when
+// it was pressed, so that it never applies to another one.
 import { loadResource } from "../../static/utils/resources.js";
 
 const colour = (name) => getComputedStyle(document.body).getPropertyValue(name).trim() || "#555";
@@ -25,14 +25,14 @@ export default {
       if (this.u && width && width !== this.u.width) this.u.setSize({ width, height: this.height });
     });
     this.resizer.observe(this.$el);
-    // Other classes of the body come and go with every key.
+    // Other classes of the body change with every key.
     this.lights = new MutationObserver(() => {
       if (this.p && this.dark !== document.body.classList.contains("body--dark")) this.build();
     });
     this.lights.observe(document.body, { attributes: true, attributeFilter: ["class"] });
     this.onKey = (event) => this.key(event);
     this.onClick = (event) => {
-      // After a click of the mouse, keys go to the plot again; whoever tabs to a button stays there.
+      // After a mouse click, the focus returns to the plot; after a click by keyboard it stays on the button.
       if (event.detail > 0 && event.target.closest("button.ps-act")) this.$el.focus({ preventScroll: true });
     };
     if (this.keyed) {
@@ -59,7 +59,7 @@ export default {
       const on = event.target instanceof Element ? event.target : document.body;
       if (!this.$el.offsetParent || document.querySelector(".q-dialog__inner, .q-menu")) return;
       if (on.closest("input, textarea, select, [contenteditable=true], [role=combobox], [role=listbox], [role=slider]")) return;
-      // What has the focus gets its own keys, once.
+      // A focused control handles its own keys.
       if (key === "Enter" && on.closest("button, a, summary, [role=button], [role=switch], [tabindex='0']")) return;
       if (key.startsWith("Arrow") && on.closest("[role=tab], [role=radio], [role=radiogroup]")) return;
       event.preventDefault();
@@ -109,7 +109,7 @@ export default {
       }, { passive: false });
     },
     drawBehind(u) {
-      // What a start or an end leaves out, and what the stream held before.
+      // Shade the parts that are cut off, and the part of the stream before the recording.
       const { ctx } = u, { left, top, width, height } = u.bbox, x = (v) => u.valToPos(v, "x", true);
       const fill = (from, to, style) => {
         const a = Math.max(left, from), b = Math.min(left + width, to);

@@ -1,4 +1,4 @@
-// A table of recordings: plain HTML, so that it is read and reached like one.
+// A table of recordings as plain HTML, for screen readers and keyboards.
 export default {
   template: `
     <table class="ps-table">
