@@ -267,7 +267,7 @@ def test_a_hard_case_is_kept_labelled_and_in_the_data_set(
     page.get_by_role("option", name="Tail hit 1", exact=True).click()
     page.locator(".q-menu").wait_for(state="detached")
     marked(page, "clip-label").click()
-    marked(page, "message").get_by_text("Tail hit 1: kept as").wait_for()
+    marked(page, "message").get_by_text("Tail hit 1: saved as").wait_for()
     assert axe(page) == []
     shots(page, "live-clip")
     marked(page, "clip-add").click()
@@ -303,7 +303,7 @@ def test_the_server_is_killed_while_a_clip_is_recorded(studio: Fixture, look: Fi
     gesture.fill("my own")
     gesture.press("Enter")
     marked(page, "clip-label").click()
-    marked(page, "message").get_by_text("my own: kept as").wait_for()
+    marked(page, "message").get_by_text("my own: saved as").wait_for()
     whole = left[: left.rfind(b"\n") + 1]
     assert stream.read_bytes() == whole, "at most a torn last line is gone"
     (made,) = stream.parent.glob("my own_*.csv")

@@ -25,6 +25,19 @@ _BUNDLE = "*.plush"
 _NOT_PLAIN = re.compile(r"[^\w .-]")
 
 T = TypeVar("T")
+FileStamps = tuple[tuple[int, int] | None, ...]
+
+
+def file_stamps(*paths: Path) -> FileStamps:
+    """Return the modification time and the size of each file, None for a missing one, to notice changes."""
+    stamps: list[tuple[int, int] | None] = []
+    for path in paths:
+        try:
+            stat = path.stat()
+            stamps.append((stat.st_mtime_ns, stat.st_size))
+        except OSError:
+            stamps.append(None)
+    return tuple(stamps)
 
 
 @dataclass
@@ -51,7 +64,7 @@ class Workspace:
     speed: float = 1.0
     invite: Callable[[], str] | None = None
     _parts: dict[type, Any] = field(default_factory=dict, repr=False)
-    _titles: dict[Path, tuple[tuple[int, int], str]] = field(default_factory=dict, repr=False)
+    _titles: dict[Path, tuple[FileStamps, str]] = field(default_factory=dict, repr=False)
     _lock: Any = field(default_factory=threading.RLock, repr=False)
 
     def __post_init__(self) -> None:
@@ -156,12 +169,11 @@ class Workspace:
     def title(self, dataset: Path) -> str:
         """Return the name of a data set; its folder's name if it cannot be read."""
         try:
-            stat = (dataset / _HEAD).stat()
-            stamp = stat.st_mtime_ns, stat.st_size
+            stamps = file_stamps(dataset / _HEAD)
             # Cached: pages call this in the event loop for every data set.
             cached = self._titles.get(dataset)
-            if cached is None or cached[0] != stamp:
-                cached = self._titles[dataset] = (stamp, DatasetHead.read(dataset).name)
+            if cached is None or cached[0] != stamps:
+                cached = self._titles[dataset] = (stamps, DatasetHead.read(dataset).name)
             return cached[1]
         except Exception:  # noqa: BLE001, RUF100
             return dataset.name

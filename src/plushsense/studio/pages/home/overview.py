@@ -21,7 +21,7 @@ from plushsense.dataset.store import HEAD, UNKNOWN_SUBJECT, DatasetHead, Recordi
 from plushsense.models.bundle import Bundle
 from plushsense.recording.session import is_finished
 from plushsense.recording.session_files import SessionHead
-from plushsense.studio.app.workspace import EXPORTS, Workspace
+from plushsense.studio.app.workspace import EXPORTS, Workspace, file_stamps
 
 INDEX = "recordings.csv"
 # The recordings of one session in the paper; fewer of one person are too few to train on.
@@ -159,29 +159,18 @@ class Overview:
     def look(self) -> WorkspaceSummary:
         """Return the current contents of the workspace."""
         with self._lock:
-            datasets = tuple(
-                self._cached(p, _stamp(p, HEAD, INDEX, MARKS), _dataset) for p in self._workspace.datasets()
-            )
+            datasets = tuple(self._cached(p, _dataset, HEAD, INDEX, MARKS) for p in self._workspace.datasets())
             sessions = tuple(_session(p, datasets) for p in self._workspace.sessions())
-            bundles = tuple(self._cached(p, _stamp(p), _bundle) for p in self._workspace.bundles())
+            bundles = tuple(self._cached(p, _bundle, "") for p in self._workspace.bundles())
         exports = sum(1 for p in (self._workspace.folder / EXPORTS).glob("*") if p.is_dir() and p.name[0] != ".")
         return WorkspaceSummary(datasets, sessions, bundles, exports)
 
-    def _cached(self, path: Path, stamp: Any, read: Callable[[Path], Any]) -> Any:
-        if self._cache.get(path, (None,))[0] != stamp:
-            self._cache[path] = (stamp, read(path))
+    def _cached(self, path: Path, read: Callable[[Path], Any], *files: str) -> Any:
+        """Return ``read(path)``, cached until one of the files in ``path`` changes."""
+        stamps = file_stamps(*(path / name for name in files))
+        if self._cache.get(path, (None,))[0] != stamps:
+            self._cache[path] = (stamps, read(path))
         return self._cache[path][1]
-
-
-def _stamp(path: Path, *names: str) -> tuple[tuple[int, int], ...]:
-    stamps = []
-    for file in [path / n for n in names] or [path]:
-        try:
-            stat = file.stat()
-            stamps.append((stat.st_mtime_ns, stat.st_size))
-        except OSError:
-            stamps.append((0, -1))
-    return tuple(stamps)
 
 
 def _error_text(path: Path, cause: Exception) -> str:

@@ -21,7 +21,7 @@ from plushsense.evaluation.scores import Predictions, read_predictions
 from plushsense.models.bundle import Bundle
 from plushsense.scoring import metrics
 from plushsense.studio.app.words import Words
-from plushsense.studio.app.workspace import Workspace
+from plushsense.studio.app.workspace import Workspace, file_stamps
 from plushsense.trials.tables import SUMMARY as SWEEP
 from plushsense.trials.tables import TRIALS_CSV
 from plushsense.windows.cut import ANYWHERE
@@ -366,19 +366,16 @@ class StoredResults:
         Raises:
             PlushSenseError: if the folder is no data set.
         """
-
-        def stamps() -> tuple[Any, ...]:
-            return tuple(_stamp(dataset / name) for name in (HEAD, "recordings.csv", MARKS))
-
+        files = [dataset / name for name in (HEAD, "recordings.csv", MARKS)]
         key = ("facts", dataset)
-        if self._read.get(key, (None,))[0] != stamps():
+        if self._read.get(key, (None,))[0] != file_stamps(*files):
             data = open_dataset(dataset)
             people = {r.subject for r in data.used} & set(data.subjects)
             used = {r.gesture for r in data.used}
             labels = tuple(label for label in data.gestures.labels if label in used)
             # Opening may have rewritten the index: stamp the files afterwards.
             self._read[key] = (
-                stamps(),
+                file_stamps(*files),
                 DatasetCounts(
                     data.head.name, len(people), len(data.used), labels, len(data.streams), data.head.simulated
                 ),
@@ -388,7 +385,7 @@ class StoredResults:
 
     def _once(self, path: Path, read: Callable[[Path, Any], T], more: Any, refuse: bool = False) -> T | None:
         """Return ``read(path, more)``, cached until the file changes; None for a file that cannot be read."""
-        key, stamp = (read.__name__, path), (_stamp(path), repr(more))
+        key, stamp = (read.__name__, path), (file_stamps(path), repr(more))
         cached = self._read.get(key)
         if cached is None or cached[0] != stamp:
             try:
@@ -439,11 +436,3 @@ def _confusion(table: Mapping[str, Any]) -> Confusion:
     return Confusion(
         tuple(label or "none" for label in table["labels"]), tuple(tuple(map(int, row)) for row in table["counts"])
     )
-
-
-def _stamp(path: Path) -> tuple[int, int] | None:
-    try:
-        stat = path.stat()
-    except OSError:
-        return None
-    return stat.st_mtime_ns, stat.st_size
