@@ -10,9 +10,8 @@ import pytest
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.layouts import load_layout
 from plushsense.devices.opening import open_device
-from plushsense.recording.recorder import Recorder
-from plushsense.recording.session import list_sessions
-from plushsense.recording.setup import (
+from plushsense.recording.recorder import (
+    Recorder,
     SessionRequest,
     check_speed,
     is_pseudo_terminal,
@@ -21,6 +20,7 @@ from plushsense.recording.setup import (
     session_head,
     session_layout,
 )
+from plushsense.recording.session import list_sessions
 from plushsense.recording.states import AutoRecording
 
 LAYOUT = load_layout("plush-15")

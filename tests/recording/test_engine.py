@@ -26,10 +26,9 @@ from plushsense.devices.opening import open_device
 from plushsense.devices.reconnect import ReconnectingDevice
 from plushsense.recording import states as machine
 from plushsense.recording.plan import load_protocol
-from plushsense.recording.recorder import Recorder
+from plushsense.recording.recorder import Recorder, prompt_virtual
 from plushsense.recording.session import OpenSession
 from plushsense.recording.session_files import SessionHead, discarded_recordings, read_events
-from plushsense.recording.setup import prompt_virtual
 from plushsense.recording.states import AutoRecording, RecorderStatus
 from plushsense.recording.writer import StreamFile
 

@@ -11,9 +11,9 @@ import pytest
 
 from plushsense.core.errors import ConfigError, DatasetError, DeviceError, PlushSenseError
 from plushsense.devices.virtual.stream import VirtualDevice
+from plushsense.recording.recorder import SessionRequest
 from plushsense.recording.session import OpenSession
 from plushsense.recording.session_files import read_events
-from plushsense.recording.setup import SessionRequest
 from plushsense.studio.app.workspace import Workspace
 from plushsense.studio.pages.record.controller import NO_CONSENT, PSEUDO, ActiveSession, RecordController
 from support.recording_pages import CALM, until

@@ -13,9 +13,8 @@ from plushsense.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from plushsense.cli.terminal import KeySource, Screen
-    from plushsense.recording.recorder import Recorder
+    from plushsense.recording.recorder import Recorder, SessionRequest
     from plushsense.recording.session_files import SessionHead
-    from plushsense.recording.setup import SessionRequest
 
 _DRAW_S = 0.1
 _WAIT_S = 0.02
@@ -76,9 +75,8 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from plushsense.cli.terminal import Screen, interrupt_on_signals, keys
     from plushsense.core.version import __version__
-    from plushsense.recording.recorder import Recorder
-    from plushsense.recording.session import OpenSession
-    from plushsense.recording.setup import (
+    from plushsense.recording.recorder import (
+        Recorder,
         open_toy,
         prompt_virtual,
         session_folder,
@@ -86,6 +84,7 @@ def run(args: argparse.Namespace) -> int:
         session_layout,
         with_speed,
     )
+    from plushsense.recording.session import OpenSession
     from plushsense.recording.states import AutoRecording
 
     software = f"plushsense {__version__}"
@@ -139,7 +138,7 @@ def _report(args: argparse.Namespace, recorder: Recorder) -> int:
 
 
 def _request(args: argparse.Namespace) -> SessionRequest:
-    from plushsense.recording.setup import SessionRequest, check_speed, speed_of
+    from plushsense.recording.recorder import SessionRequest, check_speed, speed_of
 
     if args.auto is not None and not 0.5 <= args.auto <= 3600.0:
         raise ConfigError(f"--auto is {args.auto:g}; 0.5 to 3600 seconds are accepted.")
@@ -159,7 +158,7 @@ def _request(args: argparse.Namespace) -> SessionRequest:
 
 def _notices(request: SessionRequest, head: SessionHead, fresh: bool) -> list[str]:
     """Return the notices to print before a session."""
-    from plushsense.recording.setup import is_pseudo_terminal, lacks_consent
+    from plushsense.recording.recorder import is_pseudo_terminal, lacks_consent
 
     notices = []
     if is_pseudo_terminal(request, head):

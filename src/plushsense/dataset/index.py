@@ -75,25 +75,19 @@ def open_dataset(path: str | Path) -> Dataset:
     try:
         generation = Generation.of(folder)
         if is_index_fresh(folder):
-            return Dataset(
-                folder,
-                head,
-                read_index(folder / RECORDINGS_INDEX, RecordingInfo),
-                read_index(folder / STREAMS_INDEX, StreamInfo),
-                generation,
-            )
+            return _indexed(folder, head, generation)
         if missing := missing_files(folder):
             raise DatasetError(
                 f"'{folder}' lacks {len(missing)} raw file{'s' if len(missing) > 1 else ''} that it had "
                 f"('{missing[0]}'): restore them, or delete {STAMP} there to go on without them."
             )
         stamp = current_stamp(folder)
-        # Marks change no raw file: reuse the index and apply the marks again.
-        built = (
-            _with_present_marks(folder, head, generation)
-            if is_same_raw_data(folder, stamp)
-            else build_index(folder, head)
-        )
+        if is_same_raw_data(folder, stamp):
+            # Marks change no raw file.
+            built = IndexBuild(_indexed(folder, head, generation))
+            built.dataset.recordings = apply_marks(built.dataset.recordings, read_marks(folder))
+        else:
+            built = build_index(folder, head)
     except OSError as cause:
         raise DatasetError(f"'{folder}' cannot be read: {cause.strerror or cause} ({cause.filename}).") from None
     if built.unreadable:
@@ -116,20 +110,17 @@ def open_dataset(path: str | Path) -> Dataset:
     return built.dataset
 
 
-def _with_present_marks(folder: Path, head: DatasetHead, generation: Generation) -> IndexBuild:
-    """Apply the present marks to the index on disk; the raw files must be unchanged."""
-    bare = [
-        replace(r, start=0, stop=r.rows, excluded=False) for r in read_index(folder / RECORDINGS_INDEX, RecordingInfo)
-    ]
-    streams = read_index(folder / STREAMS_INDEX, StreamInfo)
-    return IndexBuild(Dataset(folder, head, apply_marks(bare, read_marks(folder)), streams, generation))
+def _indexed(folder: Path, head: DatasetHead, generation: Generation) -> Dataset:
+    """Return the data set by its index on disk."""
+    recordings = read_index(folder / RECORDINGS_INDEX, RecordingInfo)
+    return Dataset(folder, head, recordings, read_index(folder / STREAMS_INDEX, StreamInfo), generation)
 
 
 def rebuild_index(folder: Path, head: DatasetHead | None = None, progress: Progress | None = None) -> IndexBuild:
     """Rebuild the index; while a raw file cannot be read, the index on disk stays as it is.
 
     Raises:
-        ForgottenError: when a person was taken out meanwhile.
+        ForgottenError: when a person was removed meanwhile.
     """
     stamp = current_stamp(folder)
     built = build_index(folder, head or DatasetHead.read(folder), progress)
@@ -156,14 +147,14 @@ def build_index(folder: Path, head: DatasetHead, progress: Progress | None = Non
     recordings: list[_RawFile] = []
     for done, (kind, path) in enumerate(files):
         reader = read_stream if kind == STREAMS else read_recording
-        relative = path.relative_to(folder).as_posix()
         try:
             data = read_bytes(path)
             result = reader(path, head.layout, data)
-            read = _RawFile(path, path.relative_to(folder / kind).parts[0], result, hashlib.sha256(data).hexdigest())
         except FileFormatError as cause:
-            unreadable[relative] = str(cause)
+            unreadable[path.relative_to(folder).as_posix()] = str(cause)
             continue
+        subject = path.relative_to(folder / kind).parts[0]
+        read = _RawFile(path, subject, result, hashlib.sha256(data).hexdigest())
         (streams if kind == STREAMS else recordings).append(read)
         if progress is not None:
             progress(done + 1, len(files))
@@ -248,12 +239,10 @@ def _locate(recording: ReadResult, stream: ReadResult, at: _RowLookup) -> tuple[
 def _best_stream(
     folder: Path, recording: _RawFile, session: str, streams: Iterable[_RawFile], lookups: dict[int, _RowLookup]
 ) -> tuple[_RawFile | None, int, int]:
-    """Find the person's stream that holds most of a recording, its row there, and how many rows follow.
+    """Return the person's stream that holds most of a recording, its row there and the rows that follow.
 
-    Returns (None, −1, 0) if no stream holds it.
-
-    The session's own stream comes first; another one counts only if it holds the whole recording, since two days may
-    begin with the same time stamps.
+    (None, −1, 0) if there is none. The session's own stream comes first; another one counts only if it holds the whole
+    recording, since two days may begin with the same time stamps.
     """
     best: tuple[_RawFile | None, int, int] = (None, -1, 0)
     for own in (True, False):
@@ -360,10 +349,7 @@ class _RowLookup:
 
 
 def _recordings_from_labels(folder: Path, head: DatasetHead, streams: list[_RawFile]) -> list[RecordingInfo]:
-    """Return the recordings of streams with a label on every row: one for each run of equal labels.
-
-    Rows without a label belong to none.
-    """
+    """Return the recordings of streams with a label on every row: one for each run of equal labels."""
     infos = []
     for read in streams:
         labels = read.result.frames.labels
@@ -398,11 +384,9 @@ def apply_marks(infos: Iterable[RecordingInfo], marks: dict[str, MarkState]) -> 
     """Return the recordings with the marks applied."""
     out = []
     for info in infos:
-        mark = marks.get(info.id)
-        if mark is not None:
-            stop = info.rows if mark.stop < 0 else min(mark.stop, info.rows)
-            info = replace(info, excluded=mark.excluded, start=min(mark.start, stop), stop=stop)
-        out.append(info)
+        mark = marks.get(info.id, MarkState())
+        stop = info.rows if mark.stop < 0 else min(mark.stop, info.rows)
+        out.append(replace(info, excluded=mark.excluded, start=min(mark.start, stop), stop=stop))
     return out
 
 

@@ -87,7 +87,8 @@ def suggest(frames: Frames, layout: Layout, before: Frames | None = None, spec: 
     """
     n = len(frames)
     nothing = Suggestion(0, n, False, False, 0.0, 0.0, 1.0, "too short")
-    period_s = _period_s(frames)
+    steps = np.diff(frames.device_ms)
+    period_s = float(np.median(steps[steps > 0])) / 1000.0 if (steps > 0).any() else 0.01
     if n * period_s < 2 * spec.least_s or n < 5:
         return nothing
     rest, activity, floor = _activity(frames, layout, before, period_s, spec)
@@ -122,12 +123,6 @@ def suggest(frames: Frames, layout: Layout, before: Frames | None = None, spec: 
         contrast,
         "; ".join(text for text, applies in reasons.items() if applies),
     )
-
-
-def _period_s(frames: Frames) -> float:
-    steps = np.diff(frames.device_ms)
-    forward = steps[steps > 0]
-    return float(np.median(forward)) / 1000.0 if len(forward) else 0.01
 
 
 def _activity(

@@ -5,7 +5,7 @@ The summary statistics of the authors' ``b_training_data_analysis.m``: mean, med
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,7 +66,7 @@ def duration_table(dataset: Dataset, by: str | None = None) -> list[Duration]:
     Raises:
         DatasetError: for a column that subjects.csv does not have.
     """
-    group = _Grouping(dataset, by)
+    group = _grouping(dataset, by.casefold() if by else "")
     cells: dict[tuple[str, str], list[RecordingInfo]] = {}
     for r in dataset.used:
         if r.rate_hz > 0:
@@ -95,36 +95,32 @@ def _class_order(dataset: Dataset, gesture: str) -> int:
     return labels.index(gesture) if gesture in labels else len(labels)
 
 
-class _Grouping:
-    """Maps each person to a group by a column of subjects.csv."""
-
-    def __init__(self, dataset: Dataset, by: str | None) -> None:
-        self.by = by.casefold() if by else ""
-        self.people = read_people(dataset.path) if self.by and self.by != "subject" else {}
-        if self.by in ("", "subject"):
-            return
-        columns = {"age_group", "gender", *(key for p in self.people.values() for key in p.more)}
-        if not self.people:
+def _grouping(dataset: Dataset, by: str) -> Callable[[str], str]:
+    """Return the function from a person to the group by a column of subjects.csv ("" for all)."""
+    people = read_people(dataset.path) if by not in ("", "subject") else {}
+    if by not in ("", "subject"):
+        if not people:
             raise DatasetError(
-                f"'{dataset.path}' has no {PEOPLE} with the people's groups: write one there with the columns "
-                "subject,age_group,gender."
+                f"'{dataset.path}' has no {PEOPLE}: write one there with the columns subject,age_group,gender."
             )
-        if self.by not in columns:
+        columns = {"age_group", "gender", *(key for p in people.values() for key in p.more)}
+        if by not in columns:
             raise DatasetError(
                 f"{PEOPLE} of '{dataset.head.name}' has no column '{by}': it has subject, "
-                f"{', '.join(sorted(columns))}.{nearest(self.by, columns)}"
+                f"{', '.join(sorted(columns))}.{nearest(by, columns)}"
             )
 
-    def __call__(self, subject: str) -> str:
-        if not self.by:
+    def group(subject: str) -> str:
+        if not by:
             return ""
         if subject in (NOBODY, UNKNOWN_SUBJECT):
             return "nobody" if subject == NOBODY else NOT_GIVEN
-        if self.by == "subject":
+        if by == "subject":
             return subject
-        person = self.people.get(subject, PersonInfo(subject))
-        own = {"age_group": person.age_group, "gender": person.gender} | person.more
-        return own.get(self.by) or NOT_GIVEN
+        person = people.get(subject, PersonInfo(subject))
+        return str((vars(person) | person.more).get(by) or NOT_GIVEN)
+
+    return group
 
 
 @dataclass(frozen=True)

@@ -82,8 +82,8 @@ class Generation:
             )
         if (self.folder / UNDER_WAY).exists():
             raise ForgottenError(
-                f"The removal of a person from '{self.folder}' is not finished, so nothing was written: finish  "
-                "plushsense forget  there, then run this again."
+                f"The removal of a person from '{self.folder}' is not finished, so nothing was written: run  "
+                "plushsense forget  there first."
             )
 
     @contextmanager
@@ -101,8 +101,7 @@ class Generation:
             lock.acquire()
         except Timeout:
             raise DatasetError(
-                f"Another program has held '{self.folder / LOCK}' for {_LOCK_S / 60:.0f} minutes: end it, then run "
-                "this again."
+                f"Another program has held '{self.folder / LOCK}' for {_LOCK_S / 60:.0f} minutes: end it first."
             ) from None
         except (OSError, NotImplementedError):
             pass
@@ -226,12 +225,7 @@ class DatasetHead:
         """Return the text of ``dataset.toml``."""
         table = {
             "format": FORMAT_VERSION,
-            "name": self.name,
-            "version": self.version,
-            "licence": self.licence,
-            "consent": self.consent,
-            "source": self.source,
-            "simulated": self.simulated,
+            **{k: getattr(self, k) for k in ("name", "version", "licence", "consent", "source", "simulated")},
             **({"about": about} if (about := self.about.to_table()) else {}),
             "layout": self.layout.to_dict(),
             "gesture_set": self.gestures.to_dict(),
@@ -240,11 +234,7 @@ class DatasetHead:
 
     @classmethod
     def read(cls, folder: Path) -> DatasetHead:
-        """Read the head of the data set in ``folder``.
-
-        Raises:
-            DatasetError: when the folder is not there or is no data set.
-        """
+        """Read the head of the data set in ``folder``; raise DatasetError if the folder is missing or no data set."""
         path = folder / HEAD
         if not folder.is_dir():
             raise DatasetError(f"There is no folder '{folder}': give the folder of a data set.")
@@ -332,7 +322,7 @@ class Dataset:
     def read_stream(self, stream: str) -> Frames:
         """Read the rows of one session stream and cache them, since recordings are read stream by stream."""
         if self._cached is None or self._cached[0] != stream:
-            info = self._streams_by_id.get(stream)
+            info = next((s for s in self.streams if s.id == stream), None)
             if info is None:
                 raise DatasetError(f"Data set '{self.head.name}' has no stream '{stream}'.")
             self._cached = (stream, self._frames(read_stream, info.file))
@@ -347,10 +337,6 @@ class Dataset:
             raise
 
     _cached: tuple[str, Frames] | None = None
-
-    @cached_property
-    def _streams_by_id(self) -> dict[str, StreamInfo]:
-        return {s.id: s for s in self.streams}
 
     @cached_property
     def hash(self) -> str:

@@ -187,8 +187,7 @@ def kept_rows(trim: Trim, start_s: float | None, stop_s: float | None) -> tuple[
     start, stop = min(start, info.rows), min(stop, info.rows)
     if stop <= start:
         raise DatasetError(
-            f"'{info.id}' has no row from {start_s or 0:g} to {end_s if stop_s is None else stop_s:g} s: give a later "
-            "end or an earlier start."
+            f"'{info.id}' has no row from {start_s or 0:g} to {end_s if stop_s is None else stop_s:g} s: keep more."
         )
     return start, stop
 

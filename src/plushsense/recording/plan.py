@@ -34,18 +34,12 @@ class Step:
 
 @dataclass(frozen=True)
 class Protocol:
-    """The plan of a session, in which every gesture has its prompt.
+    """The plan of a session.
 
-    Attributes:
-        gestures: labels in the order of recording.
-        prompts: text that the person reads, for each gesture.
-        repetitions: recordings of each gesture.
-        order: see `ORDERS`.
-        countdown_s: time from the first press of the space bar to the first row.
-        shortest_s: a second press within this time does not stop the recording.
-        longest_s: a recording ends automatically after this time; its rows are kept.
-        words: the chosen wording.
-        nobody: gestures that are recorded without a person.
+    ``gestures`` are labels in the order of recording, ``prompts`` the text that the person reads for each, ``words`` is
+    the chosen wording, ``order`` one of `ORDERS`, and ``nobody`` lists the gestures that are recorded without a person.
+    ``countdown_s`` is the time from the first press of the space bar to the first row. A second press within
+    ``shortest_s`` does not stop the recording, which ends automatically after ``longest_s``.
     """
 
     name: str
@@ -108,8 +102,7 @@ class Protocol:
                 raise ConfigError(f"The {where}: {key} is {value:g}; {low:g} to {high:g} seconds are accepted.")
         if file.shortest_s >= file.longest_s:
             raise ConfigError(
-                f"The {where}: shortest_s is {file.shortest_s:g} and longest_s {file.longest_s:g}; "
-                "the shortest must be below the longest."
+                f"The {where}: shortest_s is {file.shortest_s:g}; it must be below longest_s, {file.longest_s:g}."
             )
         return cls(**vars(file) | _resolved(file, where, words or file.words or DEFAULT, beside))
 
@@ -174,11 +167,7 @@ def protocol_names() -> tuple[str, ...]:
 
 
 def wordings(name_or_path: str | Path) -> tuple[str, ...]:
-    """Return the wordings of a protocol's prompts, `DEFAULT` first.
-
-    Raises:
-        ConfigError: for an unknown name or an unusable file.
-    """
+    """Return the wordings of a protocol's prompts, `DEFAULT` first; raise ConfigError as `load_protocol`."""
     table, _ = read_named(name_or_path, "protocols", "protocol", ConfigError)
     prompts = table.get("prompts")
     texts = prompts.values() if isinstance(prompts, Mapping) else ()

@@ -116,13 +116,7 @@ def new_session(person: Path) -> str:
 
 
 class OpenSession:
-    """A session's folder, locked by this process until it is closed.
-
-    Attributes:
-        folder, head, layout, protocol: those of the session.
-        progress: its state when it was opened.
-        log: the log to append events to.
-    """
+    """A session's folder, locked by this process until it is closed; ``progress`` is its state when it was opened."""
 
     def __init__(self, folder: Path, head: SessionHead | None = None) -> None:
         """Create the session of ``head`` in ``folder``, or open the existing one.
@@ -132,35 +126,29 @@ class OpenSession:
         """
         self.folder = folder
         try:
-            if head is not None:
-                folder.mkdir(parents=True, exist_ok=True)
-            elif not (folder / SESSION_HEAD).is_file():
-                raise DatasetError(f"'{folder}' holds no session: there is no {SESSION_HEAD} in it.")
-            self._lock = FileLock(str(folder / LOCK), timeout=0, thread_local=False)
-            self._lock.acquire()
+            with contextlib.ExitStack() as undo:
+                if head is not None:
+                    folder.mkdir(parents=True, exist_ok=True)
+                elif not (folder / SESSION_HEAD).is_file():
+                    raise DatasetError(f"'{folder}' holds no session: there is no {SESSION_HEAD} in it.")
+                self._lock = FileLock(str(folder / LOCK), timeout=0, thread_local=False)
+                self._lock.acquire()
+                undo.callback(self._release)
+                self.head = self._head(head)
+                self.layout = Layout.from_dict(self.head.layout, f"layout in '{folder / SESSION_HEAD}'")
+                self.protocol = Protocol.from_dict(self.head.protocol, f"protocol in '{folder / SESSION_HEAD}'")
+                _end_torn_line(folder / SESSION_LOG)
+                self.log = LogFile(folder)
+                undo.callback(self.log.close)
+                self.progress = _repair(folder, self.layout, self.log)
+                undo.pop_all()
         except Timeout:
             raise DatasetError(
                 f"Another program is recording the session '{folder}': continue there, or close it first."
             ) from None
         except (OSError, NotImplementedError) as cause:
-            raise DatasetError(_refused(folder, cause)) from None
-        try:
-            self.head = self._head(head)
-            self.layout = Layout.from_dict(self.head.layout, f"layout in '{folder / SESSION_HEAD}'")
-            self.protocol = Protocol.from_dict(self.head.protocol, f"protocol in '{folder / SESSION_HEAD}'")
-            _end_torn_line(folder / SESSION_LOG)
-            self.log = LogFile(folder)
-            try:
-                self.progress = _repair(folder, self.layout, self.log)
-            except BaseException:
-                self.log.close()
-                raise
-        except OSError as cause:
-            self._release()
-            raise DatasetError(_refused(folder, cause)) from None
-        except BaseException:
-            self._release()
-            raise
+            why = getattr(cause, "strerror", None) or cause
+            raise DatasetError(f"'{folder}' cannot be used ({why}): check the path and the disk.") from None
 
     def _head(self, given: SessionHead | None) -> SessionHead:
         known = SessionHead.read(self.folder)
@@ -212,10 +200,6 @@ class OpenSession:
                 with contextlib.suppress(OSError):
                     (self.folder / LOCK).unlink()
             self._lock.release()
-
-
-def _refused(folder: Path, cause: Exception) -> str:
-    return f"'{folder}' cannot be used ({getattr(cause, 'strerror', None) or cause}): check the path and the disk."
 
 
 def _end_torn_line(path: Path) -> None:
@@ -374,11 +358,8 @@ def _repair_takes(folder: Path, progress: SessionProgress, log: LogFile, made: d
 class SessionSummary:
     """The summary of a session on disk.
 
-    Attributes:
-        folder: the session's folder.
-        head, protocol: None where they cannot be read; ``error`` is the reason.
-        done, skipped, steps: numbers of steps by its log.
-        finished: whether it was completed.
+    ``head`` and ``protocol`` are None where they cannot be read, with ``error`` as the reason; ``done``, ``skipped``
+    and ``steps`` are numbers of steps.
     """
 
     folder: Path

@@ -101,7 +101,9 @@ def _receive(
     written = device_ms if DEVICE_MS in layout.wire else np.concatenate([e.delay_ms for e in episodes])
     kept = rng.random(len(values)) >= world.lost + world.garbled
     begin = host_ms + (int(rng.integers(0, 20_000_000)) if first else 10)
-    host = begin + _arrival(device_ms, rng)
+    # The host's clock drifts a little, and frames arrive 0 to 6 ms late.
+    passed = (device_ms - device_ms[0]) * (1.0 + 4e-5 * rng.standard_normal())
+    host = begin + np.maximum.accumulate(np.rint(passed + 6.0 * rng.random(len(passed))).astype(np.int64))
     row_of = np.concatenate(([0], np.cumsum(kept)))
     return Frames(values[kept], written[kept], host[kept]), row_of, int(np.sum(~kept))
 
@@ -113,12 +115,6 @@ def _joined(one: Frames, other: Frames) -> Frames:
         np.concatenate([one.device_ms, other.device_ms]),
         np.concatenate([one.host_ms, other.host_ms]),
     )
-
-
-def _arrival(device_ms: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
-    """Return the host times of frames from 0, with a small clock drift and delays of 0 to 6 ms."""
-    passed = (device_ms - device_ms[0]) * (1.0 + 4e-5 * rng.standard_normal())
-    return np.maximum.accumulate(np.rint(passed + 6.0 * rng.random(len(passed))).astype(np.int64))
 
 
 def _write(folder: Path, take: _Take, layout: Layout) -> int:

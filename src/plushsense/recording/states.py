@@ -43,19 +43,12 @@ class StepResult:
 class RecorderStatus:
     """A snapshot of a session.
 
-    Attributes:
-        state: current state; "finished": all steps are recorded or skipped; "stopped": no more data come or can be
-            written (``failed`` is the reason when the disk is the cause, else ``message``).
-        step: the current step; ``next_step``: the one after it.
-        done, skipped, steps: numbers of steps; ``redone``: number of discarded files.
-        existing: the file of this step if it is recorded already.
-        countdown_s: time left; ``elapsed_s`` of this recording; ``left_s`` until it ends automatically.
-        rate_hz, jitter_ms, signal: signal quality of the last seconds (see `plushsense.recording.takes.SIGNAL`).
-        away: whether the toy is disconnected.
-        frames, lost, malformed, garbage, reconnects, gaps: numbers since this program began.
-        rows: rows of the session's stream.
-        file: the last finished recording.
-        bad_share: share of the last seconds' lines that were lost, malformed or out of range, 0 to 1.
+    ``state`` is "finished" when all steps are recorded or skipped, "stopped" when no more data come or can be written
+    (``failed`` is the reason when the disk is the cause, else ``message``). ``done``, ``skipped`` and ``steps`` are
+    numbers of steps, ``redone`` is that of discarded files, ``existing`` the file of this step if it is recorded, and
+    ``file`` the last finished recording. ``countdown_s`` and ``left_s`` are times left, ``elapsed_s`` that of this
+    recording. ``rate_hz``, ``jitter_ms``, ``signal`` and ``bad_share`` are those of `SignalQuality`; ``away``: the toy
+    is disconnected. ``rows`` are rows of the session's stream; the other counts began with this program.
     """
 
     state: RecorderState
@@ -153,14 +146,10 @@ def key_of(step: Step) -> Key:
 
 
 class PlanProgress:
-    """The steps of a session and the recordings made of each.
+    """The steps of a session, in order, and the recordings made of each.
 
-    Attributes:
-        steps: all steps, in order.
-        takes: file of the recording in use of each step; the newest comes last.
-        skipped: steps that were skipped.
-        discarded: files of a step that are not used.
-        at: number of the current step.
+    ``takes`` is the file in use of each step, the newest last; ``discarded`` are the other files of a step, and ``at``
+    is the number of the current step.
     """
 
     def __init__(self, steps: tuple[Step, ...], progress: SessionProgress) -> None:
@@ -277,16 +266,9 @@ class RecordingMachine:
         self._writer: BackgroundWriter | None = None
         self._reader = threading.Thread(target=self._read, name="plushsense-reader", daemon=True)
 
-    # Status --------------------------------------------------------------------------------------------------
-
     def subscribe(self, listener: Listener) -> None:
         """Call ``listener(what, status)`` at every change, in the thread that made it; the listener must not block."""
         self._listeners.append(listener)
-
-    def unsubscribe(self, listener: Listener) -> None:
-        """Stop calling a listener."""
-        with contextlib.suppress(ValueError):
-            self._listeners.remove(listener)
 
     def status(self) -> RecorderStatus:
         """Return a snapshot of the session."""
@@ -323,16 +305,11 @@ class RecordingMachine:
                 frames=counters.frames,
             )
 
-    # State changes (with the lock) ----------------------------------------------------------------------------
-
     @contextlib.contextmanager
     def _notifying(self) -> Iterator[None]:
         """Hold the lock; notify the listeners after its release, so that they may give commands."""
         with self._changed:
             yield
-        self._notify()
-
-    def _notify(self) -> None:
         with self._changed:
             changes, self._changes = self._changes, []
         for what in changes:
@@ -396,12 +373,6 @@ class RecordingMachine:
         self._log_step("cancel")
         self._enter("idle", message)
 
-    def _first_row(self, frame: Frame, row: int) -> None:
-        counters = Counters(**self.device.counters.to_dict())
-        self._take = RecordingTake(self._plan.step, row, time.monotonic(), counters)
-        self._log_step("start", row=row, host_ms=frame.host_ms, device_ms=frame.device_ms)
-        self._enter("recording", "")
-
     def _abandon(self, why: str, message: str) -> None:
         take = self._take
         assert take is not None
@@ -423,8 +394,6 @@ class RecordingMachine:
         self._flush()
         if self._writer is not None:
             self._writer.submit(lambda: self._save(take, ended, counters))
-
-    # Reading --------------------------------------------------------------------------------------------------
 
     def _read(self) -> None:
         """Process frames as they come, in the reader's thread, independently of display and disk."""
@@ -463,7 +432,10 @@ class RecordingMachine:
         if gap is not None:
             self._gap(gap)
         if self._state == "countdown" and self._passed_s() >= self.protocol.countdown_s:
-            self._first_row(frame, row)
+            counters = Counters(**self.device.counters.to_dict())
+            self._take = RecordingTake(self._plan.step, row, time.monotonic(), counters)
+            self._log_step("start", row=row, host_ms=frame.host_ms, device_ms=frame.device_ms)
+            self._enter("recording", "")
         elif self._take is not None:
             self._take.lost += missing
         self._received.append(frame)
@@ -496,8 +468,6 @@ class RecordingMachine:
                 self._show_message(f"{message}: this recording has a gap; r records it again.")
             else:
                 self._show_message(f"{message}.")
-
-    # Writing --------------------------------------------------------------------------------------------------
 
     def _save(self, take: RecordingTake, ended: Ended, counters: Counters) -> None:
         """Save one recording (in the background writer's thread), then go to the next step."""

@@ -100,12 +100,8 @@ data, or "cut": it was cut from a longer stream afterwards."""
 class RecordingTake:
     """A recording in progress.
 
-    Attributes:
-        row: row of the session's stream at which it begins.
-        from_s: the computer's monotonic clock at its first row.
-        before: the counters at that time; malformed lines since then belong to this recording.
-        lost: frames that are missing between its rows.
-        gaps: see `gap_entry`.
+    It begins at ``row`` of the session's stream and ``from_s`` of the computer's monotonic clock, with the counters
+    ``before``. ``lost`` frames are missing between its rows; ``gaps`` are `gap_entry`.
     """
 
     step: Step
@@ -194,13 +190,9 @@ class ReceivedFrame(NamedTuple):
 class FrameReceiver:
     """Time-stamp a toy's frames and track its clock, losses and gaps. Not thread-safe: the recorder's lock guards it.
 
-    Attributes:
-        rows: rows of the session's stream.
-        toy_ms: time during which the toy has sent frames, by its own clock. Gaps count, the time goes on when the clock
-            restarts, and an impossible time stamp does not end a countdown or a recording.
-        last: the newest frame.
-        lost: frames that are missing by the toy's clock.
-        gaps: gaps, with ``after_row`` in rows of the stream.
+    ``toy_ms`` is the time during which the toy has sent frames, by its own clock: gaps count, the time continues when
+    the clock restarts, and an impossible time stamp does not end a countdown or a recording. ``rows`` counts those of
+    the session's stream, ``lost`` the frames that are missing; ``gaps`` have ``after_row`` in rows of the stream.
     """
 
     def __init__(self, device: Device, layout: Layout, speed: float, rows: int, host_ms: int) -> None:

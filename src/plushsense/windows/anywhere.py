@@ -137,7 +137,10 @@ def cut_anywhere(
         for recording, place in in_recordings:
             (resting if gestures.get(recording.gesture).idle else moving).append((recording, place))
         if idle is not None and (stream.subject, stream.session) not in adrift:
-            nobody = _unmarked(stream, idle)
+            # One idle recording without rows, so that it excludes none.
+            name, file = f"{stream.id} (unmarked)", stream.file
+            key = (name, stream.subject, stream.session, idle.label, file)
+            nobody = RecordingInfo(*key, 0, 0, 0, 0, stream.id, 0, 0, 0, 0.0, False, (), "")
             free += [(nobody, place) for place in unmarked]
         if progress is not None:
             progress(done + 1, len(dataset.streams))
@@ -165,14 +168,6 @@ def _evenly(places: Sequence[tuple[RecordingInfo, _Place]], most: int) -> list[t
     if len(places) <= most:
         return list(places)
     return [places[at] for at in (np.arange(max(0, most)) * len(places) // max(1, most)).tolist()]
-
-
-def _unmarked(stream: StreamInfo, idle: Gesture) -> RecordingInfo:
-    """Return the unmarked positions of a stream as one idle recording without rows, so that it excludes none."""
-    name, file = f"{stream.id} (unmarked)", stream.file
-    return RecordingInfo(
-        name, stream.subject, stream.session, idle.label, file, 0, 0, 0, 0, stream.id, 0, 0, 0, 0.0, False, (), ""
-    )
 
 
 def _positions(

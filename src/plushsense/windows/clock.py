@@ -71,11 +71,6 @@ class SampleClock:
         self._seen_us = None
         self._forget()
 
-    def breaks(self, device_ms: int) -> bool:
-        """Return whether a frame at this time would begin a new segment after a gap or a clock reset."""
-        time, seen = int(device_ms) * 1000, self._seen_us
-        return seen is not None and (time < seen or time - seen > self._gap)
-
     def _forget(self) -> None:
         self._held: list[int | None] = [None] * len(self._low)
         self._last: tuple[int, list[int]] | None = None
@@ -97,8 +92,8 @@ class SampleClock:
     def rows(self, device_ms: int, values: Sequence[int]) -> list[list[int]]:
         """Return what `push` does, in plain integers: faster for a live stream."""
         time = int(device_ms) * 1000
-        self.restarted = self.breaks(device_ms)
-        self._seen_us = time
+        seen, self._seen_us = self._seen_us, time
+        self.restarted = seen is not None and (time < seen or time - seen > self._gap)
         if self.restarted:
             self.restarts += 1
             self._forget()

@@ -124,17 +124,13 @@ class WindowCut:
     window_rows: tuple[int, int]
 
 
-def _starts(samples: int, window: int, step: int) -> range:
-    return range(0, samples - window + 1, step)
-
-
 def from_recording(segments: list[Segment], dataset: Dataset, window: int, step: int) -> list[WindowCut]:
     """Cut full windows from every segment; if none is long enough, loop the longest segment."""
     cuts = []
     for segment in segments:
         if len(segment) >= window:
             x = network_inputs(segment.data, dataset.layout)
-            cuts += [WindowCut(x[s : s + window], "inside", (-1, -1)) for s in _starts(len(x), window, step)]
+            cuts += [WindowCut(x[s : s + window], "inside", (-1, -1)) for s in range(0, len(x) - window + 1, step)]
     if not cuts and segments:
         x = network_inputs(max(segments, key=len).data, dataset.layout)
         repeated = np.tile(x, (-(-window // len(x)), 1))[:window]
@@ -153,7 +149,7 @@ def _from_stream(
     for segment in (s for s in segments if s.first_row < last and first < s.last_row):
         begin = int(np.searchsorted(segment.row_of, first, side="left"))
         end = int(np.searchsorted(segment.row_of, last, side="left"))
-        ends = [begin + s + window for s in _starts(end - begin, window, step)]
+        ends = [begin + s + window for s in range(0, end - begin - window + 1, step)]
         if not ends and segment.last_row >= last and end > begin:
             ends = [end]
         if not ends or ends[0] < reach:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from plushsense.core.errors import BundleError, ConfigError, DatasetError
+from plushsense.core.files import write_file
 from plushsense.dataset.index import as_dataset, open_dataset
 from plushsense.dataset.marks import append_marks
 from plushsense.dataset.privacy.forget import RemovalPlan, plan_removal
@@ -24,12 +25,11 @@ from plushsense.dataset.publishing.package import (
     complete_head,
     publish,
     require_validators,
-    save_head,
 )
 from plushsense.dataset.quality import checking
 from plushsense.dataset.quality.checking import CheckReport, check
 from plushsense.dataset.quality.findings import CheckLimits
-from plushsense.dataset.store import Dataset, DatasetHead, Progress
+from plushsense.dataset.store import HEAD, Dataset, DatasetHead, Progress
 from plushsense.evaluation.reidentification import reidentify, report, verdict
 from plushsense.models.bundle import Bundle
 
@@ -209,7 +209,7 @@ def publish_dataset(
     )
     if save:
         try:
-            save_head(dataset, head)
+            write_file(dataset.path / HEAD, head.to_toml())
         except OSError as cause:
             # The package is complete: this is only a warning.
             done.warnings.append(

@@ -125,9 +125,9 @@ def test_rest_in_a_persons_folder_is_nobodys_and_still_in_that_stream(tmp_path: 
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("file,subject\nShake_1001_60.csv\n", "line 2 names no subject"),
-        ("file,subject\nShake_1001_60.csv,\n", "line 2 names no subject"),
-        ("file,subject\n,ana\n", "line 2 names no file"),
+        ("file,subject\nShake_1001_60.csv\n", "line 2 has no subject"),
+        ("file,subject\nShake_1001_60.csv,\n", "line 2 has no subject"),
+        ("file,subject\n,ana\n", "line 2 has no file"),
         ("file,subject\na.csv,ana\na.csv,ben\n", "gives 'a.csv' to 'ana' and 'ben'"),
     ],
 )

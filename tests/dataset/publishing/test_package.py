@@ -138,7 +138,7 @@ def test_the_tables_say_what_there_is(package: PublishResult) -> None:
     assert "21 recordings of 3 gestures by 2 people" in read
     assert "of 3 gestures by 2 people" in (package.folder / "croissant.json").read_text("utf-8")
     assert set(people["P1"]) == {"subject", "age_group", "gender", "recordings", "sessions"}
-    assert any("2 people are of an age group and gender that fewer than 3" in w for w in package.warnings)
+    assert any("2 people have an age group and gender that fewer than 3" in w for w in package.warnings)
     assert (people["P1"]["age_group"], people["P1"]["sessions"], people["none"]["age_group"]) == ("child", "2", "")
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -50,18 +50,16 @@ def session_folder(session: str) -> str:
     return f"session-{name}" if name.startswith(DUPLICATE_FOLDER) else name
 
 
-def refuse_merged(found: Iterable[SourceFile], there: Iterable[str] = ()) -> None:
+def refuse_merged(found: Sequence[SourceFile], there: Iterable[str] = ()) -> None:
     """Refuse codes of people or sessions that would share a folder name.
 
     ``there`` are the folders of people that a data set has already.
     """
     codes = {(folder.casefold(), ""): folder for folder in there}
     not_met = set(codes)
-    folders = [(f, "people", f.subject, folder_name(f.subject), "") for f in found]
-    folders += [
-        (f, "sessions", f.session, session_folder(f.session), folder_name(f.subject)) for f, *_ in folders if f.session
-    ]
-    for _, what, code, folder, within in folders:
+    folders = [("people", f.subject, folder_name(f.subject), "") for f in found]
+    folders += [("sessions", f.session, session_folder(f.session), folder_name(f.subject)) for f in found if f.session]
+    for what, code, folder, within in folders:
         if len(folder.encode("utf-8")) > _LONGEST:
             raise DatasetError(f"The code '{code[:40]}…' is too long: codes of {what} have {_LONGEST} bytes at most.")
         key = (folder.casefold(), within)
@@ -76,6 +74,7 @@ def refuse_merged(found: Iterable[SourceFile], there: Iterable[str] = ()) -> Non
             )
 
 
+@dataclass
 class Copier:
     """Copies files below ``work``, which is or becomes (a part of) a data set.
 
@@ -84,25 +83,18 @@ class Copier:
     the existing data set: a stream or log in it that has grown since is replaced by the longer one.
     """
 
-    def __init__(
-        self,
-        work: Path,
-        taken: Mapping[str, str] | None = None,
-        contents: Mapping[tuple[str, str], str] | None = None,
-        there: Path | None = None,
-    ):
-        self.work = work
-        self.there = there
-        self.grown: set[str] = set()
-        """Paths below the data set of existing files that are replaced by longer ones."""
-        self.taken = dict(taken or {})
-        self.contents = dict(contents or {})
-        self.copied: dict[Path, str] = {}
-        """New path below the data set of each source that was copied."""
-        self.already: dict[Path, str] = {}
-        """Path below the data set of each source that is there already."""
-        self.companions: dict[str, list[Path]] = {}
-        """Sources of the companions of each copied file."""
+    work: Path
+    taken: dict[str, str] = field(default_factory=dict)
+    contents: dict[tuple[str, str], str] = field(default_factory=dict)
+    there: Path | None = None
+    grown: set[str] = field(default_factory=set)
+    """Paths below the data set of existing files that are replaced by longer ones."""
+    copied: dict[Path, str] = field(default_factory=dict)
+    """New path below the data set of each source that was copied."""
+    already: dict[Path, str] = field(default_factory=dict)
+    """Path below the data set of each source that exists already."""
+    companions: dict[str, list[Path]] = field(default_factory=dict)
+    """Sources of the companions of each copied file."""
 
     def copy(self, found: SourceFile) -> str:
         """Copy one file and return "", or the reason why not; companions come after the file that they belong to."""
@@ -224,9 +216,9 @@ class ImportedFiles:
         self.rejected: list[dict[str, str]] = []
         self.left_out: list[dict[str, str]] = []
         self._origin: dict[str, SourceFile] = {}
-        refuse_merged(
-            [f for f in search.found if f.kind in (RECORDINGS, STREAMS)], people_in_paths(copier.contents.values())
-        )
+        # Raw files lie in recordings/<person>/ and streams/<person>/.
+        people = {Path(file).parts[1] for file in copier.contents.values() if len(Path(file).parts) > 2}
+        refuse_merged([f for f in search.found if f.kind in (RECORDINGS, STREAMS)], people)
         # A companion goes where its file went.
         for found in sorted(search.found, key=lambda f: f.kind == COMPANIONS):
             if found.kind == LEFT_OUT:
@@ -279,11 +271,6 @@ class ImportedFiles:
 def recording_id(file: str) -> str:
     """Return the id of a recording from its path below the data set."""
     return file.removeprefix(f"{RECORDINGS}/").rpartition(".")[0]
-
-
-def people_in_paths(files: Iterable[str]) -> set[str]:
-    """Return the folders of people in the paths of raw files below the data set."""
-    return {parts[1] for path in files if len(parts := path.split("/")) > 2 and parts[0] in (RECORDINGS, STREAMS)}
 
 
 def extend_gestures(given: GestureSet | None, dataset: Dataset) -> GestureSet:

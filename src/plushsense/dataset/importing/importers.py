@@ -128,16 +128,6 @@ def _new_marks(folder: Path, set_aside: Mapping[str, str]) -> list[Mark]:
     return marks
 
 
-def refuse_mixture(dataset: Dataset, search: SourceScan) -> None:
-    """Refuse to mix recordings of the virtual toy with real ones."""
-    if dataset.head.simulated != search.simulated:
-        kinds = ("real", "virtual") if search.simulated else ("virtual", "real")
-        raise DatasetError(
-            f"'{dataset.path}' holds recordings of a {kinds[0]} toy and the source those of a {kinds[1]} one: "
-            "keep them apart."
-        )
-
-
 def add_to_dataset(
     dest: Path,
     search: SourceScan,
@@ -152,10 +142,17 @@ def add_to_dataset(
     """
     with _locked_work_folder(dest) as work:
         dataset = open_dataset(dest)
-        refuse_mixture(dataset, search)
+        if dataset.head.simulated != search.simulated:
+            kinds = ("real", "virtual") if search.simulated else ("virtual", "real")
+            raise DatasetError(
+                f"'{dest}' holds recordings of a {kinds[0]} toy, the source those of a {kinds[1]} one: keep them apart."
+            )
         copier = _copier(dataset, work)
         account = ImportedFiles(search, copier)
-        head = replace(dataset.head, gestures=_with_described(dataset.head.gestures, gestures))
+        own = dataset.head.gestures
+        if new_gestures := tuple(g for g in (gestures.gestures if gestures else ()) if own.find(g.label) is None):
+            own = GestureSet(own.name, own.gestures + new_gestures)
+        head = replace(dataset.head, gestures=own)
         built = read_copied(account, head, progress)
         if account.rejected and not account.kept and not copier.already:
             file, reason = account.rejected[0].values()
@@ -200,12 +197,6 @@ def _returning_people_warning(dest: Path, come: list[str]) -> list[str]:
         f"{f' and {len(come) - 5} more' if len(come) > 5 else ''} were added now: remove a person again with  "
         f"plushsense forget {dest} CODE"
     ]
-
-
-def _with_described(mine: GestureSet, more: GestureSet | None) -> GestureSet:
-    """Return the data set's gestures in their order, followed by those that only ``more`` describes."""
-    new = tuple(g for g in (more.gestures if more is not None else ()) if mine.find(g.label) is None)
-    return GestureSet(mine.name, mine.gestures + new, mine.inferred and not new) if new else mine
 
 
 FOLDER = "folder"
@@ -384,14 +375,12 @@ def scan_source(source: Path, options: ImportOptions) -> SourceScan:
         elif source.is_file():
             if source.suffix.lower() not in FORMATS:
                 raise DatasetError(
-                    f"'{source}' is no file that can be imported: give a folder, or a file that ends in "
-                    f"{', '.join(FORMATS)}."
+                    f"'{source}' cannot be imported: give a folder, or a file that ends in {', '.join(FORMATS)}."
                 )
             search = FORMATS[source.suffix.lower()](source, options)
         else:
             raise DatasetError(
-                f"There is no folder or file '{source}': give the recorder's folder, or a file that ends in "
-                f"{', '.join(FORMATS)}."
+                f"There is no '{source}': give the recorder's folder, or a file that ends in {', '.join(FORMATS)}."
             )
     except OSError as cause:
         raise DatasetError(f"'{source}' cannot be read: {cause.strerror or cause} ({cause.filename}).") from None
@@ -460,10 +449,7 @@ def import_recordings(
     if add_to:
         head = DatasetHead.read(dest)
         if given is not None and given.to_dict() != head.layout.to_dict():
-            raise DatasetError(
-                f"'{dest}' has the layout '{head.layout.name}', not '{given.name}': a data set has one layout, so "
-                "leave --layout out or create another data set."
-            )
+            raise DatasetError(f"'{dest}' has the layout '{head.layout.name}', not '{given.name}': leave --layout out.")
         if name or licence or consent:
             raise ConfigError("--add keeps the name, licence and consent statement of the data set: leave them out.")
     # An inferred set does not tell which markers of an XDF file are gestures.
@@ -496,8 +482,8 @@ def import_recordings(
                 done = add_to_dataset(dest, search, gestures, people_info, progress)
             except OSError as cause:
                 raise DatasetError(
-                    f"'{dest}' cannot be added to ({cause.strerror or cause}, {cause.filename}): it is as valid as "
-                    "before; check the disk and import again."
+                    f"'{dest}' cannot be written ({cause.strerror or cause}, {cause.filename}), but is as valid as "
+                    "before: check the disk and import again."
                 ) from None
     done.seconds = time.perf_counter() - began
     return done

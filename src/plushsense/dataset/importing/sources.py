@@ -136,13 +136,6 @@ def _refusal(path: Path) -> str:
     return ""
 
 
-def _is_by_label(source: Path, files: Iterable[Path]) -> bool:
-    """Return whether folders are gestures, not people: every recording's label is its folder's name."""
-    named = [(path, name) for path in files if (name := parse_name(path.name)) is not None]
-    named = [(path, name) for path, name in named if path.parent != source] or named
-    return bool(named) and all(plain_label(n.label) == plain_label(p.parent.resolve().name) for p, n in named)
-
-
 def _nobodys_folders(files: Iterable[Path], gestures: GestureSet | None) -> set[Path]:
     """Return the folders in which every recording is of a gesture that nobody makes (the toy at rest)."""
     with_nobody: set[Path] = set()
@@ -190,7 +183,11 @@ def classify_gesture_recorder(
     ``subjects`` maps file names (or paths below ``source``) to people; without it the nearest folder is the person,
     or nobody if it holds only gestures that nobody makes.
     """
-    by_label = subjects is None and _is_by_label(source, files)
+    # Folders are gestures, not people, if every recording's label is its folder's name.
+    named = [(path, name) for path in files if (name := parse_name(path.name)) is not None]
+    named = [(path, name) for path, name in named if path.parent != source] or named
+    by_label = subjects is None and bool(named)
+    by_label &= all(plain_label(n.label) == plain_label(p.parent.resolve().name) for p, n in named)
     nobodys = _nobodys_folders(files, gestures)
     for path in files:
         if subjects is not None:
@@ -263,15 +260,13 @@ def read_mapping(path: Path) -> dict[str, str]:
         raise DatasetError(f"There is no mapping file '{path}': check the path.") from None
     if columns[:2] != ["file", "subject"]:
         raise DatasetError(
-            f"The mapping file '{path}' begins with the columns {', '.join(columns) or 'nothing'}; it needs "
-            "file,subject"
+            f"The mapping file '{path}' has the columns {', '.join(columns) or 'nothing'}; it needs  file,subject"
         )
     for line, cells in rows:
         name, subject = cells["file"].replace("\\", "/"), cells["subject"]
         if not name or not subject:
             raise DatasetError(
-                f"The mapping file '{path}' line {line} names no {'subject' if name else 'file'}: each line is  "
-                "file,subject"
+                f"The mapping file '{path}' line {line} has no {'subject' if name else 'file'}: it needs  file,subject"
             )
         if mapping.setdefault(name, subject) != subject:
             raise DatasetError(f"The mapping file '{path}' gives '{name}' to '{mapping[name]}' and '{subject}'.")
@@ -333,8 +328,7 @@ def common_layout(sessions: Sessions, given: Layout | None, of: str) -> Layout |
             )
     if agreed is not None and agreed.is_labelled and any(isinstance(h, SessionHead) for h in sessions.values()):
         raise DatasetError(
-            f"Layout '{agreed.name}' has a label on every row, which recordings of a session do not carry: "
-            "take 'label' out of its csv.columns."
+            f"Layout '{agreed.name}' has a label on every row, unlike sessions: remove 'label' from its csv.columns."
         )
     return agreed
 

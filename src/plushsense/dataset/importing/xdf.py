@@ -218,15 +218,6 @@ def match_columns(layout: Layout, labels: list[str], width: int) -> tuple[list[i
     return f"it has {width} channels, and layout '{layout.name}' needs {layout.n_channels}"
 
 
-def _markers(streams: list[dict[str, Any]]) -> list[Marker]:
-    return [
-        Marker(float(time), str(sample[0]))
-        for stream in streams
-        for time, sample in zip(stream["time_stamps"], stream["time_series"], strict=True)
-        if np.isfinite(time) and sample and sample[0]
-    ]
-
-
 def _frames(
     stream: dict[str, Any], layout: Layout, channels: list[int], clock: int | None
 ) -> tuple[Frames, NDArray[np.float64], list[str]]:
@@ -290,7 +281,13 @@ def read_xdf(
         raise FileFormatError(why)
     stream, name, channels, clock = fitting[0]
     frames, times, notes = _frames(stream, layout, channels, clock)
-    cuts, unknown = segments_of(_markers(texts), times, gestures) if len(times) else ([], [])
+    markers = [
+        Marker(float(time), str(sample[0]))
+        for text in texts
+        for time, sample in zip(text["time_stamps"], text["time_series"], strict=True)
+        if np.isfinite(time) and sample and sample[0]
+    ]
+    cuts, unknown = segments_of(markers, times, gestures) if len(times) else ([], [])
     if unknown:
         listed = ", ".join(f"'{u[:40]}'" for u in dict.fromkeys(unknown[:20]))
         notes.append(f"{len(unknown)} markers name no gesture and begin no recording: {listed}")

@@ -125,8 +125,7 @@ def plan_removal(dataset: str | Path, subject: str) -> RemovalPlan:
     table = read_people(folder)
     if subject in (NOBODY, UNKNOWN_SUBJECT):
         raise DatasetError(
-            f"'{subject}' is no person, but the folder of recordings without a known person; to leave such recordings "
-            "out, exclude them by a mark."
+            f"'{subject}' is no person, but the folder of recordings without one: exclude such recordings by a mark."
         )
     files = list_files(folder)
     own = [f for f in files if f.person == subject]
@@ -212,7 +211,7 @@ def forget(dataset: str | Path, subject: str) -> RemovalPlan:
     except OSError as cause:
         raise DatasetError(
             f"'{cause.filename or folder}' cannot be removed ({cause.strerror or cause}): close the programs that use "
-            "it, then give the same command again, which finishes the removal."
+            "it, then give the same command again to finish."
         ) from None
     # The removal is complete even if the data set has other problems; opening it later reports them.
     with contextlib.suppress(DatasetError):

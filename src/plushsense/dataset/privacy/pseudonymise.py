@@ -134,8 +134,7 @@ def _refuse_places(folder: Path, dest: Path, key: Path) -> None:
     inside = next((p for p in secret.parents if p in (real, target) or (p / HEAD).is_file()), None)
     if inside is not None:
         raise DatasetError(
-            f"The key file '{key}' would lie in the data set '{inside}', so that everybody who gets the data gets the "
-            "key: choose a place outside."
+            f"The key file '{key}' would lie in the data set '{inside}' and leave with it: choose a place outside."
         )
 
 
@@ -199,9 +198,8 @@ class _Pseudonymisation:
             old = [p for p in self.people if p not in KEPT]
             for file, what in find_traces(work, old, self.names, times):
                 raise DatasetError(
-                    f"'{file}' would still hold '{what}': nothing was written. If that is a gesture's label or another "
-                    "word of the data, rename the person or the gesture first; if the file does not belong there, "
-                    "remove it."
+                    f"'{file}' would still hold '{what}': nothing was written. If that is a gesture or another word of "
+                    "the data, rename the person or the gesture first; if the file does not belong there, remove it."
                 )
             files = len(list_files(work))
             write_key(self.key, self.codes)
@@ -235,8 +233,7 @@ class _Pseudonymisation:
             times += clocks.values()
             if not _same(before, reader(target, self.source.layout), clocks, shift_ms):
                 raise DatasetError(
-                    f"The times in '{content.path}' cannot be shifted without changing something else: nothing was "
-                    "written; exclude the file or report it."
+                    f"The times in '{content.path}' cannot be shifted alone, so nothing was written: exclude it."
                 )
             if self.progress is not None:
                 self.progress(done, len(raw))

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import DatasetError
-from plushsense.core.layouts import DEVICE_MS, HOST_MS, CsvFormat, Layout
+from plushsense.core.layouts import DEVICE_MS, HOST_MS, CsvFormat
 from plushsense.core.recorder_csv import (
     STREAM_NAME,
     Frames,
@@ -129,13 +129,6 @@ class PackageContents:
     notes: tuple[str, ...]
 
 
-def public_layout(layout: Layout, host: bool) -> Layout:
-    """Return the layout with plain columns: keys as header, ``,`` as separator, clocks first."""
-    clocks = (HOST_MS, DEVICE_MS) if host else (DEVICE_MS,)
-    columns = (*clocks, *layout.names, *(("label",) if layout.is_labelled else ()))
-    return replace(layout, csv=CsvFormat(columns, columns, ","))
-
-
 def write_contents(
     dataset: Dataset, root: Path, head: DatasetHead, options: PublishOptions, progress: Progress | None = None
 ) -> PackageContents:
@@ -165,7 +158,9 @@ class _ContentsWriter:
         if not self.kept:
             raise DatasetError(f"'{dataset.path}' has no recording left to publish: every one is excluded.")
         self.streams = dataset.streams if options.streams else []
-        self.layout = public_layout(dataset.layout, self._all_have_host())
+        clocks = (HOST_MS, DEVICE_MS) if self._all_have_host() else (DEVICE_MS,)
+        columns = (*clocks, *dataset.layout.names, *(("label",) if self.labelled else ()))
+        self.layout = replace(dataset.layout, csv=CsvFormat(columns, columns, ","))
         self.head = replace(head, layout=self.layout, source="")
         held = {_folder_of(r.file) for r in self.kept} | {_folder_of(s.file) for s in self.streams}
         self.codes = {folder: public for folder, public in public_codes(dataset).items() if folder in held}

@@ -43,7 +43,12 @@ _TYPES = {INTEGER: "cr:Int64", NUMBER: "cr:Float64", TEXT: "sc:Text", YES_NO: "s
 def croissant(d: Description) -> dict[str, Any]:
     """Return the metadata as JSON-LD; the tables' checksums come from ``d.files``."""
     files = {f.path: f for f in d.files}
-    people = [_creator(c.name, c.orcid, c.affiliation) for c in d.creators]
+    people = [
+        {"@type": "sc:Person", "name": c.name}
+        | ({"url": f"https://orcid.org/{c.orcid}"} if c.orcid else {})
+        | ({"description": c.affiliation} if c.affiliation else {})
+        for c in d.creators
+    ]
     document: dict[str, Any] = {
         # Written out, so that readers need not fetch it.
         "@context": json.loads(resources.files("plushsense.dataset.publishing").joinpath(CONTEXT).read_text("utf-8")),
@@ -72,15 +77,6 @@ def croissant(d: Description) -> dict[str, Any]:
     if d.about.publisher:
         document["publisher"] = {"@type": "sc:Organization", "name": d.about.publisher}
     return document
-
-
-def _creator(name: str, orcid: str, affiliation: str) -> dict[str, Any]:
-    entry: dict[str, Any] = {"@type": "sc:Person", "name": name}
-    if orcid:
-        entry["url"] = f"https://orcid.org/{orcid}"
-    if affiliation:
-        entry["description"] = affiliation
-    return entry
 
 
 def _source_id(table: PackageTable) -> str:

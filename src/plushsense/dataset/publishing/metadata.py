@@ -242,7 +242,11 @@ def write_bids(root: Path, d: Description) -> int:
     people = sorted({r.subject for r in used})
     names = _letters(people, "x")
     tasks = _letters(list(dict.fromkeys(r.gesture for r in used)), "task")
-    sessions = {p: sorted({r.session for r in used if r.subject == p}, key=_by_number) for p in people}
+
+    def by_number(session: str) -> tuple[int, str]:
+        return int("".join(c for c in session if c.isdigit()) or 0), session
+
+    sessions = {p: sorted({r.session for r in used if r.subject == p}, key=by_number) for p in people}
     runs: Counter[tuple[str, str, str]] = Counter()
     for r in used:
         several = len(sessions[r.subject]) > 1
@@ -325,11 +329,6 @@ def _letters(words: list[str], empty: str) -> dict[str, str]:
             label, number = f"{plain}x{number}", number + 1
         labels[word] = label
     return labels
-
-
-def _by_number(session: str) -> tuple[int, str]:
-    digits = "".join(c for c in session if c.isdigit())
-    return int(digits) if digits else 0, session
 
 
 def write_json(path: Path, table: dict[str, Any]) -> None:

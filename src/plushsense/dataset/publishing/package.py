@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.core.errors import DatasetError, need
-from plushsense.core.files import new_folder, write_file
+from plushsense.core.files import new_folder
 from plushsense.core.gestures import NOBODY
 from plushsense.core.recorder_csv import SIMULATION_MARK
 from plushsense.dataset.about import Contact
@@ -128,11 +128,6 @@ def complete_head(
             f"'{where / HEAD}' has the version '{head.version}': three numbers are accepted, like 1.0.0."
         )
     return replace(head, licence=find_licence(head.licence).spdx)
-
-
-def save_head(dataset: Dataset, head: DatasetHead) -> None:
-    """Write a completed head into the data set's own ``dataset.toml``."""
-    write_file(dataset.path / HEAD, head.to_toml())
 
 
 def require_validators() -> None:

@@ -327,10 +327,8 @@ def parse_acceptance(text: str) -> tuple[str, str]:
 def acceptances(checked: CheckReport, accept: Sequence[str], *, who: str, why: str) -> list[Mark]:
     """Return marks that accept findings: ``CHECK:PATTERN``, where the pattern matches recordings, streams or people.
 
-    Only present findings can be accepted, so that a later fault is not hidden.
-
     Raises:
-        DatasetError: when the check has no such finding.
+        DatasetError: when the check has no such finding, so that a later fault is not hidden.
     """
     marks = []
     for entry in accept:

@@ -16,7 +16,7 @@ from plushsense.core.layouts import layout_names
 from plushsense.devices.base import Device, Frame
 from plushsense.devices.opening import SCAN_S, DeviceListing, list_devices, open_device, parse_url
 from plushsense.devices.reconnect import ConnectionGap
-from plushsense.recording.setup import is_virtual, speed_of, with_speed
+from plushsense.recording.recorder import is_virtual, speed_of, with_speed
 from plushsense.studio.app.workspace import ChangeSignal, Workspace
 
 KEPT_S = 60.0

@@ -15,7 +15,7 @@ from nicegui.events import GenericEventArguments
 
 from plushsense.core.errors import PlushSenseError
 from plushsense.live.reactions import reaction_names
-from plushsense.recording.setup import is_virtual
+from plushsense.recording.recorder import is_virtual
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.studio.app.guard import is_loopback
 from plushsense.studio.app.shell import AFFECT_COLOURS, AFFECT_SIGNS, LINES, Page, on_change, query, query_path, tag

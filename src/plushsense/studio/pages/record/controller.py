@@ -12,10 +12,8 @@ from plushsense.core.layouts import layout_names
 from plushsense.core.toml import builtin_names
 from plushsense.core.version import __version__
 from plushsense.devices.opening import parse_url
-from plushsense.recording.recorder import Recorder
-from plushsense.recording.session import OpenSession, SessionSummary, is_finished, list_sessions
-from plushsense.recording.session_files import SESSION_HEAD, SessionHead
-from plushsense.recording.setup import (
+from plushsense.recording.recorder import (
+    Recorder,
     SessionRequest,
     check_speed,
     is_pseudo_terminal,
@@ -29,6 +27,8 @@ from plushsense.recording.setup import (
     speed_of,
     with_speed,
 )
+from plushsense.recording.session import OpenSession, SessionSummary, is_finished, list_sessions
+from plushsense.recording.session_files import SESSION_HEAD, SessionHead
 from plushsense.recording.states import RecorderStatus, StepResult
 from plushsense.studio.app.toys import TappedDevice
 from plushsense.studio.app.workspace import VIRTUAL, ChangeSignal, Workspace

@@ -10,8 +10,8 @@ from nicegui import run, ui
 from plushsense.core.errors import ConfigError, PlushSenseError
 from plushsense.devices.opening import list_devices
 from plushsense.recording.plan import DEFAULT, wordings
+from plushsense.recording.recorder import PROTOCOL, SessionRequest, is_virtual
 from plushsense.recording.session import SessionSummary
-from plushsense.recording.setup import PROTOCOL, SessionRequest, is_virtual
 from plushsense.studio.app.shell import Page, address, html, named, query, tag
 from plushsense.studio.app.words import Words
 from plushsense.studio.pages.record.controller import ActiveSession, RecordController
