@@ -206,7 +206,7 @@ def test_no_split_lets_a_training_window_touch_what_is_tested(tmp_path: Path) ->
         ({"busy_share": 1.2}, "busy_share is 1.2"),
         ({"every_s": 0.0}, "every_s is 0.0"),
         ({"onset_s": -0.1}, "onset_s is -0.1"),
-        ({"after_s": 2.0}, "cannot be idle"),
+        ({"after_s": 2.0}, "must not be below after_s"),
     ],
 )
 def test_bad_settings_are_refused(settings: dict[str, float], said: str) -> None:

@@ -523,7 +523,7 @@ def _is_cut(path: Path) -> bool:
 
 def test_the_page_lists_every_check_of_the_registry() -> None:
     page = (Path(__file__).parents[3] / "docs" / "checks.md").read_text(encoding="utf-8")
-    table = page.partition("| check | about |")[2].partition("\n\n")[0]
+    table = page.partition("| check | applies to |")[2].partition("\n\n")[0]
     listed = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
     assert [name for cell in listed for name in re.findall(r"`([a-z-]+)`", cell)] == list(CHECKS)
     assert {re.findall(r"`([a-z-]+)`", cell)[0] for cell in listed if "*import*" in cell} == {
@@ -536,7 +536,7 @@ def test_a_check_is_one_function_and_one_line(copy: Path, monkeypatch: pytest.Mo
         if len(examined.frames) > 10:
             yield Issue("holds more than 10 rows")
 
-    monkeypatch.setitem(CHECKS, "long", Check(("recording",), "error", "exclude it", examine=long, at_import=True))
+    monkeypatch.setitem(CHECKS, "long", Check(long, ("recording",), "error", "exclude it", at_import=True))
     (copy / "index.json").unlink(missing_ok=True)
     dataset = open_dataset(copy)
     result = check(dataset, only=["long"])
