@@ -45,7 +45,7 @@ def test_given_settings_stay_and_train_says_what_it_did(cli: Cli, dataset: Datas
     assert "Decisions fitted on 1 person who were held back" not in ran.out
     assert "Decisions fitted on 1 person who was held back" in ran.out
     gate = spec.fitted["gate"]
-    notices = f"it notices {100 * gate['recall']:.0f} % of" if "recall" in gate else gate["reason"]
+    notices = f"it detects {100 * gate['recall']:.0f} % of" if "recall" in gate else gate["reason"]
     assert notices in ran.out, "what the gate's fit found, or why there is none"
 
 

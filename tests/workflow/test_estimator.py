@@ -286,7 +286,7 @@ def test_what_does_not_fit_is_refused_in_a_sentence() -> None:
         (r"at least 2 samples", small(channels=120), rows, y, None),
         (r"one class \(0\)", small(), x, np.zeros(60, dtype=int), None),
         (r"groups has the shape \(59,\)", small(), x, y, people[:-1]),
-        (r"60 samples, but 80 under the padding 'stream' sees", small(arch="80"), x, y, None),
+        (r"60 samples, but 80 with padding 'stream' needs", small(arch="80"), x, y, None),
         (r"Unknown label type", small(), x, y + 0.5 * np.pi * np.arange(60), None),
     ):
         with pytest.raises(ValueError, match=match) as refused:

@@ -403,7 +403,8 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
 
     def predict(self, X: ArrayLike) -> NDArray[Any]:
         """Return the most probable label of each window, (N,)."""
-        return np.asarray(self.classes_[self._logits(X).argmax(axis=1)])
+        best = self._logits(X).argmax(axis=1)
+        return np.asarray(self.classes_[best])
 
     def to_bundle(self, gestures: GestureSet | None = None) -> Bundle:
         """Return the trained network as a bundle, with the affects and families of ``gestures``."""
