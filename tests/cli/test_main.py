@@ -446,10 +446,10 @@ def test_windows_calls_a_broken_pipe_an_invalid_argument(monkeypatch: pytest.Mon
     from plushsense.cli import main as room
 
     gone, named = OSError(22, "Invalid argument"), OSError(22, "Invalid argument", "a:b")
-    assert not room._reader_gone(gone)
+    assert not room._output_closed(gone)
     monkeypatch.setattr(room.sys, "platform", "win32")
-    assert room._reader_gone(gone)
-    assert not room._reader_gone(named), "a path that Windows does not like"
+    assert room._output_closed(gone)
+    assert not room._output_closed(named), "a path that Windows does not like"
 
 
 def test_output_is_utf8_whatever_the_console(cli: Cli, recordings: Path, tmp_path: Path) -> None:
