@@ -198,7 +198,7 @@ def test_two_tabs_show_and_press_the_same_once(studio: Fixture, look: Fixture, t
         page.wait_for_url("**/record?ended=S01/1")
         connected(page)
         assert "1 of 4 recorded" in marked(page, "message").inner_text()
-    one.get_by_role("button", name="Go on: S01/1").click()
+    one.get_by_role("button", name="Continue: S01/1").click()
     sat(one, "S01/1")
     assert showing(one, "idle.") == "idle.1.1.0.0"
     assert browser.complaints == []

@@ -92,13 +92,13 @@ def test_a_session_that_cannot_begin(
     # A terminal has it.
     held = OpenSession(home / "recordings" / "S01" / "1")
     try:
-        page.get_by_role("button", name="Go on: S01/1").click()
+        page.get_by_role("button", name="Continue: S01/1").click()
         said(page, "Another program is recording")
     finally:
         held.close()
     fill(page, "S01")
     said(page, "has an unfinished session")
-    page.get_by_role("button", name="Go on: S01/1").click()
+    page.get_by_role("button", name="Continue: S01/1").click()
     sat(page, "S01/1")
     page.goto(server.url + "/record?session=S09/1")
     connected(page)

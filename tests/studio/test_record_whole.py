@@ -57,7 +57,7 @@ def test_51_recordings_by_the_space_bar(studio: Fixture, look: Fixture, shots: F
                 server.kill()
                 server.start()
                 # The page comes back by itself and offers to go on.
-                page.get_by_role("button", name="Go on: S01/1").click()
+                page.get_by_role("button", name="Continue: S01/1").click()
                 page.wait_for_selector('[data-test="state-box"]')
                 connected(page)
                 assert "broken off" in marked(page, "notice").first.inner_text()
