@@ -121,9 +121,8 @@ def refuse_undeployable(arch: Arch) -> None:
 
 
 def folded(arch: Arch, weights: Mapping[str, NDArray[Any]]) -> list[tuple[Floats, Floats]]:
-    """Fold normalisation into the next layer: return weights (F, C, K) and biases (F,) of each layer and the dense one.
-
-    Each normalisation is moved into the layer that reads it; exact for networks that can be deployed.
+    """Fold each normalisation into the next layer: return weights (F, C, K) and biases (F,) of each layer and the dense
+    one; exact for networks that can be deployed.
     """
     gain, shift = np.ones(arch.channels), np.zeros(arch.channels)
     parts = []

@@ -227,15 +227,8 @@ class ManySummary:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
-        return {
-            "toys": self.toys,
-            "decisions": self.decisions,
-            "late": self.late,
-            "wall_s": round(self.wall_s, 3),
-            "cpu_s": round(self.cpu_s, 3),
-            "busy": round(self.busy, 4),
-            "latency_ms": dict(self.latency_ms),
-        }
+        rounded = {name: round(getattr(self, name), 3) for name in ("wall_s", "cpu_s")}
+        return asdict(self) | rounded | {"busy": round(self.busy, 4)}
 
 
 class ManyRun(Iterator[tuple[int, Decision]]):

@@ -47,10 +47,7 @@ def parse_symbol(spec: str) -> tuple[tuple[int, int], ...]:
 
 
 def parse_filters(text: str) -> tuple[int, ...]:
-    """Return the filter counts of ``"8,12,16"``.
-
-    Raise ArchError with a caret under what is not a whole number from 1.
-    """
+    """Return the filter counts of ``"8,12,16"``; ArchError with a caret under what is not a whole number from 1."""
     counts: list[int] = []
     at = 0
     while True:
@@ -342,10 +339,7 @@ class Arch:
 
     @property
     def table3(self) -> str | None:
-        """Parameter count that the paper's Table 3 prints for this network ("13.2k").
-
-        None where it is not in the table.
-        """
+        """Parameter count that the paper's Table 3 prints for this network ("13.2k"); None where it has none."""
         if (self.channels, self.classes) != (11, 18):
             return None
         for row, spec in enumerate(PAPER_FILTERS):

@@ -361,11 +361,9 @@ def stream_state(arch: Arch) -> tuple[list[SampleRing], Pool]:
 
 
 def random_weights(arch: Arch, seed: int) -> dict[str, NDArray[np.float32]]:
-    """Return random weights with the statistics that training leaves.
+    """Return random weights with the statistics of trained ones (norms that fit, uneven gains, logits of a few units).
 
-    Fitting norms, uneven gains, logits of a few units.
-
-    For tests and for measuring; they know no gesture.
+    For tests and for measuring.
     """
     rng = np.random.default_rng(seed)
     weights: dict[str, NDArray[np.float32]] = {}

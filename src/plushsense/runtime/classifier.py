@@ -280,9 +280,8 @@ class BothEngines(IntegerClassifier):
     def agreement(self) -> dict[str, Any]:
         """Return how often both engines gave the same answer, of the ``decisions`` with an answer.
 
-        None where there was none, and for affect where no gesture carries one.
-
-        ``gesture`` and ``affect`` are shares, ``largest_difference`` that of any smoothed probability.
+        ``gesture`` and ``affect`` are shares, ``largest_difference`` that of any smoothed probability; None where there
+        was no answer, and for affect where no gesture has one.
         """
         n = self._compared
         return {

@@ -1,7 +1,4 @@
-"""Settings of decisions.
-
-In seconds and shares, as a bundle keeps them, and in integers, as a toy computes with them.
-"""
+"""Settings of decisions: in seconds and shares in a bundle, in steps and integers in a toy."""
 
 from __future__ import annotations
 

@@ -174,9 +174,7 @@ def smoothing_weight(seconds: float, step_s: float) -> int:
 
 
 def smooth(mean: Ints | None, probabilities: Ints, weight: int) -> Ints:
-    """Return the exponential mean (K,) in steps of 2^-27 after one more step of probabilities (K,).
-
-    The first starts it.
+    """Return the exponential mean (K,) in steps of 2^-27 after a step of probabilities (K,); the first starts it.
 
     ``d = (probability << 12) - mean``; the mean grows by ``(d * weight + 2^14) >> 15``.
     """

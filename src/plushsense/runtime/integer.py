@@ -1,10 +1,8 @@
-"""Integer network.
+"""Integer network: 8-bit weights and activations, 32-bit sums, fixed-point scales.
 
-The exact meaning of a deployed model, with 8-bit weights and activations, 32-bit sums, fixed-point scales.
-
-This module defines the answers; the C in the toy gives the same bits. Only ``stream`` networks are here: batch
-normalisation is folded into the layer that follows it. Sums are computed in float64, which holds every whole number
-that can occur, so that they are exact and fast.
+This module defines the exact answers of a deployed model; the C in the toy gives the same bits. Only ``stream``
+networks are here: batch normalisation is folded into the layer that follows it. Sums are computed in float64, which
+holds every whole number that can occur, so that they are exact and fast.
 """
 
 from __future__ import annotations
