@@ -16,7 +16,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import is_dataclass
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from plushsense.core.errors import BadInput, nearest
 
@@ -133,6 +133,8 @@ def _describe(kind: Any, many: bool = False) -> str:
     origin = get_origin(kind)
     if origin in _UNIONS:
         return " or ".join(filter(None, (_describe(one, many) for one in get_args(kind))))
+    if origin is Literal:
+        return " or ".join(f"'{value}'" for value in get_args(kind))
     if origin is tuple:
         return f"{'lists' if many else 'a list'} of {_describe(get_args(kind)[0], many=True)}"
     return (_MANY if many else _ONE).get(kind, "tables" if many else "a table")
