@@ -123,7 +123,7 @@ def test_excluding_is_a_mark_that_can_be_taken_back(cli: Cli, folder: Path) -> N
         (["--accept", "clock-reset:P3/*", "--why", "x"], "no finding of 'clock-reset' about 'P3/*'"),
         (["--accept", "clock-rest:P2/*", "--why", "x"], "Did you mean 'clock-reset'"),
         (["--accept", "gaps:P2/*", "--why", "x"], "found nothing"),
-        (["--unaccept", "gaps:P2/*"], "Nothing that 'gaps' found was accepted"),
+        (["--unaccept", "gaps:P2/*"], "No finding of 'gaps' is accepted"),
         (["--only", "gap"], "Did you mean 'gaps'"),
         (["--limit", "duraton=0.3"], "Did you mean 'duration'"),
         (["--limit", "duration=much"], "give a name and a number"),

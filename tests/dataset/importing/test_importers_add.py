@@ -80,7 +80,7 @@ def test_what_cannot_be_added_is_refused(tmp_path: Path, session_writer: Writer)
     session_writer(tmp_path / "out")
     with pytest.raises(DatasetError, match="'plush-15', but that of the data set is 'accel-3'"):
         import_recordings(tmp_path / "out", tmp_path / "DS", add_to=True)
-    with pytest.raises(DatasetError, match="real toy and the source those of a virtual one"):
+    with pytest.raises(DatasetError, match="real toy, the source those of a virtual one"):
         import_recordings(tmp_path / "src", tmp_path / "DS", add_to=True, simulated=True)
     with pytest.raises(ConfigError, match="--add keeps the name"):
         import_recordings(tmp_path / "src", tmp_path / "DS", add_to=True, name="new")
