@@ -176,7 +176,7 @@ def test_a_full_disk(studio: Fixture, look: Fixture, tmp_path: Path, shots: Fixt
     resource.prlimit(server.process.pid, resource.RLIMIT_FSIZE, (stream.stat().st_size + 20_000, free[1]))
     showing(page, "stopped.")
     page.get_by_text("cannot be written any more").first.wait_for()
-    page.get_by_text("What was recorded until then is kept (2 recordings)").first.wait_for()
+    page.get_by_text("the session has stopped, with 2 recordings saved").first.wait_for()
     assert axe(page) == []
     shots(page, "record-full-disk")
     assert len(files(home)) == 2

@@ -60,7 +60,7 @@ def test_51_recordings_by_the_space_bar(studio: Fixture, look: Fixture, shots: F
                 page.get_by_role("button", name="Continue: S01/1").click()
                 page.wait_for_selector('[data-test="state-box"]')
                 connected(page)
-                assert "broken off" in marked(page, "notice").first.inner_text()
+                assert "interrupted" in marked(page, "notice").first.inner_text()
                 begin(page, number)
             page.keyboard.press("Space")
             showing(page, f"idle.{number + 1}.", "finished.")
