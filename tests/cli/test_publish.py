@@ -34,7 +34,7 @@ def test_from_refusal_to_a_valid_package(cli: Cli, dataset: Dataset, tmp_path: P
     assert (found["recordings"], found["subjects"], found["problems"]) == (30, 5, [])
     assert (dataset.path / "dataset.toml").read_bytes() == head, "nothing is written back unless asked"
     assert "The right" not in (out / "reidentification.md").read_text()
-    assert any("the title is the data set's name" in w for w in found["warnings"])
+    assert any("the published title is the data set's name" in w for w in found["warnings"])
     said = (out / "README.md").read_text()
     assert "`reidentification.md`" in said
     assert "a simple program names the right one of 5 people" in said

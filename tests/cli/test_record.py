@@ -211,7 +211,7 @@ def test_asked_to_end_while_recording(tmp_path: Path, pty_possible: None, name: 
     ("words", "said"),
     [
         (["--subject", "Anna Miller"], "never a name"),
-        ([], "Give --subject"),
+        ([], "give --subject"),
         (["--subject", "S01", "--protocol", "plush17"], "Did you mean 'plush-17'"),
         (["--subject", "S01", "--words", "chld"], "Did you mean 'child'"),
         (["--subject", "S01", "--session", "../x"], "no name for a session"),
