@@ -61,7 +61,7 @@ def test_export_verify_and_break(
 
     only(page, "host")
     marked(page, "verify").click()
-    marked(page, "verdict").wait_for(timeout=90_000)
+    marked(page, "verdict").wait_for(timeout=300_000)
     assert "✓ equal" in marked(page, "verdict").inner_text()
     assert "sanitizers" in marked(page, "runs").inner_text() and "clang" in marked(page, "runs").inner_text()
     assert "scenario" in marked(page, "streams").inner_text()
@@ -75,12 +75,12 @@ def test_export_verify_and_break(
     assert "changed since" in marked(page, "exports").inner_text(), "the old verdict is no longer shown as one"
     only(page, "cortex-m4")
     marked(page, "verify").click()
-    page.get_by_text("plush_model.c in").first.wait_for(timeout=90_000)
+    page.get_by_text("plush_model.c in").first.wait_for(timeout=300_000)
     assert "is not what this version of PlushSense writes" in marked(page, "ended").inner_text()
     marked(page, "proof").get_by_text("More settings").click()
     marked(page, "trust").click()
     marked(page, "verify").click()
-    page.get_by_text("✗ not equal").first.wait_for(timeout=90_000)
+    page.get_by_text("✗ not equal").first.wait_for(timeout=300_000)
     said = marked(page, "verdict").inner_text()
     assert "answers differ" in said and "On cortex-m4" in said and "arduino/PlushSense/src/plush_model.c" in said
     assert axe(page) == []
@@ -119,7 +119,7 @@ def test_each_refusal_is_a_sentence(studio: Fixture, look: Fixture, shots: Fixtu
     assert "train 5d1_4d3 with --padding stream" in marked(page, "bundle-cannot").inner_text()
     marked(page, "name").fill("mirror")
     marked(page, "do").click()
-    marked(page, "ended").wait_for(timeout=90_000)
+    marked(page, "ended").wait_for(timeout=300_000)
     assert "train 5d1_4d3 with --padding stream" in marked(page, "ended").inner_text()
     assert marked(page, "ended").get_attribute("role") == "alert"
     assert not (home / "exports" / "mirror").exists()
@@ -143,7 +143,7 @@ def test_each_refusal_is_a_sentence(studio: Fixture, look: Fixture, shots: Fixtu
     (home / "exports").write_text("")
     marked(page, "name").fill("nowhere")
     marked(page, "do").click()
-    page.get_by_text("cannot be created").first.wait_for(timeout=90_000)
+    page.get_by_text("cannot be created").first.wait_for(timeout=300_000)
     page.goto(f"{url}/export?name=nothing")
     connected(page)
     marked(page, "detail").get_by_text("There is no export").wait_for()
