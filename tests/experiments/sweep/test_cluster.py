@@ -12,6 +12,7 @@ from polars.testing import assert_frame_equal
 
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.experiments.sweep.run import sweep
+from plushsense.jobs.progress import JobProgress
 from plushsense.trials.plan import JOURNAL
 
 GRID: dict[str, Any] = {
@@ -23,53 +24,27 @@ GRID: dict[str, Any] = {
 
 
 class Killer:
-    """Kills the second node as soon as a training has told of its first epoch."""
+    """Kills the second node when a second training reports: each node runs one by then."""
 
     def __init__(self, cluster: Any) -> None:
         self.cluster, self.node = cluster, next(iter(cluster.worker_nodes))
         self.thread: threading.Thread | None = None
-        self.begun: list[str] = []
+        self.reported: set[str] = set()
 
-    def __enter__(self) -> Killer:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self.thread is not None:
-            self.thread.join(60)
-
-    def on_start(self, job: Any) -> None:
-        self.begun.append(job.id)
-        if len(set(self.begun)) > 2:
-            self.kill()  # where a busy machine was through with the first before the second began
-
-    def on_report(self, job: Any, message: Any) -> None:
-        # One training runs on each node by then.
-        if len(set(self.begun)) > 1:
-            self.kill()
-
-    def kill(self) -> None:
-        if self.thread is None:
+    def __call__(self, progress: JobProgress) -> None:
+        self.reported.add(progress.name)
+        if len(self.reported) > 1 and self.thread is None:
             self.thread = threading.Thread(target=self.cluster.remove_node, args=(self.node, False))
             self.thread.start()
-
-    def on_done(self, job: Any, result: Any, resumed: bool) -> None:
-        """Not of interest."""
-
-    def on_failed(self, job: Any, error: Exception) -> None:
-        raise error
 
 
 def test_a_node_lost_in_a_sweep_changes_nothing(two_nodes: Any, real_data: Path, tmp_path: Path) -> None:
     for name in ("DS", "whole"):
         import_recordings(real_data / "makeability-gestures", tmp_path / name, layout="accel-3")
-    killers: list[Killer] = []
-
-    def watch(*_: object) -> Killer:
-        killers.append(Killer(two_nodes))
-        return killers[0]
-
-    found = sweep(tmp_path / "DS", out=tmp_path / "out", cluster=two_nodes.address, table=watch, **GRID)
-    assert killers[0].thread is not None, "a node was to be killed in the middle"
+    killer = Killer(two_nodes)
+    found = sweep(tmp_path / "DS", out=tmp_path / "out", cluster=two_nodes.address, progress=killer, **GRID)
+    assert killer.thread is not None, "a node was to be killed in the middle"
+    killer.thread.join(60)
     assert found.summary["done"] == found.summary["trials"] == 8 and not found.summary["failed"]
     assert len(list((tmp_path / "DS" / "cache" / JOURNAL).glob("*.npz"))) == 4
     here = sweep(tmp_path / "whole", out=tmp_path / "other", workers=1, **GRID)

@@ -28,7 +28,7 @@ def test_a_sweeps_folder_makes_its_page(cli: Callable[..., Any], tmp_path: Path)
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["{none}"], "not a folder that sweep wrote, and --dataset is missing"),
+        (["{none}"], "not a folder written by sweep, and --dataset is missing"),
         (["{tmp}/x.html", "--dataset", "{none}", "--mlflow", "{none}"], "--page and --mlflow are for a sweep"),
         (["{sweep}", "--dataset", "{none}"], "is a sweep"),
         (["{sweep}", "--page", "{tmp}/x.docx"], "does not end in .html"),
