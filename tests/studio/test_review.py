@@ -483,7 +483,7 @@ def test_a_broken_data_set_is_a_sentence(waves: Path, studio: Fixture, look: Fix
     (torn / "marks.jsonl").write_text("[1]\n")
     browser = look()
     started = studio(home=waves.parents[1])
-    for name, said in (("broken", "dataset.toml"), ("torn", "line 1 is no mark")):
+    for name, said in (("broken", "dataset.toml"), ("torn", "line 1, what was given is [1]: accepted is a table")):
         page = browser.open(f"{started.url}/review?dataset=datasets/{name}")
         assert said in marked(page, "message").inner_text()
         assert axe(page) == []
