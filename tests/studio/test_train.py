@@ -97,7 +97,7 @@ def test_a_training_is_stopped_and_killed_and_ends_in_the_commands_bundle(
     # The curve begins with the first epoch, though three runs drew it.
     (job,) = (json.loads(path.read_text(encoding="utf-8")) for path in (home / "work").glob("*.json"))
     assert [r["epoch"] for r in job["reports"] if r["stage"] == "training" and "epoch" in r] == list(range(1, 46))
-    assert page.locator('[data-column="kind"]').get_by_text("training").count() == 2
+    page.locator('[data-column="kind"]').get_by_text("training").nth(1).wait_for()
     by_page = (home / "bundles" / "by page.plush").read_bytes()
     assert not list(kept.glob("[!.]*.npz"))
     out = home / "bundles" / "by command.plush"
