@@ -113,4 +113,4 @@ def test_without_a_mapping_the_people_are_asked_for(
     assert script.main([str(made / "archive"), "--out", str(tmp_path), "--quick"]) == 0
     assert "needs --subjects map.csv" in capsys.readouterr().out
     assert script.main([str(made / "nowhere"), "--out", str(tmp_path / "x")]) == 2
-    assert "There is no folder" in capsys.readouterr().err
+    assert "There is no " in capsys.readouterr().err

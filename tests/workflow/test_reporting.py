@@ -27,7 +27,7 @@ def test_pseudonymise(cli: Cli, dataset: Dataset, tmp_path: Path) -> None:
         "findings": [],
     }
     assert cli("info", tmp_path / "OUT", "--json").json["located_in_stream"] == 30
-    for key, said in ((tmp_path / "OUT" / "k.csv", "keep it elsewhere"), (words, "no key file")):
+    for key, said in ((tmp_path / "OUT" / "k.csv", "choose a place outside"), (words, "no key file")):
         ran = cli("pseudonymise", dataset.path, tmp_path / "OUT2", "--key", key)
         assert (ran.status, said in ran.err) == (2, True)
     assert cli("pseudonymise", dataset.path, tmp_path / "O", "--key", "k", "--words", tmp_path / "no").status == 2

@@ -310,7 +310,7 @@ def test_an_older_report_is_replaced_and_nothing_else_touched(tmp_path):
     thesis = tmp_path / "elsewhere" / "thesis-files"
     thesis.mkdir(parents=True)
     (thesis / "table-3.csv").write_text("mine")
-    with pytest.raises(ConfigError, match="exists and is not of a report"):
+    with pytest.raises(ConfigError, match="exists and is not the folder of a report"):
         write_report(folder, tmp_path / "elsewhere" / "thesis.html")
     assert (thesis / "table-3.csv").read_text() == "mine" and not (tmp_path / "elsewhere" / "thesis.html").exists()
     (folder / "report.html").write_text("my thesis")
