@@ -166,7 +166,7 @@ def test_a_toy_that_goes_away_and_comes_back(studio: Fixture, look: Fixture, hom
     assert not marked(page, "simulation").is_visible(), "nobody said that this port is a virtual toy"
     process.kill()
     process.wait(20.0)
-    marked(page, "state").get_by_text("No signal from the toy").wait_for(timeout=240_000)  # a busy browser lags
+    marked(page, "state").get_by_text("No signal from the toy").wait_for(timeout=240_000)
     marked(page, "message").wait_for()
     assert "away" in marked(page, "message").inner_text() or "closed" in marked(page, "message").inner_text()
     assert axe(page) == []

@@ -398,7 +398,7 @@ class Dataset:
 
 @dataclass(frozen=True)
 class PersonInfo:
-    """One person by code; unknown values are "", ``more`` holds columns that the user added."""
+    """What is known of a person, by code: unknown values are "", ``more`` holds columns that the user added."""
 
     subject: str
     age_group: str = ""

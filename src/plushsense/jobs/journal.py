@@ -50,7 +50,7 @@ class JobWork(Protocol):
 
 
 class JobEvent(NamedTuple):
-    """What an engine reports of a job: that it started (again), a message, its result, or its exception."""
+    """A report of an engine on a job: that it started (again), a message, its result, or its exception."""
 
     job: Job
     kind: Literal["started", "report", "done", "failed"]

@@ -61,7 +61,7 @@ class ReactionRule:
 
     @property
     def shows(self) -> bool:
-        """Whether it has eyes or a sound."""
+        """Whether the reaction has eyes or a sound."""
         return self.eyes != "off" or bool(self.sound)
 
 

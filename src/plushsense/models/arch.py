@@ -260,7 +260,7 @@ class Arch:
 
     @property
     def weight_shapes(self) -> dict[str, tuple[int, ...]]:
-        """Every tensor of the network by name: what a weights dict holds, and nothing else."""
+        """Shapes of all tensors of the network by name: the keys that a dict of weights must have, and no others."""
         shapes: dict[str, tuple[int, ...]] = {}
         for i, (layer, read) in enumerate(zip(self.layers, self.inputs, strict=True)):
             shapes[f"conv{i}.weight"] = (layer.filters, read, layer.kernel)

@@ -41,7 +41,7 @@ PASSES = 3
 
 
 class GridProblems(ConfigError):
-    """All problems of a grid at once: ``found``, one sentence each."""
+    """Error with all problems of a grid at once, one sentence each in ``found``."""
 
     def __init__(self, found: Sequence[str]) -> None:
         self.found = tuple(found)
@@ -202,7 +202,7 @@ class _Cut:
 
     @property
     def split(self) -> Split:
-        """How the windows are divided; ConfigError for an unknown split."""
+        """Split of the windows; ConfigError for an unknown one."""
         return parse_split(self.grid.split)
 
     @property

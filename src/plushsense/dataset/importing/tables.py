@@ -45,7 +45,7 @@ _BETWEEN = 0.05
 
 @dataclass(frozen=True)
 class LabelledSegment:
-    """One recording: rows ``start`` to ``stop`` of the session's frames."""
+    """A labelled part of a session: the rows ``start`` to ``stop`` of its frames."""
 
     label: str
     start: int

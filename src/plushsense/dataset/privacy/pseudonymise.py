@@ -139,7 +139,7 @@ def _refuse_places(folder: Path, dest: Path, key: Path) -> None:
 
 
 class _Pseudonymisation:
-    """One run: codes of all people, and each file in turn."""
+    """A run of `pseudonymise`: holds the codes of all people and rewrites the files one by one."""
 
     def __init__(
         self,

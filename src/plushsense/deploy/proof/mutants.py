@@ -55,7 +55,7 @@ _MOST_SHIFT = 30
 
 @dataclass(frozen=True)
 class Mutant:
-    """One mutant: the changed bytes of the model, or the changed C; the other is None."""
+    """A program with one planted fault: the changed bytes of the model, or the changed C; the other is None."""
 
     kind: Kind
     name: str

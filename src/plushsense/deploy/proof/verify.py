@@ -39,7 +39,7 @@ _ENCODING = "latin-1"  # reads any bytes
 
 @dataclass(frozen=True)
 class Setting:
-    """One way to compile, which is one row of the report.
+    """A compiler with its options: one row of the report.
 
     ``image``: the model is read from plush_model.bin and not compiled in; ``cpp``: the caller is C++, the library C.
     """

@@ -100,7 +100,7 @@ def hear(frames: Frames, model: Bundle | IntegerModel, heuristic: Heuristic | No
 
 @dataclass
 class _Spell:
-    """One event from its beginning to its end, with its ``gesture`` from ``named_s``."""
+    """An event from its beginning to its end; ``gesture`` is known from ``named_s`` on."""
 
     affect: str
     source: str

@@ -31,7 +31,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class GestureTrial:
-    """One gesture that somebody made; seconds since the stream's first frame.
+    """A gesture that a person made; times in seconds since the stream's first frame.
 
     The hand works from ``start_s`` to ``stop_s``; ``onset_s`` is when there is something to react to: the same, but
     of a virtual person's blow the blow itself.
@@ -46,7 +46,7 @@ class GestureTrial:
 
 @dataclass(frozen=True, eq=False)
 class Sitting:
-    """One person's session: the whole stream, and what was done in it, in order."""
+    """A session of one person: the whole stream and the gestures in it, in order."""
 
     who: str
     frames: Frames

@@ -219,7 +219,7 @@ def gesture_intervals(events: Sequence[ReportedEvent], gestures: GestureSet) -> 
 
 @dataclass
 class Quick:
-    """All that most tuning asks of a setting: gestures hit and events matched, of how many, in how many hours."""
+    """Counts for tuning: gestures hit and events matched, their totals, and the hours of the streams."""
 
     hits: int = 0
     truths: int = 0

@@ -184,7 +184,7 @@ def crossvalidated_streams(
 
 @dataclass(frozen=True)
 class _FoldWork:
-    """One fold as a job."""
+    """A job that trains and scores one fold."""
 
     fit: FitStreams
     settings: Settings

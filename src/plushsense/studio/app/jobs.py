@@ -58,7 +58,7 @@ class StudioJob:
 
 
 class Jobs:
-    """All jobs of a studio, stored in ``<workspace>/work/<id>.json``; `changed` is notified at every report.
+    """Jobs of a studio, stored in ``<workspace>/work/<id>.json``; `changed` is notified at every report.
 
     A job with ``dry`` in its spec is an estimate: it is not stored after its end.
     """

@@ -50,7 +50,7 @@ class _Layer:
 
 @dataclass
 class _Pass:
-    """What the forward pass of a layer keeps for the backward pass."""
+    """Values of a layer's forward pass that its backward pass needs."""
 
     w: Tensor
     mean: Tensor
