@@ -166,13 +166,33 @@ def test_a_toy_that_goes_away_and_comes_back(studio: Fixture, look: Fixture, hom
     assert not marked(page, "simulation").is_visible(), "nobody said that this port is a virtual toy"
     process.kill()
     process.wait(20.0)
-    marked(page, "state").get_by_text("No signal from the toy").wait_for(timeout=240_000)
+    marked(page, "state").get_by_text("No signal from the toy").wait_for()
     marked(page, "message").wait_for()
     assert "away" in marked(page, "message").inner_text() or "closed" in marked(page, "message").inner_text()
     assert axe(page) == []
     toy(int(address.rsplit(":", 1)[1]))
     marked(page, "state").get_by_text("Reading").wait_for()
     marked(page, "message").wait_for(state="detached")
+    assert browser.complaints == []
+
+
+def test_a_toy_that_goes_away_while_the_page_is_behind(studio: Fixture, look: Fixture, home: Path, toy: Fixture) -> None:
+    process, address = toy()
+    browser = look()
+    page = started(browser, studio("--device", address, home=home).url)
+    # A page that reports nothing is sent nothing after some messages. It reports nothing while it is hidden.
+    hide = "(on) => Object.defineProperty(document, 'hidden', {get: () => on, configurable: true})"
+    page.evaluate(hide, True)
+    page.wait_for_function(
+        "() => { const n = window.plushsenseLive.updates, now = performance.now();"
+        " if (n !== window.before) { window.before = n; window.at = now; } return now - window.at > 2000; }"
+    )
+    process.kill()
+    process.wait(20.0)
+    marked(page, "message").wait_for()
+    page.wait_for_timeout(1500)
+    page.evaluate(hide, False)
+    marked(page, "state").get_by_text("No signal from the toy").wait_for()
     assert browser.complaints == []
 
 

@@ -210,7 +210,11 @@ class LiveView(Element, component="live_view.js"):
         return scene
 
     def _seen(self, event: GenericEventArguments) -> None:
+        held = self._feed.holds
         self._feed.seen(int(event.args["n"]))
+        if held:
+            # A toy that went silent meanwhile causes no further change, so what was held back is sent now.
+            self.push()
 
     def _visible(self, event: GenericEventArguments) -> None:
         visible = bool(event.args["on"])
