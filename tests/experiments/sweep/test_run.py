@@ -24,6 +24,7 @@ from plushsense.jobs.journal import UNFINISHED
 from plushsense.jobs.progress import JobProgress
 from plushsense.trials import tables as sweep_tables
 from plushsense.trials.plan import JOURNAL
+from plushsense.trials.tables import TRIAL_COLUMNS, TrialColumn
 
 SMALL: dict[str, Any] = {
     "architectures": ("5_5d2", "9"),
@@ -292,6 +293,21 @@ def test_a_grid_file_from_the_command_line(cli: Any, dataset: Dataset, tmp_path:
     )
     assert people.status == 0 and "leaky" not in people.out.lower()
     assert "8 of 8 trainings" in people.err
+
+
+def test_a_new_column_is_a_function_and_a_line(
+    cli: Any, dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    depth = TrialColumn(int, lambda trial: len(trial.planned.trial.arch.filters), "convolutions", "count")
+    monkeypatch.setitem(TRIAL_COLUMNS, "depth", depth)
+    words = ("--architectures", "9,5_5d2", "--filters", "2,2", "--epochs", "1", "--batches", "4", "--classes", "shared")
+    ran = cli("sweep", dataset.path, *words, "--out", tmp_path / "out")
+    assert "convolutions" in ran.out
+    saved = json.loads((tmp_path / "out" / "sweep.json").read_text())
+    assert {row["depth"] for row in saved["best"]} == {1, 2}
+    assert "depth" in (tmp_path / "out" / "trials.csv").read_text().splitlines()[0]
+    assert cli("report", tmp_path / "out").status == 0
+    assert "Convolutions" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
 
 
 def test_scores_of_a_simulation_say_so(cli: Any, recordings: Path, tmp_path: Path) -> None:
