@@ -151,6 +151,15 @@ def _stray(token: bytes, shift_ms: int) -> bytes:
     return _RUN.sub(one, token)
 
 
+def _replaced(text: bytes, changes: Iterable[tuple[int, int, bytes]]) -> bytes:
+    """Replace pieces of a text: (start, end, new bytes) in ascending order."""
+    parts, done = [], 0
+    for start, end, new in changes:
+        parts += [text[done:start], new]
+        done = end
+    return b"".join([*parts, text[done:]])
+
+
 def shifted_rows(data: bytes, layout: Layout, columns: Collection[str], shift_ms: int, path: Path) -> bytes:
     """Return a raw file's bytes with the dates in ``columns`` (of ``host_ms``, ``device_ms``) shifted.
 
@@ -181,19 +190,17 @@ def shifted_rows(data: bytes, layout: Layout, columns: Collection[str], shift_ms
         text: bytes = match.group()
         well = usual.fullmatch(text)
         if well is not None and all(FIRST_MS <= int(well[g]) < _BEYOND_MS for g in groups):
-            out, done = [], 0
-            for g in groups:
-                out += [text[done : well.start(g)], str(int(well[g]) + shift_ms).encode()]
-                done = well.end(g)
-            return b"".join([*out, text[done:]])
+            return _replaced(text, ((*well.span(g), str(int(well[g]) + shift_ms).encode()) for g in groups))
         tokens = list(_TOKEN.finditer(text))
         whole = len(tokens) == len(keys) or (keys[-1] == "label" and len(tokens) > len(keys))
-        # From the right, so that the places of the other cells stay.
-        for i, token in reversed([*enumerate(tokens)]):
-            if i in at or not whole:
-                change = _cell if i in at else _stray
-                text = text[: token.start()] + change(token.group(), shift_ms) + text[token.end() :]
-        return text
+        return _replaced(
+            text,
+            (
+                (*token.span(), (_cell if i in at else _stray)(token.group(), shift_ms))
+                for i, token in enumerate(tokens)
+                if i in at or not whole
+            ),
+        )
 
     return data[:start] + _LINE.sub(line, data[start:])
 
