@@ -14,15 +14,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+import work
 
 from plushsense.core.errors import ConfigError, PlushSenseError, TrainingError
 from plushsense.jobs.journal import Journal
 from plushsense.jobs.pool import Job, run_jobs
-
-HERE = str(Path(__file__).parent)
-sys.path.insert(0, HERE)
-
-import work
 
 SMALL = 80 * 2**20
 

@@ -12,14 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import work
 
 from plushsense.core.errors import ConfigError, PlushSenseError, TrainingError
 from plushsense.jobs.journal import Journal
 from plushsense.jobs.pool import Job, run_jobs
 
 HERE = Path(__file__).parent
-
-import work
 
 JOBS = [Job(f"job{n}", n) for n in range(5)]
 
@@ -213,7 +212,10 @@ def test_ctrl_c_ends_the_workers_and_keeps_what_is_done(tmp_path: Path) -> None:
     script.write_text(SCRIPT.format(here=str(HERE), folder=str(tmp_path), workers=2))
     journal = Journal(tmp_path / "journal")
     # So many jobs that a busy machine, too, is still at work when the signal comes.
-    script.write_text(script.read_text().replace("range(6)", "range(200)"))
+    text = script.read_text().replace("range(6)", "range(200)")
+    # Programs that a shell starts in the background ignore the signal.
+    heed = "import signal\nif __name__ == '__main__':\n    signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    script.write_text(heed + text)
     run = subprocess.Popen([sys.executable, str(script)], start_new_session=True, stderr=subprocess.PIPE, text=True)
     until = time.monotonic() + 30
     while not journal.has("job0"):
