@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,10 @@ import pytest
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.deploy.emit import emit
 from plushsense.deploy.package import package
+from plushsense.deploy.proof.scenarios import Scenario, scenarios_of
 from plushsense.deploy.quantize import integer_model
 from plushsense.runtime.image import IntegerModel
+from plushsense.windows.features import Scaler
 from support.c_toy import C_FOLDER, TOY_C, compiled
 from support.exports import LAYOUTS, bundle_of, exported
 from support.requirements import missing
@@ -139,3 +141,19 @@ def packages(tmp_path_factory: pytest.TempPathFactory, needs: Callable[..., None
         emit(model, bundle, out, extras=[package])
         found[layout] = out, model
     return found
+
+
+@pytest.fixture(scope="session", autouse=True)
+def scenarios_made_once() -> Iterator[None]:
+    """Make the scenarios of a model once for all tests: they follow from the model and its scaler alone."""
+    made: dict[tuple[object, ...], list[Scenario]] = {}
+
+    def once(model: IntegerModel, scaler: Scaler, repeat: int = 0) -> list[Scenario]:
+        key = (model.to_bytes(), repr(model.gestures), scaler.offset.tobytes(), scaler.scale.tobytes(), repeat)
+        if key not in made:
+            made[key] = scenarios_of(model, scaler, repeat)
+        return made[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("plushsense.deploy.proof.vectors.scenarios_of", once)
+        yield

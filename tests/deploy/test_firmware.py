@@ -23,7 +23,7 @@ from plushsense.devices.wire import LineParser, format_line
 from plushsense.runtime.image import IntegerModel
 from plushsense.windows.features import Scaler
 from support.exports import LAYOUTS, bundle_of
-from support.virtual_boards import BUILDS, SECONDS, WARNINGS, arduino, frames_of, idf, play, run, told
+from support.virtual_boards import BUILDS, SECONDS, WARNINGS, arduino, compiled, frames_of, idf, play, run, told
 
 Packages = dict[str, tuple[Path, IntegerModel]]
 
@@ -108,9 +108,8 @@ def test_a_damaged_model_blinks_and_the_lines_go_on(packages: Packages, tmp_path
 
 def test_clang_agrees(packages: Packages, tmp_path: Path) -> None:
     for layout in LAYOUTS:
-        (tmp_path / layout).mkdir()
         for sensors in (0, 1, 2):
-            arduino(packages[layout][0], tmp_path / layout, f"SENSORS={sensors}", compiler=("clang", "clang++"))
+            arduino(packages[layout][0], tmp_path, f"SENSORS={sensors}", compiler=("clang", "clang++"))
             idf(packages[layout][0], tmp_path, f"SENSORS={sensors}", compiler="clang")
 
 
@@ -135,7 +134,7 @@ def test_the_sources_compile_for_the_chip(
         out = packages[layout][0]
         for source in [*(out / ARDUINO / "src").glob("*.c"), *(out / SKETCH).glob("*.c")]:
             words = ["-std=c99", "-Wpedantic", "-Wconversion", *WARNINGS, "-O2", f"-I{out / ARDUINO / 'src'}"]
-            run(*target, *own, *words, "-c", source, "-o", tmp_path / "x.o")
+            compiled(source, *target, *own, *words)
 
 
 def test_noise_is_read_as_the_computer_reads_it(packages: Packages, tmp_path: Path, c_compiler: str) -> None:

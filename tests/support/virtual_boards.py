@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import subprocess
+import tempfile
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -24,14 +26,26 @@ def run(*words: object) -> None:
     assert done.returncode == 0, done.stderr
 
 
+_OBJECTS = tempfile.TemporaryDirectory(prefix="plushsense-objects-")
+
+
+def compiled(source: Path, *words: object) -> Path:
+    """Return the object file of a source. Nothing is compiled twice that is the same after the preprocessor."""
+    command = [str(w) for w in words]
+    text = subprocess.run([*command, "-E", "-P", str(source)], capture_output=True, check=True).stdout
+    flags = [w for w in command if not w.startswith(("-I", "-D"))]
+    built = Path(_OBJECTS.name) / f"{sha256(repr(flags).encode() + text).hexdigest()}.o"
+    if not built.exists():
+        run(*words, "-c", source, "-o", built)
+    return built
+
+
 def arduino(out: Path, to: Path, *defines: str, compiler: tuple[str, str] = ("gcc", "g++")) -> Path:
     """PlushToy and the library, built for the made-up Arduino."""
     src, sketch, program = out / ARDUINO / "src", out / SKETCH, to / "toy"
     sources = [*sorted(src.glob("*.c")), *sorted(sketch.glob("*.c"))]
-    objects = [to / f"{source.stem}.o" for source in sources]
-    for source, built in zip(sources, objects, strict=True):
-        if not built.exists():
-            run(compiler[0], "-std=c99", "-Wpedantic", *WARNINGS, "-O1", f"-I{src}", "-c", source, "-o", built)
+    words: list[object] = [compiler[0], "-std=c99", "-Wpedantic", *WARNINGS, "-O1", f"-I{src}"]
+    objects = [compiled(source, *words) for source in sources]
     # The Arduino IDE takes a sketch for C++ and puts Arduino.h before it.
     includes = [f"-I{p}" for p in (BOARDS / "arduino", src, sketch)]
     esp32 = ["-DARDUINO_ARCH_ESP32"]
@@ -46,8 +60,8 @@ def idf(out: Path, to: Path, *defines: str, compiler: str = "gcc") -> Path:
     for folder in (out / IDF, out / IDF_EXAMPLE / "main"):
         sources += [folder / name for name in re.findall(r'"([^"]+\.c)"', (folder / "CMakeLists.txt").read_text())]
     includes = [f"-I{p}" for p in (BOARDS / "idf", out / IDF / "include")]
-    words = [compiler, "-std=gnu17", *WARNINGS, "-O1", *(f"-D{d}" for d in defines), *includes]
-    run(*words, *sources, BOARDS / "idf" / "run.c", "-o", to / "toy")
+    words: list[object] = [compiler, "-std=gnu17", *WARNINGS, "-O1", *(f"-D{d}" for d in defines), *includes]
+    run(compiler, *(compiled(source, *words) for source in [*sources, BOARDS / "idf" / "run.c"]), "-o", to / "toy")
     return to / "toy"
 
 

@@ -14,7 +14,8 @@ import sys
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache as cached
+from hashlib import sha256
 from pathlib import Path
 
 from plushsense.core.errors import BuildError, ConfigError, ProgramError, ToolError, check_known
@@ -133,12 +134,13 @@ def build(
     blobs: Mapping[str, Path] | None = None,
     cc: str | None = None,
     flags: Sequence[str] = (),
+    cache: Path | None = None,
 ) -> Program:
     """Build a program from C (or assembly) sources, one of which has ``main``, in ``out_dir``.
 
     ``target.h`` is on the include path. Each file of ``blobs`` becomes bytes from the symbol NAME to NAME_end
     (``extern const uint8_t NAME[], NAME_end[]``), at a multiple of 16. ``flags`` are for the sources, not for the
-    runtime, and for linking.
+    runtime, and for linking. With the folder ``cache``, a source that was compiled before is not compiled again.
 
     Raises:
         ToolError: when a compiler or emulator is missing.
@@ -149,14 +151,21 @@ def build(
     compiler = cc or machine.compiler
     out_dir = Path(out_dir).resolve()
     out_dir.mkdir(parents=True, exist_ok=True)
-    own = [optimise, *flags, *(f"-I{Path(p).resolve()}" for p in include)]
-    own += [f"-D{name}={value}" for name, value in (defines or {}).items()]
+    included = [f"-I{folder.resolve()}" for folder in include]
+    own = [optimise, *flags, *(f"-D{name}={value}" for name, value in (defines or {}).items())]
     with tempfile.TemporaryDirectory(prefix="plushsense-", dir=out_dir) as work:
         objects = []
         for n, source in enumerate(sources):
-            objects.append(out_dir / f"{n}-{Path(source).stem}.o")
-            command = [compiler, *machine.flags, f"-I{RUNTIME}", *own, "-c", str(Path(source).resolve())]
-            _compile([*command, "-o", str(objects[-1])], Path(work), Path(source).name)
+            compiling = [compiler, *machine.flags, *own]
+            objects.append(
+                cache / _object_name(source, compiling, include) if cache else out_dir / f"{n}-{source.stem}.o"
+            )
+            if cache and objects[-1].exists():
+                continue
+            command = [*compiling, f"-I{RUNTIME}", *included, "-c", str(source.resolve())]
+            made = Path(work) / "made.o"
+            _compile([*command, "-o", str(made)], Path(work), source.name)
+            made.replace(objects[-1])
         around = [str(RUNTIME / name) for name in machine.runtime]
         if blobs:
             paths = {name: str(Path(path).resolve()) for name, path in blobs.items()}
@@ -173,6 +182,15 @@ def build(
         command = [compiler, *machine.flags, optimise, *flags, *trim, *linked, "-o", str(file), *machine.link]
         _compile(command, Path(work), "the program")
     return Program(machine, file, tuple(objects))
+
+
+def _object_name(source: Path, command: Sequence[str], include: Iterable[Path]) -> str:
+    """Return a file name for the object of a source: the same for the same compiler, flags, source and headers."""
+    headers = sorted(header for folder in include for header in folder.glob("*.h"))
+    key = sha256(repr(command).encode())
+    for path in (source, *headers):
+        key.update(path.read_bytes())
+    return f"{key.hexdigest()}.o"
 
 
 def tool(target: str, name: str) -> str:
@@ -213,6 +231,6 @@ def _error_line(output: str) -> str:
     return (matching or lines[-1:] or ["no output"])[0]
 
 
-@cache
+@cached
 def _finds(compiler: str, file: str) -> bool:
     return Path(tool_output([compiler, f"-print-file-name={file}"]).strip()).is_absolute()

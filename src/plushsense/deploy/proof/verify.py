@@ -306,7 +306,8 @@ class _Runner:
     """Compiles and runs the C of an export in a work folder; programs may run at the same time."""
 
     def __init__(self, export: Export, work: Path) -> None:
-        self.export, self.work = export, work
+        self.export, self.work, self.objects = export, work, work / "objects"
+        self.objects.mkdir()
         self.code = export.code(work / "code")
 
     def write_cases(self, stream: Stream) -> Cases:
@@ -375,9 +376,6 @@ class _Runner:
         labels = self.export.labels
         where = f"On {setting.target} ({setting.compiler} {setting.options}), {stream[0].name}"
         expected = np.concatenate([v.answers for v in stream])
-        # A copy, because the compiler would find PlushSense's own plushsense.h beside the original first.
-        harness = out / ("harness.cpp" if setting.cpp else "harness.c")
-        shutil.copyfile(HARNESS, harness)
         both = both and setting.image
         defines = {
             "PLUSH_HARNESS_CHANNELS": stream[0].frames.shape[1] - 1,
@@ -386,16 +384,21 @@ class _Runner:
             **({"PLUSH_HARNESS_IMAGE": 1} if setting.image else {}),
             **({"PLUSH_HARNESS_BOTH": 1} if both else {}),
         }
+        # A copy, because the compiler would find PlushSense's own plushsense.h beside the original first. Definitions
+        # stand in it, so that the other sources are compiled once for all streams.
+        harness = out / ("harness.cpp" if setting.cpp else "harness.c")
+        lines = [f"#define {name} {value}" for name, value in defines.items()]
+        harness.write_text("\n".join([*lines, "#line 1", HARNESS.read_text(encoding="utf-8")]), encoding="utf-8")
         program = build(
             setting.target,
             [code / LIBRARY[1], harness, *([code / MODEL[1]] if both or not setting.image else [])],
             out,
             include=[code],
-            defines=defines,
             optimise=setting.optimise,
             blobs={"cases": path, **({"image": code / IMAGE} if setting.image else {})},
             cc=setting.cc,
             flags=setting.flags,
+            cache=self.objects,
         )
         try:
             got = program.run(timeout_s=60 + 0.02 * sum(len(v.frames) for v in stream))
