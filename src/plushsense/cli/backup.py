@@ -10,9 +10,10 @@ from plushsense.jobs.progress import ProgressReporter
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("dataset", metavar="DATASET", nargs="?", help="data set folder")
-    parser.add_argument("file", metavar="FILE", nargs="?", help="new zip file")
-    parser.add_argument("--check", metavar="FILE", help="check that a backup is complete, and write nothing")
+    add = parser.add_argument
+    add("dataset", metavar="DATASET", nargs="?", help="data set folder")
+    add("file", metavar="FILE", nargs="?", help="new zip file")
+    add("--check", metavar="FILE", help="check that a backup is complete, and write nothing")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -11,27 +11,28 @@ from plushsense.cli.settings import add_out, add_settings, add_work, listed, rep
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("dataset", metavar="DATASET", help="data set folder")
-    parser.add_argument(
+    add = parser.add_argument
+    add("dataset", metavar="DATASET", help="data set folder")
+    add(
         "--split",
         default="leave-one-subject-out,windows:5",
         metavar="SPLIT,...",
         help="splits to compare, as for evaluate (default: leave-one-subject-out,windows:5, the second leaky)",
     )
-    parser.add_argument(
+    add(
         "--models",
         default="all",
         metavar="NAME,...",
         help="all (default), classical, quick, or names: forest, extra-trees, knn, subspace-knn, cubic-svm, rbf-svm, "
         "tree, boosting, mlp, lstm, bilstm, network (ours, see --arch), minirocket, multirocket-hydra (extra rocket)",
     )
-    parser.add_argument(
+    add(
         "--features",
         default="statistics,flattened",
         metavar="NAME,...",
         help="input of classical models: statistics (8 a channel), flattened (all samples), or both (default)",
     )
-    parser.add_argument("--pca", default="both", help="PCA for classical models: both (default), no or yes")
+    add("--pca", default="both", help="PCA for classical models: both (default), no or yes")
     add_work(parser, "folds")
     add_out(
         parser,
@@ -48,8 +49,8 @@ def run(args: argparse.Namespace) -> int:
 
     config = settings(args, workers=args.workers)
     dataset = open_dataset(args.dataset)
-    choice: dict[str, Any] = {"splits": listed(args.split), "models": listed(args.models)}
-    choice |= {"features": listed(args.features), "pca": args.pca}
+    choice: dict[str, Any] = {"splits": listed(args.split), "pca": args.pca}
+    choice |= {"models": listed(args.models), "features": listed(args.features)}
     name = f"baselines_{comparison_id(dataset, config, **choice)[:8]}"
     out = Path(args.out) if args.out else dataset.path / "evaluations" / name
     result = baselines(

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from plushsense.cli.output import emit, say
-from plushsense.cli.settings import listed
+from plushsense.cli.settings import listed, options
 from plushsense.core.errors import ConfigError
 from plushsense.jobs.progress import ProgressReporter
 
@@ -54,12 +54,7 @@ def run(args: argparse.Namespace) -> int:
         check_page_path(args.report)
     result, marked = decide(
         args.dataset,
-        accept=args.accept,
-        unaccept=args.unaccept,
-        exclude=args.exclude,
-        include=args.include,
-        why=args.why,
-        who=args.who,
+        **options(args, "accept", "unaccept", "exclude", "include", "why", "who"),
         only=only,
         limits=_limits(args.limit),
         progress=ProgressReporter("checking"),

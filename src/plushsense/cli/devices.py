@@ -7,25 +7,20 @@ import json
 from pathlib import Path
 
 from plushsense.cli.output import emit, say, table
-from plushsense.cli.settings import listed, report_stages
+from plushsense.cli.settings import listed, options, report_stages
 from plushsense.core.errors import ConfigError
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--scan-s",
-        type=float,
-        default=3.0,
-        metavar="S",
-        help="seconds to search for Bluetooth and LSL devices (3)",
-    )
-    parser.add_argument(
+    add = parser.add_argument
+    add("--scan-s", type=float, default=3.0, metavar="S", help="seconds to search for Bluetooth and LSL devices (3)")
+    add(
         "--lsl-out",
         metavar="URL",
         help="publish this toy as an LSL stream until Ctrl-C instead, and reconnect when it disappears",
     )
-    parser.add_argument("--lsl-name", metavar="NAME", help="name of that stream (default: PlushSense)")
-    parser.add_argument("--layout", metavar="NAME", help="layout of that toy: name or TOML file (default: plush-15)")
+    add("--lsl-name", metavar="NAME", help="name of that stream (default: PlushSense)")
+    add("--layout", metavar="NAME", help="layout of that toy: name or TOML file (default: plush-15)")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -84,13 +79,7 @@ def add_toy(parser: argparse.ArgumentParser) -> None:
         help="perform the gestures that a recorder prompts: the session.jsonl of `plushsense record`, which need not "
         "exist yet (default: independent)",
     )
-    add(
-        "--seconds",
-        type=float,
-        default=0.0,
-        metavar="S",
-        help="stop after this much of the toy's time (0: never)",
-    )
+    add("--seconds", type=float, default=0.0, metavar="S", help="stop after this much of the toy's time (0: never)")
     add("--truth", metavar="FILE", help="append the performed gestures as JSON lines")
 
 
@@ -159,10 +148,7 @@ def run_simulate(args: argparse.Namespace) -> int:
 
     summary = simulate(
         args.out,
-        people=args.people,
-        repetitions=args.repetitions,
-        seed=args.seed,
-        dataset=args.dataset,
+        **options(args, "people", "repetitions", "seed", "dataset"),
         progress=report_stages(),
     )
     emit(

@@ -12,14 +12,15 @@ from plushsense.workflow.reporting import name_of
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("dataset", metavar="DATASET", help="data set folder")
-    parser.add_argument(
+    add = parser.add_argument
+    add("dataset", metavar="DATASET", help="data set folder")
+    add(
         "--split",
         metavar="SPLIT",
         help="leave-one-subject-out (default), by-subject:K or by-recording:K for K folds; leaky, as in the paper: "
         "windows:K, windows:holdout",
     )
-    parser.add_argument(
+    add(
         "--train-context",
         metavar="CONTEXT",
         help="context of the training windows: stream, loop or anywhere (default: as --context)",
@@ -31,7 +32,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         "in DATASET/evaluations/, named by settings and data",
         "an evaluation of other settings or data",
     )
-    parser.add_argument("--int8", action="store_true", help="also score each fold's network deployed in 8 bits")
+    add("--int8", action="store_true", help="also score each fold's network deployed in 8 bits")
     add_settings(parser)
 
 

@@ -30,15 +30,16 @@ _STAGES = {
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("bundle", metavar="BUNDLE", help=".plush bundle, trained with padding stream and norm batch")
-    parser.add_argument("out", metavar="OUT", help="new or empty folder")
-    parser.add_argument(
+    add = parser.add_argument
+    add("bundle", metavar="BUNDLE", help=".plush bundle, trained with padding stream and norm batch")
+    add("out", metavar="OUT", help="new or empty folder")
+    add(
         "--dataset",
         metavar="DS",
         help="data set that it was trained on: calibrate on the windows of its training people (default: use the "
         "calibration in the bundle)",
     )
-    parser.add_argument(
+    add(
         "--also",
         default="",
         metavar="A,B",
@@ -100,13 +101,7 @@ def add_verify(parser: argparse.ArgumentParser) -> None:
     _add_targets(parser, ", ".join(TARGETS), "all with installed compilers and emulators")
     add = parser.add_argument
     add("--dataset", metavar="DS", help="also stream these recordings through the C; nothing of them is stored")
-    add(
-        "--subject",
-        metavar="CODE",
-        action="append",
-        default=[],
-        help="only these people of DS, joined by commas",
-    )
+    add("--subject", metavar="CODE", action="append", default=[], help="only these people of DS, joined by commas")
     add(
         "--samples",
         metavar="N",

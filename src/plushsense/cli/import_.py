@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from plushsense.cli.output import emit, say
+from plushsense.cli.settings import options
 from plushsense.core.errors import ConfigError
 from plushsense.jobs.progress import ProgressReporter
 
@@ -75,15 +76,9 @@ def run(args: argparse.Namespace) -> int:
     done = import_recordings(
         args.source,
         args.dest,
-        layout=args.layout,
-        gestures=args.gestures,
-        subjects=args.subjects,
-        name=args.name,
-        licence=args.licence,
-        consent=args.consent,
+        **options(args, "layout", "gestures", "subjects", "name", "licence", "consent", "people"),
         progress=ProgressReporter("reading"),
         add_to=args.add,
-        people=args.people,
         columns=_columns(args.column),
         limits=None if args.max_gb is None else UnpackLimits(total_bytes=_whole_bytes(args.max_gb)),
     )

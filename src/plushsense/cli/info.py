@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from plushsense.cli.output import emit, table
+from plushsense.cli.settings import options
 
 if TYPE_CHECKING:
     from plushsense.dataset.statistics import Duration, SummaryStatistics
@@ -54,11 +55,10 @@ def _bundle(args: argparse.Namespace) -> int:
 
 
 def add_stats(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("dataset", metavar="DATASET", help="data set folder")
-    parser.add_argument(
-        "--by", metavar="COLUMN", help="group by subject, age_group, gender or another column of subjects.csv"
-    )
-    parser.add_argument("--channels", action="store_true", help="add mean and standard deviation of every channel")
+    add = parser.add_argument
+    add("dataset", metavar="DATASET", help="data set folder")
+    add("--by", metavar="COLUMN", help="group by subject, age_group, gender or another column of subjects.csv")
+    add("--channels", action="store_true", help="add mean and standard deviation of every channel")
 
 
 def run_stats(args: argparse.Namespace) -> int:
@@ -114,19 +114,20 @@ def _duration_row(d: Duration, grouped: bool, after: bool) -> tuple[object, ...]
 
 
 def add_arch(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
+    add = parser.add_argument
+    add(
         "spec",
         metavar="SPEC",
         help="architecture: kernel lengths in samples, joined by _, dilations after d (14d1_39d2_41d4)",
     )
-    parser.add_argument("--filters", required=True, metavar="N,N,...", help="filters of each layer, such as 8,12,16")
-    parser.add_argument("--padding", default="stream", help="stream (default), causal or mirror")
-    parser.add_argument("--norm", default="batch", help="batch (default) or layer")
-    parser.add_argument("--channels", type=int, default=11, metavar="N", help="number of input channels (11)")
-    parser.add_argument("--classes", type=int, default=18, metavar="N", help="number of classes (18)")
-    parser.add_argument("--window", type=int, default=250, metavar="N", help="window in samples (250: 2.5 s at 100 Hz)")
-    parser.add_argument("--step", type=int, default=5, metavar="N", help="samples between two live decisions (5)")
-    parser.add_argument(
+    add("--filters", required=True, metavar="N,N,...", help="filters of each layer, such as 8,12,16")
+    add("--padding", default="stream", help="stream (default), causal or mirror")
+    add("--norm", default="batch", help="batch (default) or layer")
+    add("--channels", type=int, default=11, metavar="N", help="number of input channels (11)")
+    add("--classes", type=int, default=18, metavar="N", help="number of classes (18)")
+    add("--window", type=int, default=250, metavar="N", help="window in samples (250: 2.5 s at 100 Hz)")
+    add("--step", type=int, default=5, metavar="N", help="samples between two live decisions (5)")
+    add(
         "--pool",
         type=int,
         metavar="N",
@@ -141,13 +142,7 @@ def run_arch(args: argparse.Namespace) -> int:
     arch = Arch.parse(
         args.spec,
         args.filters,
-        channels=args.channels,
-        classes=args.classes,
-        padding=args.padding,
-        norm=args.norm,
-        window=args.window,
-        step=args.step,
-        pool=args.pool,
+        **options(args, "channels", "classes", "padding", "norm", "window", "step", "pool"),
     )
     printed = f" (the paper's Table 3 prints {arch.table3})" if arch.table3 else ""
     again = "" if arch.padding == "stream" else "; this padding recomputes the window at every step"

@@ -15,7 +15,7 @@ import sys
 from collections.abc import Callable, Sequence
 
 from plushsense.cli.output import Parser, say, utf8
-from plushsense.core.errors import PlushSenseError, nearest
+from plushsense.core.errors import BadInput, PlushSenseError, check_known
 from plushsense.core.version import __version__
 from plushsense.jobs.progress import close_active
 
@@ -89,8 +89,7 @@ def load_verb(verb: str) -> tuple[Callable[[argparse.ArgumentParser], None], Cal
     Raises:
         PlushSenseError: for an unknown verb.
     """
-    if verb not in VERBS:
-        raise PlushSenseError(f"Unknown verb '{verb}': accepted are {', '.join(VERBS)}.{nearest(verb, VERBS)}")
+    check_known(verb, VERBS, "verb", BadInput)
     module_name, colon, name = VERBS[verb][0].partition(":")
     module = importlib.import_module(f"plushsense.cli.{module_name}")
     suffix = f"_{name}" if colon else ""

@@ -18,16 +18,17 @@ _MOST_FILES = 10
 
 
 def add_pseudonymise(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("dataset", metavar="DATASET", help="data set folder; it is not changed")
-    parser.add_argument("out", metavar="OUT", help="new or empty folder for the copy")
-    parser.add_argument(
+    add = parser.add_argument
+    add("dataset", metavar="DATASET", help="data set folder; it is not changed")
+    add("out", metavar="OUT", help="new or empty folder for the copy")
+    add(
         "--key",
         required=True,
         metavar="FILE",
         help="CSV file of people and codes, outside of both data sets; an existing one is extended",
     )
-    parser.add_argument("--words", metavar="FILE", help="file of words, one a line, that the copy must not contain")
-    parser.add_argument("--drop-notes", action="store_true", help="leave out notes and reasons in free text")
+    add("--words", metavar="FILE", help="file of words, one a line, that the copy must not contain")
+    add("--drop-notes", action="store_true", help="leave out notes and reasons in free text")
 
 
 def run_pseudonymise(args: argparse.Namespace) -> int:
@@ -63,10 +64,11 @@ def run_pseudonymise(args: argparse.Namespace) -> int:
 
 
 def add_forget(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("dataset", metavar="DATASET", help="data set folder")
-    parser.add_argument("subject", metavar="SUBJECT", help="code of the person")
-    parser.add_argument("--yes", action="store_true", help="remove; without it only list what would go (status 1)")
-    parser.add_argument(
+    add = parser.add_argument
+    add("dataset", metavar="DATASET", help="data set folder")
+    add("subject", metavar="SUBJECT", help="code of the person")
+    add("--yes", action="store_true", help="remove; without it only list what would go (status 1)")
+    add(
         "--bundles",
         action="append",
         default=[],

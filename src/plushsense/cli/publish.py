@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from plushsense.cli.output import emit, say
-from plushsense.cli.settings import listed, report_stages
+from plushsense.cli.settings import listed, options, report_stages
 from plushsense.core.errors import ConfigError
 
 _MOST_PROBLEMS = 20
@@ -58,18 +58,11 @@ def _publish(args: argparse.Namespace) -> int:
     done = publish_dataset(
         args.dataset,
         args.out,
-        licence=args.licence,
-        contact=args.contact,
-        consent=args.consent,
-        save=args.save,
+        **options(args, "licence", "contact", "consent", "save", "key", "bids", "seed", "thorough"),
         streams=not args.no_streams,
         excluded=args.allow_excluded,
         columns=tuple(listed(args.allow_columns)),
-        key=args.key,
-        bids=args.bids,
         reidentification=not args.no_reidentification,
-        seed=args.seed,
-        thorough=args.thorough,
         progress=report_stages(),
     )
     result = done.to_dict()

@@ -53,12 +53,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     add("--words", metavar="NAME", help="wording of the prompts, such as child (default: default)")
     add("--age-group", default="", metavar="WORD", help="such as child, teen, adult (default: none)")
     add("--gender", default="", metavar="WORD", help="as the person says (default: none)")
-    add(
-        "--consent",
-        default="",
-        metavar="REF",
-        help="number of the signed consent form (required to publish)",
-    )
+    add("--consent", default="", metavar="REF", help="number of the signed consent form (required to publish)")
     add("--layout", metavar="NAME", help="firmware of the toy: plush-15 (default), plush-14, or a TOML file")
     add("--speed", type=float, metavar="X", help="speed of a virtual toy relative to real time (1)")
     add(

@@ -89,19 +89,31 @@ _GRID_OPTIONS: dict[str, tuple[str | None, str]] = {
 
 def add_grid(parser: argparse.ArgumentParser, defaults: Mapping[str, str]) -> None:
     """Add the options that change a grid; ``defaults`` says what applies without an option, else it is the grid's."""
+    add = parser.add_argument
     for key, (metavar, words) in _GRID_OPTIONS.items():
         default = defaults.get(key, "the grid's")
-        parser.add_argument(f"--{key}", metavar=metavar, help=f"{words} (default: {default})")
+        add(f"--{key}", metavar=metavar, help=f"{words} (default: {default})")
     default = defaults.get("seeds", "the grid's")
-    parser.add_argument("--seeds", type=int, metavar="N", help=f"seeds 0 to N - 1 (default: {default})")
-    parser.add_argument("--threads", type=int, metavar="N", help="threads of a training, part of its identity (1)")
+    add("--seeds", type=int, metavar="N", help=f"seeds 0 to N - 1 (default: {default})")
+    add("--threads", type=int, metavar="N", help="threads of a training, part of its identity (1)")
 
 
 def grid_changes(args: argparse.Namespace, *more: str) -> dict[str, Any]:
     """Return the keys of a grid that options change, and the options ``more`` of the verb."""
-    changes: dict[str, Any] = {key: getattr(args, key) for key in (*_GRID_OPTIONS, "threads", *more)}
     # An empty tuple is reported with the other problems of the grid.
-    return changes | {"seeds": None if args.seeds is None else tuple(range(args.seeds))}
+    return options(args, *_GRID_OPTIONS, "threads", *more) | {
+        "seeds": None if args.seeds is None else tuple(range(args.seeds))
+    }
+
+
+def work_options(args: argparse.Namespace) -> dict[str, Any]:
+    """Return the options of `add_out` and `add_work` as a sweep and a search take them."""
+    return {"overwrite": args.force, "workers": args.workers or 0} | options(args, "out", "cluster")
+
+
+def options(args: argparse.Namespace, *names: str) -> dict[str, Any]:
+    """Return the values of some options by name, for a library function that has parameters of these names."""
+    return {name: getattr(args, name) for name in names}
 
 
 def marks(result: Mapping[str, Any]) -> list[str]:
@@ -120,16 +132,9 @@ def settings(args: argparse.Namespace, **evaluation: Any) -> RunConfig:
 
     return resolve(
         args.config,
-        windows={"context": args.context},
-        model={"arch": args.arch, "filters": args.filters, "padding": args.padding, "norm": args.norm}
-        | {"pool_s": args.pool_s},
-        training={
-            "preset": args.preset,
-            "epochs": args.epochs,
-            "batch": args.batch,
-            "seed": args.seed,
-            "device": args.device,
-        },
+        windows=options(args, "context"),
+        model=options(args, "arch", "filters", "padding", "norm", "pool_s"),
+        training=options(args, "preset", "epochs", "batch", "seed", "device"),
         evaluation={"classes": args.classes, "seed": args.seed, **evaluation},
     )
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from plushsense.cli.output import emit, say, table, warn
+from plushsense.cli.output import emit, figure, say, table, warn
 from plushsense.cli.settings import add_settings, add_workers, listed, marks, report_jobs, settings
 from plushsense.core.errors import ConfigError
 
@@ -95,8 +96,7 @@ def _run_split(args: argparse.Namespace) -> int:
     return 0
 
 
-def _number(value: float | None, digits: int = 2) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
+_number = partial(figure, digits=2)
 
 
 def _rate(value: float | None) -> str:

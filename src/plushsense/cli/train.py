@@ -8,22 +8,23 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.cli.output import emit, figure, warn
-from plushsense.cli.settings import add_settings, report_epochs, settings
+from plushsense.cli.settings import add_settings, options, report_epochs, settings
 from plushsense.core.errors import ConfigError
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("dataset", metavar="DATASET", help="data set folder")
-    parser.add_argument("--out", metavar="FILE", default="model.plush", help="bundle to write (model.plush)")
-    parser.add_argument("--force", action="store_true", help="replace an existing bundle")
-    parser.add_argument(
+    add = parser.add_argument
+    add("dataset", metavar="DATASET", help="data set folder")
+    add("--out", metavar="FILE", default="model.plush", help="bundle to write (model.plush)")
+    add("--force", action="store_true", help="replace an existing bundle")
+    add(
         "--quantize-aware",
         type=int,
         default=0,
         metavar="EPOCHS",
         help="fine-tune for 8 bits for this many epochs after the training (0); training reports where it would help",
     )
-    parser.add_argument(
+    add(
         "--no-fit-decisions",
         dest="fit_decisions",
         action="store_false",
@@ -40,8 +41,7 @@ def run(args: argparse.Namespace) -> int:
     done = train(
         args.dataset,
         settings(args),
-        quantize_aware=args.quantize_aware,
-        fit_decisions=args.fit_decisions,
+        **options(args, "quantize_aware", "fit_decisions"),
         journal=unfinished(args.dataset),
         progress=report_epochs(),
         warn=warn,

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from plushsense.cli.output import emit, say, table
+from plushsense.cli.settings import options
 from plushsense.jobs.progress import ProgressReporter
 
 if TYPE_CHECKING:
@@ -19,12 +20,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     repeated: dict[str, Any] = {"action": "append", "default": []}
     add = parser.add_argument
     add("dataset", metavar="DATASET", help="data set folder")
-    add(
-        "--only",
-        metavar="GLOB",
-        default="*",
-        help="recordings to list, plot and accept: 'P01/*' (default: all)",
-    )
+    add("--only", metavar="GLOB", default="*", help="recordings to list, plot and accept: 'P01/*' (default: all)")
     add("--accept", **repeated, metavar="ID|GLOB", help="mark the suggestions for these recordings; can be repeated")
     add("--accept-above", type=float, metavar="C", help="mark all suggestions of at least this confidence, 0 to 1")
     add(
@@ -55,14 +51,9 @@ def run(args: argparse.Namespace) -> int:
         check_picture_path(Path(args.plot))
     result = decide_trims(
         args.dataset,
-        only=args.only,
-        accept=args.accept,
+        **options(args, "only", "accept", "undo", "offset", "who", "why"),
         above=args.accept_above,
         keep=[(identity, *_seconds(text)) for identity, text in args.set],
-        undo=args.undo,
-        offset=args.offset,
-        who=args.who,
-        why=args.why,
         progress=ProgressReporter("reading"),
     )
     drawn: list[Path] = []

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from plushsense.core.errors import BadInput, BundleError, ConfigError, DatasetError, nearest, need
+from plushsense.core.errors import BadInput, BundleError, ConfigError, DatasetError, check_known, nearest, need
 from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.version import __version__
@@ -355,8 +355,7 @@ def _named(systems: Sequence[str] | None) -> tuple[str, ...]:
     if systems is None:
         return tuple(SYSTEMS)
     for name in systems:
-        if name not in SYSTEMS:
-            raise ConfigError(f"Unknown system '{name}': accepted are {', '.join(SYSTEMS)}.{nearest(name, SYSTEMS)}")
+        check_known(name, SYSTEMS, "system", ConfigError)
     return tuple(name for name in SYSTEMS if name in systems)
 
 
