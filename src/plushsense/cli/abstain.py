@@ -6,30 +6,9 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from plushsense.cli.options import options
 from plushsense.cli.output import emit, figure, say, spread, table, warn
-from plushsense.cli.settings import add_settings, add_workers, marks, options, report_jobs, settings
-
-
-def add(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("dataset", metavar="DATASET", help="data set folder, with session streams")
-    add("--split", metavar="SPLIT", default="by-subject:5", help="by-subject:K (5) or leave-one-subject-out")
-    add(
-        "--withhold",
-        action="store_true",
-        help="also train without each gesture in turn and measure how well it is detected as unknown; for each gesture "
-        "as many trainings again",
-    )
-    add(
-        "--coverage",
-        type=float,
-        default=0.9,
-        metavar="SHARE",
-        help="share of steps in which the set of classes must contain the true one (0.9)",
-    )
-    add_workers(parser, "trainings")
-    add("--out", metavar="DIR", help="folder for abstaining.json and risk-coverage.png (default: DATASET/abstaining)")
-    add_settings(parser)
+from plushsense.cli.settings import marks, report_jobs, settings
 
 
 def run(args: argparse.Namespace) -> int:

@@ -7,40 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.cli.output import emit, say, warn
-from plushsense.cli.settings import add_out, add_settings, add_work, listed, report_jobs, settings
-
-
-def add(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("dataset", metavar="DATASET", help="data set folder")
-    add(
-        "--split",
-        default="leave-one-subject-out,windows:5",
-        metavar="SPLIT,...",
-        help="splits to compare, as for evaluate (default: leave-one-subject-out,windows:5, the second leaky)",
-    )
-    add(
-        "--models",
-        default="all",
-        metavar="NAME,...",
-        help="all (default), classical, quick, or names: forest, extra-trees, knn, subspace-knn, cubic-svm, rbf-svm, "
-        "tree, boosting, mlp, lstm, bilstm, network (ours, see --arch), minirocket, multirocket-hydra (extra rocket)",
-    )
-    add(
-        "--features",
-        default="statistics,flattened",
-        metavar="NAME,...",
-        help="input of classical models: statistics (8 a channel), flattened (all samples), or both (default)",
-    )
-    add("--pca", default="both", help="PCA for classical models: both (default), no or yes")
-    add_work(parser, "folds")
-    add_out(
-        parser,
-        "baselines.json, .csv, .html and .png",
-        "in DATASET/evaluations/, named by the settings",
-        "a comparison of other settings or data",
-    )
-    add_settings(parser)
+from plushsense.cli.settings import listed, report_jobs, settings
 
 
 def run(args: argparse.Namespace) -> int:

@@ -7,15 +7,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from plushsense.cli.options import options
 from plushsense.cli.output import emit, table
-from plushsense.cli.settings import options
 
 if TYPE_CHECKING:
     from plushsense.dataset.statistics import Duration, SummaryStatistics
-
-
-def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("path", metavar="PATH", help="data set folder or .plush bundle")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -52,13 +48,6 @@ def _bundle(args: argparse.Namespace) -> int:
         result["adapted"] = {key: value for key, value in bundle.personal.items() if key != "original"}
     emit(args, result, [f"{key:<20}{value}" for key, value in result.items()])
     return 0
-
-
-def add_stats(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("dataset", metavar="DATASET", help="data set folder")
-    add("--by", metavar="COLUMN", help="group by subject, age_group, gender or another column of subjects.csv")
-    add("--channels", action="store_true", help="add mean and standard deviation of every channel")
 
 
 def run_stats(args: argparse.Namespace) -> int:
@@ -110,28 +99,6 @@ def _duration_row(d: Duration, grouped: bool, after: bool) -> tuple[object, ...]
         None if s.variance is None else f"{s.variance:.3f}",
         f"{s.min:.2f}–{s.max:.2f}",
         f"{rows.min:.0f}–{rows.max:.0f}, mean {rows.mean:.0f}",
-    )
-
-
-def add_arch(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add(
-        "spec",
-        metavar="SPEC",
-        help="architecture: kernel lengths in samples, joined by _, dilations after d (14d1_39d2_41d4)",
-    )
-    add("--filters", required=True, metavar="N,N,...", help="filters of each layer, such as 8,12,16")
-    add("--padding", default="stream", help="stream (default), causal or mirror")
-    add("--norm", default="batch", help="batch (default) or layer")
-    add("--channels", type=int, default=11, metavar="N", help="number of input channels (11)")
-    add("--classes", type=int, default=18, metavar="N", help="number of classes (18)")
-    add("--window", type=int, default=250, metavar="N", help="window in samples (250: 2.5 s at 100 Hz)")
-    add("--step", type=int, default=5, metavar="N", help="samples between two live decisions (5)")
-    add(
-        "--pool",
-        type=int,
-        metavar="N",
-        help="samples that a decision averages, stream padding only (default: fill the window)",
     )
 
 

@@ -71,6 +71,11 @@ def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     return Table.of(head, rows).text()
 
 
+def plural(n: int, noun: str) -> str:
+    """Format a count with its noun: ``1 fold``, ``2 folds``."""
+    return f"{n} {noun}{'s' * (n != 1)}"
+
+
 def figure(value: float | None, digits: int = 3) -> str:
     """Format a score with fixed digits; a dash for None."""
     return "-" if value is None else f"{value:z.{digits}f}"

@@ -17,20 +17,6 @@ if TYPE_CHECKING:
 _MOST_FILES = 10
 
 
-def add_pseudonymise(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("dataset", metavar="DATASET", help="data set folder; it is not changed")
-    add("out", metavar="OUT", help="new or empty folder for the copy")
-    add(
-        "--key",
-        required=True,
-        metavar="FILE",
-        help="CSV file of people and codes, outside of both data sets; an existing one is extended",
-    )
-    add("--words", metavar="FILE", help="file of words, one a line, that the copy must not contain")
-    add("--drop-notes", action="store_true", help="leave out notes and reasons in free text")
-
-
 def run_pseudonymise(args: argparse.Namespace) -> int:
     from plushsense.dataset.privacy.pseudonymise import pseudonymise
 
@@ -61,20 +47,6 @@ def run_pseudonymise(args: argparse.Namespace) -> int:
         f"The key is {args.key}: store it apart from the data, and never publish it.",
     )
     return 0
-
-
-def add_forget(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("dataset", metavar="DATASET", help="data set folder")
-    add("subject", metavar="SUBJECT", help="code of the person")
-    add("--yes", action="store_true", help="remove; without it only list what would go (status 1)")
-    add(
-        "--bundles",
-        action="append",
-        default=[],
-        metavar="DIR",
-        help="also search this folder for models trained on the person; can be repeated",
-    )
 
 
 def run_forget(args: argparse.Namespace) -> int:

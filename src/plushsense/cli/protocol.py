@@ -5,25 +5,11 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+from plushsense.cli.options import options
 from plushsense.cli.output import emit
-from plushsense.cli.settings import listed, options
+from plushsense.cli.settings import listed
 from plushsense.core.errors import ConfigError
 from plushsense.jobs.progress import ProgressReporter
-
-
-def add(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("--model", required=True, metavar="BUNDLE", help=".plush bundle")
-    add("--people", type=int, metavar="N", help="number of virtual people (5, as in the paper)")
-    add("--first", type=int, metavar="N", help="number of the first virtual person (1001: in no data set)")
-    add("--seed", type=int, metavar="N", help="seed of the virtual population (1)")
-    add("--repetitions", type=int, metavar="N", help="recordings of each gesture by each person (3)")
-    add("--dataset", metavar="DS", help="use recorded sessions: a data set with session streams")
-    add("--session", metavar="DIR", help="use recorded sessions: a folder of recordings with their stream")
-    add("--subjects", metavar="NAME,...", help="people of DS or DIR (default: all that the network was not trained on)")
-    add("--engine", default="float", choices=("float", "int8"), help="float (default), or int8: the toy's arithmetic")
-    add("--no-rules", action="store_true", help="leave out the rule baseline, which has to be fitted first")
-    add("--out", metavar="DIR", help="folder for protocol.html, table.csv, trials.csv and protocol.json")
 
 
 def run(args: argparse.Namespace) -> int:

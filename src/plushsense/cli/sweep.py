@@ -5,27 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from plushsense.cli.output import emit, figure, say, table, warn
-from plushsense.cli.settings import add_grid, add_out, add_work, grid_changes, marks, work_options
-
-
-def add(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("dataset", metavar="DATASET", help="data set folder")
-    add("--grid", default="paper", metavar="GRID", help="paper (default, 468 trials), or a TOML file")
-    add(
-        "--split",
-        metavar="SPLIT",
-        help="leave-one-subject-out, by-subject:K, by-recording:K; leaky, as in the paper: windows:holdout, windows:K "
-        "(default: the grid's; paper windows:holdout)",
-    )
-    default = "DATASET/evaluations/sweep-GRID"
-    add_out(parser, "the tables and sweep.json", default, "a sweep of other settings or data")
-    add_work(parser, "trainings")
-    of_paper = {"padding": "mirror", "norm": "batch", "context": "loop", "classes": "all", "device": "auto"}
-    add_grid(parser, {key: f"the grid's; paper {value}" for key, value in of_paper.items()})
-    add("--epochs", metavar="N,...", help="only these numbers of epochs (default: the grid's)")
-    add("--dry-run", action="store_true", help="print what would be trained and all problems, without training")
+from plushsense.cli.output import emit, figure, plural, say, table, warn
+from plushsense.cli.settings import grid_changes, marks, work_options
 
 
 def run(args: argparse.Namespace) -> int:
@@ -49,19 +30,15 @@ def preview_lines(plan: dict[str, Any]) -> list[str]:
         return [f"- {line}" for line in plan["problems"]]
     return [
         *marks(plan),
-        f"{several(plan['trials'], 'trial')} in {several(plan['trainings'], 'training')} "
-        f"({several(plan['folds'], 'fold')}, {several(plan['seeds'], 'seed')})",
-        f"{several(plan['held'], 'training')} done before; split {plan['split']}",
+        f"{plural(plan['trials'], 'trial')} in {plural(plan['trainings'], 'training')} "
+        f"({plural(plan['folds'], 'fold')}, {plural(plan['seeds'], 'seed')})",
+        f"{plural(plan['held'], 'training')} done before; split {plan['split']}",
         f"about {plan['macs']:.2e} multiply-accumulates; trial by trial {plan['macs_one_by_one']:.2e}",
         f"memory of each process: windows {plan['windows_mb']:.0f} MB; a step of the largest training "
         + ("as PyTorch takes it" if plan["training_mb"] is None else f"{plan['training_mb']:.0f} MB"),
         "",
         table(("network", "share of the cost"), [(arch, f"{share:.1%}") for arch, share in plan["cost"].items()]),
     ]
-
-
-def several(n: int, what: str) -> str:
-    return f"{n} {what}{'s' * (n != 1)}"
 
 
 def lines(s: dict[str, Any]) -> list[str]:

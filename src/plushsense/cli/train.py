@@ -7,30 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from plushsense.cli.options import options
 from plushsense.cli.output import emit, figure, warn
-from plushsense.cli.settings import add_settings, options, report_epochs, settings
+from plushsense.cli.settings import report_epochs, settings
 from plushsense.core.errors import ConfigError
-
-
-def add(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("dataset", metavar="DATASET", help="data set folder")
-    add("--out", metavar="FILE", default="model.plush", help="bundle to write (model.plush)")
-    add("--force", action="store_true", help="replace an existing bundle")
-    add(
-        "--quantize-aware",
-        type=int,
-        default=0,
-        metavar="EPOCHS",
-        help="fine-tune for 8 bits for this many epochs after the training (0); training reports where it would help",
-    )
-    add(
-        "--no-fit-decisions",
-        dest="fit_decisions",
-        action="store_false",
-        help="use the default decision settings instead of fitting them on the validation people",
-    )
-    add_settings(parser)
 
 
 def run(args: argparse.Namespace) -> int:
