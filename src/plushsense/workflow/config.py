@@ -13,7 +13,7 @@ Options of the command line override the file; an unknown key is refused with th
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -189,18 +189,10 @@ def resolve(path: str | Path | None = None, **flags: Mapping[str, Any]) -> RunCo
     refuse_unknown(flags, _TABLES, "the settings", ConfigError)
     for name, given in flags.items():
         tables[name].update(_checked(name, {key: value for key, value in given.items() if value is not None}, ""))
-    chosen = tables["training"].pop("preset", "people")
-    training = preset(chosen)
-    tables["windows"].setdefault("context", CONTEXT[chosen])
-    return RunConfig(
-        chosen,
-        WindowSpec(**tables["windows"]),
-        ModelSpec(**tables["model"]),
-        training.changed(**tables["training"]),
-        EvaluationSpec(**tables["evaluation"]),
-        DecideSpec(**tables["live"]),
-        AnywhereSpec(**tables["anywhere"]),
-    )
+    name = tables["training"].pop("preset", "people")
+    make: dict[str, Callable[..., Any]] = {**_TABLES, "training": preset(name).changed}
+    tables["windows"].setdefault("context", CONTEXT[name])
+    return RunConfig(name, **{table: make[table](**values) for table, values in tables.items()})
 
 
 # The table of each setting of `train`, `evaluate` and `baselines`.
