@@ -282,25 +282,25 @@ def _trial(
     )
 
 
-def verdict(found: Reidentified) -> str:
+def verdict(results: Reidentified) -> str:
     """Return the verdict as one Markdown paragraph.
 
     Raises:
         MissingExtraError: when jinja2 is not installed.
     """
-    sentences = _fill("reidentification_verdict.md.j2", found=found, hundred=_hundred, interval=_range)
+    sentences = _fill("reidentification_verdict.md.j2", found=results, hundred=_hundred, interval=_range)
     return " ".join(sentences.splitlines())
 
 
-def report(found: Reidentified, command: str) -> str:
+def report(results: Reidentified, command: str) -> str:
     """Return the whole report in Markdown; ``command`` is the command that made it."""
-    trial = found.find("recordings", "everything")
+    trial = results.find("recordings", "everything")
     by_person = None if trial is None else sorted(trial.by_person.items(), key=lambda item: (-item[1], item[0]))
     return _fill(
         "reidentification.md.j2",
-        found=found,
+        found=results,
         command=command,
-        verdict=verdict(found),
+        verdict=verdict(results),
         by_person=by_person,
         designs=DESIGNS,
         sees=SEES,

@@ -31,7 +31,7 @@ _JUDGED = {
 
 
 def percent(part: int, of: int) -> str:
-    """Return ``98 % (44/45)``, with one decimal close to 0 % and 100 %."""
+    """Format a share with its counts: ``98 % (44/45)``; shares close to 0 % and 100 % have one decimal."""
     if not of:
         return DASH
     share = 100.0 * part / of
@@ -132,7 +132,7 @@ def _judgements(counts: Mapping[str, int]) -> str:
 
 
 def judged_table(result: Mapping[str, Any]) -> Table:
-    """Return one row for each group and network system: how the first naming compares with the gesture."""
+    """Return one row for each group and network system: how the first gesture it named compares with the true one."""
     rows = tuple(
         {"title": row["title"], "system": _SHORT[row["system"]]}
         | {judged: percent(row["called"][judged], row["trials"]) for judged in _JUDGED}
@@ -145,7 +145,7 @@ def judged_table(result: Mapping[str, Any]) -> Table:
 
 
 def confusion_table(result: Mapping[str, Any]) -> Table:
-    """Return one row for each family and network system: what it was called, most often first."""
+    """Return one row for each true family and network system: the families it was recognised as, most often first."""
     called: dict[tuple[str, str], list[str]] = {}
     for entry in result["confusions"]:
         if entry["system"] != "rules":
@@ -166,7 +166,7 @@ def confusion_table(result: Mapping[str, Any]) -> Table:
 
 
 def between_table(result: Mapping[str, Any]) -> Table:
-    """Return one row for each system: its events while nobody made a gesture."""
+    """Return one row for each system: the events that began outside every trial."""
     rows = tuple(
         {
             **row,
@@ -191,7 +191,7 @@ def between_table(result: Mapping[str, Any]) -> Table:
 
 
 def aim_table(result: Mapping[str, Any]) -> Table:
-    """Return one row for each aim: what was measured, and whether it is met."""
+    """Return one row for each aim of the project: the measured value, and whether the aim is met."""
     rows = []
     for aim in result["aims"]:
         measured = seconds(aim["measured"]) + " s" if aim["unit"] == "s" else percent(aim["part"], aim["of"])
@@ -209,7 +209,7 @@ def aim_table(result: Mapping[str, Any]) -> Table:
 
 
 def figure_table(result: Mapping[str, Any]) -> Table:
-    """Return the figures of every group and gesture by each system as numbers, with the paper's, for CSV."""
+    """Return one row for each group and each gesture by system, as numbers for CSV, with the paper's figures."""
     rows = []
     for kind, key in (("rows", "group"), ("by_gesture", "gesture")):
         for row in result[kind]:
@@ -237,7 +237,7 @@ def has_paper(result: Mapping[str, Any]) -> bool:
 
 
 def figure(result: Mapping[str, Any]) -> Figure:
-    """Draw reaction times by group and system with medians, the number not answered, and the paper's ranges."""
+    """Draw the reaction times of all trials by group and system: medians, unanswered trials, and the paper's ranges."""
     rows = [row for row in result["rows"] if row["group"] != "all"]
     picture = new_figure(10.0, 1.6 + 0.42 * len(rows))
     axes = picture.add_subplot()
@@ -293,7 +293,7 @@ def figure(result: Mapping[str, Any]) -> Figure:
 
 
 def page(result: Mapping[str, Any]) -> str:
-    """Return the protocol as one self-contained HTML page."""
+    """Return the result of the protocol as one self-contained HTML page."""
     return render_page(
         "protocol.html.j2",
         title=result["heading"],
