@@ -92,15 +92,15 @@ class ReidentificationTrial:
 class Reidentified:
     """The results of a re-identification; ``skipped`` holds the designs that the data do not allow, with the reason.
 
-    ``of_one_person`` are gestures that only one person made, so that their label identifies the person.
+    ``gestures_of_one_person`` are gestures that only one person made, so that their label identifies the person.
     """
 
-    trials: tuple[ReidentificationTrial, ...]
     people: int
     recordings: int
     sessions: int
+    trials: tuple[ReidentificationTrial, ...]
     skipped: dict[str, str]
-    of_one_person: tuple[str, ...]
+    gestures_of_one_person: tuple[str, ...]
     seed: int
     trees: int
     simulated: bool
@@ -120,17 +120,11 @@ class Reidentified:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
-        return {
-            "people": self.people,
-            "recordings": self.recordings,
-            "sessions": self.sessions,
+        lists = {
             "trials": [t.to_dict() for t in self.trials],
-            "skipped": self.skipped,
-            "gestures_of_one_person": list(self.of_one_person),
-            "seed": self.seed,
-            "trees": self.trees,
-            "simulated": self.simulated,
+            "gestures_of_one_person": list(self.gestures_of_one_person),
         }
+        return {**vars(self), **lists}
 
 
 def reidentify(dataset: Dataset, *, seed: int = 1, trees: int = 150, progress: Progress | None = None) -> Reidentified:
@@ -187,10 +181,10 @@ def reidentify(dataset: Dataset, *, seed: int = 1, trees: int = 150, progress: P
     sessions = len(set(zip(person.tolist(), session.tolist(), strict=True)))
     alone = [g for g in labels if len(np.unique(person[gesture == g])) == 1]
     return Reidentified(
-        tuple(trials),
         len(np.unique(person)),
         len(person),
         sessions,
+        tuple(trials),
         skipped,
         tuple(map(str, alone)),
         seed,
