@@ -6,13 +6,15 @@ import json
 import os
 import subprocess
 import sys
+import tomllib
 from collections.abc import Callable
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from plushsense.cli.main import VERBS, load_verb
+from plushsense.cli.main import VERBS
 from plushsense.cli.settings import report_epochs
 from plushsense.dataset.store import Dataset
 from plushsense.models.bundle import Bundle
@@ -412,11 +414,17 @@ def test_what_is_left_when_stopped(
     def stopped(_: object) -> int:
         raise KeyboardInterrupt
 
-    add, _ = load_verb(verb)
-    monkeypatch.setattr("plushsense.cli.main.load_verb", lambda _: (add, stopped))
+    monkeypatch.setattr("plushsense.cli.main.load_verb", lambda _: stopped)
     ran = cli(verb, *words)
     assert ran.status == 130
     assert said in ran.err
+
+
+def test_every_verb_has_a_table_of_options_and_every_table_a_verb_or_another_table() -> None:
+    text = resources.files("plushsense.cli").joinpath("options.toml").read_text(encoding="utf-8")
+    tables = tomllib.loads(text)
+    inserted = {name[1:] for table in tables.values() for name in table if name.startswith("@")}
+    assert set(tables) == set(VERBS) | inserted
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import pytest
 from plushsense.cli.main import main
 from plushsense.core.gestures import load_gestures
 from plushsense.core.layouts import load_layout
-from plushsense.experiments.protocol.run import NO_GATE, NO_RULES
+from plushsense.experiments.protocol.score import NOTES
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.models.reference import random_weights
@@ -59,14 +59,14 @@ def test_five_strangers_three_systems_one_page(capsys, model, tmp_path):
     result = json.loads(text)
     assert result["simulated"] is True
     assert (result["trials"], result["gestures"], len(result["people"])) == (34, 17, 2)
-    assert {NO_GATE, NO_RULES} <= set(result["said"])
+    assert {NOTES["no_gate"], NOTES["no_rules"]} <= set(result["said"])
     assert {row["system"] for row in result["rows"]} == {"cnn"}
     assert [a["met"] for a in result["aims"]] == [None] * 4
     page = (out / "protocol.html").read_text(encoding="utf-8")
     assert "This is a simulation." in page
     assert "SIMULATED" in page.split("</h1>")[0]
     assert "≈ 0.83" in page
-    assert NO_GATE in page
+    assert NOTES["no_gate"] in page
     for name, rows in (("trials.csv", 34), ("table.csv", 7 + 17)):
         with (out / name).open(encoding="utf-8", newline="") as file:
             table = list(csv.DictReader(file))

@@ -161,5 +161,5 @@ def test_a_gesture_of_one_person_is_told(tmp_path: Path) -> None:
         some = next(iter((dataset.path / "recordings" / "P2").glob("*.csv")))
         target.write_bytes(some.read_bytes().replace(b", 1", b", 2", 1 + number))
     found = reidentify(open_dataset(dataset.path), trees=10)
-    assert found.of_one_person == ("Salute",)
+    assert found.gestures_of_one_person == ("Salute",)
     assert "that label alone names a person" in verdict(found)

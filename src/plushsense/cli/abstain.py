@@ -6,33 +6,9 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from plushsense.cli.options import options
 from plushsense.cli.output import emit, figure, say, spread, table, warn
-from plushsense.cli.settings import add_settings, add_workers, marks, report_jobs, settings
-
-
-def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("dataset", metavar="DATASET", help="data set folder, with session streams")
-    parser.add_argument(
-        "--split", metavar="SPLIT", default="by-subject:5", help="by-subject:K (5) or leave-one-subject-out"
-    )
-    parser.add_argument(
-        "--withhold",
-        action="store_true",
-        help="also train without each gesture in turn and measure how well it is detected as unknown; for each gesture "
-        "as many trainings again",
-    )
-    parser.add_argument(
-        "--coverage",
-        type=float,
-        default=0.9,
-        metavar="SHARE",
-        help="share of steps in which the set of classes must contain the true one (0.9)",
-    )
-    add_workers(parser, "trainings")
-    parser.add_argument(
-        "--out", metavar="DIR", help="folder for abstaining.json and risk-coverage.png (default: DATASET/abstaining)"
-    )
-    add_settings(parser)
+from plushsense.cli.settings import marks, report_jobs, settings
 
 
 def run(args: argparse.Namespace) -> int:
@@ -43,9 +19,7 @@ def run(args: argparse.Namespace) -> int:
     result = abstaining(
         args.dataset,
         config,
-        split=args.split,
-        withhold=args.withhold,
-        coverage=args.coverage,
+        **options(args, "split", "withhold", "coverage"),
         out=out,
         progress=report_jobs("training", "networks"),
         warn=warn,

@@ -7,44 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from plushsense.cli.output import emit, figure, say, spread, table, warn
-from plushsense.cli.settings import add_settings, marks, settings
+from plushsense.cli.settings import marks, settings
 from plushsense.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from plushsense.experiments.adaptation import Adapted
-
-_EXAMPLES = """
-  plushsense adapt model.plush RECORDINGS --out mine.plush      a person's folder as the recorder left it, or a data set
-  plushsense adapt model.plush DS --subject S07 --use 2 --out mine.plush
-  plushsense adapt mine.plush --undo --out model.plush          restores the bundle byte for byte
-  plushsense adapt --evaluate DS                                measures the gain on people left out (needs PyTorch)
-
-Where the person's own recordings show no gain, nothing is written and the exit status is 1.
-"""
-
-
-def add(parser: argparse.ArgumentParser) -> None:
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = _EXAMPLES
-    add = parser.add_argument
-    add("bundle", metavar="BUNDLE", nargs="?", help="bundle to adapt; it is not changed")
-    add("recordings", metavar="RECORDINGS", nargs="?", help="data set, or a recorder's folder")
-    add("--out", metavar="BUNDLE", help="bundle to write")
-    add("--force", action="store_true", help="replace another bundle at --out")
-    add("--subject", metavar="CODE", help="person whose recordings are used (default: the only one)")
-    add(
-        "--use",
-        type=int,
-        metavar="N",
-        help="adapt with the first N recordings of each gesture and score the rest before and after (default: adapt "
-        "with all, and score each with a bundle adapted without it; with --evaluate: 2)",
-    )
-    add("--undo", action="store_true", help="write the bundle as it was before it was adapted")
-    add("--evaluate", metavar="DATASET", help="train networks and adapt them to people left out")
-    add("--split", metavar="SPLIT", help="split of --evaluate: leave-one-subject-out (default) or by-subject:K")
-    add("--choices", type=int, metavar="N", help="further random choices of recordings for --evaluate (0)")
-    add("--int8", action="store_true", help="with --evaluate: also adapt the 8-bit networks")
-    add_settings(parser)
 
 
 def run(args: argparse.Namespace) -> int:

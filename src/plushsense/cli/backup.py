@@ -9,12 +9,6 @@ from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.jobs.progress import ProgressReporter
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("dataset", metavar="DATASET", nargs="?", help="data set folder")
-    parser.add_argument("file", metavar="FILE", nargs="?", help="new zip file")
-    parser.add_argument("--check", metavar="FILE", help="check that a backup is complete, and write nothing")
-
-
 def run(args: argparse.Namespace) -> int:
     from plushsense.dataset.backup import backup
 
@@ -42,11 +36,6 @@ def _check(args: argparse.Namespace) -> int:
         return 1
     emit(args, {**found, "valid": True}, f"{args.check}: valid, {_counts(found)}")
     return 0
-
-
-def add_restore(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("file", metavar="FILE", help="zip file written by plushsense backup")
-    parser.add_argument("dest", metavar="DEST", help="new or empty folder for the data set")
 
 
 def run_restore(args: argparse.Namespace) -> int:

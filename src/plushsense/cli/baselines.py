@@ -7,39 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.cli.output import emit, say, warn
-from plushsense.cli.settings import add_out, add_settings, add_work, listed, report_jobs, settings
-
-
-def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("dataset", metavar="DATASET", help="data set folder")
-    parser.add_argument(
-        "--split",
-        default="leave-one-subject-out,windows:5",
-        metavar="SPLIT,...",
-        help="splits to compare, as for evaluate (default: leave-one-subject-out,windows:5, the second leaky)",
-    )
-    parser.add_argument(
-        "--models",
-        default="all",
-        metavar="NAME,...",
-        help="all (default), classical, quick, or names: forest, extra-trees, knn, subspace-knn, cubic-svm, rbf-svm, "
-        "tree, boosting, mlp, lstm, bilstm, network (ours, see --arch), minirocket, multirocket-hydra (extra rocket)",
-    )
-    parser.add_argument(
-        "--features",
-        default="statistics,flattened",
-        metavar="NAME,...",
-        help="input of classical models: statistics (8 a channel), flattened (all samples), or both (default)",
-    )
-    parser.add_argument("--pca", default="both", help="PCA for classical models: both (default), no or yes")
-    add_work(parser, "folds")
-    add_out(
-        parser,
-        "baselines.json, .csv, .html and .png",
-        "in DATASET/evaluations/, named by the settings",
-        "a comparison of other settings or data",
-    )
-    add_settings(parser)
+from plushsense.cli.settings import listed, report_jobs, settings
 
 
 def run(args: argparse.Namespace) -> int:
@@ -48,8 +16,8 @@ def run(args: argparse.Namespace) -> int:
 
     config = settings(args, workers=args.workers)
     dataset = open_dataset(args.dataset)
-    choice: dict[str, Any] = {"splits": listed(args.split), "models": listed(args.models)}
-    choice |= {"features": listed(args.features), "pca": args.pca}
+    choice: dict[str, Any] = {"splits": listed(args.split), "pca": args.pca}
+    choice |= {"models": listed(args.models), "features": listed(args.features)}
     name = f"baselines_{comparison_id(dataset, config, **choice)[:8]}"
     out = Path(args.out) if args.out else dataset.path / "evaluations" / name
     result = baselines(

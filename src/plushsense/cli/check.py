@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from plushsense.cli.options import options
 from plushsense.cli.output import emit, say
 from plushsense.cli.settings import listed
 from plushsense.core.errors import ConfigError
@@ -18,28 +19,6 @@ if TYPE_CHECKING:
 
 _LINES = 8
 _DECISIONS = 20
-
-
-def add(parser: argparse.ArgumentParser) -> None:
-    from plushsense.dataset.quality.checking import CHECKS
-
-    repeated: dict[str, Any] = {"action": "append", "default": []}
-    add = parser.add_argument
-    add("dataset", metavar="DATASET", help="data set folder")
-    add("--only", metavar="CHECK,…", default="", help=f"run only these checks (default: all): {', '.join(CHECKS)}")
-    add("--report", metavar="FILE.html", help="write a page with plots of all findings")
-    add("--limit", metavar="NAME=NUMBER", **repeated, help="change a limit, e.g. duration=0.5 (see docs/checks.md)")
-    add(
-        "--accept",
-        metavar="CHECK:RECORDING",
-        **repeated,
-        help="mark findings as known and correct; patterns such as 'gaps:P26/*'",
-    )
-    add("--unaccept", metavar="CHECK:RECORDING", **repeated, help="remove the mark of --accept")
-    add("--exclude", metavar="RECORDING", **repeated, help="mark recordings as unused; patterns such as 'P19/*'")
-    add("--include", metavar="RECORDING", **repeated, help="remove the mark of --exclude")
-    add("--why", metavar="TEXT", default="", help="reason, stored with the mark")
-    add("--who", metavar="NAME", help="person who decides, stored with the mark (default: login name)")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -54,12 +33,7 @@ def run(args: argparse.Namespace) -> int:
         check_page_path(args.report)
     result, marked = decide(
         args.dataset,
-        accept=args.accept,
-        unaccept=args.unaccept,
-        exclude=args.exclude,
-        include=args.include,
-        why=args.why,
-        who=args.who,
+        **options(args, "accept", "unaccept", "exclude", "include", "why", "who"),
         only=only,
         limits=_limits(args.limit),
         progress=ProgressReporter("checking"),

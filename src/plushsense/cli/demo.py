@@ -10,11 +10,6 @@ from plushsense.cli.output import emit, say, spread, table
 from plushsense.cli.settings import report_stages
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--quick", action="store_true", help="fewer people and epochs: under 90 seconds")
-    parser.add_argument("--out", metavar="DIR", default="plushsense-demo", help="output folder (plushsense-demo)")
-
-
 def run(args: argparse.Namespace) -> int:
     from plushsense.workflow.demo import SIMULATION, run_demo
 

@@ -6,26 +6,10 @@ import argparse
 import json
 from pathlib import Path
 
+from plushsense.cli.options import options
 from plushsense.cli.output import emit, say, table
 from plushsense.cli.settings import listed, report_stages
 from plushsense.core.errors import ConfigError
-
-
-def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--scan-s",
-        type=float,
-        default=3.0,
-        metavar="S",
-        help="seconds to search for Bluetooth and LSL devices (3)",
-    )
-    parser.add_argument(
-        "--lsl-out",
-        metavar="URL",
-        help="publish this toy as an LSL stream until Ctrl-C instead, and reconnect when it disappears",
-    )
-    parser.add_argument("--lsl-name", metavar="NAME", help="name of that stream (default: PlushSense)")
-    parser.add_argument("--layout", metavar="NAME", help="layout of that toy: name or TOML file (default: plush-15)")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -62,36 +46,6 @@ def _publish(args: argparse.Namespace) -> int:
             counters = device.counters
             say(f"published {counters.frames} frames; lost {counters.lost}, reconnected {counters.reconnects} times")
     return 0
-
-
-def add_toy(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    transport = parser.add_mutually_exclusive_group(required=True)
-    transport.add_argument("--serial-pty", action="store_true", help="serve on a pseudo terminal, like a serial port")
-    transport.add_argument("--tcp", type=int, metavar="PORT", help="serve on a port of 127.0.0.1; 0: any free one")
-    transport.add_argument("--lsl", metavar="NAME", help="publish an LSL stream of this name")
-    add("--person", type=int, default=101, metavar="N", help="number of the virtual person (101: in no data set)")
-    add("--seed", type=int, default=1, metavar="N", help="random seed; the same seed sends the same bytes (1)")
-    add("--speed", type=float, default=1.0, metavar="X", help="speed relative to real time (1)")
-    add("--layout", default="plush-15", metavar="NAME", help="firmware: plush-15 (default) or plush-14")
-    add("--gestures", metavar="LABELS", help="labels joined by commas, repeated (default: all, at random)")
-    add("--lost", type=float, metavar="P", help="share of lines that are lost, 0 to 0.9 (0.0005)")
-    add("--garbled", type=float, metavar="P", help="share of lines that are garbled, 0 to 0.9 (0.0003)")
-    add("--glitch", type=float, metavar="P", help="share of frames with an invalid reading, 0 to 0.9 (0.00002)")
-    add(
-        "--follow",
-        metavar="LOG",
-        help="perform the gestures that a recorder prompts: the session.jsonl of `plushsense record`, which need not "
-        "exist yet (default: independent)",
-    )
-    add(
-        "--seconds",
-        type=float,
-        default=0.0,
-        metavar="S",
-        help="stop after this much of the toy's time (0: never)",
-    )
-    add("--truth", metavar="FILE", help="append the performed gestures as JSON lines")
 
 
 def run_toy(args: argparse.Namespace) -> int:
@@ -145,24 +99,12 @@ def run_toy(args: argparse.Namespace) -> int:
     return 0
 
 
-def add_simulate(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("out", metavar="OUT", help="new or empty folder; gets one folder a person with recordings and session stream")
-    add("--people", type=int, default=25, metavar="N", help="number of virtual people (25, as in the paper)")
-    add("--repetitions", type=int, default=3, metavar="N", help="recordings of each gesture by each person (3)")
-    add("--seed", type=int, default=1, metavar="N", help="random seed; the same seed gives the same recordings (1)")
-    add("--dataset", metavar="DIR", help="also import them as a data set in this new folder")
-
-
 def run_simulate(args: argparse.Namespace) -> int:
     from plushsense.workflow.api import simulate
 
     summary = simulate(
         args.out,
-        people=args.people,
-        repetitions=args.repetitions,
-        seed=args.seed,
-        dataset=args.dataset,
+        **options(args, "people", "repetitions", "seed", "dataset"),
         progress=report_stages(),
     )
     emit(

@@ -7,32 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.cli.output import emit, figure, say, spread, table, warn
-from plushsense.cli.settings import add_out, add_settings, add_work, marks, report_jobs, settings
+from plushsense.cli.settings import marks, report_jobs, settings
 from plushsense.workflow.reporting import name_of
-
-
-def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("dataset", metavar="DATASET", help="data set folder")
-    parser.add_argument(
-        "--split",
-        metavar="SPLIT",
-        help="leave-one-subject-out (default), by-subject:K or by-recording:K for K folds; leaky, as in the paper: "
-        "windows:K, windows:holdout",
-    )
-    parser.add_argument(
-        "--train-context",
-        metavar="CONTEXT",
-        help="context of the training windows: stream, loop or anywhere (default: as --context)",
-    )
-    add_work(parser, "folds")
-    add_out(
-        parser,
-        "evaluation.json, predictions.parquet and report.html",
-        "in DATASET/evaluations/, named by settings and data",
-        "an evaluation of other settings or data",
-    )
-    parser.add_argument("--int8", action="store_true", help="also score each fold's network deployed in 8 bits")
-    add_settings(parser)
 
 
 def run(args: argparse.Namespace) -> int:

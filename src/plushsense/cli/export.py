@@ -29,24 +29,6 @@ _STAGES = {
 }
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("bundle", metavar="BUNDLE", help=".plush bundle, trained with padding stream and norm batch")
-    parser.add_argument("out", metavar="OUT", help="new or empty folder")
-    parser.add_argument(
-        "--dataset",
-        metavar="DS",
-        help="data set that it was trained on: calibrate on the windows of its training people (default: use the "
-        "calibration in the bundle)",
-    )
-    parser.add_argument(
-        "--also",
-        default="",
-        metavar="A,B",
-        help="formats for other runtimes, each tried there first: onnx, onnx-int8 (extra onnx), tflite, tflite-int8 "
-        "(extra tflite), espdl, espdl-esp32, espdl-esp32p4 (extra espdl)",
-    )
-
-
 def _conversion(entry: dict[str, Any]) -> str:
     largest = entry["largest_difference"]
     difference = "" if largest is None else f"; logits differ from the original by at most {largest:.1g}"
@@ -73,47 +55,6 @@ def run(args: argparse.Namespace) -> int:
         ],
     )
     return 0
-
-
-def _add_targets(parser: argparse.ArgumentParser, names: str, default: str) -> None:
-    """Add the options of verbs that compile and run an export."""
-    add = parser.add_argument
-    add("export", metavar="OUT", help="folder written by plushsense export")
-    add(
-        "--target",
-        metavar="NAME",
-        action="append",
-        default=[],
-        help=f"{names}; several joined by commas (default: {default})",
-    )
-    add(
-        "--trust",
-        action="store_true",
-        help="compile and run C files that this version would not write (default: refuse them); they can do whatever "
-        "you can on this computer, and the result says that they are not ours",
-    )
-
-
-def add_verify(parser: argparse.ArgumentParser) -> None:
-    from plushsense.deploy.targets import TARGETS
-
-    _add_targets(parser, ", ".join(TARGETS), "all with installed compilers and emulators")
-    add = parser.add_argument
-    add("--dataset", metavar="DS", help="also stream these recordings through the C; nothing of them is stored")
-    add(
-        "--subject",
-        metavar="CODE",
-        action="append",
-        default=[],
-        help="only these people of DS, joined by commas",
-    )
-    add(
-        "--samples",
-        metavar="N",
-        type=int,
-        help=f"samples to stream besides the golden vectors: of DS ({_SAMPLES:,}), else synthetic (default: none)",
-    )
-    add("--faults", action="store_true", help="also test that deliberate errors (mutants) are detected; takes minutes")
 
 
 def run_verify(args: argparse.Namespace) -> int:
@@ -179,12 +120,6 @@ def verification_lines(done: VerificationReport) -> list[str]:
             "answers say nothing about what else it does. Export again to be sure.",
         ]
     return lines
-
-
-def add_profile(parser: argparse.ArgumentParser) -> None:
-    names = "xtensa, cortex-m4, cortex-m0, riscv32, or host for sizes only"
-    _add_targets(parser, names, "every installed emulator")
-    parser.add_argument("--optimise", default="O2", choices=("O2", "O3", "Os"), help="compiler optimisation (O2)")
 
 
 def run_profile(args: argparse.Namespace) -> int:

@@ -7,14 +7,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from plushsense.cli.options import options
 from plushsense.cli.output import emit, table
 
 if TYPE_CHECKING:
     from plushsense.dataset.statistics import Duration, SummaryStatistics
-
-
-def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("path", metavar="PATH", help="data set folder or .plush bundle")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -51,14 +48,6 @@ def _bundle(args: argparse.Namespace) -> int:
         result["adapted"] = {key: value for key, value in bundle.personal.items() if key != "original"}
     emit(args, result, [f"{key:<20}{value}" for key, value in result.items()])
     return 0
-
-
-def add_stats(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("dataset", metavar="DATASET", help="data set folder")
-    parser.add_argument(
-        "--by", metavar="COLUMN", help="group by subject, age_group, gender or another column of subjects.csv"
-    )
-    parser.add_argument("--channels", action="store_true", help="add mean and standard deviation of every channel")
 
 
 def run_stats(args: argparse.Namespace) -> int:
@@ -113,27 +102,6 @@ def _duration_row(d: Duration, grouped: bool, after: bool) -> tuple[object, ...]
     )
 
 
-def add_arch(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "spec",
-        metavar="SPEC",
-        help="architecture: kernel lengths in samples, joined by _, dilations after d (14d1_39d2_41d4)",
-    )
-    parser.add_argument("--filters", required=True, metavar="N,N,...", help="filters of each layer, such as 8,12,16")
-    parser.add_argument("--padding", default="stream", help="stream (default), causal or mirror")
-    parser.add_argument("--norm", default="batch", help="batch (default) or layer")
-    parser.add_argument("--channels", type=int, default=11, metavar="N", help="number of input channels (11)")
-    parser.add_argument("--classes", type=int, default=18, metavar="N", help="number of classes (18)")
-    parser.add_argument("--window", type=int, default=250, metavar="N", help="window in samples (250: 2.5 s at 100 Hz)")
-    parser.add_argument("--step", type=int, default=5, metavar="N", help="samples between two live decisions (5)")
-    parser.add_argument(
-        "--pool",
-        type=int,
-        metavar="N",
-        help="samples that a decision averages, stream padding only (default: fill the window)",
-    )
-
-
 def run_arch(args: argparse.Namespace) -> int:
     from plushsense.models.arch import Arch
     from plushsense.workflow.reporting import card
@@ -141,13 +109,7 @@ def run_arch(args: argparse.Namespace) -> int:
     arch = Arch.parse(
         args.spec,
         args.filters,
-        channels=args.channels,
-        classes=args.classes,
-        padding=args.padding,
-        norm=args.norm,
-        window=args.window,
-        step=args.step,
-        pool=args.pool,
+        **options(args, "channels", "classes", "padding", "norm", "window", "step", "pool"),
     )
     printed = f" (the paper's Table 3 prints {arch.table3})" if arch.table3 else ""
     again = "" if arch.padding == "stream" else "; this padding recomputes the window at every step"

@@ -23,36 +23,6 @@ STATES = {
 }
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add(
-        "--device",
-        required=True,
-        metavar="URL",
-        help="toy: serial:///dev/ttyUSB0, ble://name:PlushName, tcp://host:port, lsl://NAME, "
-        "replay:///path/stream.csv?speed=0, virtual://?person=7 (plushsense devices lists those connected)",
-    )
-    add("--model", required=True, metavar="BUNDLE", help=".plush bundle")
-    add(
-        "--engine",
-        default="float",
-        choices=("float", "int8", "both"),
-        help="float (default); int8: integers, bit for bit as the toy's C computes; both: decide with int8 and report "
-        "in the summary how often float agrees",
-    )
-    add("--seconds", type=float, metavar="S", help="stop after this much of the toy's time (default: at its end)")
-    add("--smoothing", type=float, metavar="S", help="time constant of the smoothing; 0: off (default: the bundle's)")
-    output = parser.add_mutually_exclusive_group()
-    output.add_argument("--events", action="store_true", help="print only lines with an event or a change of state")
-    output.add_argument("--text", action="store_true", help="print events and states as sentences instead of JSON")
-    add("--reconnect", action="store_true", help="wait for a toy that disconnects")
-    add(
-        "--reactions",
-        metavar="NAME|FILE",
-        help="also print the reactions of the toy: standard, gentle (never rewards rough touch), or a TOML file",
-    )
-
-
 def run(args: argparse.Namespace) -> int:
     from plushsense.devices.opening import open_device
     from plushsense.live.loop import run_live

@@ -1,7 +1,7 @@
 """Run ``plushsense VERB ...``: load the verb's module, parse its options, and report errors as one sentence.
 
-A verb is a pair of functions ``add(parser)`` and ``run(args) -> int`` in a module of this package. In `VERBS`,
-``module:name`` means the functions ``add_name`` and ``run_name``. Only the module of the given verb is imported.
+A verb is a function ``run(args) -> int`` in a module of this package, and a table of its options in ``options.toml``.
+In `VERBS`, ``module:name`` means the function ``run_name``. Only the module of the given verb is imported.
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 
+from plushsense.cli.options import add_options
 from plushsense.cli.output import Parser, say, utf8
-from plushsense.core.errors import PlushSenseError, nearest
+from plushsense.core.errors import BadInput, PlushSenseError, check_known
 from plushsense.core.version import __version__
 from plushsense.jobs.progress import close_active
 
@@ -83,18 +84,17 @@ def _overview() -> str:
     )
 
 
-def load_verb(verb: str) -> tuple[Callable[[argparse.ArgumentParser], None], Callable[[argparse.Namespace], int]]:
-    """Import the functions ``add`` and ``run`` of a verb.
+def load_verb(verb: str) -> Callable[[argparse.Namespace], int]:
+    """Import the function ``run`` of a verb.
 
     Raises:
         PlushSenseError: for an unknown verb.
     """
-    if verb not in VERBS:
-        raise PlushSenseError(f"Unknown verb '{verb}': accepted are {', '.join(VERBS)}.{nearest(verb, VERBS)}")
+    check_known(verb, VERBS, "verb", BadInput)
     module_name, colon, name = VERBS[verb][0].partition(":")
     module = importlib.import_module(f"plushsense.cli.{module_name}")
-    suffix = f"_{name}" if colon else ""
-    return getattr(module, f"add{suffix}"), getattr(module, f"run{suffix}")
+    run: Callable[[argparse.Namespace], int] = getattr(module, f"run_{name}" if colon else "run")
+    return run
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -109,10 +109,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     verb = words[0]
     try:
-        add, run = load_verb(verb)
+        run = load_verb(verb)
         summary = VERBS[verb][1]
         parser = Parser(prog=f"plushsense {verb}", description=summary[0].upper() + summary[1:] + ".")
-        add(parser)
+        add_options(parser, verb)
         json_help = "print one JSON object on standard output and nothing else there (default: text)"
         if verb == "live":
             json_help = "no effect: decisions are always JSON, one object a line"

@@ -71,9 +71,14 @@ def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     return Table.of(head, rows).text()
 
 
-def figure(value: float | None) -> str:
-    """Format a score with three digits; a dash for None."""
-    return "-" if value is None else f"{value:z.3f}"
+def plural(n: int, noun: str) -> str:
+    """Format a count with its noun: ``1 fold``, ``2 folds``."""
+    return f"{n} {noun}{'s' * (n != 1)}"
+
+
+def figure(value: float | None, digits: int = 3) -> str:
+    """Format a score with fixed digits; a dash for None."""
+    return "-" if value is None else f"{value:z.{digits}f}"
 
 
 def spread(score: dict[str, Any]) -> str:

@@ -17,19 +17,6 @@ if TYPE_CHECKING:
 _MOST_FILES = 10
 
 
-def add_pseudonymise(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("dataset", metavar="DATASET", help="data set folder; it is not changed")
-    parser.add_argument("out", metavar="OUT", help="new or empty folder for the copy")
-    parser.add_argument(
-        "--key",
-        required=True,
-        metavar="FILE",
-        help="CSV file of people and codes, outside of both data sets; an existing one is extended",
-    )
-    parser.add_argument("--words", metavar="FILE", help="file of words, one a line, that the copy must not contain")
-    parser.add_argument("--drop-notes", action="store_true", help="leave out notes and reasons in free text")
-
-
 def run_pseudonymise(args: argparse.Namespace) -> int:
     from plushsense.dataset.privacy.pseudonymise import pseudonymise
 
@@ -60,19 +47,6 @@ def run_pseudonymise(args: argparse.Namespace) -> int:
         f"The key is {args.key}: store it apart from the data, and never publish it.",
     )
     return 0
-
-
-def add_forget(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("dataset", metavar="DATASET", help="data set folder")
-    parser.add_argument("subject", metavar="SUBJECT", help="code of the person")
-    parser.add_argument("--yes", action="store_true", help="remove; without it only list what would go (status 1)")
-    parser.add_argument(
-        "--bundles",
-        action="append",
-        default=[],
-        metavar="DIR",
-        help="also search this folder for models trained on the person; can be repeated",
-    )
 
 
 def run_forget(args: argparse.Namespace) -> int:

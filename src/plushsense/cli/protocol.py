@@ -5,48 +5,26 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+from plushsense.cli.options import options
 from plushsense.cli.output import emit
+from plushsense.cli.settings import listed
 from plushsense.core.errors import ConfigError
 from plushsense.jobs.progress import ProgressReporter
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("--model", required=True, metavar="BUNDLE", help=".plush bundle")
-    add("--people", type=int, metavar="N", help="number of virtual people (5, as in the paper)")
-    add("--first", type=int, metavar="N", help="number of the first virtual person (1001: in no data set)")
-    add("--seed", type=int, metavar="N", help="seed of the virtual population (1)")
-    add("--repetitions", type=int, metavar="N", help="recordings of each gesture by each person (3)")
-    add("--dataset", metavar="DS", help="use recorded sessions: a data set with session streams")
-    add("--session", metavar="DIR", help="use recorded sessions: a folder of recordings with their stream")
-    add("--subjects", metavar="NAME,...", help="people of DS or DIR (default: all that the network was not trained on)")
-    add(
-        "--engine",
-        default="float",
-        choices=("float", "int8"),
-        help="float (default), or int8: the toy's arithmetic",
-    )
-    add("--no-rules", action="store_true", help="leave out the rule baseline, which has to be fitted first")
-    add("--out", metavar="DIR", help="folder for protocol.html, table.csv, trials.csv and protocol.json")
-
-
 def run(args: argparse.Namespace) -> int:
-    from plushsense.cli.settings import listed
     from plushsense.experiments.protocol.run import protocol
 
-    virtual = {name: getattr(args, name) for name in ("people", "first", "seed", "repetitions")}
+    virtual = options(args, "people", "first", "seed", "repetitions")
     virtual = {name: value for name, value in virtual.items() if value is not None}
     if virtual and (args.dataset or args.session):
         raise ConfigError(f"--{next(iter(virtual))} is for virtual people: leave it out, or --dataset and --session.")
     result = protocol(
         args.model,
         **virtual,
-        dataset=args.dataset,
-        session=args.session,
+        **options(args, "dataset", "session", "engine", "out"),
         subjects=listed(args.subjects) if args.subjects else None,
-        engine=args.engine,
         rules=not args.no_rules,
-        out=args.out,
         progress=ProgressReporter("people"),
     )
     emit(args, result, lines(result))

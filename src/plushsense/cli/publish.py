@@ -4,34 +4,12 @@ from __future__ import annotations
 
 import argparse
 
+from plushsense.cli.options import options
 from plushsense.cli.output import emit, say
 from plushsense.cli.settings import listed, report_stages
 from plushsense.core.errors import ConfigError
 
 _MOST_PROBLEMS = 20
-
-
-def add(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("dataset", metavar="DATASET", nargs="?", help="data set folder")
-    add("out", metavar="OUT", nargs="?", help="new or empty folder; the zip file is OUT.zip")
-    add("--check", metavar="PACKAGE", help="validate an existing package, a folder or a zip file, and write nothing")
-    add("--licence", default="", metavar="SPDX", help="licence, such as CC-BY-4.0 (default: from dataset.toml)")
-    add("--contact", default="", metavar="WHO", help='contact as "Name <mail>" (default: from dataset.toml)')
-    add("--consent", default="", metavar="TEXT", help="consent statement (default: from dataset.toml)")
-    add("--save", action="store_true", help="write licence, contact and consent into dataset.toml")
-    add("--no-streams", action="store_true", help="leave out the session streams between the recordings")
-    add("--allow-excluded", action="store_true", help="publish excluded recordings too, marked")
-    add("--allow-columns", default="", metavar="A,B", help="columns of subjects.csv besides age_group and gender")
-    add(
-        "--key",
-        metavar="FILE",
-        help="secret that fixes the time shifts for later versions; created if absent (default: random each time)",
-    )
-    add("--bids", action="store_true", help="add a tree in the manner of Motion-BIDS")
-    add("--no-reidentification", action="store_true", help="do not test whether people can be recognised")
-    add("--seed", type=int, default=1, metavar="N", help="seed of the re-identification (1)")
-    add("--thorough", action="store_true", help="let slow validators read all rows of the streams")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -58,18 +36,11 @@ def _publish(args: argparse.Namespace) -> int:
     done = publish_dataset(
         args.dataset,
         args.out,
-        licence=args.licence,
-        contact=args.contact,
-        consent=args.consent,
-        save=args.save,
+        **options(args, "licence", "contact", "consent", "save", "key", "bids", "seed", "thorough"),
         streams=not args.no_streams,
         excluded=args.allow_excluded,
         columns=tuple(listed(args.allow_columns)),
-        key=args.key,
-        bids=args.bids,
         reidentification=not args.no_reidentification,
-        seed=args.seed,
-        thorough=args.thorough,
         progress=report_stages(),
     )
     result = done.to_dict()

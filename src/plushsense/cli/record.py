@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from plushsense.cli.options import options
 from plushsense.cli.output import emit, say
 from plushsense.core.errors import ConfigError
 
@@ -18,58 +19,6 @@ if TYPE_CHECKING:
 
 _DRAW_S = 0.1
 _WAIT_S = 0.02
-
-_DESCRIPTION = """\
-The screen shows the prompt. Press SPACE: after a countdown of three seconds the recording begins. Press SPACE again
-when the gesture is over. After an interruption (a pulled cable, a crash, a full disk), give the same command again:
-what was recorded is kept, and the session resumes.
-
-keys: SPACE start and stop   r redo the last   s skip   b back   p pause   n note   q quit
-Where standard input is not a keyboard, a point waits for one second of the toy's time, and SPACE waits for the
-countdown:   printf ' ... ' | plushsense record ...   makes one recording of three seconds.
-"""
-
-
-def add(parser: argparse.ArgumentParser) -> None:
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.description = f"{parser.description}\n\n{_DESCRIPTION}"
-    add = parser.add_argument
-    add("out", metavar="OUT", help="folder for all recordings; gets OUT/SUBJECT/SESSION/")
-    add(
-        "--device",
-        required=True,
-        metavar="URL",
-        help="toy: serial:///dev/ttyUSB0, serial://COM3, tcp://host:port; virtual:// to try it without one",
-    )
-    add("--subject", metavar="CODE", help="code of the person, such as S01, never a name (default: nobody)")
-    add("--session", metavar="NAME", help="name of the session (default: the unfinished one, or a number)")
-    add("--new", action="store_true", help="begin a new session even if the last one is unfinished")
-    add(
-        "--protocol",
-        metavar="NAME",
-        help="protocol: plush-17 (default: the paper's 17 gestures, 3 times), quick (a short trial), rest (the toy at "
-        "rest), or a TOML file",
-    )
-    add("--words", metavar="NAME", help="wording of the prompts, such as child (default: default)")
-    add("--age-group", default="", metavar="WORD", help="such as child, teen, adult (default: none)")
-    add("--gender", default="", metavar="WORD", help="as the person says (default: none)")
-    add(
-        "--consent",
-        default="",
-        metavar="REF",
-        help="number of the signed consent form (required to publish)",
-    )
-    add("--layout", metavar="NAME", help="firmware of the toy: plush-15 (default), plush-14, or a TOML file")
-    add("--speed", type=float, metavar="X", help="speed of a virtual toy relative to real time (1)")
-    add(
-        "--auto",
-        type=float,
-        nargs="?",
-        const=5.0,
-        metavar="S",
-        help="start and stop each recording automatically after S seconds (5): for trials and for the toy at rest",
-    )
-    add("--simulated", action="store_true", help="mark as a simulation, where the toy is `plushsense toy`")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -142,17 +91,12 @@ def _request(args: argparse.Namespace) -> SessionRequest:
 
     if args.auto is not None and not 0.5 <= args.auto <= 3600.0:
         raise ConfigError(f"--auto is {args.auto:g}; 0.5 to 3600 seconds are accepted.")
+    given = options(args, "age_group", "gender", "consent", "simulated")
+    given |= {name: getattr(args, name) or "" for name in ("subject", "protocol", "words", "layout")}
     return SessionRequest(
         device=args.device,
-        subject=args.subject or "",
-        protocol=args.protocol or "",
-        words=args.words or "",
-        layout=args.layout or "",
-        age_group=args.age_group,
-        gender=args.gender,
-        consent=args.consent,
+        **given,
         speed=check_speed(speed_of(args.device) if args.speed is None else float(args.speed)),
-        simulated=args.simulated,
     )
 
 

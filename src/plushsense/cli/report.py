@@ -4,27 +4,9 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from plushsense.cli.output import emit
 from plushsense.core.errors import ConfigError
-
-
-def add(parser: argparse.ArgumentParser) -> None:
-    repeated: dict[str, Any] = {"action": "append", "default": []}
-    add = parser.add_argument
-    add("out", metavar="OUT.html|SWEEP", help="page to write, new or an earlier report; or a folder written by sweep")
-    add("--dataset", metavar="DATASET", help="data set folder (required for a page of evaluations)")
-    add(
-        "--evaluation",
-        **repeated,
-        metavar="DIR",
-        help="folder written by evaluate; can be repeated (default: all in DATASET/evaluations)",
-    )
-    add("--model", **repeated, metavar="FILE", help="bundle to describe; can be repeated")
-    add("--title", metavar="TEXT", help="heading of the page (default: the data set's name)")
-    add("--page", metavar="FILE", help="page of a sweep (default: SWEEP/report.html)")
-    add("--mlflow", metavar="WHERE", help="also log the finished trials of a sweep to MLflow, a folder or a URI")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from plushsense.cli.output import emit, figure, say, table, warn
-from plushsense.cli.settings import add_grid, add_out, add_work, grid_changes, marks
-from plushsense.cli.sweep import several
+from plushsense.cli.output import emit, figure, plural, say, table, warn
+from plushsense.cli.settings import grid_changes, marks, work_options
 from plushsense.jobs.progress import ProgressReporter
 
 if TYPE_CHECKING:
@@ -18,83 +16,32 @@ if TYPE_CHECKING:
 _SEARCH_OPTIONS = ("rungs", "folds", "share", "eta", "max_parameters", "max_state_bytes", "max_macs_per_step")
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("dataset", metavar="DATASET", help="data set folder")
-    parser.add_argument(
-        "--grid",
-        default="paper",
-        metavar="GRID",
-        help="networks to try: paper (default, 52), or a TOML file with [grid] and [search]",
-    )
-    parser.add_argument("--max-parameters", type=int, metavar="P", help="only networks of at most P parameters")
-    parser.add_argument(
-        "--max-state-bytes", type=int, metavar="S", help="only networks of at most S bytes of 8-bit state"
-    )
-    parser.add_argument(
-        "--max-macs-per-step", type=int, metavar="M", help="only networks of at most M multiply-accumulates in 50 ms"
-    )
-    parser.add_argument(
-        "--split", metavar="SPLIT", help="by-subject:5 (default), leave-one-subject-out, by-recording:K, windows:K"
-    )
-    parser.add_argument("--rungs", metavar="N,...", help="epochs after which networks are compared (4,15,60)")
-    parser.add_argument("--folds", metavar="N,...", help="folds to use in each rung but the last (default: all)")
-    parser.add_argument(
-        "--share",
-        type=float,
-        metavar="X",
-        help="largest share of the cost of the whole grid (0.25; more if only few networks fit)",
-    )
-    parser.add_argument(
-        "--eta", type=float, metavar="X", help="one in X continues after each rung, if the cost allows (2)"
-    )
-    defaults = {"batches": "64", "padding": "stream", "norm": "batch", "context": "stream", "classes": "shared"}
-    add_grid(parser, {**defaults, "device": "auto", "seeds": "1"})
-    default = "DATASET/evaluations/search-GRID-…"
-    add_out(parser, "the tables and search.json", default, "a search of other settings or data")
-    add_work(parser, "trainings")
-    parser.add_argument(
-        "--dry-run", action="store_true", help="print what would be tried, left out and spent, without training"
-    )
-
-
 def run(args: argparse.Namespace) -> int:
-    from plushsense.experiments.search.run import search
+    from plushsense.experiments.search.run import preview_search, search
 
     changes = grid_changes(args, "split", *_SEARCH_OPTIONS)
     if args.dry_run:
-        return _dry_run(args, changes)
-    done = search(
-        args.dataset,
-        args.grid,
-        out=None if args.out is None else Path(args.out),
-        overwrite=args.force,
-        workers=args.workers or 0,
-        cluster=args.cluster,
-        progress=report_search(),
-        warn=warn,
-        **changes,
-    )
+        plan = preview_search(args.dataset, args.grid, warn=warn, **changes)
+        emit(args, plan, preview_lines(plan))
+        return 0
+    done = search(args.dataset, args.grid, **work_options(args), progress=report_search(), warn=warn, **changes)
     result = done.to_dict()
     say(f"written: {done.out}")
     emit(args, result, lines(result))
     return 0
 
 
-def _dry_run(args: argparse.Namespace, changes: dict[str, Any]) -> int:
-    from plushsense.experiments.search.run import preview_search
-
-    found = preview_search(args.dataset, args.grid, warn=warn, **changes)
-    text = [f"left out: {row['arch']} {row['filters']}: {row['why']}" for row in found["left_out"]]
-    rungs = ", ".join(f"{e} epochs on {f} folds" for e, f in zip(found["rungs"], found["folds"], strict=True))
-    text += [
-        *marks(found),
-        f"{several(found['candidates'], 'network')}, split {found['split']}, {several(found['seeds'], 'seed')}; "
+def preview_lines(plan: dict[str, Any]) -> list[str]:
+    """Format what a search would try, leave out and spend."""
+    rungs = ", ".join(f"{e} epochs on {f} folds" for e, f in zip(plan["rungs"], plan["folds"], strict=True))
+    return [
+        *(f"left out: {row['arch']} {row['filters']}: {row['why']}" for row in plan["left_out"]),
+        *marks(plan),
+        f"{plural(plan['candidates'], 'network')}, split {plan['split']}, {plural(plan['seeds'], 'seed')}; "
         f"compared after {rungs}",
-        f"at most {found['bound_macs']:.2e} multiply-accumulates, {found['bound_share']:.0%} of the whole grid's "
-        f"{found['grid_macs']:.2e}; the first rung takes {found['first_share']:.1%}",
+        f"at most {plan['bound_macs']:.2e} multiply-accumulates, {plan['bound_share']:.0%} of the whole grid's "
+        f"{plan['grid_macs']:.2e}; the first rung takes {plan['first_share']:.1%}",
     ]
-    emit(args, found, text)
-    return 0
 
 
 def report_search() -> Callable[[SearchProgress], None]:
@@ -120,8 +67,8 @@ def lines(s: dict[str, Any]) -> list[str]:
     mark = " (leaky)" if s["leaky"] else ""
     beyond = f" within the limits, {len(s['left_out'])} beyond" if s["left_out"] else ""
     out.append(
-        f"{several(s['candidates'], 'network')}{beyond}; split {s['split']}, context {s['context']}, "
-        f"{several(len(s['grid']['seeds']), 'seed')}\n"
+        f"{plural(s['candidates'], 'network')}{beyond}; split {s['split']}, context {s['context']}, "
+        f"{plural(len(s['grid']['seeds']), 'seed')}\n"
     )
     out.append(_rungs(s, mark))
     best, cost = s["winner"], s["cost"]
@@ -171,7 +118,7 @@ def _rungs(s: dict[str, Any], mark: str) -> str:
     for rung in s["rungs"]:
         error = rung["standard_error"]
         apart = "" if error is None else f", standard error of a difference {figure(error)}"
-        entered, folds = several(rung["entered"], "network"), several(rung["folds"], "fold")
+        entered, folds = plural(rung["entered"], "network"), plural(rung["folds"], "fold")
         text.append(
             f"up to epoch {rung['epochs']}: {entered} on {folds}, {rung['share']:.1%} of the grid's cost{apart}"
         )

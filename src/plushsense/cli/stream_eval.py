@@ -3,47 +3,13 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from plushsense.cli.output import emit, say, table, warn
-from plushsense.cli.settings import add_settings, add_workers, listed, marks, report_jobs, settings
+from plushsense.cli.output import emit, figure, say, table, warn
+from plushsense.cli.settings import listed, marks, report_jobs, settings
 from plushsense.core.errors import ConfigError
-
-
-def add(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("source", metavar="DATASET|FOLDER", help="data set; with --model also a folder of recordings with their stream")
-    add("--model", metavar="BUNDLE", help="replay streams through this bundle with its decision settings")
-    add("--subjects", metavar="P01,P02", help="people to score with --model (default: all it was not trained on)")
-    add(
-        "--split",
-        metavar="SPLIT",
-        help="instead of --model, train and fit each fold and compare all systems: by-subject:5, leave-one-subject-out",
-    )
-    add(
-        "--systems",
-        metavar="NAME,...",
-        help="systems to compare with --split: argmax, smoothed, hysteresis, hybrid, anywhere-smoothed, anywhere, full "
-        "(default: all)",
-    )
-    add(
-        "--late",
-        type=float,
-        default=1.0,
-        metavar="S",
-        help="seconds after its end in which a gesture counts as hit (1)",
-    )
-    add(
-        "--anywhere-pool",
-        type=float,
-        metavar="S",
-        help="with --split: seconds that networks trained with context anywhere average (default: as the others)",
-    )
-    add_workers(parser, "folds")
-    add("--out", metavar="DIR", help="with --split: folder for the page, figures, CSV and JSON")
-    add("--force", action="store_true", help="replace an earlier benchmark in --out")
-    add_settings(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -95,8 +61,7 @@ def _run_split(args: argparse.Namespace) -> int:
     return 0
 
 
-def _number(value: float | None, digits: int = 2) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
+_number = partial(figure, digits=2)
 
 
 def _rate(value: float | None) -> str:

@@ -6,37 +6,11 @@ import argparse
 import json
 import sys
 from pathlib import Path
-from typing import Any
 
 from plushsense.cli.output import say
 from plushsense.core.errors import ConfigError
 
 _HOME = "PlushSense"
-
-
-def add(parser: argparse.ArgumentParser) -> None:
-    repeated: dict[str, Any] = {"action": "append", "default": []}
-    add = parser.add_argument
-    add(
-        "--home",
-        metavar="DIR",
-        help="folder of recordings, data sets, bundles and exports (default: PlushSense in your home folder); pages "
-        "see nothing outside of it except the data sets and bundles given here",
-    )
-    add("--dataset", metavar="DIR", **repeated, help="data set elsewhere; can be repeated")
-    add("--model", metavar="BUNDLE", **repeated, help="bundle elsewhere; can be repeated")
-    add("--device", metavar="URL", **repeated, help="toy to offer; can be repeated")
-    add("--speed", type=float, default=1.0, metavar="X", help="speed of a virtual toy relative to real time (1)")
-    add(
-        "--host",
-        default="127.0.0.1",
-        metavar="ADDRESS",
-        help="address to listen on (default: 127.0.0.1, this machine only); another, such as 0.0.0.0 for a tablet, "
-        "requires a one-time token",
-    )
-    add("--name", metavar="NAME", **repeated, help="host name under which browsers may open this machine")
-    add("--port", type=int, metavar="N", help="port (default: 8137 or the next free one; 0: any)")
-    add("--no-show", action="store_true", help="do not open a browser")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -3,79 +3,42 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import Any
 
-from plushsense.cli.output import emit, figure, say, table, warn
-from plushsense.cli.settings import add_grid, add_out, add_work, grid_changes, marks
-
-
-def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("dataset", metavar="DATASET", help="data set folder")
-    parser.add_argument("--grid", default="paper", metavar="GRID", help="paper (default, 468 trials), or a TOML file")
-    parser.add_argument(
-        "--split",
-        metavar="SPLIT",
-        help="leave-one-subject-out, by-subject:K, by-recording:K; leaky, as in the paper: windows:holdout, windows:K "
-        "(default: the grid's; paper windows:holdout)",
-    )
-    default = "DATASET/evaluations/sweep-GRID"
-    add_out(parser, "the tables and sweep.json", default, "a sweep of other settings or data")
-    add_work(parser, "trainings")
-    of_paper = {"padding": "mirror", "norm": "batch", "context": "loop", "classes": "all", "device": "auto"}
-    add_grid(parser, {key: f"the grid's; paper {value}" for key, value in of_paper.items()})
-    parser.add_argument("--epochs", metavar="N,...", help="only these numbers of epochs (default: the grid's)")
-    parser.add_argument(
-        "--dry-run", action="store_true", help="print what would be trained and all problems, without training"
-    )
+from plushsense.cli.output import emit, figure, plural, say, table, warn
+from plushsense.cli.settings import grid_changes, marks, work_options
 
 
 def run(args: argparse.Namespace) -> int:
-    from plushsense.experiments.sweep.run import sweep
+    from plushsense.experiments.sweep.run import preview, sweep
 
     changes = grid_changes(args, "split", "epochs")
     if args.dry_run:
-        return _dry_run(args, changes)
-    done = sweep(
-        args.dataset,
-        args.grid,
-        out=None if args.out is None else Path(args.out),
-        overwrite=args.force,
-        workers=args.workers or 0,
-        cluster=args.cluster,
-        display=True,
-        warn=warn,
-        **changes,
-    )
+        plan = preview(args.dataset, args.grid, warn=warn, **changes)
+        emit(args, plan, preview_lines(plan))
+        return 1 if plan["problems"] else 0
+    done = sweep(args.dataset, args.grid, **work_options(args), display=True, warn=warn, **changes)
     result = done.to_dict()
     say(f"written: {done.out}; make a page of it with  plushsense report {done.out}")
     emit(args, result, lines(result))
     return 1 if result["trainings_lost"] else 0
 
 
-def _dry_run(args: argparse.Namespace, changes: dict[str, Any]) -> int:
-    from plushsense.experiments.sweep.run import preview
-
-    found = preview(args.dataset, args.grid, warn=warn, **changes)
-    text = [f"- {line}" for line in found["problems"]]
-    if not text:
-        text = [
-            *marks(found),
-            f"{several(found['trials'], 'trial')} in {several(found['trainings'], 'training')} "
-            f"({several(found['folds'], 'fold')}, {several(found['seeds'], 'seed')})",
-            f"{several(found['held'], 'training')} done before; split {found['split']}",
-            f"about {found['macs']:.2e} multiply-accumulates; trial by trial {found['macs_one_by_one']:.2e}",
-            f"memory of each process: windows {found['windows_mb']:.0f} MB; a step of the largest training "
-            + ("as PyTorch takes it" if found["training_mb"] is None else f"{found['training_mb']:.0f} MB"),
-            "",
-            table(("network", "share of the cost"), [(arch, f"{share:.1%}") for arch, share in found["cost"].items()]),
-        ]
-    emit(args, found, text)
-    return 1 if found["problems"] else 0
-
-
-def several(n: int, what: str) -> str:
-    return f"{n} {what}{'s' * (n != 1)}"
+def preview_lines(plan: dict[str, Any]) -> list[str]:
+    """Format what a sweep would train, or the problems of its grid."""
+    if plan["problems"]:
+        return [f"- {line}" for line in plan["problems"]]
+    return [
+        *marks(plan),
+        f"{plural(plan['trials'], 'trial')} in {plural(plan['trainings'], 'training')} "
+        f"({plural(plan['folds'], 'fold')}, {plural(plan['seeds'], 'seed')})",
+        f"{plural(plan['held'], 'training')} done before; split {plan['split']}",
+        f"about {plan['macs']:.2e} multiply-accumulates; trial by trial {plan['macs_one_by_one']:.2e}",
+        f"memory of each process: windows {plan['windows_mb']:.0f} MB; a step of the largest training "
+        + ("as PyTorch takes it" if plan["training_mb"] is None else f"{plan['training_mb']:.0f} MB"),
+        "",
+        table(("network", "share of the cost"), [(arch, f"{share:.1%}") for arch, share in plan["cost"].items()]),
+    ]
 
 
 def lines(s: dict[str, Any]) -> list[str]:

@@ -7,29 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from plushsense.cli.options import options
 from plushsense.cli.output import emit, figure, warn
-from plushsense.cli.settings import add_settings, report_epochs, settings
+from plushsense.cli.settings import report_epochs, settings
 from plushsense.core.errors import ConfigError
-
-
-def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("dataset", metavar="DATASET", help="data set folder")
-    parser.add_argument("--out", metavar="FILE", default="model.plush", help="bundle to write (model.plush)")
-    parser.add_argument("--force", action="store_true", help="replace an existing bundle")
-    parser.add_argument(
-        "--quantize-aware",
-        type=int,
-        default=0,
-        metavar="EPOCHS",
-        help="fine-tune for 8 bits for this many epochs after the training (0); training reports where it would help",
-    )
-    parser.add_argument(
-        "--no-fit-decisions",
-        dest="fit_decisions",
-        action="store_false",
-        help="use the default decision settings instead of fitting them on the validation people",
-    )
-    add_settings(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -40,8 +21,7 @@ def run(args: argparse.Namespace) -> int:
     done = train(
         args.dataset,
         settings(args),
-        quantize_aware=args.quantize_aware,
-        fit_decisions=args.fit_decisions,
+        **options(args, "quantize_aware", "fit_decisions"),
         journal=unfinished(args.dataset),
         progress=report_epochs(),
         warn=warn,

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from plushsense.cli.options import options
 from plushsense.cli.output import emit, say, table
 from plushsense.jobs.progress import ProgressReporter
 
@@ -13,37 +14,6 @@ if TYPE_CHECKING:
     from plushsense.dataset.trimming import TrimResult
 
 _LINES = 20
-
-
-def add(parser: argparse.ArgumentParser) -> None:
-    repeated: dict[str, Any] = {"action": "append", "default": []}
-    add = parser.add_argument
-    add("dataset", metavar="DATASET", help="data set folder")
-    add(
-        "--only",
-        metavar="GLOB",
-        default="*",
-        help="recordings to list, plot and accept: 'P01/*' (default: all)",
-    )
-    add("--accept", **repeated, metavar="ID|GLOB", help="mark the suggestions for these recordings; can be repeated")
-    add("--accept-above", type=float, metavar="C", help="mark all suggestions of at least this confidence, 0 to 1")
-    add(
-        "--set",
-        nargs=2,
-        **repeated,
-        metavar=("ID", "FROM:TO"),
-        help="keep these seconds of one recording, such as 0.35:2.1, 0.35: or :2.1; can be repeated",
-    )
-    add("--undo", **repeated, metavar="ID|GLOB", help="remove the marks of these recordings; can be repeated")
-    add(
-        "--offset",
-        action=argparse.BooleanOptionalAction,
-        default=False,
-        help="accept the suggested end too (default: only the start, as in the paper)",
-    )
-    add("--who", metavar="NAME", help="person who decides, stored with the mark (default: login name)")
-    add("--why", default="", metavar="TEXT", help="reason, stored with the mark")
-    add("--plot", metavar="FILE.png|DIR", help="plot recordings, least confident first: one page, or all into a folder")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -55,14 +25,9 @@ def run(args: argparse.Namespace) -> int:
         check_picture_path(Path(args.plot))
     result = decide_trims(
         args.dataset,
-        only=args.only,
-        accept=args.accept,
+        **options(args, "only", "accept", "undo", "offset", "who", "why"),
         above=args.accept_above,
         keep=[(identity, *_seconds(text)) for identity, text in args.set],
-        undo=args.undo,
-        offset=args.offset,
-        who=args.who,
-        why=args.why,
         progress=ProgressReporter("reading"),
     )
     drawn: list[Path] = []

@@ -49,7 +49,7 @@ def fold_windows(train: WindowSet, score: WindowSet, split: Split, seed: int = 0
         return make_folds(split, score.subject, score.y, seed)
     recordings = _Recordings.of(train, score)
     of_train, of_score = recordings.place(train), recordings.place(score)
-    found = []
+    divided = []
     for fold in make_folds(split, recordings.subject, recordings.y, seed):
         keep = purge(train.stream, train.window_rows, *recordings.rows(fold.test))
         windows = Fold(
@@ -60,8 +60,8 @@ def fold_windows(train: WindowSet, score: WindowSet, split: Split, seed: int = 0
             np.flatnonzero(np.isin(of_score, fold.test)),
         )
         _require_windows(windows, fold, split)
-        found.append(windows)
-    return found
+        divided.append(windows)
+    return divided
 
 
 @dataclass(frozen=True)
@@ -275,19 +275,19 @@ class _FoldWork:
             report((epoch, epochs, row))
 
         out = self.fit_predict(train.take(task.train), train.take(task.validation), score.take(task.test), progress)
-        found = {"probabilities": out.probabilities}
+        arrays = {"probabilities": out.probabilities}
         if out.deployed is not None:
-            found["deployed"] = out.deployed
+            arrays["deployed"] = out.deployed
         expected = (len(task.test), len(score.labels))
-        for what, probabilities in found.items():
-            found[what] = probabilities = np.asarray(probabilities, dtype=np.float32)
+        for what, probabilities in arrays.items():
+            arrays[what] = probabilities = np.asarray(probabilities, dtype=np.float32)
             if probabilities.shape != expected:
                 raise ConfigError(
                     f"fit_predict gave {what} of the shape {probabilities.shape}; {expected} (windows, classes) is "
                     "expected."
                 )
         return {
-            **found,
+            **arrays,
             "history": out.history,
             "seconds": out.seconds,
             "best_epoch": out.best_epoch,

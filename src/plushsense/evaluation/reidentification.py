@@ -92,15 +92,15 @@ class ReidentificationTrial:
 class Reidentified:
     """The results of a re-identification; ``skipped`` holds the designs that the data do not allow, with the reason.
 
-    ``of_one_person`` are gestures that only one person made, so that their label identifies the person.
+    ``gestures_of_one_person`` are gestures that only one person made, so that their label identifies the person.
     """
 
-    trials: tuple[ReidentificationTrial, ...]
     people: int
     recordings: int
     sessions: int
+    trials: tuple[ReidentificationTrial, ...]
     skipped: dict[str, str]
-    of_one_person: tuple[str, ...]
+    gestures_of_one_person: tuple[str, ...]
     seed: int
     trees: int
     simulated: bool
@@ -120,17 +120,11 @@ class Reidentified:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
-        return {
-            "people": self.people,
-            "recordings": self.recordings,
-            "sessions": self.sessions,
+        lists = {
             "trials": [t.to_dict() for t in self.trials],
-            "skipped": self.skipped,
-            "gestures_of_one_person": list(self.of_one_person),
-            "seed": self.seed,
-            "trees": self.trees,
-            "simulated": self.simulated,
+            "gestures_of_one_person": list(self.gestures_of_one_person),
         }
+        return {**vars(self), **lists}
 
 
 def reidentify(dataset: Dataset, *, seed: int = 1, trees: int = 150, progress: Progress | None = None) -> Reidentified:
@@ -187,10 +181,10 @@ def reidentify(dataset: Dataset, *, seed: int = 1, trees: int = 150, progress: P
     sessions = len(set(zip(person.tolist(), session.tolist(), strict=True)))
     alone = [g for g in labels if len(np.unique(person[gesture == g])) == 1]
     return Reidentified(
-        tuple(trials),
         len(np.unique(person)),
         len(person),
         sessions,
+        tuple(trials),
         skipped,
         tuple(map(str, alone)),
         seed,
@@ -282,25 +276,25 @@ def _trial(
     )
 
 
-def verdict(found: Reidentified) -> str:
+def verdict(results: Reidentified) -> str:
     """Return the verdict as one Markdown paragraph.
 
     Raises:
         MissingExtraError: when jinja2 is not installed.
     """
-    sentences = _fill("reidentification_verdict.md.j2", found=found, hundred=_hundred, interval=_range)
+    sentences = _fill("reidentification_verdict.md.j2", found=results, hundred=_hundred, interval=_range)
     return " ".join(sentences.splitlines())
 
 
-def report(found: Reidentified, command: str) -> str:
+def report(results: Reidentified, command: str) -> str:
     """Return the whole report in Markdown; ``command`` is the command that made it."""
-    trial = found.find("recordings", "everything")
+    trial = results.find("recordings", "everything")
     by_person = None if trial is None else sorted(trial.by_person.items(), key=lambda item: (-item[1], item[0]))
     return _fill(
         "reidentification.md.j2",
-        found=found,
+        found=results,
         command=command,
-        verdict=verdict(found),
+        verdict=verdict(results),
         by_person=by_person,
         designs=DESIGNS,
         sees=SEES,

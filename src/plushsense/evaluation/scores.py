@@ -207,8 +207,8 @@ class _Scorer:
         recording = self._recording[mask]
         ids, read = metrics.vote(self._all.probabilities[mask], recording)
         _, first = np.unique(recording, return_index=True)
-        found = metrics.scores_of(metrics.confusion(self._all.truth[mask][first], read, self._classes))
-        return _plain(found) | {"recordings": len(ids)}
+        figures = metrics.scores_of(metrics.confusion(self._all.truth[mask][first], read, self._classes))
+        return _plain(figures) | {"recordings": len(ids)}
 
     def by_context(self, mask: Mask) -> dict[str, Any]:
         table = {}
@@ -240,10 +240,10 @@ def _fold(fold: FoldRecord, scorer: _Scorer, mask: Mask) -> dict[str, Any]:
 
 
 def _person(name: str, scorer: _Scorer, mask: Mask) -> dict[str, Any]:
-    found = _plain(scorer.figures(mask))
+    figures = _plain(scorer.figures(mask))
     return {
         "subject": name,
         **scorer.size(mask),
-        **{key: found[key] for key in metrics.column_metrics()},
+        **{key: figures[key] for key in metrics.column_metrics()},
         "by_recording_accuracy": scorer.by_recording(mask)["accuracy"],
     }

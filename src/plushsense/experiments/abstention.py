@@ -252,11 +252,11 @@ _STYLES = (
 )
 
 
-def curves(found: Mapping[str, RiskCoverage], *, title: str = "") -> Figure:
+def curves(measured: Mapping[str, RiskCoverage], *, title: str = "") -> Figure:
     """Draw a risk-coverage curve for each confidence, with those of chance and of an oracle."""
     figure = new_figure(6.4, 4.2)
     axes = figure.add_subplot()
-    ranked = sorted(found.items(), key=lambda item: item[1].area)
+    ranked = sorted(measured.items(), key=lambda item: item[1].area)
     first = ranked[0][1]
     axes.axhline(100 * first.random, color="#888888", linewidth=1.0, label=f"chance (area {first.random:.3f})")
     for (name, curve), (colour, style) in zip(ranked, _STYLES, strict=False):
@@ -277,7 +277,7 @@ def curves(found: Mapping[str, RiskCoverage], *, title: str = "") -> Figure:
     axes.grid(color="#dddddd", linewidth=0.5)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(fontsize=7.5, frameon=False, loc="upper left", bbox_to_anchor=(0, 1.0))
-    axes.set_ylim(0, 100 * max(first.random, *(float(c.risk.max()) for c in found.values())) * 1.75)
+    axes.set_ylim(0, 100 * max(first.random, *(float(c.risk.max()) for c in measured.values())) * 1.75)
     if title:
         axes.set_title(title, fontsize=10, parse_math=False)
     return figure
@@ -420,12 +420,12 @@ def abstaining(
             "None of the test people, or none of the validation people, has a stream with recordings in it: use other "
             "folds."
         )
-    found = summarise(answers, coverage, known_share)
-    found.table.update(split=parsed.text, simulated=dataset.head.simulated, dataset=dataset.head.name)
+    done = summarise(answers, coverage, known_share)
+    done.table.update(split=parsed.text, simulated=dataset.head.simulated, dataset=dataset.head.name)
     if out is not None:
         with dataset.generation.writing():
-            save(found, Path(out))
-    return found
+            save(done, Path(out))
+    return done
 
 
 def save(done: Abstaining, out: Path) -> None:

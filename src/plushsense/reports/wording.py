@@ -2,54 +2,18 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Mapping, Sequence
+from importlib import resources
 from typing import Any
 
 from plushsense.reports.table import DASH, count, text
 
-CONTEXT_WORDS = {
-    "stream": "real context: what the session's stream contains before the gesture",
-    "loop": "looped windows: a short recording repeated until the window is full, which a toy never sends",
-    "inside": "windows completely inside a recording",
-}
-CONTEXT_SHORT = {"stream": "real context", "loop": "loops", "inside": "windows inside the recording"}
+_TEXTS = tomllib.loads(resources.files("plushsense.reports").joinpath("wording.toml").read_text(encoding="utf-8"))
+CONTEXT_WORDS: dict[str, str] = _TEXTS["contexts"]
+CONTEXT_SHORT: dict[str, str] = _TEXTS["contexts_short"]
 
 _NO_LEAK = "No training or validation window overlaps a recording that is scored."
-_PEOPLE_VALIDATE = "Other whole people validate{role}; in that fold they are neither trained on nor scored."
-# For each kind of split: how the data are divided, and who validates.
-_SPLITS = {
-    "leave-one-subject-out": (
-        "Leave one subject out: each person in turn is held out, and the network is trained anew on the "
-        "others; it never saw the person it is scored on.",
-        _PEOPLE_VALIDATE,
-    ),
-    "by-subject": (
-        "By subject, {k} folds: the people are divided into groups; each group in turn is held out, and "
-        "the network never saw the people it is scored on.",
-        _PEOPLE_VALIDATE,
-    ),
-    "by-recording": (
-        "By recording, {k} folds: each recording is completely on one side, but the people are known: other "
-        "recordings of the same person are trained on. The scores show how well the network reads people it was "
-        "trained for.",
-        "Other recordings validate{role}.",
-    ),
-    "windows": (
-        "Random windows, {k} folds: windows are drawn at random, regardless of recording and person.",
-        "Other random windows validate{role}.",
-    ),
-    "holdout": (
-        "Hold-out, as in the paper: windows are drawn at random, evenly over the gestures: 70 % train, 15 % "
-        "validate, 15 % are scored, regardless of recording and person.",
-        "Other random windows validate{role}.",
-    ),
-}
-_ROLES = {
-    True: " (they decide when training stops)",
-    False: " (only to be observed: training runs its full length)",
-    None: "",
-}
-
 # Splits by person, for evaluations without the key "over".
 _SPLITS_BY_PERSON = ("leave-one-subject-out", "by-subject")
 
@@ -62,11 +26,12 @@ def describe_split(split: str, folds: int | None = None, decides: bool | None = 
     kind, _, given_folds = split.partition(":")
     if split == "windows:holdout":
         kind = "holdout"
-    if kind not in _SPLITS:
+    if kind not in _TEXTS["splits"]:
         return f"Split “{split}”.", "Who validates is not recorded."
-    how, who = _SPLITS[kind]
+    sentences = _TEXTS["splits"][kind]
     k = given_folds or (str(folds) if folds else "several")
-    return how.format(k=k), who.format(role=_ROLES[decides])
+    role = "" if decides is None else _TEXTS["roles"]["decides" if decides else "observed"]
+    return sentences["how"].format(k=k), sentences["who"].format(role=role)
 
 
 def describe_contexts(evaluation: Mapping[str, Any]) -> tuple[str, str]:

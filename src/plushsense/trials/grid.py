@@ -125,15 +125,15 @@ class Training:
 
 def trainings(grid: GridSpec, layout: Layout, classes: int) -> list[Training]:
     """Return the trainings that contain all trials of a grid without `problems`."""
-    found = []
+    planned = []
     nested = grid.training.patience is None
     for symbol in grid.architectures:
         for filters in grid.filters:
             arch = _network(grid, symbol, filters, layout, classes)
             for batch in grid.batches:
                 trials = tuple(Trial(arch, filters, epochs, batch) for epochs in grid.epochs)
-                found += [Training(trials)] if nested else [Training((trial,)) for trial in trials]
-    return found
+                planned += [Training(trials)] if nested else [Training((trial,)) for trial in trials]
+    return planned
 
 
 def _network(grid: GridSpec, symbol: str, filters: Sequence[int], layout: Layout, classes: int) -> Arch:
@@ -159,52 +159,52 @@ def problems(
         past: samples up to the end of a recording in its stream, for at least half of the recordings.
         windows: smallest number of training windows of a fold, or more where the split cannot be made.
     """
-    found = _of_settings(grid)
+    wrong = _of_settings(grid)
     shapes: dict[str, int] = {}
     for symbol in grid.architectures:
         try:
             shapes[symbol] = len(parse_symbol(symbol))
         except ArchError as cause:
-            found.append(first_line(cause))
+            wrong.append(first_line(cause))
     for filters in grid.filters:
         if not filters or min(filters) < 1:
-            found.append(
+            wrong.append(
                 f"The filters {slashed(filters) or '(none)'} cannot be used: accepted are whole numbers from 1."
             )
             continue
         for symbol, layers in shapes.items():
             if len(filters) < layers:
-                found.append(
+                wrong.append(
                     f"{symbol} has {layers} layers, but the filters {slashed(filters)} are only {len(filters)}: "
                     "give one a layer."
                 )
-    found += _twice(grid)
+    wrong += _twice(grid)
     for epochs in grid.epochs:
         if epochs < 1:
-            found.append(f"Epochs {epochs} cannot be trained: accepted are whole numbers from 1.")
+            wrong.append(f"Epochs {epochs} cannot be trained: accepted are whole numbers from 1.")
     if list(grid.epochs) != sorted(grid.epochs):
-        found.append(f"The epochs {_listed(grid.epochs)} do not ascend: give {_listed(sorted(set(grid.epochs)))}.")
+        wrong.append(f"The epochs {_listed(grid.epochs)} do not ascend: give {_listed(sorted(set(grid.epochs)))}.")
     for batch in grid.batches:
         if isinstance(batch, int) and batch < 2:
-            found.append(f"A batch of {batch} cannot be used: accepted are whole numbers from 2 and '{FULL}'.")
+            wrong.append(f"A batch of {batch} cannot be used: accepted are whole numbers from 2 and '{FULL}'.")
         elif isinstance(batch, int) and windows is not None and batch > windows:
-            found.append(
+            wrong.append(
                 f"A batch of {batch} is larger than the {windows} windows to train on with the split {grid.split}: "
                 f"give at most {windows}, or '{FULL}'."
             )
-    found += [f"Seed {seed} cannot be used: accepted are whole numbers from 0." for seed in grid.seeds if seed < 0]
+    wrong += [f"Seed {seed} cannot be used: accepted are whole numbers from 0." for seed in grid.seeds if seed < 0]
     if layout is not None:
-        found += [line for symbol in shapes for line in _too_long(grid, symbol, layout, past)]
-    return list(dict.fromkeys(found))
+        wrong += [line for symbol in shapes for line in _too_long(grid, symbol, layout, past)]
+    return list(dict.fromkeys(wrong))
 
 
 def _of_settings(grid: GridSpec) -> list[str]:
-    found = []
+    wrong = []
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", grid.name):
-        found.append(f"The name '{grid.name}' cannot be a folder's: accepted are letters, digits and . _ - between.")
+        wrong.append(f"The name '{grid.name}' cannot be a folder's: accepted are letters, digits and . _ - between.")
     for key in ("architectures", "filters", "epochs", "batches", "seeds"):
         if not getattr(grid, key):
-            found.append(f"The grid has no {key}: give at least one.")
+            wrong.append(f"The grid has no {key}: give at least one.")
     for key, known in (
         ("preset", tuple(PRESETS)),
         ("padding", PADDINGS),
@@ -214,15 +214,15 @@ def _of_settings(grid: GridSpec) -> list[str]:
     ):
         value = getattr(grid, key)
         if value not in known:
-            found.append(f"Unknown {key} '{value}': accepted are {', '.join(known)}.{nearest(value, known)}")
+            wrong.append(f"Unknown {key} '{value}': accepted are {', '.join(known)}.{nearest(value, known)}")
     for key in (*_OF_TRAINING, "threads"):
         if getattr(grid, key) is not None:
-            found += _refused(partial(TrainSpec().changed, **{key: getattr(grid, key)}))
-    found += _refused(lambda: WindowSpec(window_s=grid.window_s, step_s=grid.step_s))
-    found += _refused(lambda: parse_split(grid.split))
+            wrong += _refused(partial(TrainSpec().changed, **{key: getattr(grid, key)}))
+    wrong += _refused(lambda: WindowSpec(window_s=grid.window_s, step_s=grid.step_s))
+    wrong += _refused(lambda: parse_split(grid.split))
     if grid.split_seed < 0:
-        found.append(f"split_seed is {grid.split_seed}: accepted are whole numbers from 0.")
-    return found
+        wrong.append(f"split_seed is {grid.split_seed}: accepted are whole numbers from 0.")
+    return wrong
 
 
 def _refused(make: Callable[[], object]) -> list[str]:
@@ -235,11 +235,11 @@ def _refused(make: Callable[[], object]) -> list[str]:
 
 def _twice(grid: GridSpec) -> list[str]:
     """Report trials that are in the grid more than once: repeated values, and several names of one network."""
-    found = []
+    wrong = []
     for key in ("epochs", "batches", "seeds"):
         values = getattr(grid, key)
         again = [value for value in dict.fromkeys(values) if values.count(value) > 1]
-        found += [f"The grid has {value} among its {key} {values.count(value)} times: give it once." for value in again]
+        wrong += [f"The grid has {value} among its {key} {values.count(value)} times: give it once." for value in again]
     seen: dict[object, str] = {}
     for symbol in grid.architectures:
         for filters in grid.filters:
@@ -250,9 +250,9 @@ def _twice(grid: GridSpec) -> list[str]:
             network, name = (shape, filters[: len(shape)]), f"{symbol} with {slashed(filters) or '(none)'}"
             if network in seen:
                 other = f"as {seen[network]}" if seen[network] != name else "twice"
-                found.append(f"{name} is the same network {other}: leave one out.")
+                wrong.append(f"{name} is the same network {other}: leave one out.")
             seen.setdefault(network, name)
-    return found
+    return wrong
 
 
 def _too_long(grid: GridSpec, symbol: str, layout: Layout, past: int | None) -> list[str]:
@@ -313,17 +313,17 @@ def load_grid(
     Raises:
         ConfigError: for an unknown name, or a file that is missing or not TOML.
     """
-    found: list[str] = []
+    wrong: list[str] = []
     if not isinstance(grid, GridSpec):
         path = os.fspath(grid)
         if path in GRIDS:
             grid = GRIDS[path]
         else:
-            tables, found = grid_tables(path)
+            tables, wrong = grid_tables(path)
             grid, more = over(GridSpec(name=Path(path).stem), tables["grid"], f"[grid] in '{path}'")
-            found += more
+            wrong += more
     grid, more = over(grid, changes or {}, "the grid")
-    return grid, found + more
+    return grid, wrong + more
 
 
 def grid_tables(path: str | Path) -> tuple[dict[str, Mapping[str, Any]], list[str]]:
@@ -338,14 +338,14 @@ def grid_tables(path: str | Path) -> tuple[dict[str, Mapping[str, Any]], list[st
             f"{nearest(str(path), GRIDS)}"
         )
     content = read_toml(Path(path), "grid", ConfigError)
-    found = [unknown_key(key, TABLES, f"'{path}'") for key in content if key not in TABLES]
+    wrong = [unknown_key(key, TABLES, f"'{path}'") for key in content if key not in TABLES]
     tables: dict[str, Mapping[str, Any]] = {name: {} for name in TABLES}
     for name in tables:
         if isinstance(content.get(name), Mapping):
             tables[name] = content[name]
         elif name in content or name == "grid":
-            found.append(f"'{path}' has no table [{name}]: write  [{name}]  and its keys below.")
-    return tables, found
+            wrong.append(f"'{path}' has no table [{name}]: write  [{name}]  and its keys below.")
+    return tables, wrong
 
 
 def over(spec: Spec, table: Mapping[str, Any], where: str) -> tuple[Spec, list[str]]:
@@ -356,8 +356,8 @@ def over(spec: Spec, table: Mapping[str, Any], where: str) -> tuple[Spec, list[s
     """
     kinds = get_type_hints(type(spec))
     parsed = {key: _from_text(key, value, kinds.get(key)) for key, value in table.items() if value is not None}
-    values, found = check_table(parsed, type(spec), where)
-    return replace(spec, **values), found
+    values, wrong = check_table(parsed, type(spec), where)
+    return replace(spec, **values), wrong
 
 
 def _from_text(key: str, value: Any, kind: Any) -> Any:

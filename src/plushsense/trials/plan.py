@@ -41,12 +41,12 @@ PASSES = 3
 
 
 class GridProblems(ConfigError):
-    """Error with all problems of a grid at once, one sentence each in ``found``."""
+    """Error with all problems of a grid at once, one sentence each in ``problems``."""
 
-    def __init__(self, found: Sequence[str]) -> None:
-        self.found = tuple(found)
-        several = "\n  - ".join([f"The grid has {len(found)} problems:", *found])
-        super().__init__(found[0] if len(found) == 1 else several)
+    def __init__(self, problems: Sequence[str]) -> None:
+        self.problems = tuple(problems)
+        listed = "\n  - ".join([f"The grid has {len(problems)} problems:", *problems])
+        super().__init__(problems[0] if len(problems) == 1 else listed)
 
 
 @dataclass(frozen=True)
@@ -152,17 +152,17 @@ def _cut(dataset: Dataset, grid: GridSpec, unreadable: Sequence[str], warn: Warn
         (max(r.stream_row, 0) + r.stop - r.start) * (rate / r.rate_hz if r.rate_hz > 0 else 1.0) for r in dataset.used
     ]
     past = int(median(reaches)) if reaches else 0
-    cut, fewest, found = None, None, list[str]()
+    cut, fewest, failures = None, None, list[str]()
     try:
         cut = _Cut.of(dataset, grid, warn)
         fewest = len(cut.windows)
         fewest = min(len(fold.train) for fold in cut.folds())
     except BadInput as cause:
-        found.append(first_line(cause))
+        failures.append(first_line(cause))
     # A problem of the grid may have the same message as the failure to cut windows.
-    found = list(dict.fromkeys([*unreadable, *problems(grid, dataset.layout, past, fewest), *found]))
-    if found or cut is None:
-        raise GridProblems(found)
+    wrong = list(dict.fromkeys([*unreadable, *problems(grid, dataset.layout, past, fewest), *failures]))
+    if wrong or cut is None:
+        raise GridProblems(wrong)
     _warn_of_rare(dataset, cut, warn)
     return cut
 
@@ -318,6 +318,9 @@ def train_all(
 class TrainAndScore:
     """One training as a job: probabilities of the tested windows after each number of epochs that is scored.
 
+    Its result holds ``probabilities`` (E, N, K) float32, the ``validation`` scores (E, 2) and the ``curve``, with the
+    columns of `CURVE`.
+
     A training that diverges does not stop the others: it is scored after the largest number of epochs that succeeds,
     and ``failed`` holds the reason for the others. ``at`` is the epoch whose weights are scored. A long training saves
     its state in ``unfinished`` once a minute, and continues from there after an interruption.
@@ -332,7 +335,7 @@ class TrainAndScore:
         sets, folds = shared
         windows, fold = sets[task.span], folds[task.span][task.fold]
         train, validation, test = (windows.take(index) for index in (fold.train, fold.validation, fold.test))
-        wanted, failed, fitted = task.epochs, dict[str, str](), None
+        epochs_left, failed, fitted = task.epochs, dict[str, str](), None
         before = None if self.unfinished is None else self.unfinished.find(task.id)
         start = task.start if before is None else FitState.from_arrays(before)
 
@@ -340,56 +343,41 @@ class TrainAndScore:
             if self.unfinished is not None:
                 keep_if_possible(self.unfinished, task.id, state.to_arrays())
 
-        while wanted and fitted is None:
-            spec = replace(task.spec, epochs=wanted[-1])
-            keep = wanted if task.nested else ()
+        while epochs_left and fitted is None:
+            spec = replace(task.spec, epochs=epochs_left[-1])
+            keep = epochs_left if task.nested else ()
             try:
                 fitted = fit(
                     train, validation, task.arch, spec, lambda at, of, row: report((at, of, row["train_loss"])), keep,
                     start=start, save=save if task.nested else None,
                 )  # fmt: skip
             except DivergedError as cause:
-                failed[str(wanted[-1])] = str(cause)
-                wanted, start = wanted[:-1], None
-        if fitted is None:
-            return _result(
-                (), np.zeros((0, len(test), len(windows.labels))), [], [], np.zeros((0, len(CURVE))), 0, failed
-            )
+                failed[str(epochs_left[-1])] = str(cause)
+                epochs_left, start = epochs_left[:-1], None
+        # Where every training diverged, ``fitted`` is None and no epochs are left.
         tested, watched = [], []
-        for epochs in wanted:
+        for epochs in epochs_left:
+            assert fitted is not None
             weights = fitted.kept[epochs] if task.nested else fitted.weights
             tested.append(predict(task.arch, weights, fitted.scaler, test, task.spec.device))
             read = predict(task.arch, weights, fitted.scaler, validation, task.spec.device).argmax(axis=1)
             counts = metrics.confusion(validation.y, read.astype(np.int64), len(validation.labels))
             watched.append((metrics.accuracy(counts), metrics.macro_f1(counts)))
-        curve = np.array([[row[name] for name in CURVE] for row in fitted.history], dtype=np.float64)
-        at = list(wanted) if task.nested else [fitted.best_epoch]
-        seconds = task.spent_s + fitted.seconds
-        result = _result(wanted, np.stack(tested), watched, at, curve, seconds, failed)
-        state = fitted.state if task.stateful and not failed else None
+        history = [] if fitted is None else fitted.history
+        result: Result = {
+            "epochs": list(epochs_left),
+            "at": list(epochs_left) if task.nested or fitted is None else [fitted.best_epoch],
+            "probabilities": np.array(tested, dtype=np.float32).reshape(
+                len(epochs_left), len(test), len(windows.labels)
+            ),
+            "validation": np.array(watched, dtype=np.float64).reshape(-1, 2),
+            "curve": np.array([[row[name] for name in CURVE] for row in history], np.float64).reshape(-1, len(CURVE)),
+            "seconds": 0 if fitted is None else task.spent_s + fitted.seconds,
+            "failed": failed,
+        }
+        state = fitted.state if fitted is not None and task.stateful and not failed else None
         # The weights that were scored on the way are no longer needed.
         return result if state is None else {**result, **replace(state, kept={}).to_arrays()}
-
-
-def _result(
-    epochs: tuple[int, ...],
-    probabilities: NDArray[Any],
-    validation: list[tuple[float, float]],
-    at: list[int],
-    curve: NDArray[Any],
-    seconds: float,
-    failed: dict[str, str],
-) -> Result:
-    """Return probabilities (E, n, K) float32, validation scores (E, 2) and the curve, columns as in `CURVE`."""
-    return {
-        "epochs": list(epochs),
-        "at": at,
-        "probabilities": probabilities.astype(np.float32),
-        "validation": np.array(validation, dtype=np.float64).reshape(-1, 2),
-        "curve": curve,
-        "seconds": seconds,
-        "failed": failed,
-    }
 
 
 @dataclass(frozen=True)

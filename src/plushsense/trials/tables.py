@@ -249,11 +249,11 @@ class Tables:
             key=lambda row: (-(row["validation_macro_f1"] or 0.0), row["parameters"]),
             default=None,
         )
-        kept = self._with_confusions(best)
+        detailed = self._with_confusions(best)
         failed = [
             {"run": job, **_words(*self._of[job][0]), "epochs": epochs, "why": why}
-            for job, found in self.outcomes.items()
-            for epochs, why in found.failed.items()
+            for job, finished in self.outcomes.items()
+            for epochs, why in finished.failed.items()
         ]
         failed += [
             {"run": job, **_words(*self._of[job][0]), "epochs": self._of[job][-1][0].trial.epochs, "why": why}
@@ -270,12 +270,12 @@ class Tables:
             "trainings_lost": len(self.lost),
             "failed": sorted(failed, key=lambda f: (f["run"], f["epochs"])),
             "seconds": round(time.monotonic() - self._began, 1),
-            "training_seconds": round(sum(found.seconds for found in self.outcomes.values()), 1),
+            "training_seconds": round(sum(finished.seconds for finished in self.outcomes.values()), 1),
             "ranked_by": "accuracy",
             "best": best[:BEST],
             "best_on_validation": chosen,
-            "confusions": {p.id: self._counts(p).tolist() for p in kept},
-            "per_class": {p.id: class_rows(self._counts(p), self.plan.gestures.labels) for p in kept},
+            "confusions": {p.id: self._counts(p).tolist() for p in detailed},
+            "per_class": {p.id: class_rows(self._counts(p), self.plan.gestures.labels) for p in detailed},
         }
 
     def write(self) -> dict[str, Any]:
@@ -310,8 +310,8 @@ class Tables:
         return summary
 
     def _run_row(self, planned: PlannedTrial, run: PlannedRun) -> dict[str, Any] | None:
-        found = self.outcomes.get(run.job)
-        scored = None if found is None else found.scored.get(planned.trial.epochs)
+        finished = self.outcomes.get(run.job)
+        scored = None if finished is None else finished.scored.get(planned.trial.epochs)
         if scored is None:
             return None
         figures = {name: scored.figures[name] for name in _RUN_COLUMNS if name in scored.figures}

@@ -13,12 +13,12 @@ Options of the command line override the file; an unknown key is refused with th
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from plushsense.core.errors import ConfigError, nearest
+from plushsense.core.errors import ConfigError, check_known
 from plushsense.core.layouts import Layout
 from plushsense.core.toml import check_table, read_toml, refuse_unknown
 from plushsense.models.arch import DEFAULT_FILTERS, DEFAULT_SYMBOL, Arch, parse_filters
@@ -83,12 +83,8 @@ class EvaluationSpec:
         for name, value in (("workers", self.workers), ("seed", self.seed)):
             if value < 0:
                 raise ConfigError(f"{name} is {value}: accepted are whole numbers from 0 up.")
-        context = self.train_context
-        if context is not None and context not in TRAIN_CONTEXTS:
-            raise ConfigError(
-                f"Unknown train_context '{context}': accepted are {', '.join(TRAIN_CONTEXTS)}."
-                f"{nearest(context, TRAIN_CONTEXTS)}"
-            )
+        if self.train_context is not None:
+            check_known(self.train_context, TRAIN_CONTEXTS, "train_context", ConfigError)
 
     @property
     def processes(self) -> int:
@@ -193,18 +189,10 @@ def resolve(path: str | Path | None = None, **flags: Mapping[str, Any]) -> RunCo
     refuse_unknown(flags, _TABLES, "the settings", ConfigError)
     for name, given in flags.items():
         tables[name].update(_checked(name, {key: value for key, value in given.items() if value is not None}, ""))
-    chosen = tables["training"].pop("preset", "people")
-    training = preset(chosen)
-    tables["windows"].setdefault("context", CONTEXT[chosen])
-    return RunConfig(
-        chosen,
-        WindowSpec(**tables["windows"]),
-        ModelSpec(**tables["model"]),
-        training.changed(**tables["training"]),
-        EvaluationSpec(**tables["evaluation"]),
-        DecideSpec(**tables["live"]),
-        AnywhereSpec(**tables["anywhere"]),
-    )
+    name = tables["training"].pop("preset", "people")
+    make: dict[str, Callable[..., Any]] = {**_TABLES, "training": preset(name).changed}
+    tables["windows"].setdefault("context", CONTEXT[name])
+    return RunConfig(name, **{table: make[table](**values) for table, values in tables.items()})
 
 
 # The table of each setting of `train`, `evaluate` and `baselines`.
@@ -229,8 +217,7 @@ def from_settings(**settings: Any) -> RunConfig:
     """
     known = [key for keys in _SETTINGS.values() for key in keys] + ["seed"]
     for key in settings:
-        if key not in known:
-            raise ConfigError(f"Unknown setting '{key}': accepted are {', '.join(known)}.{nearest(key, known)}")
+        check_known(key, known, "setting", ConfigError)
     tables: dict[str, dict[str, Any]] = {
         table: {key: settings[key] for key in keys if key in settings} for table, keys in _SETTINGS.items()
     }

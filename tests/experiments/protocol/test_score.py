@@ -1,4 +1,4 @@
-"""The real-time protocol: who is said to have answered what, when, and what the systems hear."""
+"""The real-time protocol: who is said to have answered what, when, and what the systems receive."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from plushsense.experiments.protocol.score import (
     aims,
     confusions,
     group_of,
-    hear,
     run,
     score,
     summary,
+    system_outputs,
     windows_of,
 )
 from plushsense.experiments.protocol.sittings import GestureTrial, Sitting, virtual_sittings
@@ -189,8 +189,8 @@ def sitting(model):
 
 
 def test_each_system_hears_the_very_events_of_the_live_reader(model, sitting):
-    heard = hear(sitting.frames, model, lambda frames: [event("begun", 1, len(frames) / 1e4)])
-    assert list(heard) == ["rules", "cnn", "hybrid"]
+    outputs = system_outputs(sitting.frames, model, lambda frames: [event("begun", 1, len(frames) / 1e4)])
+    assert list(outputs) == ["rules", "cnn", "hybrid"]
     spec = DecideSpec.from_dict(model.decision)
     for key, settings in (("cnn", replace(spec, gate=GateSettings())), ("hybrid", spec)):
         reader = StreamClassifier(model, settings)
@@ -200,17 +200,17 @@ def test_each_system_hears_the_very_events_of_the_live_reader(model, sitting):
             for d in reader.push(Frame(0, int(ms), tuple(int(v) for v in values)))
         ]
         live = [e for d in decisions for e in d.events]
-        replayed = [e for e in heard[key].events if e.t_s <= reader.time_s]
+        replayed = [e for e in outputs[key].events if e.t_s <= reader.time_s]
         assert len(live) > 4
         assert replayed[: len(live)] == live
         assert all(e.what == "ended" for e in replayed[len(live) :]), "only that the stream is over"
-    assert any(e.source == "gate" for e in heard["hybrid"].events)
-    assert not any(e.source == "gate" for e in heard["cnn"].events)
+    assert any(e.source == "gate" for e in outputs["hybrid"].events)
+    assert not any(e.source == "gate" for e in outputs["cnn"].events)
 
 
 def test_a_model_without_a_gate_makes_no_hybrid(model, sitting):
     bare = replace(model, decision={**model.decision, "gate": {}})
-    assert list(hear(sitting.frames, bare)) == ["cnn"]
+    assert list(system_outputs(sitting.frames, bare)) == ["cnn"]
 
 
 def test_a_run_adds_up_and_rules_are_whatever_is_plugged_in(model, sitting):

@@ -22,10 +22,10 @@ from plushsense.experiments.streams.replay import (
     StreamScore,
     StreamTrace,
     StreamTruth,
-    hear,
+    count_events,
     people_with_streams,
-    quick,
     rate,
+    read_streams,
     score,
     truth_of,
 )
@@ -165,7 +165,7 @@ def steps(*pieces: tuple[int, int]) -> np.ndarray:
     return np.concatenate([np.tile(np.where(np.arange(4) == k, 4000, -4000), (n, 1)) for k, n in pieces])
 
 
-def heard(truth: StreamTruth, *pieces: tuple[int, int]) -> StreamTrace:
+def stream_trace(truth: StreamTruth, *pieces: tuple[int, int]) -> StreamTrace:
     trace = made_trace([steps(*pieces)])
     hours = trace.seconds / 3600
     return StreamTrace(truth, TraceReplayer(trace), hours, hours / 2, 2.0 / 3600)
@@ -190,7 +190,7 @@ def test_every_count_of_one_stream_by_hand() -> None:
         other=((when(150), when(170)),),
         doubtful=((when(270), when(400)),),
     )
-    h = heard(
+    h = stream_trace(
         truth, (REST, 16), (HUG, 20), (REST, 30), (SQUEEZE, 4), (REST, 40), (HIT, 5), (REST, 40), (HUG, 5),
         (REST, 70), (HIT, 3), (REST, 40), (HIT, 20), (REST, 10),
     )  # fmt: skip
@@ -209,8 +209,8 @@ def test_every_count_of_one_stream_by_hand() -> None:
     assert shown["false_events_per_hour"] == pytest.approx(4 / h.hours)
     assert shown["outside_per_uncovered_hour"] == pytest.approx(3 / h.free_hours)
     assert shown["at_rest_per_hour"] == pytest.approx(1 / h.rest_hours)
-    assert StreamScore.from_kept(found.kept()).to_dict() == shown
-    n = quick([h], argmax_spec())
+    assert StreamScore.from_journal(found.to_journal()).to_dict() == shown
+    n = count_events([h], argmax_spec())
     assert (n.hits, n.truths, n.insertions) == (1, 3, 4) and n.f1 == pytest.approx(gesture.f1)
 
 
@@ -240,7 +240,7 @@ def test_the_quick_counts_are_those_of_the_whole_score(seed: int) -> None:
     truths = tuple(Interval(float(s), float(s + 1), str(k)) for s, k in zip(starts, labels, strict=True))
     h = StreamTrace(StreamTruth("s", "P1", False, truths, (), (), ((3.0, 4.0),)), TraceReplayer(trace), 0.5, 0.4, 0.0)
     for spec in (argmax_spec(), argmax_spec(0.3), DecideSpec(enter=0.5), DecideSpec(gate=GATE)):
-        n, whole = quick([h], spec), score(h, spec).total()
+        n, whole = count_events([h], spec), score(h, spec).total()
         assert (n.hits, n.truths, n.matched, n.insertions) == (
             whole.hits, whole.truths, whole.matched, whole.insertions,
         )  # fmt: skip
@@ -250,7 +250,7 @@ def test_settings_are_chosen_on_those_who_tune() -> None:
     truths = tuple(Interval(when(20 + 60 * n), when(40 + 60 * n), "Hug") for n in range(3))
     # Each hug is preceded by a short false blow, which a least duration would swallow.
     pieces = [p for _ in range(3) for p in ((REST, 8), (HIT, 2), (REST, 12), (HUG, 18), (REST, 20))]
-    tuning = [heard(StreamTruth("s", "P1", False, truths, (), (), ()), *pieces)]
+    tuning = [stream_trace(StreamTruth("s", "P1", False, truths, (), (), ()), *pieces)]
     points = searched(tuning, SYSTEMS["hysteresis"])
     best = fewest(points, 1.0)
     assert (best.recall, best.false_per_hour) == (1.0, 0.0)
@@ -317,7 +317,7 @@ def test_truth_lies_where_it_was_recorded(dataset: Dataset) -> None:
 
 
 def test_time_that_was_heard_and_time_without_truth(dataset: Dataset) -> None:
-    (h,) = hear(dataset, bundle(), ["P1"])
+    (h,) = read_streams(dataset, bundle(), ["P1"])
     assert 3600 * h.hours == pytest.approx(16.0, abs=0.1)
     assert 3600 * h.free_hours == pytest.approx(16.0 - 1.49 - 0.59, abs=0.1)
     assert 3600 * h.rest_hours == pytest.approx(0.99, abs=0.05)

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import BadInput, ConfigError, nearest, need
+from plushsense.core.errors import BadInput, ConfigError, check_known, need
 from plushsense.experiments.baselines.score import Contender, Reader
 from plushsense.windows.cut import WindowSet
 from plushsense.windows.features import Scaler, statistics
@@ -174,8 +174,7 @@ def classical(
     """
     for what, given, known in (("baseline", names, tuple(BASELINES)), ("features", features, tuple(FEATURES))):
         for one in given:
-            if one not in known:
-                raise ConfigError(f"Unknown {what} '{one}': accepted are {', '.join(known)}.{nearest(one, known)}")
+            check_known(one, known, what, ConfigError)
     library = f"scikit-learn {need('sklearn', extra=EXTRA).__version__}"
     key = {"version": BASELINES_VERSION, "library": library, "samples": samples, "seed": seed}
     return [

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import ConfigError, nearest, need
+from plushsense.core.errors import ConfigError, check_known, nearest, need
 from plushsense.core.files import write_file
 from plushsense.core.gestures import GestureSet
 from plushsense.core.layouts import Layout
@@ -107,9 +107,7 @@ def chosen(models: str | Sequence[str]) -> tuple[str, ...]:
     given = [m.strip() for m in models.split(",")] if isinstance(models, str) else list(models)
     names: set[str] = set()
     for one in given:
-        if one not in MODELS and one not in SETS:
-            known = (*SETS, *MODELS)
-            raise ConfigError(f"Unknown model '{one}': accepted are {', '.join(known)}.{nearest(one, known)}")
+        check_known(one, (*SETS, *MODELS), "model", ConfigError)
         names |= set(SETS.get(one, (one,)))
     return tuple(name for name in MODELS if name in names)
 

@@ -3,54 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from plushsense.experiments.protocol.score import GROUPS, PrintedFigures
 from plushsense.reports.figures import data_uri, new_figure
 from plushsense.reports.page import render_page
 from plushsense.reports.table import DASH, Column, Table, number
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-
-SOURCE = (
-    "The paper, section 4.6: five new people, 17 gestures, three times each, with the real toy. Times were taken by "
-    "hand, when the output first was stable (± 0.3 s). It gives most figures as ranges or approximations (here a dash "
-    "where it gives none), and it proposes the hybrid without building it."
-)
-
-
-@dataclass(frozen=True)
-class Printed:
-    """Figures as printed in the paper: share answered, reaction time, likelihood; "" where it prints none.
-
-    ``reaction_s``: the reaction time as a range (low, high).
-    """
-
-    activation: str = ""
-    reaction: str = ""
-    likelihood: str = ""
-    reaction_s: tuple[float, float] | None = None
-
-
-PAPER: dict[tuple[str, str], Printed] = {
-    ("broad", "rules"): Printed("≈ 90 %", "≈ 3 s", "", (3.0, 3.0)),
-    ("broad", "cnn"): Printed("“consistently”", "2.0–2.2 s", "", (2.0, 2.2)),
-    ("fine", "rules"): Printed("≈ 6 %"),
-    ("fine", "cnn"): Printed("all trials", "2.3–2.4 s", "0.75–0.88, up to 0.98", (2.3, 2.4)),
-    ("energetic", "rules"): Printed("all trials", "0.1–0.2 s", "", (0.1, 0.2)),
-    ("energetic", "cnn"): Printed("“reliably”", "2.0–2.5 s", "more variable", (2.0, 2.5)),
-    ("neutral", "rules"): Printed("none: not processed"),
-    ("neutral", "cnn"): Printed("“consistently”", "≈ 2.4 s", "≈ 0.83", (2.4, 2.4)),
-}
-CONFUSED = (
-    "The paper's network took about 13 % of the Tail scratches for Tail taps, and no other fine scratch for something "
-    "of another family."
-)
-"""The paper counts both as one family; in our gesture set a scratch and a tap are two families."""
 
 
 SIMULATION = "SIMULATION: virtual people touched a virtual toy. These figures say nothing about a real one."
@@ -67,7 +31,7 @@ _JUDGED = {
 
 
 def percent(part: int, of: int) -> str:
-    """Return ``98 % (44/45)``, with one decimal close to 0 % and 100 %."""
+    """Format a share with its counts: ``98 % (44/45)``; shares close to 0 % and 100 % have one decimal."""
     if not of:
         return DASH
     share = 100.0 * part / of
@@ -89,9 +53,11 @@ _CELLS = (
     Column("likelihood", "Likelihood", "right", plain="likelihood"),
     Column("negative", "Called\nnegative", "right", plain="called negative"),
 )
+# What the paper prints, by group and system.
+PAPER = {(name, system): figures for name, group in GROUPS.items() for system, figures in group.paper.items()}
+_PRINTED = ("answered", "time", "likelihood")
 _PAPER_CELLS = tuple(
-    Column(f"paper_{key}", key, group="The paper, real toy", plain=f"paper: {key}", style="paper")
-    for key in ("answered", "time", "likelihood")
+    Column(f"paper_{key}", key, group="The paper, real toy", plain=f"paper: {key}", style="paper") for key in _PRINTED
 )
 
 
@@ -113,7 +79,7 @@ def group_table(result: Mapping[str, Any]) -> Table:
     rows: list[dict[str, Any]] = []
     last = None
     for row in result["rows"]:
-        paper = PAPER.get((row["group"], row["system"]), Printed())
+        paper = PAPER.get((row["group"], row["system"]), PrintedFigures())
         first = row["group"] != last
         rows.append(
             {
@@ -121,9 +87,7 @@ def group_table(result: Mapping[str, Any]) -> Table:
                 "trials": str(row["trials"]) if first else "",
                 "system": _SHORT[row["system"]],
                 **_cells(row, row["group"] in ("energetic", "fast")),
-                "paper_answered": paper.activation or DASH,
-                "paper_time": paper.reaction or DASH,
-                "paper_likelihood": paper.likelihood or DASH,
+                **{f"paper_{key}": getattr(paper, key) or DASH for key in _PRINTED},
                 "class": "top" if first else "",
             }
         )
@@ -168,7 +132,7 @@ def _judgements(counts: Mapping[str, int]) -> str:
 
 
 def judged_table(result: Mapping[str, Any]) -> Table:
-    """Return one row for each group and network system: how the first naming compares with the gesture."""
+    """Return one row for each group and network system: how the first gesture it named compares with the true one."""
     rows = tuple(
         {"title": row["title"], "system": _SHORT[row["system"]]}
         | {judged: percent(row["called"][judged], row["trials"]) for judged in _JUDGED}
@@ -181,7 +145,7 @@ def judged_table(result: Mapping[str, Any]) -> Table:
 
 
 def confusion_table(result: Mapping[str, Any]) -> Table:
-    """Return one row for each family and network system: what it was called, most often first."""
+    """Return one row for each true family and network system: the families it was recognised as, most often first."""
     called: dict[tuple[str, str], list[str]] = {}
     for entry in result["confusions"]:
         if entry["system"] != "rules":
@@ -202,7 +166,7 @@ def confusion_table(result: Mapping[str, Any]) -> Table:
 
 
 def between_table(result: Mapping[str, Any]) -> Table:
-    """Return one row for each system: its events while nobody made a gesture."""
+    """Return one row for each system: the events that began outside every trial."""
     rows = tuple(
         {
             **row,
@@ -227,7 +191,7 @@ def between_table(result: Mapping[str, Any]) -> Table:
 
 
 def aim_table(result: Mapping[str, Any]) -> Table:
-    """Return one row for each aim: what was measured, and whether it is met."""
+    """Return one row for each aim of the project: the measured value, and whether the aim is met."""
     rows = []
     for aim in result["aims"]:
         measured = seconds(aim["measured"]) + " s" if aim["unit"] == "s" else percent(aim["part"], aim["of"])
@@ -245,11 +209,11 @@ def aim_table(result: Mapping[str, Any]) -> Table:
 
 
 def figure_table(result: Mapping[str, Any]) -> Table:
-    """Return the figures of every group and gesture by each system as numbers, with the paper's, for CSV."""
+    """Return one row for each group and each gesture by system, as numbers for CSV, with the paper's figures."""
     rows = []
     for kind, key in (("rows", "group"), ("by_gesture", "gesture")):
         for row in result[kind]:
-            paper = PAPER.get((row[key], row["system"]), Printed())
+            paper = PAPER.get((row[key], row["system"]), PrintedFigures())
             rows.append(
                 {
                     "of": key,
@@ -260,9 +224,7 @@ def figure_table(result: Mapping[str, Any]) -> Table:
                     "reaction_p90_s": row["reaction_s"]["p90"],
                     **{k: row[k] for k in ("within_200_ms", "likelihood", "gentle", "called_negative")},
                     **{f"said_first_{judged}": n for judged, n in row["called"].items()},
-                    "paper_answered": paper.activation,
-                    "paper_time": paper.reaction,
-                    "paper_likelihood": paper.likelihood,
+                    **{f"paper_{key}": getattr(paper, key) for key in _PRINTED},
                     "simulated": "yes" if result["simulated"] else "no",
                 }
             )
@@ -275,7 +237,7 @@ def has_paper(result: Mapping[str, Any]) -> bool:
 
 
 def figure(result: Mapping[str, Any]) -> Figure:
-    """Draw reaction times by group and system with medians, the number not answered, and the paper's ranges."""
+    """Draw the reaction times of all trials by group and system: medians, unanswered trials, and the paper's ranges."""
     rows = [row for row in result["rows"] if row["group"] != "all"]
     picture = new_figure(10.0, 1.6 + 0.42 * len(rows))
     axes = picture.add_subplot()
@@ -294,8 +256,8 @@ def figure(result: Mapping[str, Any]) -> Figure:
             for o in result["outcomes"]
             if o["group"] == row["group"] and o["system"] == row["system"] and o["reaction_s"] is not None
         ]
-        paper = PAPER.get((row["group"], row["system"]), Printed()).reaction_s
-        if paper is not None:
+        paper = PAPER.get((row["group"], row["system"]), PrintedFigures()).reaction_s
+        if paper:
             low, high = paper
             axes.plot(
                 [low - 0.02, high + 0.02], [y, y], color="#bbbbbb", linewidth=11, solid_capstyle="butt", zorder=1,
@@ -331,7 +293,7 @@ def figure(result: Mapping[str, Any]) -> Figure:
 
 
 def page(result: Mapping[str, Any]) -> str:
-    """Return the protocol as one self-contained HTML page."""
+    """Return the result of the protocol as one self-contained HTML page."""
     return render_page(
         "protocol.html.j2",
         title=result["heading"],
@@ -346,8 +308,6 @@ def page(result: Mapping[str, Any]) -> str:
         between=between_table(result),
         left=result["left"],
         with_paper=has_paper(result),
-        source=SOURCE,
-        confused=CONFUSED,
         counted=result["counted"],
         picture=data_uri(figure(result)),
     )

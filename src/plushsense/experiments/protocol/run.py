@@ -20,7 +20,7 @@ from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
 from plushsense.deploy.quantize import integer_model
 from plushsense.experiments.protocol import score as scoring
-from plushsense.experiments.protocol.score import Heuristic
+from plushsense.experiments.protocol.score import NOTES, Heuristic
 from plushsense.experiments.protocol.sittings import (
     FIRST_STRANGER,
     Progress,
@@ -66,34 +66,6 @@ def recorded_rules(dataset: Dataset, gestures: GestureSet, scored: Collection[st
 
 RESULT, TRIALS, TABLE, PAGE = "protocol.json", "trials.csv", "table.csv", "protocol.html"
 ENGINES = ("float", "int8")
-
-NO_GATE = (
-    "This bundle has no gate, so there is no hybrid: network and hybrid would be the same. Blows wait for the network."
-)
-NO_AFFECT = "These gestures have no affect: any event counts as an answer, and nothing can be called negative."
-NO_RULES = "The old heuristic was not run: there are no figures of rules only."
-_ANSWERED = (
-    "Answered: an event of the gesture's affect began between 0.3 s before the hand touched and 2 s after it left. "
-    "Named: an event of the trial, also one that began before it, was called rightly. Shares are of all trials, times "
-    "of those that were answered."
-)
-_LIKELIHOOD = (
-    "Likelihood: mean over the trials of the highest smoothed probability of what was said first. Called negative: an "
-    "event of negative affect began while the hand worked or within 0.3 s after; blows and pulls are not counted there."
-)
-COUNTED = (
-    _ANSWERED,
-    "Reaction time counts from the onset: when the hand touches, and of a blow or pull when the blow or jerk itself "
-    "comes, 0.15 to 0.6 s after the hand began. A sooner answer has a negative time: a tail that is grasped can be "
-    "felt before the jerk.",
-    _LIKELIHOOD,
-)
-COUNTED_RECORDED = (
-    _ANSWERED,
-    "Reaction time counts from the recording's start mark, as it was trimmed; untrimmed recordings begin with some "
-    "waiting, which makes reactions look slower than they were.",
-    _LIKELIHOOD,
-)
 
 
 def protocol(
@@ -149,17 +121,17 @@ def protocol(
     else:
         numbers = virtual_numbers(people, first, bundle.provenance)
         sittings = virtual_sittings(numbers, seed, repetitions, bundle.layout)
-        heuristic, tuned = virtual_rules(seed, bundle.layout, bundle.gestures) if rules else (None, NO_RULES)
+        heuristic, tuned = virtual_rules(seed, bundle.layout, bundle.gestures) if rules else (None, NOTES["no_rules"])
         made = scoring.run(sittings, asked, heuristic, progress, len(numbers))
         whom = f"{people} virtual, number {numbers[0]} to {numbers[-1]} of the population of seed {seed}"
         made |= {
             "heading": "The paper's real-time protocol, SIMULATED",
             "simulated": True,
             "left": [],
-            "people_said": whom,
-            "rules_said": tuned,
+            "people_text": whom,
+            "rules_text": tuned,
             "aims": scoring.aims(made),
-            "counted": list(COUNTED),
+            "counted": [NOTES[key] for key in ("answered", "onset_virtual", "likelihood")],
         }
     result = _with_notes(made, bundle, engine)
     if place is not None:
@@ -184,7 +156,7 @@ def _recorded(
         )
     people = recorded_people(dataset, subjects, bundle.provenance)
     sittings, left = recorded_sittings(dataset, people, bundle.gestures)
-    heuristic, tuned = recorded_rules(dataset, bundle.gestures, people) if rules else (None, NO_RULES)
+    heuristic, tuned = recorded_rules(dataset, bundle.gestures, people) if rules else (None, NOTES["no_rules"])
     made = scoring.run(sittings, asked, heuristic, progress, len(sittings))
     virtual = dataset.head.simulated
     what = "recorded sessions of a simulation" if virtual else "recorded sessions"
@@ -193,11 +165,11 @@ def _recorded(
         "simulated": virtual,
         "codes": people,
         "left": left,
-        "people_said": f"{len({s.who.partition(',')[0] for s in sittings})} of {len(dataset.subjects)}: "
+        "people_text": f"{len({s.who.partition(',')[0] for s in sittings})} of {len(dataset.subjects)}: "
         + ", ".join(s.who for s in sittings),
-        "rules_said": tuned,
+        "rules_text": tuned,
         "aims": [],
-        "counted": list(COUNTED_RECORDED),
+        "counted": [NOTES[key] for key in ("answered", "onset_recorded", "likelihood")],
     }
 
 
@@ -205,37 +177,37 @@ def _with_notes(made: dict[str, Any], bundle: Bundle, engine: str) -> dict[str, 
     """Return the result with notes on the network and the settings."""
     settings = DecideSpec.from_dict(bundle.decision)
     provenance = bundle.provenance
-    said = []
+    notes = []
     if not settings.gate.rules:
-        said.append(NO_GATE)
+        notes.append(NOTES["no_gate"])
     ruled = any(row["system"] == "rules" for row in made["systems"])
-    tuned = made.pop("rules_said")
+    tuned = made.pop("rules_text")
     if not ruled:
-        said.append(tuned)
+        notes.append(tuned)
     if not bundle.gestures.has_affect:
-        said.append(NO_AFFECT)
+        notes.append(NOTES["no_affect"])
     if not settings.fitted:
-        said.append("The event settings of this bundle were not fitted: they are the defaults.")
+        notes.append(NOTES["not_fitted"])
     known = known_people(provenance)
     if not known:
-        said.append("This bundle does not say on whom it was trained: it may have been on these people.")
+        notes.append(NOTES["unknown_people"])
     known |= {bundle.adapted_to} if bundle.adapted_to is not None else set()
     met = sorted(known & set(made.pop("codes", ())))
     if met:
-        said.append(
+        notes.append(
             f"This bundle was trained on, or adapted to, people of the codes {', '.join(met)}: if they are the same "
             "people, their figures flatter."
         )
     if provenance.get("simulated") is True and not made["simulated"]:
-        said.append("This network was trained on a virtual toy: on a real one its figures mean nothing yet.")
-    said += [f"{entry['who']} {entry['why']}, and was left out." for entry in made["left"]]
+        notes.append(NOTES["trained_virtual"])
+    notes += [f"{entry['who']} {entry['why']}, and was left out." for entry in made["left"]]
     filters, span_s = slashed(bundle.arch.filters), bundle.arch.span / bundle.layout.rate_hz
     subjects = provenance.get("subjects", ())
     who = subjects if isinstance(subjects, int) else len(set(subjects) - {NOBODY})
     trained = f"{provenance['dataset']}, {who} people" if provenance.get("dataset") else "unknown to the bundle"
     times = [o["repetition"] for o in made["outcomes"]]
     about = [
-        ["People", made.pop("people_said")],
+        ["People", made.pop("people_text")],
         ["Trials", f"{made['trials']}: {made['gestures']} gestures, up to {max(times, default=0)} times each a person"],
         ["Network", f"{bundle.arch.symbol}, filters {filters}, {bundle.arch.padding}; span {span_s:.2f} s"],
         ["Trained on", trained],
@@ -245,7 +217,7 @@ def _with_notes(made: dict[str, Any], bundle: Bundle, engine: str) -> dict[str, 
     ]
     if ruled:
         about.append(["Old rules", tuned])
-    return made | {"said": said, "about": about, "engine": engine}
+    return made | {"said": notes, "about": about, "engine": engine}
 
 
 def _place(out: Path) -> Path:

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from statistics import mean, median
 from typing import Any
 
 import numpy as np
 
+from plushsense.core.errors import ConfigError
 from plushsense.core.gestures import Gesture, GestureSet
 from plushsense.core.recorder_csv import Frames
+from plushsense.core.toml import load_table, read_toml
 from plushsense.experiments.protocol.sittings import GestureTrial, Progress, Sitting
 from plushsense.models.bundle import Bundle
 from plushsense.runtime.classifier import GestureEvent, events_of
@@ -24,28 +27,43 @@ from plushsense.runtime.trace import replay, trace_of
 from plushsense.scoring.events import latency_summary
 
 SYSTEMS = {"rules": "Rules only", "cnn": "Network only", "hybrid": "Hybrid: rules and network"}
-GROUPS = {
-    "broad": "Broad strokes",
-    "fine": "Fine scratches",
-    "taps": "Taps",
-    "hug": "Hug",
-    "energetic": "Blows and pulls",
-    "neutral": "Holding",
-    "fast": "Energetic gestures",
-    "other": "Other gestures",
-}
-_GROUP_OF = {
-    "back stroke": "broad",
-    "head stroke": "broad",
-    "ear scratch": "fine",
-    "neck scratch": "fine",
-    "tail scratch": "fine",
-    "tail tap": "taps",
-    "tail hit": "energetic",
-    "tail pull": "energetic",
-    "hold strong": "hug",
-    "hold in hands": "neutral",
-}
+
+
+@dataclass(frozen=True)
+class PrintedFigures:
+    """Figures of one group and system as the paper prints them; "" where it prints none.
+
+    ``reaction_s``: the reaction time as a range (low, high).
+    """
+
+    answered: str = ""
+    time: str = ""
+    likelihood: str = ""
+    reaction_s: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class GestureGroup:
+    """A group of gesture families, with the paper's figures by system."""
+
+    title: str
+    families: tuple[str, ...] = ()
+    paper: Mapping[str, PrintedFigures] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _ProtocolFile:
+    groups: Mapping[str, GestureGroup]
+    notes: Mapping[str, str]
+
+
+def _read_protocol() -> _ProtocolFile:
+    path = Path(__file__).with_name("protocol.toml")
+    return load_table(read_toml(path, "protocol", ConfigError), _ProtocolFile, path.name, ConfigError)
+
+
+_PROTOCOL = _read_protocol()
+GROUPS, NOTES = _PROTOCOL.groups, _PROTOCOL.notes
 
 EARLY_S = 0.3
 """An answer may come so long before the touch, as the sensors detect the approaching hand."""
@@ -63,7 +81,8 @@ Heuristic = Callable[[Frames], Sequence[GestureEvent]]
 
 def group_of(gesture: Gesture) -> str:
     """Return the protocol's group of a gesture (paper, section 4.6); gestures of other toys have two groups."""
-    return _GROUP_OF.get(gesture.family.casefold(), "fast" if gesture.energetic else "other")
+    groups = (name for name, group in GROUPS.items() if gesture.family.casefold() in group.families)
+    return next(groups, "fast" if gesture.energetic else "other")
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +93,9 @@ class SystemOutput:
     answers: tuple[tuple[float, int, float], ...] = ()
 
 
-def hear(frames: Frames, model: Bundle | IntegerModel, heuristic: Heuristic | None = None) -> dict[str, SystemOutput]:
+def system_outputs(
+    frames: Frames, model: Bundle | IntegerModel, heuristic: Heuristic | None = None
+) -> dict[str, SystemOutput]:
     """Return the events of each system on a stream, by the keys of `SYSTEMS`.
 
     Network and gate use the model's own settings; without a gate there is no hybrid. ``heuristic`` are the old rules;
@@ -87,19 +108,19 @@ def hear(frames: Frames, model: Bundle | IntegerModel, heuristic: Heuristic | No
         spec = DecideSpec.from_dict(model.decision)
         step_s = model.arch.step * model.layout.period_us / 1e6
         rules, weight = spec.rules(step_s), smoothing_weight(spec.smoothing_s, step_s)
-    heard = {} if heuristic is None else {"rules": SystemOutput(tuple(heuristic(frames)))}
+    outputs = {} if heuristic is None else {"rules": SystemOutput(tuple(heuristic(frames)))}
     ways = {"cnn": replace(rules, gate=GateSettings())}
     if rules.gate.rules:
         ways["hybrid"] = rules
     for key, way in ways.items():
         done = replay(trace, way, weight)
         answers = tuple((now / 1e6, answer.best, answer.share / ONE) for now, answer in done.answers)
-        heard[key] = SystemOutput(events_of(done.updates, trace.gestures), answers)
-    return heard
+        outputs[key] = SystemOutput(events_of(done.updates, trace.gestures), answers)
+    return outputs
 
 
 @dataclass
-class _Spell:
+class _EventSpan:
     """An event from its beginning to its end; ``gesture`` is known from ``named_s`` on."""
 
     affect: str
@@ -110,17 +131,17 @@ class _Spell:
     ended_s: float = math.inf
 
 
-def _spells(events: Sequence[GestureEvent]) -> list[_Spell]:
-    spells: dict[int, _Spell] = {}
+def _event_spans(events: Sequence[GestureEvent]) -> list[_EventSpan]:
+    spans: dict[int, _EventSpan] = {}
     for event in events:
         if event.what == "begun":
-            spells[event.number] = _Spell(event.affect, event.source, event.t_s, event.gesture, event.t_s)
+            spans[event.number] = _EventSpan(event.affect, event.source, event.t_s, event.gesture, event.t_s)
         elif event.what == "named":
-            spells[event.number].gesture, spells[event.number].named_s = event.gesture, event.t_s
-            spells[event.number].affect = event.affect
+            spans[event.number].gesture, spans[event.number].named_s = event.gesture, event.t_s
+            spans[event.number].affect = event.affect
         else:
-            spells[event.number].ended_s = event.t_s
-    return list(spells.values())
+            spans[event.number].ended_s = event.t_s
+    return list(spans.values())
 
 
 @dataclass(frozen=True)
@@ -174,27 +195,27 @@ class Between:
 
 def windows_of(trials: Sequence[GestureTrial]) -> list[tuple[float, float]]:
     """Return the interval in which answers count for each trial; they overlap only where the gestures do."""
-    found = []
+    windows = []
     for n, trial in enumerate(trials):
         before = trials[n - 1].stop_s if n else -math.inf
         after = trials[n + 1].start_s if n + 1 < len(trials) else math.inf
         first = max(trial.start_s - EARLY_S, min(before, trial.start_s))
-        found.append((first, max(trial.stop_s, min(trial.stop_s + LATE_S, after - EARLY_S))))
-    return found
+        windows.append((first, max(trial.stop_s, min(trial.stop_s + LATE_S, after - EARLY_S))))
+    return windows
 
 
 def score(
-    sitting: Sitting, system: str, heard: SystemOutput, gestures: GestureSet
+    sitting: Sitting, system: str, output: SystemOutput, gestures: GestureSet
 ) -> tuple[list[TrialOutcome], Between]:
     """Return every trial's outcome, and the events between the trials; an idle gesture is no trial."""
     trials = [t for t in sitting.trials if not gestures.get(t.label).idle]
     windows = windows_of(trials)
-    spells = _spells(heard.events)
+    spans = _event_spans(output.events)
     outcomes = [
-        _outcome(sitting.who, system, trial, window, spells, heard, gestures)
+        _outcome(sitting.who, system, trial, window, spans, output, gestures)
         for trial, window in zip(trials, windows, strict=True)
     ]
-    stray = [s for s in spells if not any(a <= s.begun_s <= b for a, b in windows)]
+    stray = [s for s in spans if not any(a <= s.begun_s <= b for a, b in windows)]
     ms = sitting.frames.device_ms.astype(np.int64)
     steps = np.diff(ms)
     whole_s = float(steps[(steps > 0) & (steps < 1000)].sum()) / 1000.0
@@ -208,13 +229,13 @@ def _outcome(
     system: str,
     trial: GestureTrial,
     window: tuple[float, float],
-    spells: Sequence[_Spell],
-    heard: SystemOutput,
+    spans: Sequence[_EventSpan],
+    output: SystemOutput,
     gestures: GestureSet,
 ) -> TrialOutcome:
     gesture = gestures.get(trial.label)
     first, last = window
-    here = [s for s in spells if s.ended_s > first and s.begun_s <= last]
+    here = [s for s in spans if s.ended_s > first and s.begun_s <= last]
     begun = [s for s in here if s.begun_s >= first]
     right = next((s for s in begun if s.affect == gesture.affect), None)
     named = next((s for s in here if s.gesture == gesture.label and first <= s.named_s <= last), None)
@@ -222,9 +243,9 @@ def _outcome(
     answer = begun[0] if begun else here[0] if here else None
     called = answer.gesture if answer is not None and answer.named_s <= last else None
     likelihood = None
-    if called is not None and heard.answers:
+    if called is not None and output.answers:
         best = gestures.index(called)
-        shares = [share for t, k, share in heard.answers if k == best and first <= t <= last]
+        shares = [share for t, k, share in output.answers if k == best and first <= t <= last]
         likelihood = max(shares, default=None)
     return TrialOutcome(
         who,
@@ -279,34 +300,34 @@ def run(
     people: list[str] = []
     for done, sitting in enumerate(sittings, 1):
         people.append(sitting.who)
-        for system, heard in hear(sitting.frames, model, heuristic).items():
-            made, stray = score(sitting, system, heard, gestures)
+        for system, output in system_outputs(sitting.frames, model, heuristic).items():
+            made, stray = score(sitting, system, output, gestures)
             outcomes += made
             between.setdefault(system, []).append(stray)
         if progress is not None:
             progress(done, of or done)
     systems = [key for key in SYSTEMS if key in between]
-    kept = {key: [o for o in outcomes if o.system == key] for key in systems}
+    by_system = {key: [o for o in outcomes if o.system == key] for key in systems}
     groups = [g for g in GROUPS if any(o.group == g for o in outcomes)]
     labels = [g for g in gestures.labels if any(o.gesture == g for o in outcomes)]
     return {
         "people": people,
-        "trials": len(kept[systems[0]]),
+        "trials": len(by_system[systems[0]]),
         "gestures": len(labels),
         "systems": [{"system": key, "title": SYSTEMS[key]} for key in systems],
         "rows": [
-            {"group": group, "title": GROUPS[group], "system": key}
-            | summary([o for o in kept[key] if o.group == group])
+            {"group": group, "title": GROUPS[group].title, "system": key}
+            | summary([o for o in by_system[key] if o.group == group])
             for group in groups
             for key in systems
         ]
-        + [{"group": "all", "title": "All gestures", "system": key} | summary(kept[key]) for key in systems],
+        + [{"group": "all", "title": "All gestures", "system": key} | summary(by_system[key]) for key in systems],
         "by_gesture": [
-            {"gesture": label, "system": key} | summary([o for o in kept[key] if o.gesture == label])
+            {"gesture": label, "system": key} | summary([o for o in by_system[key] if o.gesture == label])
             for label in labels
             for key in systems
         ],
-        "confusions": [c for key in systems for c in confusions(kept[key])],
+        "confusions": [c for key in systems for c in confusions(by_system[key])],
         "between": [{"system": key} | _strays(between[key]) for key in systems],
         "outcomes": [o.to_dict() for o in outcomes],
     }
@@ -385,8 +406,8 @@ def aims(result: Mapping[str, Any]) -> list[dict[str, Any]]:
     """
     outcomes = result["outcomes"]
 
-    def of(system: str, **wanted: Any) -> list[dict[str, Any]]:
-        return [o for o in outcomes if o["system"] == system and all(o[k] in v for k, v in wanted.items())]
+    def of(system: str, **accepted: Any) -> list[dict[str, Any]]:
+        return [o for o in outcomes if o["system"] == system and all(o[k] in v for k, v in accepted.items())]
 
     blows = of("hybrid", group=("energetic",))
     kind = of("hybrid", affect=("positive", "neutral"))

@@ -114,8 +114,8 @@ def _play(
             episodes.append(session.idle(float(rng.uniform(*_IDLE_S))))
         device_ms = np.concatenate([e.device_ms for e in episodes])
         values = np.concatenate([e.values for e in episodes])[:, columns]
-        kept = rng.random(len(values)) >= world.lost + world.garbled
-        frames = Frames(values[kept], device_ms[kept])
+        received = rng.random(len(values)) >= world.lost + world.garbled
+        frames = Frames(values[received], device_ms[received])
         first_ms = int(frames.device_ms[0])
         trials = []
         for n, mark in enumerate(m for e in episodes for m in e.marks):
@@ -177,7 +177,7 @@ def recorded_sittings(
         if not streams:
             left.append({"who": who, "why": "has no session stream, only single recordings"})
             continue
-        found = 0
+        trials_made = 0
         for stream in streams:
             located = [r for r in dataset.used if r.stream == stream.id and r.stream_row >= 0]
             known = [r for r in located if (g := gestures.find(r.gesture)) is not None and not g.idle]
@@ -195,10 +195,10 @@ def recorded_sittings(
                 trials.append(
                     GestureTrial(label, made[label], float(times[first]), float(times[first]), float(times[last]))
                 )
-            found += len(trials)
+            trials_made += len(trials)
             name = who if len(streams) == 1 else f"{who}, {stream.session}"
             sittings.append(Sitting(name, frames, tuple(trials)))
-        if not found:
+        if not trials_made:
             left.append({"who": who, "why": "has a session stream, but none of the recordings was found in it"})
     if not sittings:
         why = f" ('{left[0]['who']}' {left[0]['why']})" if left else ""

@@ -381,8 +381,8 @@ class _Trainer:
         assert progress is not None
 
         def report(at: JobProgress) -> None:
-            shown = {**vars(at), "share": (spent + at.share * rung.cost) / bound}
-            progress(SearchProgress(**shown, rung=rung.number + 1, rungs=len(plans), networks=len(rung.entered)))
+            values = {**vars(at), "share": (spent + at.share * rung.cost) / bound}
+            progress(SearchProgress(**values, rung=rung.number + 1, rungs=len(plans), networks=len(rung.entered)))
 
         return report
 

@@ -107,15 +107,15 @@ class StreamTrace:
     """
 
     truth: StreamTruth
-    listener: TraceReplayer
+    replayer: TraceReplayer
     hours: float
     free_hours: float
     rest_hours: float
 
 
-def hear(dataset: Dataset, model: Bundle | IntegerModel, subjects: Sequence[str]) -> list[StreamTrace]:
+def read_streams(dataset: Dataset, model: Bundle | IntegerModel, subjects: Sequence[str]) -> list[StreamTrace]:
     """Read every stream of some people once."""
-    found = []
+    traces = []
     for stream in dataset.streams:
         if stream.subject not in subjects or not located(dataset, stream):
             continue
@@ -127,8 +127,8 @@ def hear(dataset: Dataset, model: Bundle | IntegerModel, subjects: Sequence[str]
         left = uncovered_s(parts, truth.doubtful)
         free = uncovered_s(parts, [*marked, *truth.doubtful])
         rest = uncovered_s(parts, []) - uncovered_s(parts, truth.rest)
-        found.append(StreamTrace(truth, TraceReplayer(trace), left / 3600, free / 3600, rest / 3600))
-    return found
+        traces.append(StreamTrace(truth, TraceReplayer(trace), left / 3600, free / 3600, rest / 3600))
+    return traces
 
 
 @dataclass
@@ -162,37 +162,33 @@ class StreamScore:
         """Return the pooled tally of all labels of a level."""
         return pooled(self.levels[level].values())
 
-    def kept(self) -> dict[str, Any]:
+    def to_journal(self) -> dict[str, Any]:
         """Return plain values, as a journal stores them."""
         levels = {level: {k: t.kept() for k, t in tallies.items()} for level, tallies in self.levels.items()}
         return {**vars(self), "levels": levels, "places": dict(self.places)}
 
     @classmethod
-    def from_kept(cls, table: Mapping[str, Any]) -> StreamScore:
-        """Return the score that `kept` gave as plain values."""
+    def from_journal(cls, table: Mapping[str, Any]) -> StreamScore:
+        """Return the score that `to_journal` gave as plain values."""
         levels = {level: {k: Tally(**t) for k, t in rows.items()} for level, rows in table["levels"].items()}
         return cls(**{**table, "levels": levels})
 
     def to_dict(self) -> dict[str, Any]:
         """Return the figures of reports, ready for JSON."""
         gesture = self.total()
-        said = gesture.to_dict()
-        names = ("events", "hits", "deletions", "insertions", "fragmentations", "merges")
+        counts = gesture.to_dict()
+        errors = ("deletions", "insertions", "fragmentations", "merges")
+        names = ("truths", "events", "hits", *errors, "recall", "precision", "f1", "confused")
         return {
-            "truths": said["truths"],
-            **{name: said[name] for name in names},
-            "recall": said["recall"],
-            "precision": said["precision"],
-            "f1": said["f1"],
-            "confused": said["confused"],
-            "outside": self.places | {"all": said["outside"]},
+            **{name: counts[name] for name in names},
+            "outside": self.places | {"all": counts["outside"]},
             "false_events_per_hour": rate(gesture.insertions, self.hours),
             "outside_per_uncovered_hour": rate(gesture.outside, self.free_hours),
             "at_rest_per_hour": rate(self.places["rest"], self.rest_hours),
             "hours": round(self.hours, 4),
             "uncovered_hours": round(self.free_hours, 4),
             "rest_hours": round(self.rest_hours, 4),
-            "latency_s": said["latency_s"],
+            "latency_s": counts["latency_s"],
             "cost_per_truth": self.cost / gesture.truths if gesture.truths else None,
             "gate_events": self.gate_events,
             "levels": {level: pooled(rows.values()).to_dict() for level, rows in self.levels.items() if rows},
@@ -205,10 +201,10 @@ def rate(count: float, hours: float) -> float | None:
     return count / hours if hours > 0 else None
 
 
-def kept_events(heard: StreamTrace, spec: DecideSpec) -> list[ReportedEvent]:
+def counted_events(stream: StreamTrace, spec: DecideSpec) -> list[ReportedEvent]:
     """Return the events of a setting, without those that begin in a doubtful stretch."""
-    doubtful = heard.truth.doubtful
-    return [e for e in heard.listener.events(spec) if not any(a <= e.start_s < b for a, b in doubtful)]
+    doubtful = stream.truth.doubtful
+    return [e for e in stream.replayer.events(spec) if not any(a <= e.start_s < b for a, b in doubtful)]
 
 
 def gesture_intervals(events: Sequence[ReportedEvent], gestures: GestureSet) -> list[Interval]:
@@ -218,7 +214,7 @@ def gesture_intervals(events: Sequence[ReportedEvent], gestures: GestureSet) -> 
 
 
 @dataclass
-class Quick:
+class EventCounts:
     """Counts for tuning: gestures hit and events matched, their totals, and the hours of the streams."""
 
     hits: int = 0
@@ -240,57 +236,57 @@ class Quick:
     @property
     def f1(self) -> float:
         """Harmonic mean of recall and precision."""
-        said = self.matched + self.insertions
-        precision = self.matched / said if said else 0.0
+        events = self.matched + self.insertions
+        precision = self.matched / events if events else 0.0
         both = precision + self.recall
         return 2 * precision * self.recall / both if both else 0.0
 
 
-def quick(heard: Sequence[StreamTrace], spec: DecideSpec, late_s: float = LATE_S) -> Quick:
+def count_events(streams: Sequence[StreamTrace], spec: DecideSpec, late_s: float = LATE_S) -> EventCounts:
     """Return the counts of gestures alone, as `score` would count them."""
-    found = Quick()
-    for h in heard:
-        gestures, truths = h.listener.trace.gestures, h.truth.truths
-        events = gesture_intervals(kept_events(h, spec), gestures)
-        found.hours += h.hours
-        found.truths += len(truths)
+    counts = EventCounts()
+    for stream in streams:
+        gestures, truths = stream.replayer.trace.gestures, stream.truth.truths
+        events = gesture_intervals(counted_events(stream, spec), gestures)
+        counts.hours += stream.hours
+        counts.truths += len(truths)
         over = overlaps(truths, events, late_s)
         number = {label: n for n, label in enumerate(gestures.labels)}
-        said = np.array([number.get(e.label, -1) for e in events], dtype=np.int64)
-        same = over & (np.array([number[t.label] for t in truths], dtype=np.int64)[:, None] == said)
+        predicted = np.array([number.get(e.label, -1) for e in events], dtype=np.int64)
+        same = over & (np.array([number[t.label] for t in truths], dtype=np.int64)[:, None] == predicted)
         matched = same.any(axis=0)
-        found.hits += int(same.any(axis=1).sum())
-        found.matched += int(matched.sum())
-        found.insertions += int((~matched & ~((said < 0) & over.any(axis=0))).sum())
-    return found
+        counts.hits += int(same.any(axis=1).sum())
+        counts.matched += int(matched.sum())
+        counts.insertions += int((~matched & ~((predicted < 0) & over.any(axis=0))).sum())
+    return counts
 
 
 def score(
-    heard: StreamTrace, spec: DecideSpec, weights: ErrorCosts | None = None, late_s: float = LATE_S
+    stream: StreamTrace, spec: DecideSpec, weights: ErrorCosts | None = None, late_s: float = LATE_S
 ) -> StreamScore:
     """Return the scores of one setting on one stream."""
-    gestures = heard.listener.trace.gestures
-    events = kept_events(heard, spec)
+    gestures = stream.replayer.trace.gestures
+    events = counted_events(stream, spec)
     families = dict(zip(gestures.labels, gestures.families, strict=True))
     affects = dict(zip(gestures.labels, gestures.affects, strict=True))
     by_gesture = gesture_intervals(events, gestures)
-    truths = heard.truth.truths
-    out = StreamScore(hours=heard.hours, free_hours=heard.free_hours, rest_hours=heard.rest_hours)
+    truths = stream.truth.truths
+    out = StreamScore(hours=stream.hours, free_hours=stream.free_hours, rest_hours=stream.rest_hours)
     out.gate_events = sum(bool(e.source) for e in events)
     out.levels["gesture"] = tally(truths, by_gesture, late_s)
     out.levels["family"] = tally(_called(truths, families), _called(by_gesture, families), late_s)
     if gestures.has_affect:
-        said = [
+        by_affect = [
             Interval(e.start_s, e.stop_s, AFFECTS[e.affect] if e.affect or e.gesture != NO_GESTURE else UNNAMED)
             for e in events
         ]
-        out.levels["affect"] = tally(_called(truths, affects), said, late_s)
+        out.levels["affect"] = tally(_called(truths, affects), by_affect, late_s)
     whole = [Interval(e.start_s, e.stop_s, "anything") for e in events]
     out.levels["anything"] = tally([Interval(t.start_s, t.stop_s, "anything") for t in truths], whole, late_s)
     for event in outside_insertions(truths, by_gesture, late_s):
-        out.places[_place(event, heard.truth)] += 1
-    told = [AFFECTS[e.affect] for e in events]
-    out.cost = cost(truths, by_gesture, told, families, affects, weights, late_s)
+        out.places[_place(event, stream.truth)] += 1
+    named_affects = [AFFECTS[e.affect] for e in events]
+    out.cost = cost(truths, by_gesture, named_affects, families, affects, weights, late_s)
     return out
 
 

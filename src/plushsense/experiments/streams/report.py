@@ -171,11 +171,11 @@ def recall_table(result: Mapping[str, Any]) -> Table:
     for row in result["at_recall"]:
         cells = {"recall": f"{row['recall']:.2f}"}
         for name in result["systems"]:
-            found = row["systems"][name]
-            cells[name] = rate(found["false_events_per_hour"])
-            if cells[name] != DASH and name != result["reference"] and found["ratio"] is not None:
-                interval = ", 95 % {:.2f} to {:.2f}".format(*found["ci95"]) if found["ci95"] else ""
-                cells[name] += f" (× {found['ratio']:.2f}{interval})"
+            cell = row["systems"][name]
+            cells[name] = rate(cell["false_events_per_hour"])
+            if cells[name] != DASH and name != result["reference"] and cell["ratio"] is not None:
+                interval = ", 95 % {:.2f} to {:.2f}".format(*cell["ci95"]) if cell["ci95"] else ""
+                cells[name] += f" (× {cell['ratio']:.2f}{interval})"
         rows.append(cells)
     systems = (Column(name, system["title"], "right") for name, system in result["systems"].items())
     return Table("recalls", "At equal recall", (Column("recall", "Recall", "right"), *systems), tuple(rows))

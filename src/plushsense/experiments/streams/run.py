@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from plushsense.core.errors import BadInput, BundleError, ConfigError, DatasetError, nearest, need
+from plushsense.core.errors import BadInput, BundleError, ConfigError, DatasetError, check_known, nearest, need
 from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.version import __version__
@@ -101,11 +101,19 @@ class TrainStreams:
         train = cut.take(np.flatnonzero(mine & outside_streams(cut, dataset, {*fold.validation, *fold.test})))
         watch = scored.take(np.flatnonzero(np.isin(scored.subject, fold.validation)))
         fitted = fit(train, watch, arch, recipe.training, progress)
-        kept = calibration(arch, fitted.weights, fitted.scaler, train.x)
+        calibrated = calibration(arch, fitted.weights, fitted.scaler, train.x)
         people = {"subjects": list(fold.train), "validation_subjects": list(fold.validation)}
         origin = {"dataset": dataset.head.name, "dataset_hash": dataset.hash, "code_version": __version__, **people}
         bundle = Bundle(
-            arch, fitted.weights, dataset.layout, fitted.scaler, gestures, dict(vars(recipe.windows)), {}, origin, kept
+            arch,
+            fitted.weights,
+            dataset.layout,
+            fitted.scaler,
+            gestures,
+            dict(vars(recipe.windows)),
+            {},
+            origin,
+            calibrated,
         )
         with dataset.generation.writing():
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -132,23 +140,23 @@ def recipes_for(
     if config.padding != "stream":
         raise ConfigError(f"A network with {config.padding} padding cannot follow a stream: use --padding stream.")
     training = resolve_device(config.training)
-    wanted, found = config.evaluation.classes, {}
+    classes, recipes = config.evaluation.classes, dict[str, Recipe]()
     if WINDOWS in networks:
-        gestures = choose_classes(dataset, wanted, warn)
+        gestures = choose_classes(dataset, classes, warn)
         windows = replace(
             config.windows, context="stream" if config.windows.context == "anywhere" else config.windows.context
         )
         arch = config.model.build(dataset.layout, len(gestures), windows.window_s, config.padding)
-        found[WINDOWS] = Recipe(arch, training, windows, gestures)
+        recipes[WINDOWS] = Recipe(arch, training, windows, gestures)
     if ANYWHERE in networks:
-        gestures = classes_for(dataset, wanted, "anywhere", warn if WINDOWS not in networks else silent)
+        gestures = classes_for(dataset, classes, "anywhere", warn if WINDOWS not in networks else silent)
         model = config.model if anywhere_pool_s is None else replace(config.model, pool_s=anywhere_pool_s)
         arch = model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
         halved = replace(training, epochs=-(-training.epochs // 2))
         if training.halve_every:
             halved = replace(halved, halve_every=-(-training.halve_every // 2))
-        found[ANYWHERE] = Recipe(arch, halved, replace(config.windows, context="anywhere"), gestures, config.anywhere)
-    return found
+        recipes[ANYWHERE] = Recipe(arch, halved, replace(config.windows, context="anywhere"), gestures, config.anywhere)
+    return recipes
 
 
 TABLE, SHEET, PAGE, CURVES, LATENCIES = "streams.json", "streams.csv", "streams.html", "curves.png", "latencies.png"
@@ -355,8 +363,7 @@ def _named(systems: Sequence[str] | None) -> tuple[str, ...]:
     if systems is None:
         return tuple(SYSTEMS)
     for name in systems:
-        if name not in SYSTEMS:
-            raise ConfigError(f"Unknown system '{name}': accepted are {', '.join(SYSTEMS)}.{nearest(name, SYSTEMS)}")
+        check_known(name, SYSTEMS, "system", ConfigError)
     return tuple(name for name in SYSTEMS if name in systems)
 
 

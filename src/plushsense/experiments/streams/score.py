@@ -17,7 +17,13 @@ from numpy.typing import NDArray
 from plushsense.core.errors import BadInput, ConfigError
 from plushsense.core.gestures import GestureSet
 from plushsense.dataset.store import Dataset
-from plushsense.experiments.streams.replay import StreamScore, StreamTrace, hear, people_with_streams, quick
+from plushsense.experiments.streams.replay import (
+    StreamScore,
+    StreamTrace,
+    count_events,
+    people_with_streams,
+    read_streams,
+)
 from plushsense.experiments.streams.systems import (
     ANYWHERE,
     REFERENCE,
@@ -204,7 +210,7 @@ class _FoldWork:
 
 def scored_fold(dataset: Dataset, fold: PeopleFold, fitted: Fitted, settings: Settings) -> dict[str, Any]:
     """Tune every system on a fold's validation people and score it on those left out: counts, ready for JSON."""
-    found: dict[str, Any] = {}
+    systems: dict[str, Any] = {}
     for network in (WINDOWS, ANYWHERE):
         if network not in fitted.networks:
             continue
@@ -212,8 +218,8 @@ def scored_fold(dataset: Dataset, fold: PeopleFold, fitted: Fitted, settings: Se
         names = [n for n in names if fitted.gate is not None or SYSTEMS[n].gate_to is None]
         if not names:
             continue
-        tuning = hear(dataset, fitted.networks[network], fold.validation)
-        testing = hear(dataset, fitted.networks[network], fold.test)
+        tuning = read_streams(dataset, fitted.networks[network], fold.validation)
+        testing = read_streams(dataset, fitted.networks[network], fold.test)
         searches: dict[str, list[TunedPoint]] = {}
         for name in names:
             system = SYSTEMS[name]
@@ -223,9 +229,9 @@ def scored_fold(dataset: Dataset, fold: PeopleFold, fitted: Fitted, settings: Se
             points = searches[base]
             if system.gate_to is not None:
                 points = gated(tuning, points, fitted.gate or GateSettings(), settings.late_s)
-            found[name] = _scored(system, points, tuning, testing, settings)
+            systems[name] = _scored(system, points, tuning, testing, settings)
     people = {"train": list(fold.train), "validation": list(fold.validation), "test": list(fold.test)}
-    return {"name": fold.name, **people, "systems": {n: found[n] for n in settings.systems if n in found}}
+    return {"name": fold.name, **people, "systems": {n: systems[n] for n in settings.systems if n in systems}}
 
 
 def _scored(
@@ -242,7 +248,9 @@ def _scored(
         by_person.setdefault(h.truth.subject, []).append(h)
 
     def outcome(spec: DecideSpec) -> dict[str, Any]:
-        return {person: total(heard, spec, settings.weights, late_s).kept() for person, heard in by_person.items()}
+        return {
+            person: total(streams, spec, settings.weights, late_s).to_journal() for person, streams in by_person.items()
+        }
 
     curve: list[dict[str, Any]] = []
     of_spec: dict[int, dict[str, Any]] = {}
@@ -251,8 +259,8 @@ def _scored(
         if id(point) not in of_spec:
             of_spec[id(point)] = {
                 person: [n.hits, n.truths, n.insertions, n.hours]
-                for person, heard in by_person.items()
-                for n in [quick(heard, point.spec, late_s)]
+                for person, streams in by_person.items()
+                for n in [count_events(streams, point.spec, late_s)]
             }
         curve.append({"target": target, "tuned": _tuned_setting(point), "people": of_spec[id(point)]})
     chosen = {"balanced": balanced(points), "cheapest": cheapest(tuning, points, settings.weights, late_s)}
@@ -267,7 +275,7 @@ def _scored(
         smoothing_s = SMOOTHING_S if any(p.spec.smoothing_s in SMOOTHINGS for p in points) else 0.0
         table["plain"] = {"tuned": None, "people": outcome(argmax_spec(smoothing_s))}
     for h in (*tuning, *testing):
-        h.listener.clear_cache()
+        h.replayer.clear_cache()
     return table
 
 
@@ -282,12 +290,12 @@ def scored_people(
 ) -> dict[str, StreamScore]:
     """Return the scores of one model under one setting, person by person; nothing is tuned."""
     settings = settings or Settings(())
-    found: dict[str, StreamScore] = {}
+    scores: dict[str, StreamScore] = {}
     for person in subjects:
-        heard = hear(dataset, model, [person])
-        if heard:
-            found[person] = total(heard, spec, settings.weights, settings.late_s)
-    return found
+        streams = read_streams(dataset, model, [person])
+        if streams:
+            scores[person] = total(streams, spec, settings.weights, settings.late_s)
+    return scores
 
 
 HITS, TRUTHS, FALSE, HOURS = range(4)
@@ -348,27 +356,27 @@ def _points(counts: NDArray[np.float64]) -> list[tuple[float, float]]:
 
 def _curve(folds: Folds, name: str, counts: NDArray[np.float64]) -> list[dict[str, Any]]:
     """Return the points of a curve, without targets that the tuning people of no fold reach."""
-    found = []
+    points = []
     targets = [point["target"] for point in folds[0]["systems"][name]["curve"]]
     reach = max(fold["systems"][name]["reach"] for fold in folds)
     for target, (recall, false) in zip(targets, _points(counts), strict=True):
         if target <= reach:
-            found.append({"target": target, "recall": recall, "false_events_per_hour": false})
-    return found
+            points.append({"target": target, "recall": recall, "false_events_per_hour": false})
+    return points
 
 
 def _outcome(folds: Folds, name: str, how: str) -> dict[str, Any]:
     """Return one choice of setting over everybody, and person by person."""
     whole, people = StreamScore(), []
     for fold in folds:
-        for person, kept in sorted(fold["systems"][name][how]["people"].items()):
-            mine = StreamScore.from_kept(kept)
+        for person, stored in sorted(fold["systems"][name][how]["people"].items()):
+            mine = StreamScore.from_journal(stored)
             whole.add(mine)
-            said = mine.to_dict()
+            figures = mine.to_dict()
             people.append(
                 {"subject": person, "fold": fold["name"]}
-                | {k: said[k] for k in ("truths", "events", "recall", "precision", "f1", "false_events_per_hour")}
-                | {"latency_s": said["latency_s"]["median"]}
+                | {k: figures[k] for k in ("truths", "events", "recall", "precision", "f1", "false_events_per_hour")}
+                | {"latency_s": figures["latency_s"]["median"]}
             )
     latencies = {level: whole.total(level).latencies for level, tallies in whole.levels.items() if tallies}
     return {
@@ -389,7 +397,7 @@ def _at_recall(counts: Mapping[str, NDArray[np.float64]]) -> list[dict[str, Any]
     drawn = np.random.default_rng(BOOTSTRAP_SEED).integers(0, people, size=(_RESAMPLES, people))
     curves = {name: _points(table) for name, table in counts.items()}
     again = {name: [_points(table[:, draw]) for draw in drawn] for name, table in counts.items()}
-    found = []
+    rows = []
     for recall in RECALLS:
         base = at_recall(curves[REFERENCE], recall)
         row: dict[str, Any] = {"recall": recall, "systems": {}}
@@ -407,8 +415,8 @@ def _at_recall(counts: Mapping[str, NDArray[np.float64]]) -> list[dict[str, Any]
                 if len(ratios) >= 0.9 * _RESAMPLES:
                     ci = [float(q) for q in np.percentile(ratios, [2.5, 97.5])]
             row["systems"][name] = {"false_events_per_hour": false, "ratio": ratio, "ci95": ci}
-        found.append(row)
-    return found
+        rows.append(row)
+    return rows
 
 
 def pooled_scores(scores: Mapping[str, StreamScore]) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from plushsense.core.gestures import GestureSet
-from plushsense.experiments.streams.replay import StreamScore, StreamTrace, quick, score
+from plushsense.experiments.streams.replay import StreamScore, StreamTrace, count_events, score
 from plushsense.runtime.decisions import DecideSpec, argmax_spec
 from plushsense.runtime.gate import GateSettings
 from plushsense.scoring.events import LATE_S, ErrorCosts, front
@@ -70,9 +70,9 @@ _WAITS = (0.5, 1.5)
 
 def _beside(spec: DecideSpec) -> list[DecideSpec]:
     """Return the settings that differ from one in a single value."""
-    found = [replace(spec, **{name: value}) for name, values in _STEPS.items() for value in values]
-    found += [replace(spec, leave=share * spec.enter, leave_affect=share * spec.enter) for share in (0.3, 0.5, 0.8)]
-    return [each for each in found if each != spec]
+    specs = [replace(spec, **{name: value}) for name, values in _STEPS.items() for value in values]
+    specs += [replace(spec, leave=share * spec.enter, leave_affect=share * spec.enter) for share in (0.3, 0.5, 0.8)]
+    return [each for each in specs if each != spec]
 
 
 @dataclass(frozen=True)
@@ -113,31 +113,31 @@ class TunedPoint:
     f1: float = 0.0
 
 
-def tried(heard: Sequence[StreamTrace], specs: Sequence[DecideSpec], late_s: float = LATE_S) -> list[TunedPoint]:
+def tried(streams: Sequence[StreamTrace], specs: Sequence[DecideSpec], late_s: float = LATE_S) -> list[TunedPoint]:
     """Score every setting on these streams, grouped by smoothing to save memory."""
     points: dict[int, TunedPoint] = {}
     order = sorted(range(len(specs)), key=lambda i: specs[i].smoothing_s)
     for _, group in itertools.groupby(order, key=lambda i: specs[i].smoothing_s):
         for i in group:
-            n = quick(heard, specs[i], late_s)
+            n = count_events(streams, specs[i], late_s)
             points[i] = TunedPoint(specs[i], n.recall, n.false_per_hour, n.f1)
-        for h in heard:
-            h.listener.clear_cache()
+        for stream in streams:
+            stream.replayer.clear_cache()
     return [points[i] for i in range(len(specs))]
 
 
-def searched(heard: Sequence[StreamTrace], system: System, late_s: float = LATE_S) -> list[TunedPoint]:
+def searched(streams: Sequence[StreamTrace], system: System, late_s: float = LATE_S) -> list[TunedPoint]:
     """Return all settings of a system that were tried on these streams, without a gate."""
-    points = tried(heard, system.grid(heard[0].listener.trace.gestures), late_s)
+    points = tried(streams, system.grid(streams[0].replayer.trace.gestures), late_s)
     for _ in range(system.rounds):
         known = {_key(p.spec) for p in points}
         more = {_key(s): s for spec in _best_specs(points) for s in _beside(spec)}
-        points += tried(heard, [s for key, s in more.items() if key not in known], late_s)
+        points += tried(streams, [s for key, s in more.items() if key not in known], late_s)
     return points
 
 
 def gated(
-    heard: Sequence[StreamTrace], points: Sequence[TunedPoint], gate: GateSettings, late_s: float = LATE_S
+    streams: Sequence[StreamTrace], points: Sequence[TunedPoint], gate: GateSettings, late_s: float = LATE_S
 ) -> list[TunedPoint]:
     """Return the best of these settings with a gate, and how long its events wait for the network.
 
@@ -148,7 +148,7 @@ def gated(
     # Every setting that could be chosen without the gate, so that the two systems differ by the gate only.
     base = {_key(spec): spec for spec in (*_best_specs(points), *(p.spec for p in best_of(points)))}
     specs = [replace(spec, gate=gate, wait_s=wait_s) for spec in base.values() for wait_s in _WAITS]
-    return tried(heard, specs, late_s)
+    return tried(streams, specs, late_s)
 
 
 def _best_specs(points: Sequence[TunedPoint]) -> list[DecideSpec]:
@@ -173,13 +173,15 @@ def fewest(points: Sequence[TunedPoint], recall: float) -> TunedPoint:
 
 
 def cheapest(
-    heard: Sequence[StreamTrace],
+    streams: Sequence[StreamTrace],
     points: Sequence[TunedPoint],
     weights: ErrorCosts | None = None,
     late_s: float = LATE_S,
 ) -> TunedPoint:
     """Return the setting of the lowest cost, the first of equal ones."""
-    return min(best_of(points), key=lambda point: sum(score(h, point.spec, weights, late_s).cost for h in heard))
+    return min(
+        best_of(points), key=lambda point: sum(score(stream, point.spec, weights, late_s).cost for stream in streams)
+    )
 
 
 def balanced(points: Sequence[TunedPoint]) -> TunedPoint:
@@ -188,10 +190,10 @@ def balanced(points: Sequence[TunedPoint]) -> TunedPoint:
 
 
 def total(
-    heard: Sequence[StreamTrace], spec: DecideSpec, weights: ErrorCosts | None = None, late_s: float = LATE_S
+    streams: Sequence[StreamTrace], spec: DecideSpec, weights: ErrorCosts | None = None, late_s: float = LATE_S
 ) -> StreamScore:
     """Return one setting over several streams."""
-    found = StreamScore()
-    for h in heard:
-        found.add(score(h, spec, weights, late_s))
-    return found
+    summed = StreamScore()
+    for stream in streams:
+        summed.add(score(stream, spec, weights, late_s))
+    return summed

@@ -1,4 +1,4 @@
-"""The figures of a sweep, in the order of the paper's; each is returned, and says below what its scores are of."""
+"""Draw the figures of a sweep, in the order of the paper's. A line below each describes the data and the split."""
 
 from __future__ import annotations
 
@@ -43,16 +43,16 @@ CLASSES = (
 )
 _STYLES = ("-", "--", ":", "-.")
 BARS = 30
-"""Architectures that a figure of bars shows, the best; more could not be read."""
+"""Largest number of architectures in a bar chart, the best ones; more would not be legible."""
 _LETTERS_AN_INCH = 13
 _NARROWEST_IN = 5.2
 _RANKED = 15
 NAMED = 14
-"""Points of a front that are named."""
+"""Largest number of points of a Pareto front that are labelled."""
 
 
 def about(sweep: SweepResults) -> str:
-    """Return what the scores of a sweep are of, as one line below a figure."""
+    """Return the line below a figure: data set, split, number of runs, and whether it is leaky or simulated."""
     parts = [
         f"data: {sweep.head.get('dataset')}",
         f"split {sweep.head.get('split')}" + (" (LEAKY)" if sweep.leaky else ""),
@@ -76,8 +76,8 @@ def _describe_below(figure: Figure, sweep: SweepResults) -> None:
     warned = sweep.leaky or sweep.simulated
     colour, weight = ("#b3261e", "bold") if warned else ("#57606a", "normal")
     lines = textwrap.fill(about(sweep), round(_LETTERS_AN_INCH * figure.get_figwidth()), break_on_hyphens=False)
-    said = figure.supxlabel(lines, fontsize=7.5, color=colour, fontweight=weight)
-    said.set_parse_math(False)
+    text = figure.supxlabel(lines, fontsize=7.5, color=colour, fontweight=weight)
+    text.set_parse_math(False)
 
 
 def score_label(sweep: SweepResults, measure: str) -> str:
@@ -105,18 +105,18 @@ def by_architecture(sweep: SweepResults) -> Figure:
 
 
 def by_filters(sweep: SweepResults) -> Figure:
-    """Draw Figure 8: as Figure 7, a panel for each filter set, the largest first."""
+    """Draw Figure 8: the bars of Figure 7 in one panel for each filter set, the largest set first."""
     sets = sweep.filter_sets[::-1]
-    shown = [row["arch"] for row in _bars(architectures(sweep))]
+    names = [row["arch"] for row in _bars(architectures(sweep))]
     rows_of_panels = -(-len(sets) // 2)
     figure = _figure(
-        sweep, 9.6, 1.2 + rows_of_panels * (1.0 + 0.33 * len(shown)), "Accuracy of each architecture by filter set"
+        sweep, 9.6, 1.2 + rows_of_panels * (1.0 + 0.33 * len(names)), "Accuracy of each architecture by filter set"
     )
     panels = figure.subplots(rows_of_panels, 2, sharex=True, squeeze=False).flatten()
     for i, (axes, filter_set) in enumerate(zip(panels, sets, strict=False)):
-        found = {row["arch"]: row for row in architectures(sweep, filter_set)}
+        by_name = {row["arch"]: row for row in architectures(sweep, filter_set)}
         lacking = {"highest": None, "mean": None, "sd": None}
-        rows = [found.get(arch, {"arch": arch, **lacking}) for arch in shown]
+        rows = [by_name.get(arch, {"arch": arch, **lacking}) for arch in names]
         _accuracy_bars(axes, rows, "epochs and batch")
         axes.set_title(f"({chr(97 + i % 26)})  [{filter_set.replace('/', ' ')}]", fontsize=9.5, loc="left")
         axes.set_xlabel(score_label(sweep, "Accuracy (% of test windows)"), fontsize=8.5)
@@ -129,7 +129,7 @@ def by_filters(sweep: SweepResults) -> Figure:
 
 
 def _bars(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the rows to draw in their order: all, or where they are too many the best."""
+    """Return the `BARS` rows of the highest accuracy, in their original order."""
     best = sorted(rows, key=lambda r: -(r["highest"] or 0.0))[:BARS]
     return [row for row in rows if row in best]
 
@@ -165,7 +165,7 @@ def _legend(figure: Figure, axes: Axes) -> None:
 
 
 def size_and_accuracy(sweep: SweepResults) -> Figure:
-    """Figure 9: accuracy against size, of the networks in Table 4."""
+    """Draw Figure 9: accuracy against the number of parameters, for the networks in Table 4."""
     rows = table4(sweep).rows
     figure = _figure(sweep, 9.2, 5.2, "Accuracy and size of the best of each size class")
     axes = figure.add_subplot()
@@ -187,7 +187,7 @@ def size_and_accuracy(sweep: SweepResults) -> Figure:
 
 
 def pareto(sweep: SweepResults, cost: str) -> Figure:
-    """Draw the best macro-F1 of each network against a cost, the front as a line and its members named."""
+    """Draw the best macro-F1 of each network against a cost, the Pareto front as a line with labelled members."""
     rows = pareto_points(sweep, cost)
     label = COSTS[cost]
     figure = _figure(sweep, 9.2, 5.2, f"Macro-F1 against {label[0].lower()}{label[1:]}")
@@ -245,11 +245,11 @@ def acr_bars(sweep: SweepResults) -> Figure:
     values = [100 * (r["acr"] or 0.0) for r in rows]
     axes.barh(at, values, 0.62, color=MAX)
     for y, (value, row) in enumerate(zip(values, rows, strict=True)):
-        said = f"{value:.1f}   accuracy {100 * row['accuracy']:.1f} %, {count(row['parameters'])} parameters"
+        label = f"{value:.1f}   accuracy {100 * row['accuracy']:.1f} %, {count(row['parameters'])} parameters"
         # Inside a bar where it has the room.
         inside = value > 0.5 * max(values)
         at_x, ink = (0.01 * max(values), "white") if inside else (value + 0.01 * max(values), "black")
-        axes.text(at_x, y, said, va="center", fontsize=7.5, color=ink)
+        axes.text(at_x, y, label, va="center", fontsize=7.5, color=ink)
     axes.set_yticks(at, [f"{r['arch']}  {r['filters']}" for r in rows], parse_math=False)
     axes.tick_params(labelsize=8)
     axes.set_ylim(len(rows) - 0.4, -0.6)
@@ -314,7 +314,7 @@ def curves(sweep: SweepResults, trial: Row) -> Figure | None:
 
 
 def confusion(sweep: SweepResults, trial: Row) -> Figure | None:
-    """Draw Figures 10 and 11: the confusions of a trial, classes by affect, a frame around each affect."""
+    """Draw Figures 10 and 11: the confusion matrix of a trial, classes sorted and framed by affect."""
     counts = sweep.confusion(str(trial["trial"]))
     if counts is None:
         return None
@@ -333,10 +333,10 @@ def confusion(sweep: SweepResults, trial: Row) -> Figure | None:
         frame.set_clip_on(False)
         axes.add_patch(frame)
         at = first + (size - 1) / 2
-        said = axes.text(
+        label = axes.text(
             len(labels) - 0.35, at, affect, rotation=270, va="center", ha="left", fontsize=9, color="#9c4400"
         )
-        said.set_parse_math(False)
+        label.set_parse_math(False)
     axes.set_xlabel("Read as   (windows; shade: share of the row)")
     _describe_below(figure, sweep)
     return figure

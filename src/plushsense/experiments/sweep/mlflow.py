@@ -44,17 +44,19 @@ def export_trials(sweep: SweepResults, where: str | os.PathLike[str]) -> dict[st
     title = f"plushsense sweep {sweep.name}"
     try:
         client = mlflow.MlflowClient(tracking_uri=uri)
-        found = client.get_experiment_by_name(title)
-        experiment = found.experiment_id if found else client.create_experiment(title, artifact_location=artifacts)
+        existing = client.get_experiment_by_name(title)
+        experiment = (
+            existing.experiment_id if existing else client.create_experiment(title, artifact_location=artifacts)
+        )
         there = _there(client, experiment)
         finished = [t for t in sweep.done if there.get(str(t["trial"]), ("", ""))[1] != "FINISHED"]
         for trial in finished:
             run = there.get(str(trial["trial"]), ("", ""))[0]
             _log(mlflow, client, experiment, run, sweep, trial)
     except (mlflow.exceptions.MlflowException, OSError) as cause:
-        said = str(cause).splitlines()[0].split(". ")[0].rstrip(".") if str(cause) else type(cause).__name__
+        reason = str(cause).splitlines()[0].split(". ")[0].rstrip(".") if str(cause) else type(cause).__name__
         raise ConfigError(
-            f"MLflow refuses '{where}' ({said}): give a folder, or a URI such as sqlite:///x.db."
+            f"MLflow refuses '{where}' ({reason}): give a folder, or a URI such as sqlite:///x.db."
         ) from None
     before = len(sweep.done) - len(finished)
     return {"uri": uri, "experiment": title, "new": len(finished), "before": before}
@@ -74,17 +76,17 @@ def _place(where: str) -> tuple[str, str | None]:
 
 def _there(client: Any, experiment: str) -> dict[str, tuple[str, str]]:
     """Return the trials that have a run: its id and status."""
-    kept: dict[str, tuple[str, str]] = {}
+    runs: dict[str, tuple[str, str]] = {}
     token = None
     while True:
         page = client.search_runs([experiment], max_results=_PAGE, page_token=token)
         for run in page:
             trial = run.data.tags.get(TRIAL)
-            if trial and kept.get(trial, ("", ""))[1] != "FINISHED":
-                kept[trial] = (run.info.run_id, run.info.status)
+            if trial and runs.get(trial, ("", ""))[1] != "FINISHED":
+                runs[trial] = (run.info.run_id, run.info.status)
         token = page.token
         if not token:
-            return kept
+            return runs
 
 
 def _log(mlflow: Any, client: Any, experiment: str, run: str, sweep: SweepResults, trial: Row) -> None:

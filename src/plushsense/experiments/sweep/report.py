@@ -61,9 +61,9 @@ def sections_of(sweep: SweepResults) -> Iterator[Section]:
     yield _top(sweep)
     yield Section("acr", "ACR ranking", (tables.acr_ranking(sweep),), (_acr(sweep),))
     yield _effect(sweep)
-    shown = _looked_at(sweep, best)
-    yield _confusions(sweep, shown)
-    yield _curves(sweep, shown)
+    trials = _looked_at(sweep, best)
+    yield _confusions(sweep, trials)
+    yield _curves(sweep, trials)
     yield _fronts(sweep)
 
 
@@ -87,11 +87,11 @@ def _by_filters(sweep: SweepResults) -> Section:
     title = "Figure 8: accuracy by filter set"
     if len(sweep.filter_sets) < 2:
         return Section("figure-8", title, dropped=("There is one filter set only: it would be Figure 7 again.",))
-    said = []
+    best = []
     for filter_set in sweep.filter_sets[::-1]:
         rows = sorted(tables.architectures(sweep, filter_set), key=lambda r: -(r["highest"] or 0.0))
-        said.append(f"{filter_set}: {_bar_words(rows[:1])}")
-    alt = f"A panel of bars a filter set: highest and mean accuracy of each architecture. The best: {'; '.join(said)}."
+        best.append(f"{filter_set}: {_bar_words(rows[:1])}")
+    alt = f"A panel of bars a filter set: highest and mean accuracy of each architecture. The best: {'; '.join(best)}."
     drawing = Drawing("figure-8-filter-sets", draw.by_filters(sweep), alt)
     return Section("figure-8", title, drawings=(drawing,), dropped=_only_best(len(sweep.archs)))
 
@@ -118,10 +118,10 @@ def _top(sweep: SweepResults) -> Section:
         return Section(
             "table-4", title, (table,), dropped=("One network only is scored: Figure 9 would be one point.",)
         )
-    said = ", ".join(
+    first = ", ".join(
         f"{r['arch']} {r['filters']} {100 * r['accuracy']:.1f} % at {count(r['parameters'])}" for r in table.rows[:3]
     )
-    alt = f"Points: accuracy against parameters of {len(table.rows)} networks. The most accurate: {said} parameters."
+    alt = f"Points: accuracy against parameters of {len(table.rows)} networks. The most accurate: {first} parameters."
     return Section("table-4", title, (table,), (Drawing("figure-9-size", draw.size_and_accuracy(sweep), alt),))
 
 
@@ -152,25 +152,25 @@ def _effect(sweep: SweepResults) -> Section:
 
 def _looked_at(sweep: SweepResults, best: Row) -> list[Row]:
     """Return the trials with confusions and curves: the paper's two networks if in the grid, and the best."""
-    found = [sweep.chosen, sweep.best_of(*SECOND), best]
-    return list({t["trial"]: t for t in found if t}.values())
+    candidates = [sweep.chosen, sweep.best_of(*SECOND), best]
+    return list({t["trial"]: t for t in candidates if t}.values())
 
 
-def _confusions(sweep: SweepResults, shown: Sequence[Row]) -> Section:
+def _confusions(sweep: SweepResults, trials: Sequence[Row]) -> Section:
     title = "Figures 10 and 11: confusions"
     if len(sweep.labels) < 2:
         return Section("confusion", title, dropped=("The sweep names no classes: there is nothing to confuse.",))
-    drawings, kept, dropped = [], [], []
-    for trial in shown:
+    drawings, by_gesture, dropped = [], [], []
+    for trial in trials:
         figure = draw.confusion(sweep, trial)
         if figure is None:
             dropped.append(f"The confusions of {name_of(trial)} were not kept.")
             continue
         drawings.append(Drawing(f"confusion-{_file_name(trial)}", figure, confusion_words(sweep, trial)))
-        kept += [table for table in (tables.per_class(sweep, trial),) if table]
-    if kept and set(sweep.affects) == {"none"}:
+        by_gesture += [table for table in (tables.per_class(sweep, trial),) if table]
+    if by_gesture and set(sweep.affects) == {"none"}:
         dropped.append("The gestures of this data set have no affect: there are no blocks.")
-    return Section("confusion", title, tuple(kept), tuple(drawings), tuple(dropped))
+    return Section("confusion", title, tuple(by_gesture), tuple(drawings), tuple(dropped))
 
 
 def confusion_words(sweep: SweepResults, trial: Row) -> str:
@@ -179,23 +179,23 @@ def confusion_words(sweep: SweepResults, trial: Row) -> str:
     total, right = int(counts.sum()), int(np.trace(counts))
     names, by_affect = grouped(counts, sweep.affects)
     share = 100 * right / max(total, 1)
-    said = f"Confusion matrix of {name_of(trial)}: {right} of {count(total)} windows right ({share:.1f} %)"
+    description = f"Confusion matrix of {name_of(trial)}: {right} of {count(total)} windows right ({share:.1f} %)"
     if len(names) > 1:
         same_affect = int(np.trace(by_affect))
-        said += (
+        description += (
             f"; {100 * (same_affect - right) / max(total, 1):.1f} % read as another gesture of the same affect, "
             f"{100 * (total - same_affect) / max(total, 1):.1f} % as one of another affect"
         )
     wrong = counts - np.diag(np.diag(counts))
     if wrong.any():
         i, j = np.unravel_index(wrong.argmax(), wrong.shape)
-        said += f". Most often mistaken: {sweep.labels[i]} for {sweep.labels[j]} ({wrong[i, j]} windows)"
-    return said + "."
+        description += f". Most often mistaken: {sweep.labels[i]} for {sweep.labels[j]} ({wrong[i, j]} windows)"
+    return description + "."
 
 
-def _curves(sweep: SweepResults, shown: Sequence[Row]) -> Section:
+def _curves(sweep: SweepResults, trials: Sequence[Row]) -> Section:
     drawings, dropped = [], []
-    for trial in shown:
+    for trial in trials:
         figure = draw.curves(sweep, trial)
         if figure is None:
             dropped.append(f"No learning curves of {name_of(trial)} were kept.")
@@ -215,8 +215,8 @@ def _fronts(sweep: SweepResults) -> Section:
             dropped.append(f"No front of macro-F1 against “{label.lower()}”, which does not differ{same}.")
             continue
         edge = [p for p in points if p["front"]]
-        said = "; ".join(f"{p['arch']} {p['filters']} ({count(p['value'])}, {p['macro_f1']:.3f})" for p in edge)
-        alt = f"Points: macro-F1 against {label.lower()} of {len(points)} networks, log scale. On the front: {said}."
+        members = "; ".join(f"{p['arch']} {p['filters']} ({count(p['value'])}, {p['macro_f1']:.3f})" for p in edge)
+        alt = f"Points: macro-F1 against {label.lower()} of {len(points)} networks, log scale. On the front: {members}."
         drawings.append(Drawing(f"pareto-{cost.replace('_', '-')}", draw.pareto(sweep, cost), alt))
     return Section("pareto", "Pareto fronts", (tables.pareto(sweep),), tuple(drawings), tuple(dropped))
 
@@ -272,20 +272,22 @@ def write_sweep_report(
     page_text = render(sweep, sections, pictures, title=title, files=beside.name)
     write_files(beside, files, before)
     write_page(target, page_text)
-    said = [f"{len(files)} tables and figures in {beside}"]
+    summary = [f"{len(files)} tables and figures in {beside}"]
     logged = None
     if mlflow is not None:
         from plushsense.experiments.sweep.mlflow import export_trials
 
         logged = export_trials(sweep, mlflow)
-        said.append(f"MLflow: {logged['new']} trials logged, {logged['before']} were there already ({logged['uri']})")
+        summary.append(
+            f"MLflow: {logged['new']} trials logged, {logged['before']} were there already ({logged['uri']})"
+        )
     return {
         "report": str(target),
         "files": str(beside),
         "trials": sweep.total,
         "done": len(sweep.done),
         "mlflow": logged,
-        "said": said,
+        "said": summary,
     }
 
 

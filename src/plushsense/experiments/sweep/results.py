@@ -104,8 +104,8 @@ class SweepResults:
     @property
     def affects(self) -> list[str]:
         """The affect of each class; "none" where the data set has none."""
-        kept = [str(a) for a in self.head.get("affects") or ()]
-        return kept if len(kept) == len(self.labels) else ["none"] * len(self.labels)
+        affects = [str(a) for a in self.head.get("affects") or ()]
+        return affects if len(affects) == len(self.labels) else ["none"] * len(self.labels)
 
     def confusion(self, trial: str) -> list[list[int]] | None:
         """Return the windows (K, K) of a trial, truth in rows; None where they were not kept."""
@@ -128,10 +128,10 @@ class SweepResults:
             rows = mine.sort("epoch").collect().to_dicts()
         except (OSError, polars.exceptions.PolarsError) as cause:
             raise _unread(path, cause) from None
-        kept: dict[tuple[Any, ...], list[Row]] = {}
+        by_run: dict[tuple[Any, ...], list[Row]] = {}
         for row in rows:
-            kept.setdefault((row["run"], row.get("seed"), row.get("fold")), []).append(row)
-        return list(kept.values())
+            by_run.setdefault((row["run"], row.get("seed"), row.get("fold")), []).append(row)
+        return list(by_run.values())
 
     @property
     def chosen(self) -> Row | None:

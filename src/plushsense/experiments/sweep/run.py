@@ -201,7 +201,7 @@ def preview(
     try:
         planned = plan(dataset, spec, wrong, warn)
     except GridProblems as cause:
-        return {"name": spec.name, "trials": 0, "problems": list(cause.found), "grid": spec.to_dict()}
+        return {"name": spec.name, "trials": 0, "problems": list(cause.problems), "grid": spec.to_dict()}
     journal = journal_of(dataset, JOURNAL)
     macs = {job.id: planned.macs(job) for job in planned.jobs}
     total = sum(macs.values())

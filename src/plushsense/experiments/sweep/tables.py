@@ -132,8 +132,8 @@ def architecture_table(sweep: SweepResults) -> Table:
         Column("parameters", "Parameters (of the largest)", "count"),
     )
     rows = tuple(row for part in parts for row in architectures(sweep, part))
-    shown = len(architectures(sweep))
-    return Table("architectures", "Each architecture over all its trials", columns, rows, (), shown)
+    limit = len(architectures(sweep))
+    return Table("architectures", "Each architecture over all its trials", columns, rows, (), limit)
 
 
 def acr_ranking(sweep: SweepResults) -> Table:
@@ -222,7 +222,7 @@ def effect(sweep: SweepResults) -> Table:
             for part, head in (("", f"Mean {m.name}"), ("_sd", "sd"))
         ),
     )
-    said = (
+    note = (
         f"Over the {len(networks)} networks that have every schedule scored, so that the rows differ in nothing else."
         if whole
         else "No network has every schedule scored yet: each row is over others, and they are not to be compared."
@@ -232,7 +232,7 @@ def effect(sweep: SweepResults) -> Table:
         "Effect of epochs and batch",
         columns,
         tuple(rows),
-        (said, "The spread is over networks, not over seeds.") if rows else (),
+        (note, "The spread is over networks, not over seeds.") if rows else (),
     )
 
 
@@ -303,22 +303,22 @@ def table3(sweep: SweepResults) -> Table:
             network = cells.get((label, filter_set))
             if network is None:
                 continue
-            said = printed_parameters(network.arch, network.filters)
+            printed = printed_parameters(network.arch, network.filters)
             row[f"{filter_set} ours"] = network.parameters
-            row[f"{filter_set} paper"] = said
-            if said is None:
+            row[f"{filter_set} paper"] = printed
+            if printed is None:
                 continue
             seen = True
             ours = row[f"{filter_set} at the paper's size"] = count_parameters(network.arch, network.filters)
             if is_misprint(network.arch, network.filters):
-                row[f"{filter_set} paper"] = f"{said} (misprint?)"
-                off.append(f"{label} at {network.filters}: we count {count(ours)}, the paper prints {said}")
-            elif agrees(said, ours):
+                row[f"{filter_set} paper"] = f"{printed} (misprint?)"
+                off.append(f"{label} at {network.filters}: we count {count(ours)}, the paper prints {printed}")
+            elif agrees(printed, ours):
                 met += 1
-            elif abs(ours / parse_count(said) - 1) <= 0.04:
+            elif abs(ours / parse_count(printed) - 1) <= 0.04:
                 near += 1
             else:
-                off.append(f"{label} at {network.filters}: we count {count(ours)}, the paper prints {said}")
+                off.append(f"{label} at {network.filters}: we count {count(ours)}, the paper prints {printed}")
         rows.append(row)
     columns = [Column("arch", "Architecture")]
     for filter_set in sets:
@@ -347,7 +347,7 @@ def _table3_words(met: int, near: int, off: Sequence[str], other: bool) -> list[
         + (f". Not: {'; '.join(off)}." if off else ".")
     ]
     arch, filters = TABLE3_MISPRINT
-    if any(said.startswith(f"{arch} at {slashed(filters)}") for said in off):
+    if any(cell.startswith(f"{arch} at {slashed(filters)}") for cell in off):
         words.append(
             f"The cell of {arch} looks like a misprint: the paper's other three sizes of it agree with our count "
             "within 1 %."
@@ -362,11 +362,11 @@ def _table3_words(met: int, near: int, off: Sequence[str], other: bool) -> list[
 
 def top_networks(sweep: SweepResults, top: int = TOP) -> list[SweepNetwork]:
     """Return the ``top`` networks of every size class by their best trial, sorted from the best down."""
-    found: list[SweepNetwork] = []
+    best: list[SweepNetwork] = []
     for filter_set in sweep.filter_sets:
         mine = [n for n in sweep.networks if n.filter_set == filter_set and n.done]
-        found += sorted(mine, key=_rank)[:top]
-    return sorted(found, key=_rank)
+        best += sorted(mine, key=_rank)[:top]
+    return sorted(best, key=_rank)
 
 
 def _rank(network: SweepNetwork) -> tuple[float, int]:
@@ -420,7 +420,7 @@ def table4(sweep: SweepResults, *, threshold: float = PAPER_THRESHOLD, top: int 
 def _table4_row(network: SweepNetwork, threshold: float) -> dict[str, Any]:
     best, validated = network.best(), network.best("validation_accuracy")
     assert best is not None
-    said = TABLE4.get((network.arch, network.filters))
+    printed = TABLE4.get((network.arch, network.filters))
     return {
         "arch": network.label,
         "filters": network.filters,
@@ -434,19 +434,19 @@ def _table4_row(network: SweepNetwork, threshold: float) -> dict[str, Any]:
         **{key: best.get(key) for key in column_metrics() if key != "accuracy"},
         "validated_accuracy": validated["accuracy"] if validated else None,
         "above": "yes" if float(best["accuracy"]) > threshold else "no",
-        "paper_accuracy": said.highest if said else None,
-        "paper_mean": said.mean if said else None,
-        "paper_acr": said.acr if said else None,
+        "paper_accuracy": printed.highest if printed else None,
+        "paper_mean": printed.mean if printed else None,
+        "paper_acr": printed.acr if printed else None,
     }
 
 
 def per_class(sweep: SweepResults, trial: Row) -> Table | None:
     """Return recall, precision and F1 of each gesture in one trial; None where they were not kept."""
-    kept = (sweep.head.get("per_class") or {}).get(trial["trial"])
-    if not isinstance(kept, Sequence) or not all(isinstance(row, Mapping) for row in kept) or not kept:
+    stored = (sweep.head.get("per_class") or {}).get(trial["trial"])
+    if not isinstance(stored, Sequence) or not all(isinstance(row, Mapping) for row in stored) or not stored:
         return None
     affects = dict(zip(sweep.labels, sweep.affects, strict=True))
-    rows = tuple({**row, "affect": affects.get(str(row.get("label")))} for row in kept)
+    rows = tuple({**row, "affect": affects.get(str(row.get("label")))} for row in stored)
     columns = (
         Column("label", "Gesture"),
         Column("affect", "Affect"),
