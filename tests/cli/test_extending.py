@@ -1,4 +1,4 @@
-"""A layout and a gesture set are one TOML file each, and a verb is a module and a line in ``VERBS``."""
+"""A layout and a gesture set are one TOML file each, and a verb is a module and a table in ``verbs.toml``."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 import plushsense.core
 from plushsense import cli as verbs
-from plushsense.cli.main import VERBS
+from plushsense.cli.options import VERBS
 from plushsense.core import toml
 from support.small_dataset import Cli
 
@@ -32,10 +32,6 @@ gestures = [
 """
 VERB = """
 import json
-
-
-def add(parser):
-    parser.add_argument("name")
 
 
 def run(args):
@@ -73,10 +69,11 @@ def test_a_layout_and_a_gesture_set_are_one_file_each(
     assert "pitch" in (export / "plush_model.h").read_text()
 
 
-def test_a_verb_is_a_module_and_a_line(cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_verb_is_a_module_and_a_table(cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "hello_extension.py").write_text(VERB)
     monkeypatch.setattr(verbs, "__path__", [*verbs.__path__, str(tmp_path)])
-    monkeypatch.setitem(VERBS, "hello", ("hello_extension", "greet somebody"))
+    table = {"summary": "greet somebody", "module": "hello_extension", "name": {"help": "whom to greet"}}
+    monkeypatch.setitem(VERBS, "hello", table)
     assert "greet somebody" in cli("--help").out
     assert cli("hello", "Ana").out == "Hello Ana.\n"
     assert cli("hello", "Ana", "--json").json == {"hello": "Ana"}

@@ -14,7 +14,8 @@ from typing import Any
 
 import pytest
 
-from plushsense.cli.main import VERBS
+from plushsense.cli.main import load_verb
+from plushsense.cli.options import VERBS
 from plushsense.cli.settings import report_epochs
 from plushsense.dataset.store import Dataset
 from plushsense.models.bundle import Bundle
@@ -420,11 +421,11 @@ def test_what_is_left_when_stopped(
     assert said in ran.err
 
 
-def test_every_verb_has_a_table_of_options_and_every_table_a_verb_or_another_table() -> None:
-    text = resources.files("plushsense.cli").joinpath("options.toml").read_text(encoding="utf-8")
-    tables = tomllib.loads(text)
+def test_every_table_is_a_verb_or_inserted_in_another() -> None:
+    tables = tomllib.loads(resources.files("plushsense.cli").joinpath("verbs.toml").read_text(encoding="utf-8"))
     inserted = {name[1:] for table in tables.values() for name in table if name.startswith("@")}
     assert set(tables) == set(VERBS) | inserted
+    assert all(callable(load_verb(verb)) for verb in VERBS)
 
 
 @pytest.mark.parametrize(

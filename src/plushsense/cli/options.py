@@ -1,4 +1,4 @@
-"""Add the options that ``options.toml`` describes to a parser, and pass the given values on."""
+"""The verbs of ``verbs.toml``: their options for a parser, and the given values for library functions."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import argparse
 import importlib
 import tomllib
 from collections.abc import Mapping
-from functools import cache
 from importlib import resources
 from typing import Any
 
@@ -26,16 +25,20 @@ class _Words(dict[str, str]):
         return ", ".join(getattr(importlib.import_module(module), name))
 
 
-@cache
-def _tables() -> dict[str, dict[str, Any]]:
-    return tomllib.loads(resources.files("plushsense.cli").joinpath("options.toml").read_text(encoding="utf-8"))
+_TABLES: dict[str, dict[str, Any]] = tomllib.loads(
+    resources.files("plushsense.cli").joinpath("verbs.toml").read_text(encoding="utf-8")
+)
+VERBS = {name: table for name, table in _TABLES.items() if "summary" in table}
+"""The table of every verb, by name."""
 
 
 def add_options(parser: argparse.ArgumentParser, table: str, words: Mapping[str, str] | None = None) -> None:
-    """Add the options of a table of ``options.toml``, in its order; ``words`` fill placeholders in help texts."""
+    """Add the options of a table of ``verbs.toml``, in its order; ``words`` fill placeholders in help texts."""
     texts = _Words(words or {})
     groups: dict[str, Any] = {}
-    for name, entry in _tables()[table].items():
+    for name, entry in {**_TABLES, **VERBS}[table].items():
+        if name in ("summary", "module", "stopped"):
+            continue
         if name == "description":
             parser.formatter_class = argparse.RawDescriptionHelpFormatter
             parser.description = f"{parser.description}\n\n{entry}"
