@@ -166,8 +166,7 @@ def made_up_windows(bundle: Bundle, n: int = 24) -> Windows:
     )
     scaler = bundle.scaler
     unit = 1 / np.where(scaler.scale == 0, 1.0, scaler.scale)
-    raw: Windows = np.rint(scaler.offset[:, None] + scaled * unit[:, None]).astype(np.int64)
-    return raw
+    return np.asarray(np.rint(scaler.offset[:, None] + scaled * unit[:, None]), dtype=np.int64)
 
 
 def scaling(scaler: Scaler) -> tuple[Floats, Floats, Floats]:

@@ -35,6 +35,7 @@ from plushsense.runtime.integer import IntegerNetwork
 
 OPSET = 18
 IR_VERSION = 9
+Shape = list[str | int]
 
 
 class OnnxGraph:
@@ -57,26 +58,24 @@ class OnnxGraph:
         """Add a constant with one value a channel, shaped for windows (N, C, T)."""
         return self.constant(name, values[:, None])
 
-    def model(self, bundle: Bundle) -> bytes:
-        """Return the checked graph from RAW to PROBABILITIES as bytes."""
-        onnx, arch = self.onnx, bundle.arch
-        real = onnx.TensorProto.FLOAT
-        graph = onnx.helper.make_graph(
-            self.nodes,
-            "plushsense",
-            [onnx.helper.make_tensor_value_info(RAW, real, ["N", arch.channels, arch.span])],
-            [onnx.helper.make_tensor_value_info(n, real, ["N", arch.classes]) for n in (LOGITS, PROBABILITIES)],
-            self.constants,
-        )
-        model = onnx.helper.make_model(
-            graph,
-            producer_name="plushsense",
-            ir_version=IR_VERSION,
-            opset_imports=[onnx.helper.make_opsetid("", OPSET)],
-            doc_string=f"Touch gestures, {arch.title}",
-        )
-        onnx.helper.set_model_props(model, describe(bundle))
-        onnx.checker.check_model(model, full_check=True)
+    def model(self, inputs: dict[str, Shape], outputs: dict[str, Shape], **settings: Any) -> Any:
+        """Return the checked graph as an ONNX model; inputs and outputs are names and shapes of float32 tensors."""
+        helper, real = self.onnx.helper, self.onnx.TensorProto.FLOAT
+        ends = [[helper.make_tensor_value_info(n, real, s) for n, s in part.items()] for part in (inputs, outputs)]
+        graph = helper.make_graph(self.nodes, "plushsense", *ends, self.constants)
+        opset = [helper.make_opsetid("", OPSET)]
+        model = helper.make_model(graph, ir_version=IR_VERSION, opset_imports=opset, **settings)
+        self.onnx.checker.check_model(model, full_check=True)
+        return model
+
+    def to_bytes(self, bundle: Bundle) -> bytes:
+        """Return the graph from RAW to LOGITS and PROBABILITIES as the bytes of a file."""
+        arch = bundle.arch
+        inputs: dict[str, Shape] = {RAW: ["N", arch.channels, arch.span]}
+        classes: Shape = ["N", arch.classes]
+        about = {"producer_name": "plushsense", "doc_string": f"Touch gestures, {arch.title}"}
+        model = self.model(inputs, {LOGITS: classes, PROBABILITIES: classes}, **about)
+        self.onnx.helper.set_model_props(model, describe(bundle))
         return bytes(model.SerializeToString(deterministic=True))
 
 
@@ -104,7 +103,7 @@ def float_model(bundle: Bundle) -> bytes:
     w, b = (g.constant(n, bundle.weights[n]) for n in ("dense.weight", "dense.bias"))
     g.add("Gemm", LOGITS, z, w, b, transB=1)
     g.add("Softmax", PROBABILITIES, LOGITS, axis=-1)
-    return g.model(bundle)
+    return g.to_bytes(bundle)
 
 
 def _padding(g: OnnxGraph, i: int, arch: Arch, layer: ConvLayer, z: str) -> tuple[str, list[int]]:
@@ -166,7 +165,7 @@ def integer_model(bundle: Bundle, network: IntegerNetwork) -> bytes:
     )
     g.add("Clip", LOGITS, z, low, high)
     g.add("Softmax", PROBABILITIES, LOGITS, axis=-1)
-    return g.model(bundle)
+    return g.to_bytes(bundle)
 
 
 def answers(model: bytes, windows: NDArray[Any]) -> NDArray[np.float32] | None:

@@ -35,16 +35,12 @@ class SourceMutant:
     when: Literal["always", "dilated", "magnitude", "ranged", "smoothed", "stepped", "ties"] = "always"
 
 
-@dataclass(frozen=True)
-class _MutantFile:
-    mutants: tuple[SourceMutant, ...]
-
-
 @cache
 def source_mutants() -> tuple[SourceMutant, ...]:
     """Read the mutants of plushsense.c from ``mutants.toml``."""
     path = Path(__file__).with_name("mutants.toml")
-    return load_table(read_toml(path, "mutants", BadInput), _MutantFile, path.name, BadInput).mutants
+    rows = read_toml(path, "mutants", BadInput)["mutants"]
+    return tuple(load_table(row, SourceMutant, path.name, BadInput) for row in rows)
 
 
 _FIXED_BYTES, _SCALE_BYTES = 28, 8
