@@ -287,8 +287,7 @@ def _parquet_numbers(pl: Any, column: Any) -> NDArray[np.float64]:
     if column.dtype.is_temporal():
         microseconds = column.dt.total_microseconds() if column.dtype == pl.Duration else column.dt.epoch("us")
         column = microseconds.cast(pl.Float64) / 1000.0
-    numbers: NDArray[np.float64] = column.cast(pl.Float64, strict=False).fill_null(float("nan")).to_numpy()
-    return numbers
+    return np.asarray(column.cast(pl.Float64, strict=False).fill_null(float("nan")).to_numpy())
 
 
 def milliseconds(name: str, times: NDArray[np.float64], rate_hz: float) -> tuple[float, str]:
