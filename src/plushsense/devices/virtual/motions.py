@@ -158,8 +158,7 @@ def sense(
     acc = (canvas.down + canvas.shake) * climate.axis * world.acc_counts_per_g
     acc += world.acc_noise_counts * rng.standard_normal((n, 3))
     raw = np.column_stack((total, zones, np.clip(acc, -32768, 32767)))
-    whole: NDArray[np.int64] = np.rint(raw).astype(np.int64)
-    return whole
+    return np.asarray(np.rint(raw), dtype=np.int64)
 
 
 PICK_S, PUT_S, APPROACH_S, LEAVE_S = 0.8, 0.8, 0.30, 0.25
@@ -188,18 +187,17 @@ class RepetitionPlan:
     light_grip: float
 
 
+@dataclass(frozen=True)
 class Hands:
     """Simulate the holding hands of one person."""
 
-    def __init__(self, who: Person, world: World, rng: np.random.Generator) -> None:
-        self._who = who
-        self._world = world
-        self._rng = rng
+    _who: Person
+    _world: World
+    _rng: np.random.Generator
 
     def upright(self) -> Floats:
         """Draw how the toy stands on the table: direction of gravity, (3,)."""
-        stand: Floats = _UPRIGHT + 0.06 * self._rng.standard_normal(3)
-        return stand
+        return np.asarray(_UPRIGHT + 0.06 * self._rng.standard_normal(3))
 
     def light(self) -> float:
         """Draw the strength of a light grip: of a hand that steadies the toy, or of a toy on the lap."""
@@ -411,10 +409,6 @@ def _hug(canvas: Canvas, trial: Performance, rng: np.random.Generator, world: Wo
     canvas.knock(trial.at + 20, np.array([0.5, 0.2, 0.6]), 0.25 * trial.force, 1.5, 0.25)
 
 
-def _hold(canvas: Canvas, trial: Performance, rng: np.random.Generator, world: World) -> None:
-    """Add nothing: the session simulates the grip."""
-
-
 Motion = Callable[[Canvas, Performance, np.random.Generator, World], None]
 
 MOTIONS: dict[str, tuple[str, Motion]] = {
@@ -427,7 +421,7 @@ MOTIONS: dict[str, tuple[str, Motion]] = {
     "Tail hit": ("hit_s", _hit),
     "Tail pull": ("pull_s", _pull),
     "Hold strong": ("hold_s", _hug),
-    "Hold in hands": ("hold_s", _hold),
+    "Hold in hands": ("hold_s", lambda c, t, r, w: None),  # the session simulates the grip
 }
 """The field of `World` that has a family's duration, and the function that simulates it."""
 

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from plushsense.core.errors import ConfigError, nearest
+from plushsense.core.errors import ConfigError
 from plushsense.core.layouts import DELAY_MS, DEVICE_MS, Layout
 from plushsense.devices.base import Frame, PacedDevice, now_ms
 from plushsense.devices.opening import DeviceAddress
-from plushsense.devices.virtual.motions import AT_REST, PICK_S, split_label
-from plushsense.devices.virtual.session import GESTURES, Episode, VirtualSession
+from plushsense.devices.virtual.motions import PICK_S, split_label
+from plushsense.devices.virtual.session import GESTURES, Episode, VirtualSession, check_gesture
 from plushsense.devices.virtual.world import CHANNELS, WORLD, World, draw_person
 from plushsense.devices.wire import LineParser
 
@@ -129,13 +129,8 @@ class ToySpec:
         for name, value in (("lost", self.lost), ("garbled", self.garbled), ("glitch", self.glitch)):
             if value is not None and not 0.0 <= value <= 0.9:
                 raise ConfigError(f"The virtual toy's {name} is {value}; a share from 0 to 0.9 is accepted.")
-        known = (AT_REST, *GESTURES)
         for label in self.gestures:
-            if label not in known:
-                raise ConfigError(
-                    f"The virtual toy's people know no gesture '{label}'; they know {', '.join(known)}."
-                    f"{nearest(label, known)}"
-                )
+            check_gesture(label)
 
 
 def channel_columns(layout: Layout) -> list[int]:
