@@ -17,7 +17,7 @@ from plushsense.deploy.targets import TARGETS
 from plushsense.models.bundle import Bundle
 from plushsense.studio.app.guard import download_address, path_in
 from plushsense.studio.app.jobs import Jobs, StudioJob
-from plushsense.studio.app.shell import Page, address, html, moment, query, set_address, tag
+from plushsense.studio.app.shell import Page, address, button, html, moment, query, set_address, tag
 from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import EXPORTS, plain_name
 from plushsense.studio.pages.export.exports import BundleFacts, ExportFacts, exports_of, formats, newest_job, targets
@@ -59,7 +59,7 @@ def show_cost(page: Page, work: WorkPanel, export: ExportFacts, counted: StudioJ
             assert counted is not None
             _display_cost(words, profile, moment(counted.ended_s))
         if not current or "refused" in profile:
-            tag(ui.button(words("export.count"), on_click=start).props("outline no-caps"), "count")
+            button("count", words("export.count"), start)
 
 
 def _display_cost(words: Words, profile: dict[str, Any], when: str) -> None:
@@ -185,8 +185,8 @@ class VerificationCard:
                 self._dataset = ui.select(options, value="", label=words("export.recorded")).classes("w-full")
                 self._faults = tag(ui.checkbox(words("export.faults")), "faults")
                 self._trust = tag(ui.checkbox(words("export.trust")), "trust")
-            button = ui.button(words("export.verify"), icon="fact_check", on_click=self._start).props("no-caps")
-            tag(button, "verify").set_enabled(bool(self._chosen))
+            start = button("verify", words("export.verify"), self._start, "", icon="fact_check")
+            start.set_enabled(bool(self._chosen))
             proof = newest_job(self.page.workspace.part(Jobs), "verify", self.export.folder)
             if proof is not None:
                 self._display(proof)
@@ -336,8 +336,7 @@ class _Exporting:
             self._name = tag(ui.input(words("export.name")).props("maxlength=64").classes("w-full"), "name")
             with ui.expansion(words("export.more")).classes("w-full"):
                 await self._more()
-            self._button = ui.button(words("export.do"), icon="memory", on_click=self._start).props("no-caps")
-            tag(self._button, "do")
+            self._button = button("do", words("export.do"), self._start, "", icon="memory")
             await self._choose(first)
 
     def _label(self, path: Path) -> str:

@@ -13,7 +13,7 @@ from plushsense.dataset.publishing.description import LICENCES
 from plushsense.dataset.publishing.package import complete_head
 from plushsense.dataset.store import Dataset, DatasetHead
 from plushsense.studio.app.jobs import Jobs, StudioJob
-from plushsense.studio.app.shell import Page, address, query, tag
+from plushsense.studio.app.shell import Page, address, button, query, tag
 from plushsense.studio.app.workspace import DATASETS, PACKAGES, plain_name
 from plushsense.studio.pages.publish.packages import KEYS, DatasetFacts, PackagesSection, missing_extras
 from plushsense.studio.widgets.elements import WorkPanel, facts, notice, scroll_to, style, text, titles
@@ -94,8 +94,7 @@ class PseudonymsForm:
             self._listed = tag(ui.textarea(words("publish.rename_words")).props("autogrow").classes("w-full"), "words")
             self._drop = tag(ui.checkbox(words("publish.rename_drop")), "drop-notes")
             notice(words("publish.rename_safe"))
-            do = ui.button(words("publish.rename_do"), icon="masks", on_click=self._go).props("outline no-caps")
-            tag(do, "rename-do")
+            button("rename-do", words("publish.rename_do"), self._go, icon="masks")
 
     async def _go(self) -> None:
         listed = [line.strip() for line in (self._listed.value or "").splitlines() if line.strip()]
@@ -172,8 +171,7 @@ class _Publishing:
             self._choices(found)
             name = ui.input(words("publish.name"), value=self._free_name(found.path.name)).props("maxlength=64")
             self._name = tag(name.classes("w-full"), "name")
-            button = ui.button(words("publish.do"), icon="inventory_2", on_click=self._start).props("no-caps")
-            self._button = tag(button, "do")
+            self._button = button("do", words("publish.do"), self._start, "", icon="inventory_2")
         self._allow()
 
     def _facts_of(self, dataset: Dataset) -> list[tuple[str, str]]:
@@ -199,10 +197,7 @@ class _Publishing:
         if "baselines" in self.lacking:
             self._switches["reidentification"].set_value(False)
             self._switches["reidentification"].set_enabled(False)
-            tag(
-                notice(words("publish.missing_baselines")),
-                "missing-baselines",
-            )
+            tag(notice(words("publish.missing_baselines")), "missing-baselines")
         self._columns: dict[str, ui.checkbox] = {}
         if found.columns:
             text(words("publish.columns"), classes="ps-dim")

@@ -274,7 +274,7 @@ class RecordController:
             device.close()
             raise
         session = ActiveSession(
-            _name(folder),
+            f"{folder.parent.name}/{folder.name}",
             recorder,
             device,
             replace(request, subject=head.subject),
@@ -285,7 +285,3 @@ class RecordController:
             self._active[session.name] = session
         self.changed.notify()
         return session
-
-
-def _name(folder: Path) -> str:
-    return f"{folder.parent.name}/{folder.name}"

@@ -12,7 +12,7 @@ from nicegui import run, ui
 from nicegui.element import Element
 
 from plushsense.recording.states import RecorderStatus
-from plushsense.studio.app.shell import LINES, Keys, Page, address, focus, html, named, on_change, on_click, tag
+from plushsense.studio.app.shell import LINES, Keys, Page, address, button, focus, html, named, on_change, on_click, tag
 from plushsense.studio.app.words import Words
 from plushsense.studio.pages.record.controller import ActiveSession, RecordController
 from plushsense.studio.widgets.elements import Plot, own_picture, picture
@@ -152,9 +152,9 @@ class StepList:
             self._states = [""] * len(steps)
 
     def _button(self, number: int, go: Callable[[int, str], Any]) -> ui.button:
-        button = tag(ui.button().props("no-caps outline dense"), f"step-{number}").style("min-width: 3.2rem")
-        on_click(button, lambda seen: go(number, seen))
-        return button
+        step = button(f"step-{number}", "", look="outline dense").style("min-width: 3.2rem")
+        on_click(step, lambda seen: go(number, seen))
+        return step
 
     def draw(self, status: RecorderStatus) -> None:
         """Update the state of each step if anything has changed."""
@@ -289,25 +289,20 @@ class _View:
     def _controls(self) -> None:
         words = self._page.words
         with ui.row().classes("ps-current w-full items-center").style("gap: 10px"):
-            self._main = tag(ui.button(color=None).props("no-caps unelevated"), "main")
+            self._main = button("main", "", look="unelevated", color=None)
             self._main.style("font-size: 1.6rem; min-width: 260px; min-height: 72px")
             on_click(self._main, self._main_clicked, once=True)
             self._small: dict[str, ui.button] = {}
             for key, name in {"r": "redo", "s": "skip", "b": "back", "p": "pause"}.items():
-                button = tag(ui.button(words(f"record.{name}")).props("no-caps outline"), name)
-                button.style("min-height: 48px")
-                on_click(button, partial(self._press, key))
-                self._small[key] = button
+                self._small[key] = button(name, words(f"record.{name}")).style("min-height: 48px")
+                on_click(self._small[key], partial(self._press, key))
             ui.space()
-            self._end_button = ui.button(words("record.end"), on_click=self._ask_end)
-            tag(self._end_button, "end").props("no-caps flat").style("min-height: 48px")
+            self._end_button = button("end", words("record.end"), self._ask_end, "flat").style("min-height: 48px")
         self._ending = tag(ui.row().classes("ps-message ps-message-warning w-full items-center"), "ending")
         with self._ending:
             self._end_text = ui.label().classes("flex-grow")
-            yes = ui.button(words("record.end_yes"), on_click=self._end, color="deep-orange-10")
-            tag(yes.props("no-caps unelevated"), "end-yes")
-            self._no = ui.button(words("record.end_no"), on_click=self._stay, color=None).props("no-caps outline")
-            tag(self._no, "end-no")
+            button("end-yes", words("record.end_yes"), self._end, "unelevated", color="deep-orange-10")
+            self._no = button("end-no", words("record.end_no"), self._stay, color=None)
         self._ending.set_visibility(False)
 
     def _finished(self) -> None:
@@ -326,8 +321,7 @@ class _View:
         with ui.row().classes("w-full items-center no-wrap"):
             self._note = tag(ui.input(label=words("record.note")).props("maxlength=500 name=note"), "note")
             self._note.classes("flex-grow").on("keydown.enter", self._store_note)
-            keep = ui.button(words("record.keep_note"), on_click=self._store_note).props("no-caps outline")
-            tag(keep, "keep-note")
+            button("keep-note", words("record.keep_note"), self._store_note)
 
     # Commands -------------------------------------------------------------------------------------------------
 
