@@ -176,7 +176,9 @@ def test_a_toy_that_goes_away_and_comes_back(studio: Fixture, look: Fixture, hom
     assert browser.complaints == []
 
 
-def test_a_toy_that_goes_away_while_the_page_is_behind(studio: Fixture, look: Fixture, home: Path, toy: Fixture) -> None:
+def test_a_toy_that_goes_away_while_the_page_is_behind(
+    studio: Fixture, look: Fixture, home: Path, toy: Fixture
+) -> None:
     process, address = toy()
     browser = look()
     page = started(browser, studio("--device", address, home=home).url)

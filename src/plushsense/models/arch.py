@@ -88,11 +88,6 @@ def _number(text: str, at: int, what: str, symbol: bool = True) -> tuple[int, in
     return int(text[at:end]), end
 
 
-def layer_start(spec: str, layer: int) -> int:
-    """Return the place in the symbol at which a layer (from 0) begins."""
-    return sum(len(part) + 1 for part in spec.split("_")[:layer])
-
-
 def fail(why: str, text: str, at: int, symbol: bool = True) -> NoReturn:
     """Raise ArchError: what is wrong, the text, and a caret under place ``at``."""
     printable = "".join(c if c.isprintable() else "?" for c in text)
@@ -232,7 +227,7 @@ class Arch:
                 f"{len(shape)} layers but only {len(counts)} filter counts ({given}): "
                 f"give one count a layer, for example {example}",
                 spec,
-                layer_start(spec, len(counts)),
+                sum(len(part) + 1 for part in spec.split("_")[: len(counts)]),
             )
         layers = tuple(ConvLayer(k, d, f) for (k, d), f in zip(shape, counts, strict=False))
         return cls(layers, channels, classes, cast(Padding, padding), cast(Norm, norm), window, step, pool)

@@ -44,7 +44,7 @@ from plushsense.core.layouts import Layout
 from plushsense.runtime.decisions import Rules
 from plushsense.runtime.events import AFFECT_CODES, NO_GESTURE
 from plushsense.runtime.fixed import PROBABILITY_BITS, LogitScale, Requantize
-from plushsense.runtime.gate import JERK, GateSettings
+from plushsense.runtime.gate import JERK
 from plushsense.runtime.integer import IntegerNetwork
 
 MAGIC = b"PLSH"
@@ -242,16 +242,12 @@ def memory_bytes(model: IntegerModel) -> int:
     if health.low or health.still_ms:
         pieces.append(4 * channels)  # the frame before
     if gate.rules:
-        pieces.append(4 * arch.channels * (gate_past(gate) + 1))  # inputs
+        past = max((s.lag for s in gate.signals if s.kind == JERK), default=1)
+        pieces.append(4 * arch.channels * (past + 1))  # inputs
         pieces.append(12 * len(gate.signals))  # baseline, noise, size
         terms = sum(len(rule.terms) for rule in gate.rules)
         pieces += [2 * terms, terms]  # how long each holds, how many in a row
     return sum(_filled(piece) for piece in pieces)
-
-
-def gate_past(gate: GateSettings) -> int:
-    """Return the number of samples that the gate looks back: the longest lag."""
-    return max((s.lag for s in gate.signals if s.kind == JERK), default=1)
 
 
 def _filled(n: int) -> int:

@@ -185,8 +185,7 @@ def predict(
     x, _ = _tensors(windows, scaler, arch, place)
     with torch_threads(1):
         reader = engine(arch, net, place, 1, 1)
-        found: NDArray[np.float32] = F.softmax(reader.logits(x), dim=1).cpu().numpy()
-    return found
+        return np.asarray(F.softmax(reader.logits(x), dim=1).cpu().numpy())
 
 
 def _train(
