@@ -126,8 +126,8 @@ class FrameGenerator:
                 spoilt = np.array([garbage_channel])
             for channel in spoilt:
                 values[channel] = self._garbage(int(channel))
-            for held, value in (stuck or {}).items():
-                values[held] = value
+            for stuck_channel, value in (stuck or {}).items():
+                values[stuck_channel] = value
             if rng.random() >= lost:
                 self.put(values)
             if rng.random() >= equal:

@@ -167,8 +167,8 @@ class Cost:
     @property
     def ram_bytes(self) -> int:
         """Bytes of one toy, its memory and static data; without stack."""
-        kept = sum(part[name] for part in self.sections.values() for name in ("data", "bss"))
-        return self.toy_bytes + self.memory_bytes + kept
+        static = sum(part[name] for part in self.sections.values() for name in ("data", "bss"))
+        return self.toy_bytes + self.memory_bytes + static
 
     @property
     def heap(self) -> tuple[str, ...]:

@@ -141,9 +141,9 @@ def personalise(
     examples = Examples(original.network().features(original.scaler.apply(x)), y, recording)
     weight, bias = (np.asarray(original.weights[name], dtype=np.float64) for name in _DENSE)
     enough = [k for k in np.unique(y) if len(np.unique(recording[y == k])) >= spec.least]
-    kept = examples.take(np.isin(y, enough))
+    used_examples = examples.take(np.isin(y, enough))
     labels = original.gestures.labels
-    used = tuple(labels[k] for k in np.unique(kept.y))
+    used = tuple(labels[k] for k in np.unique(used_examples.y))
     # With fewer recorded gestures, the others suffer: on makeability up to 5 of 10 cost nobody more than one recording.
     needed = max(2, -(-len(labels) // 2))
     if len(used) < needed:
@@ -153,8 +153,8 @@ def personalise(
             f"with {spec.least} recordings each are needed, better all; there are {len(used)}. Record more of: "
             f"{missing}."
         )
-    own = judge(softmax(kept.features @ weight.T + bias), kept.y, kept.recording)
-    tried = [(s, _left_out(weight, bias, kept, s)) for s in spec.strengths]
+    own = judge(softmax(used_examples.features @ weight.T + bias), used_examples.y, used_examples.recording)
+    tried = [(s, _left_out(weight, bias, used_examples, s)) for s in spec.strengths]
     strength, adapted_scores = min(tried, key=lambda each: float(each[1].losses.mean()))
     fell = own.losses - adapted_scores.losses
     least = spec.margin * float(fell.std(ddof=1)) / np.sqrt(len(fell))
@@ -171,7 +171,7 @@ def personalise(
     if fell.mean() <= least or after.right <= before.right:
         reason = f"it would not clearly help: {figures}"
         return Personal(bundle, False, reason, strength, before, after, used, without)
-    dense = dict(zip(_DENSE, fit_dense(weight, bias, kept, strength), strict=True))
+    dense = dict(zip(_DENSE, fit_dense(weight, bias, used_examples, strength), strict=True))
     table = {
         "subject": subject,
         "recordings": before.recordings,

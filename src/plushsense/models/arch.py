@@ -79,8 +79,8 @@ def _number(text: str, at: int, what: str, symbol: bool = True) -> tuple[int, in
         end += 1
     if end == at:
         ends = at == len(text) or text[at] in "_,"
-        found = "nothing stands here" if ends else f"unknown token {text[at]!r}"
-        fail(f"{found}: {what} is expected, a whole number from 1", text, at, symbol)
+        problem = "nothing stands here" if ends else f"unknown token {text[at]!r}"
+        fail(f"{problem}: {what} is expected, a whole number from 1", text, at, symbol)
     if text[at:end].strip("0") == "":
         fail(f"{what} is 0: the smallest is 1", text, at, symbol)
     if end - at > 9 or int(text[at:end]) > MAX_NUMBER:

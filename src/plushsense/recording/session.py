@@ -294,9 +294,9 @@ def _repair_stream(path: Path, layout: Layout, progress: SessionProgress, log: L
                 last += block
             size += len(block)
         if size > whole:
-            kept = last[:_KEPT_BYTES].decode("ascii", "backslashreplace")
+            torn = last[:_KEPT_BYTES].decode("ascii", "backslashreplace")
             log.write(
-                [new_event("mended", file=path.name, how="torn last line cut off", bytes=size - whole, text=kept)]
+                [new_event("mended", file=path.name, how="torn last line cut off", bytes=size - whole, text=torn)]
             )
             file.truncate(whole)
             os.fsync(file.fileno())

@@ -482,12 +482,6 @@ class RecordingMachine:
             self._changes.append("take")
             self._advance(message)
 
-    def _wait_for_descriptor(self) -> None:
-        with self._notifying():
-            self._show_message(
-                "Too many files are open on this computer: saving waits until some are closed. Nothing is lost."
-            )
-
     def _fail(self, cause: Exception) -> None:
         with contextlib.suppress(OSError):
             self.session.log.write([SessionEvent("failed", now_ms(), {"why": str(cause)})])

@@ -179,10 +179,10 @@ def tally(truths: Sequence[Interval], events: Sequence[Interval], late_s: float 
     merged: list[bool] = (same & (per_event > 1)[None, :]).any(axis=1).tolist()
     fragmenting: list[bool] = (same & (per_truth > 1)[:, None]).any(axis=0).tolist()
     anything = [bool(n) for n in over.sum(axis=0)]
-    found: Tallies = {}
+    tallies: Tallies = {}
 
     def at(label: str) -> Tally:
-        return found.setdefault(label, Tally())
+        return tallies.setdefault(label, Tally())
 
     for i, truth in enumerate(truths):
         row = at(truth.label)
@@ -212,7 +212,7 @@ def tally(truths: Sequence[Interval], events: Sequence[Interval], late_s: float 
             row.fragmenting += split and not joined
             row.merging += joined and not split
             row.fragmenting_merging += split and joined
-    return found
+    return tallies
 
 
 def outside_insertions(

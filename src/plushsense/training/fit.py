@@ -140,13 +140,13 @@ def _state(
     kept: Mapping[int, dict[str, NDArray[np.float32]]],
     best: dict[str, NDArray[np.float32]] | None = None,
 ) -> FitState:
-    held = [adam.state[p] for p in net.parameters if p in adam.state]
+    moments = [adam.state[p] for p in net.parameters if p in adam.state]
     return FitState(
         epoch=len(history),
-        steps=int(held[0]["step"]) if held else 0,
+        steps=int(moments[0]["step"]) if moments else 0,
         weights=net.export_weights(),
-        means=[one["exp_avg"].cpu().numpy().copy() for one in held],
-        squares=[one["exp_avg_sq"].cpu().numpy().copy() for one in held],
+        means=[one["exp_avg"].cpu().numpy().copy() for one in moments],
+        squares=[one["exp_avg_sq"].cpu().numpy().copy() for one in moments],
         random=order.get_state().numpy().copy(),
         history=[dict(row) for row in history],
         kept=dict(kept),

@@ -156,8 +156,8 @@ class ContentsWriter:
         columns = (*clocks, *dataset.layout.names, *(("label",) if self.labelled else ()))
         self.layout = replace(dataset.layout, csv=CsvFormat(columns, columns, ","))
         self.head = replace(head, layout=self.layout, source="")
-        held = {_folder_of(r.file) for r in self.kept} | {_folder_of(s.file) for s in self.streams}
-        self.codes = {folder: public for folder, public in public_codes(dataset).items() if folder in held}
+        folders = {_folder_of(r.file) for r in self.kept} | {_folder_of(s.file) for s in self.streams}
+        self.codes = {folder: public for folder, public in public_codes(dataset).items() if folder in folders}
         self.shifts = self._shifts()
         self.sessions = self._sessions()
         self.taken: set[str] = set()

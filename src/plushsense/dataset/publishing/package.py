@@ -216,17 +216,17 @@ def publish(
     )
 
 
-def _write_texts(work: Path, d: Description, source: Dataset, found: Reidentification | None) -> None:
-    write_text(work / README, readme(d, found.short if found else None))
+def _write_texts(work: Path, d: Description, source: Dataset, reidentification: Reidentification | None) -> None:
+    write_text(work / README, readme(d, reidentification.short if reidentification else None))
     own = next((source.path / name for name in _LICENCE_FILES if (source.path / name).is_file()), None)
     text = own.read_text(encoding="utf-8", errors="replace") if own else fill_template("LICENSE.txt.j2", d)
     write_text(work / LICENCE, text)
     if d.simulated:
         write_text(work / SIMULATION_MARK, f"{SIMULATION}\n")
-    if found is not None:
+    if reidentification is not None:
         banner = f"**{SIMULATION}**\n\n" if d.simulated else ""
-        write_text(work / REIDENTIFICATION, banner + found.report)
-        write_json(work / REIDENTIFICATION_JSON, found.figures)
+        write_text(work / REIDENTIFICATION, banner + reidentification.report)
+        write_json(work / REIDENTIFICATION_JSON, reidentification.figures)
 
 
 def _write_metadata(work: Path, d: Description) -> None:

@@ -132,15 +132,15 @@ def stuck(w: DatasetSummary) -> Iterator[Issue]:
     names = w.dataset.layout.names
     limit = np.maximum(w.limits.stuck_s * 1000, 10 * w.usual_run_ms)
     for o, least in [(o, limit) for o in w.recordings] + [(o, 4 * limit) for o in w.streams]:
-        held = o.runs * o.period_ms
-        affected = np.flatnonzero((held > least) & (o.runs < o.rows))
+        run_ms = o.runs * o.period_ms
+        affected = np.flatnonzero((run_ms > least) & (o.runs < o.rows))
         if not len(affected):
             continue
-        c = int(affected[np.argmax(held[affected])])
+        c = int(affected[np.argmax(run_ms[affected])])
         first = int(o.run_at[c]) + o.first_row
         yield Issue(
             f"{_channels(names, affected)} {'holds' if len(affected) == 1 else 'hold'} one value for up to "
-            f"{held[c] / 1000:.1f} s (from row {first + 1}); usual is {w.usual_run_ms[c] / 1000:.2f} s",
+            f"{run_ms[c] / 1000:.1f} s (from row {first + 1}); usual is {w.usual_run_ms[c] / 1000:.2f} s",
             ((first, first + int(o.runs[c])),),
             tuple(affected.tolist()),
             o.info.id,
@@ -161,18 +161,18 @@ def saturated(w: DatasetSummary) -> Iterator[Issue]:
     most = np.maximum(w.limits.saturated_s * 1000, 4 * w.usual_top_ms)
     for o in w.recordings:
         at_rail = shared & (np.abs(o.top) >= _RAIL * rail)
-        held = o.top_runs * o.period_ms
-        long = np.where(at_rail, held >= most / 2, held >= most) & (o.top_runs >= 3)
+        run_ms = o.top_runs * o.period_ms
+        long = np.where(at_rail, run_ms >= most / 2, run_ms >= most) & (o.top_runs >= 3)
         often = at_rail & (o.top_rows >= 10) & (o.top_rows >= _OFTEN * o.rows)
         moving = (o.spread > 0.5 * usual) & (o.spread > 0) & (o.runs < o.rows)
         affected = np.flatnonzero((long | often) & moving)
         if not len(affected):
             continue
-        c = int(affected[np.argmax(held[affected])])
+        c = int(affected[np.argmax(run_ms[affected])])
         first = int(o.top_at[c]) + o.first_row
         yield Issue(
             f"{_channels(names, affected)} {'stays' if len(affected) == 1 else 'stay'} at the highest or lowest value, "
-            f"{names[c]} for {held[c]:.0f} ms at {o.top[c]:g} (from row {first + 1}), {o.top_rows[c]} rows in all",
+            f"{names[c]} for {run_ms[c]:.0f} ms at {o.top[c]:g} (from row {first + 1}), {o.top_rows[c]} rows in all",
             ((first, first + int(o.top_runs[c])),),
             tuple(affected.tolist()),
             o.info.id,

@@ -101,9 +101,9 @@ def all_outcomes() -> set[str]:
 
 def covered(scenario: Scenario) -> set[str]:
     """Return those of `all_outcomes` that a scenario covers."""
-    rows, found = scenario.rows.astype(np.int64), set()
+    rows, outcomes = scenario.rows.astype(np.int64), set()
     answered = column(rows, "answer")[column(rows, "state") == TRACKING]
-    found |= {ANSWERS[k] for k in set(answered.tolist())}
+    outcomes |= {ANSWERS[k] for k in set(answered.tolist())}
     at = {name: n for n, name in enumerate(COLUMNS[EVENT])}
     state, warm, ended = COLUMNS[ANSWER].index("state"), False, None
     frame = COLUMNS[ANSWER].index("frame")
@@ -113,19 +113,19 @@ def covered(scenario: Scenario) -> set[str]:
             warm = row[state] == TRACKING
         elif row[0] == HEALTH:
             fault, suspect = row[state] == 2, row[5]
-            found.add("fault" if fault else "suspect only" if suspect else "recovery")
+            outcomes.add("fault" if fault else "suspect only" if suspect else "recovery")
         else:
             what, source = row[at["what"]], row[at["source"]]
-            found.add(f"{KINDS[what]} by {SOURCES[source]}")
+            outcomes.add(f"{KINDS[what]} by {SOURCES[source]}")
             if what == BEGUN:
                 if source == GATE and not warm:
-                    found.add("gate while warming")
+                    outcomes.add("gate while warming")
                 if row[at["gesture"]] == NO_GESTURE:
-                    found.add("unnamed")
+                    outcomes.add("unnamed")
                 if row[at["affect"]] == 0:
-                    found.add("without affect")
+                    outcomes.add("without affect")
                 if ended is not None and row[at["ms"]] - ended > 0:
-                    found.add("resting")
+                    outcomes.add("resting")
             if what == ENDED:
                 ended = row[at["ms"]]
                 if (
@@ -134,14 +134,14 @@ def covered(scenario: Scenario) -> set[str]:
                     and after[at["what"]] == BEGUN
                     and after[frame] == row[frame]
                 ):
-                    found.add("replaced by the gate" if after[at["source"]] == GATE else "replaced")
+                    outcomes.add("replaced by the gate" if after[at["source"]] == GATE else "replaced")
                 elif after is not None and after[0] == HEALTH and after[frame] == row[frame] and after[state] == 2:
-                    found.add("lost in a fault")
+                    outcomes.add("lost in a fault")
                 elif row[frame] in scenario.silences and row[at["since"]] == row[at["ms"]]:
-                    found.add("lost in silence")
+                    outcomes.add("lost in silence")
                 elif after is not None and after[HEAD - 2] > row[HEAD - 2]:
-                    found.add("lost in a gap")
-    return found
+                    outcomes.add("lost in a gap")
+    return outcomes
 
 
 def _scenario(plain: IntegerModel, scaler: Scaler, settings: _ScenarioSettings, seed: int) -> Scenario:

@@ -234,9 +234,9 @@ class Hands:
                 level += (plan.light_grip - grip) * here
                 sway *= 1.0 - (1.0 - world.light_sway) * here
             level *= np.exp(0.15 * rng.standard_normal() * here)
-        held = ramp(n, pick, 35) * (1.0 - ramp(n, put + 25, 40))
-        self._grip(canvas, level * held)
-        self._sway(canvas, sway * held)
+        lifted = ramp(n, pick, 35) * (1.0 - ramp(n, put + 25, 40))
+        self._grip(canvas, level * lifted)
+        self._sway(canvas, sway * lifted)
         lift = 0.12 + 0.16 * rng.random()
         canvas.shake[:, 2] += lift * np.sin(2 * math.pi * np.clip((np.arange(n) - pick) / samples(PICK_S), 0, 1))
         canvas.shake[:, 2] -= 0.6 * lift * np.sin(2 * math.pi * np.clip((np.arange(n) - put) / samples(PUT_S), 0, 1))

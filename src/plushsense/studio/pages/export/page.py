@@ -359,19 +359,19 @@ class _Exporting:
         self._dataset = ui.select(options, value="", label=words("export.calibrate_on")).classes("w-full")
 
     async def _choose(self, path: str) -> None:
-        found = await run.io_bound(lambda: BundleFacts.of(Path(path)))
-        assert found is not None
-        self.bundle = found
+        chosen = await run.io_bound(lambda: BundleFacts.of(Path(path)))
+        assert chosen is not None
+        self.bundle = chosen
         self._about.clear()
         with self._about:
-            if found.bundle is None:
-                tag(notice(found.problem, "error"), "bundle-problem")
+            if chosen.bundle is None:
+                tag(notice(chosen.problem, "error"), "bundle-problem")
             else:
-                if found.simulated:
+                if chosen.simulated:
                     notice(self.words("shell.simulation"))
-                facts(self._facts_of(found.bundle, found.bytes))
-                if found.cannot:
-                    tag(notice(found.cannot, "error"), "bundle-cannot")
+                facts(self._facts_of(chosen.bundle, chosen.bytes))
+                if chosen.cannot:
+                    tag(notice(chosen.cannot, "error"), "bundle-cannot")
         self._name.set_value(self._free_name(Path(path).stem))
         self._allow()
 
@@ -446,8 +446,8 @@ class _Exporting:
         words = self.words
         with self.page.show_errors():
             folder = path_in(self.workspace, EXPORTS, name)
-            found = await run.io_bound(lambda: ExportFacts.of(folder))
-            assert found is not None
+            export = await run.io_bound(lambda: ExportFacts.of(folder))
+            assert export is not None
             jobs = self.workspace.part(Jobs)
             made = newest_job(jobs, "export", folder)
             counted = max(
@@ -460,16 +460,16 @@ class _Exporting:
             self._detail.clear()
             with self._detail:
                 text(words("export.one", name=name), "h2")
-                if found.problem:
-                    notice(found.problem, "error")
+                if export.problem:
+                    notice(export.problem, "error")
                     return
                 show_facts(
                     self.page,
-                    found,
-                    made if made and made.result.get("profile", {}).get("digest") == found.digest else None,
+                    export,
+                    made if made and made.result.get("profile", {}).get("digest") == export.digest else None,
                 )
-                show_cost(self.page, self.work, found, counted)
-                await VerificationCard(self.page, self.work, found).build()
+                show_cost(self.page, self.work, export, counted)
+                await VerificationCard(self.page, self.work, export).build()
                 show_next(self.page)
 
     # All exports ----------------------------------------------------------------------------------------------

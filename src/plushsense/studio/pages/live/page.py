@@ -220,9 +220,9 @@ class LiveView(Element, component="live_view.js"):
         return scene
 
     def _seen(self, event: GenericEventArguments) -> None:
-        held = self._feed.holds
+        held_back = self._feed.holds
         self._feed.seen(int(event.args["n"]))
-        if held:
+        if held_back:
             # A toy that went silent meanwhile causes no further change, so what was held back is sent now.
             self.push()
 

@@ -185,17 +185,17 @@ class _Form:
         self._look.disable()
         self._page.say(words("record.looking", s=f"{_SCAN_S:g}"))
         try:
-            found = await run.io_bound(list_devices, _SCAN_S)
+            listing = await run.io_bound(list_devices, _SCAN_S)
         finally:
             self._look.enable()
-        if found is None:
+        if listing is None:
             return
         known = dict.fromkeys(self._controller.toys())
         options = {u: toy_name(words, u) for u in known} | {
-            d.url: f"{d.name} · {d.url}" for d in found.devices if d.url not in known
+            d.url: f"{d.name} · {d.url}" for d in listing.devices if d.url not in known
         }
         self._toy.set_options(options, value=self._toy.value)
-        self._page.say(" ".join([words("record.found", n=len(options)), *found.notes]))
+        self._page.say(" ".join([words("record.found", n=len(options)), *listing.notes]))
 
     def _request(self) -> SessionRequest:
         toy = str(self._other.value or "").strip() or str(self._toy.value)
