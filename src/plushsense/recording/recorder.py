@@ -61,11 +61,6 @@ class Recorder(RecordingMachine):
             )
 
     @property
-    def over(self) -> str:
-        """Why the toy sends no more data; "" while it may."""
-        return self._over
-
-    @property
     def begins_ms(self) -> int | None:
         """The toy's clock at the end of the countdown; None without a countdown, or before the first frame."""
         with self._changed:

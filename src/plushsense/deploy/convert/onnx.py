@@ -134,9 +134,8 @@ def integer_model(bundle: Bundle, network: IntegerNetwork) -> bytes:
     zero = g.constant("code.zero", np.array(0, dtype=np.uint8))
 
     def codes(z: str, name: str) -> str:
-        return g.add(
-            "DequantizeLinear", f"{name}.read", g.add("QuantizeLinear", f"{name}.codes", z, one, zero), one, zero
-        )
+        z = g.add("QuantizeLinear", f"{name}.codes", z, one, zero)
+        return g.add("DequantizeLinear", f"{name}.read", z, one, zero)
 
     def parted(name: str, whole: NDArray[Any], scales: NDArray[np.float64]) -> str:
         scale = g.constant(f"{name}.scale", scales.astype(np.float32))
@@ -149,10 +148,8 @@ def integer_model(bundle: Bundle, network: IntegerNetwork) -> bytes:
     z = codes(g.add("Add", "scaled", z, g.columns("input.start", start)), "input")
     for i, (layer, part) in enumerate(zip(arch.layers, network.layers, strict=True)):
         sizes = sum_scales(part.scale.multiplier, part.scale.before, part.scale.after)
-        w, b = (
-            parted(f"conv{i}.weight", part.weights, sizes),
-            parted(f"conv{i}.bias", part.bias.astype(np.int32), sizes),
-        )
+        w = parted(f"conv{i}.weight", part.weights, sizes)
+        b = parted(f"conv{i}.bias", part.bias.astype(np.int32), sizes)
         z = g.add("Conv", f"conv{i}", z, w, b, dilations=[layer.dilation], kernel_shape=[layer.kernel])
         z = codes(g.add("Relu", f"relu{i}", z), f"layer{i}")
     z = _mean(g, z)
@@ -160,9 +157,8 @@ def integer_model(bundle: Bundle, network: IntegerNetwork) -> bytes:
     sizes = sum_scales(dense.scale.multiplier, dense.scale.before, dense.scale.after) / 256
     w = parted("dense.weight", dense.weights, sizes * arch.pooled)
     z = g.add("Gemm", "dense", z, w, g.constant("dense.bias", (dense.bias * sizes).astype(np.float32)), transB=1)
-    low, high = (
-        g.constant(f"logits.{n}", np.array(v, dtype=np.float32)) for n, v in (("low", -LIMIT), ("high", LIMIT))
-    )
+    low = g.constant("logits.low", np.array(-LIMIT, dtype=np.float32))
+    high = g.constant("logits.high", np.array(LIMIT, dtype=np.float32))
     g.add("Clip", LOGITS, z, low, high)
     g.add("Softmax", PROBABILITIES, LOGITS, axis=-1)
     return g.to_bytes(bundle)

@@ -174,8 +174,12 @@ def samples(seconds: float) -> int:
 class RepetitionPlan:
     """The timing of one repetition of a gesture, in samples from the start of its episode.
 
-    The hand works for ``n`` samples from ``at`` on; ``lap``: the toy is on the lap instead of in the hands;
-    ``steadied``: the other hand lies on the toy on the table; ``light_grip``: how firm either then is.
+    Attributes:
+        record_start, record_stop: part that a recorder started and stopped by hand would hold.
+        at, n: first sample and number of samples of the movement.
+        lap: whether a toy "in the hands" lies on the lap.
+        steadied: whether the other hand lies on a toy on the table.
+        light_grip: firmness of the grip in these two cases.
     """
 
     record_start: int
@@ -265,9 +269,14 @@ class Hands:
 
 @dataclass(frozen=True)
 class Performance:
-    """One performance of a gesture: person, family, place in the canvas, force and tempo.
+    """One performance of a gesture by a person.
 
-    ``at`` and ``n``: the hand works for ``n`` samples from ``at`` on.
+    Attributes:
+        family: the gesture without its number, such as "Tail tap".
+        in_hands: whether the toy is held in the hands.
+        at, n: first sample of the movement in the canvas, and number of samples.
+        force, tempo: relative to what is usual for this person.
+        shift: offset of the place along the toy's back, in addition to the person's own.
     """
 
     person: Person
@@ -281,6 +290,7 @@ class Performance:
 
 
 def _edges(n: int, rise_s: float = 0.12) -> Floats:
+    """Return a window (n,) that rises from 0 to 1 within ``rise_s`` and falls again at the end."""
     length = max(1, min(n // 3, round(rise_s * RATE_HZ)))
     return ramp(n, 0, length) * (1.0 - ramp(n, n - length, length))
 

@@ -230,7 +230,8 @@ _BLOCK = 200
 class VirtualDevice(PacedDevice):
     """A virtual toy in this process, with the same bytes and the same parser as a real one.
 
-    ``performed`` lists the gestures that its person made; ``on_performed`` is called with each.
+    ``performed`` lists the gestures that its person made; ``on_performed`` is called with each. ``first_ms`` is the
+    device clock at the first line, from which a live run counts its times; None before it.
 
     Args:
         speed: 1 real time, 0 as fast as frames are taken.
@@ -247,13 +248,8 @@ class VirtualDevice(PacedDevice):
         self._prompt: Prompt | None = None
         self._parser = LineParser(layout, self.counters)
         self._seconds = seconds
-        self._first_ms: int | None = None
+        self.first_ms: int | None = None
         self._next: ToyLine | None = None
-
-    @property
-    def first_ms(self) -> int | None:
-        """The device clock at the first line, from which a live run counts its times; None before it."""
-        return self._first_ms
 
     def play_ahead(self) -> None:
         """Compute all lines now, so that reading is as fast as with a real toy. It needs ``seconds``.
@@ -286,9 +282,9 @@ class VirtualDevice(PacedDevice):
         if self._next is None:
             self._next = next(self._lines)
         at = self._next.device_ms
-        if self._first_ms is None:
-            self._first_ms = at
-        return None if self._seconds and at - self._first_ms >= self._seconds * 1000.0 else at
+        if self.first_ms is None:
+            self.first_ms = at
+        return None if self._seconds and at - self.first_ms >= self._seconds * 1000.0 else at
 
     def read(self) -> list[Frame] | None:
         """Return the frames that are due, waiting at most about ``wait_s``; return None after ``seconds``."""
