@@ -134,7 +134,7 @@ class StepList:
         self._states: list[str] = []
         self._seen = ""
         words = page.words
-        steps = session.steps()
+        steps = session.recorder.steps()
         with tag(ui.element("details").classes("ps-card w-full"), "steps"):
             summary(words("record.steps"))
             if len(steps) > _MAX_STEPS:
@@ -162,7 +162,7 @@ class StepList:
             return
         self._seen = status.seen
         words = self._page.words
-        for n, result in enumerate(self._session.steps()):
+        for n, result in enumerate(self._session.recorder.steps()):
             state = "made" if result.file else "skipped" if result.skipped else "open"
             now = n == status.step.number and status.state not in ("finished", "stopped")
             key = f"{state}{now}"
@@ -336,7 +336,7 @@ class _View:
     async def _main_clicked(self, seen: str) -> None:
         state = seen.partition(".")[0]
         if state in ("finished", "stopped"):
-            if self._left or self._session.status().state == state:
+            if self._left or self._session.recorder.status().state == state:
                 await (self._end() if state == "finished" else self._reopen())
         else:
             self._press("p" if state == "paused" else " ", seen)
@@ -351,7 +351,7 @@ class _View:
 
     def _ask_end(self) -> None:
         words = self._page.words
-        recording = self._session.status().state == "recording"
+        recording = self._session.recorder.status().state == "recording"
         self._end_text.text = words("record.end_running" if recording else "record.end_really")
         self._ending.set_visibility(True)
         focus(self._no)
@@ -398,7 +398,7 @@ class _View:
             reopened = self._controller.get(self._session.name) is not None
             ui.navigate.to(address("record", **{"session" if reopened else "ended": self._session.name}))
             return
-        s = self._session.status()
+        s = self._session.recorder.status()
         self._keys.show(s.seen)
         self._draw_plan(s)
         self._draw_state(s)
