@@ -34,16 +34,16 @@ def controller(tmp_path: Path) -> Iterator[RecordController]:
 
 def press(session: ActiveSession, key: str = " ") -> bool:
     """Upon what is to be seen now."""
-    return session.press(key, session.status().seen)
+    return session.press(key, session.recorder.status().seen)
 
 
 def take(session: ActiveSession) -> None:
     """One recording of two seconds."""
-    until(lambda: session.status().signal not in ("none", "unreadable"))
+    until(lambda: session.recorder.status().signal not in ("none", "unreadable"))
     assert press(session)
-    until(lambda: session.status().state == "recording" and session.status().elapsed_s > 2)
+    until(lambda: session.recorder.status().state == "recording" and session.recorder.status().elapsed_s > 2)
     assert press(session)
-    until(lambda: session.status().state in ("idle", "finished"))
+    until(lambda: session.recorder.status().state in ("idle", "finished"))
 
 
 def test_a_session_from_its_beginning_to_its_end(controller: RecordController, tmp_path: Path) -> None:
@@ -64,7 +64,7 @@ def test_a_session_from_its_beginning_to_its_end(controller: RecordController, t
     begun = len(changes)
     for _ in range(4):
         take(session)
-    assert session.status().state == "finished"
+    assert session.recorder.status().state == "finished"
     until(lambda: len(changes) > begun)
     end()
     loop.call_soon_threadsafe(loop.stop)
@@ -73,9 +73,9 @@ def test_a_session_from_its_beginning_to_its_end(controller: RecordController, t
     # The person does what is asked for; the last one may have been stopped before the hand came.
     asked = ["Back stroke 1", "Head stroke 1", "Hold strong", "Tail tap 1"]
     assert [p.label for p in toy.performed][:3] == asked[:3]
-    assert [bool(s.file) for s in session.steps()] == [True] * 4
+    assert [bool(s.file) for s in session.recorder.steps()] == [True] * 4
     # The tap sees what the recorder gets.
-    assert session.device.buffer.count == pytest.approx(session.status().rows, abs=400)
+    assert session.device.buffer.count == pytest.approx(session.recorder.status().rows, abs=400)
     # The next session of this person makes the finished one way.
     again = controller.begin(QUICK)
     assert (again.name, [s.name for s in controller.active_sessions()]) == ("S01/2", ["S01/2"])
@@ -88,8 +88,8 @@ def test_a_session_from_its_beginning_to_its_end(controller: RecordController, t
 
 def test_a_command_counts_once(controller: RecordController, tmp_path: Path) -> None:
     session = controller.begin(QUICK)
-    until(lambda: session.status().signal not in ("none", "unreadable"))
-    seen = session.status().seen
+    until(lambda: session.recorder.status().signal not in ("none", "unreadable"))
+    seen = session.recorder.status().seen
     answers: list[bool] = []
     threads = [threading.Thread(target=lambda: answers.append(session.press(" ", seen))) for _ in range(8)]
     for thread in threads:
@@ -97,19 +97,19 @@ def test_a_command_counts_once(controller: RecordController, tmp_path: Path) -> 
     for thread in threads:
         thread.join()
     assert sorted(answers) == [False] * 7 + [True]
-    until(lambda: session.status().state == "recording")
+    until(lambda: session.recorder.status().state == "recording")
     for stale in (seen, "", "recording.1.0.0.0"):
         assert not session.press(" ", stale)
-    assert session.status().state == "recording"
+    assert session.recorder.status().state == "recording"
     for key in ("x", "", "go:", "go:4", "go:-1", "q"):
         with pytest.raises(ConfigError, match="is not a command"):
-            session.press(key, session.status().seen)
+            session.press(key, session.recorder.status().seen)
     assert press(session, "r")
     assert press(session, "go:2")
-    assert session.status().step.number == 2
+    assert session.recorder.status().step.number == 2
     assert press(session, "b")
     assert press(session, "p")
-    assert session.status().state == "paused"
+    assert session.recorder.status().state == "paused"
     assert press(session, "p")
     assert press(session, "s")
     assert [e.what for e in read_events(tmp_path / "recordings" / "S01" / "1")].count("countdown") <= 1
@@ -131,13 +131,13 @@ def test_an_unfinished_session_is_gone_on_with(controller: RecordController, tmp
     session = controller.begin(QUICK)
     take(session)
     press(session)
-    until(lambda: session.status().state == "recording")
+    until(lambda: session.recorder.status().state == "recording")
     controller.close_session("S01/1")
     with pytest.raises(ConfigError, match="S01 has an unfinished session, 1"):
         controller.begin(QUICK)
     assert controller.active_sessions() == []
     again = controller.resume("S01/1")
-    assert (again.status().done, again.request.speed, again.request.device) == (1, SPEED, CALM)
+    assert (again.recorder.status().done, again.request.speed, again.request.device) == (1, SPEED, CALM)
     controller.close_session("S01/1")
     assert controller.begin(QUICK, anew=True).name == "S01/2"
 
@@ -177,7 +177,7 @@ def test_a_users_own_protocol_and_layout(controller: RecordController, tmp_path:
     assert controller.protocols()[str(own)] == "mine.toml"
     assert "plush-14" in controller.layouts()
     session = controller.begin(SessionRequest(CALM, "S02", str(own), layout="plush-14", speed=SPEED))
-    assert [s.step.gesture for s in session.steps()] == ["Tail pull"] * 2
+    assert [s.step.gesture for s in session.recorder.steps()] == ["Tail pull"] * 2
     assert session.device.layout.name == "plush-14"
     controller.close_session("S02/1")
     # The protocol and the layout are the session's: the files may be gone.
@@ -227,4 +227,4 @@ def test_a_session_that_another_program_has(controller: RecordController, tmp_pa
         assert controller.active_sessions() == []
     finally:
         held.close()
-    assert controller.resume("S01/1").status().state == "idle"
+    assert controller.resume("S01/1").recorder.status().state == "idle"

@@ -57,12 +57,12 @@ class Contact:
     @classmethod
     def parse(cls, text: str) -> Contact:
         """Read a contact of the form ``Name <mail>``; raise DatasetError for another form."""
-        found = _CONTACT.fullmatch(text)
-        if found is None or not found["name"] or not _EMAIL.fullmatch(found["email"]):
+        match = _CONTACT.fullmatch(text)
+        if match is None or not match["name"] or not _EMAIL.fullmatch(match["email"]):
             raise DatasetError(
                 f"The contact '{text}' cannot be used: write it as  \"Marie Curie <marie@example.org>\"."
             )
-        return cls(found["name"], found["email"])
+        return cls(match["name"], match["email"])
 
 
 @dataclass(frozen=True)

@@ -138,16 +138,16 @@ def list_files(folder: Path) -> list[DatasetFile]:
     def refuse(cause: OSError) -> None:
         raise cause
 
-    found: list[tuple[PurePosixPath, bool]] = []
+    paths: list[tuple[PurePosixPath, bool]] = []
     for place, folders, names in os.walk(folder, onerror=refuse, followlinks=False):
         here = Path(place)
         links = [f for f in folders if (here / f).is_symlink()]
         for name in names + links:
             path = PurePosixPath((here / name).relative_to(folder).as_posix())
-            found.append((path, name not in links and (here / name).is_file()))
+            paths.append((path, name not in links and (here / name).is_file()))
     known = set(person_folders(folder))
     out = []
-    for path, plain in sorted(found):
+    for path, plain in sorted(paths):
         own = len(path.parts) > 2 and path.parts[0] not in (CACHE, EVALUATIONS) and path.parts[1] in known
         out.append(DatasetFile(path, _kind(path) if plain else "link", path.parts[1] if own else ""))
     return out

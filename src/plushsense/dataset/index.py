@@ -344,8 +344,7 @@ class _RowLookup:
 
     def at(self, stamp: int) -> list[int]:
         first, last = np.searchsorted(self.stamps, [stamp, stamp + 1])
-        found: list[int] = self.rows[first:last].tolist()
-        return found
+        return [int(row) for row in self.rows[first:last]]
 
 
 def _recordings_from_labels(folder: Path, head: DatasetHead, streams: list[_RawFile]) -> list[RecordingInfo]:

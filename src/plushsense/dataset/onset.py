@@ -224,10 +224,10 @@ def _clear(activity: Floats, threshold: float, period_s: float, spec: OnsetSpec)
     breaks = np.flatnonzero(np.diff(hot) * period_s > spec.join_s)
     firsts, lasts = hot[np.append(0, breaks + 1)], hot[np.append(breaks, len(hot) - 1)]
     weight = np.add.reduceat(activity, np.stack([firsts, lasts + 1], 1).ravel().clip(max=len(activity) - 1))[::2]
-    kept = (weight >= spec.least_share * weight.max()) & ((lasts - firsts + 1) * period_s >= 0.06)
-    if not kept.any():
-        kept = weight == weight.max()
-    return int(firsts[kept][0]), int(lasts[kept][-1])
+    long_enough = (weight >= spec.least_share * weight.max()) & ((lasts - firsts + 1) * period_s >= 0.06)
+    if not long_enough.any():
+        long_enough = weight == weight.max()
+    return int(firsts[long_enough][0]), int(lasts[long_enough][-1])
 
 
 def _walk_back(activity: Floats, rest: Floats, threshold: float, quiet: int) -> int:
@@ -239,5 +239,5 @@ def _walk_back(activity: Floats, rest: Floats, threshold: float, quiet: int) -> 
     k = len(low) - len(activity)
     sums = np.cumsum(np.insert(low, 0, 0))
     at = np.arange(max(1, quiet - k), len(activity))
-    found = np.flatnonzero(sums[at + k] - sums[at + k - quiet] == quiet)
-    return int(at[found[-1]]) if len(found) else 0
+    quiet_before = np.flatnonzero(sums[at + k] - sums[at + k - quiet] == quiet)
+    return int(at[quiet_before[-1]]) if len(quiet_before) else 0

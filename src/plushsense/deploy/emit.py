@@ -74,8 +74,8 @@ def emit(model: IntegerModel, bundle: Bundle, out: str | Path, extras: Sequence[
         facts = _write(model, bundle, part)
         for extra in extras:
             extra(part, facts)
-        found = sorted(p.relative_to(part).as_posix() for p in part.rglob("*") if p.is_file())
-        facts["files"] = sorted({*found, FACTS})
+        files = sorted(p.relative_to(part).as_posix() for p in part.rglob("*") if p.is_file())
+        facts["files"] = sorted({*files, FACTS})
         (part / FACTS).write_text(json.dumps(facts, indent=1, ensure_ascii=False) + "\n", "utf-8", newline="\n")
     return ExportResult(out, tuple(facts["files"]), facts["model_bytes"], facts["memory_bytes"] + TOY_BYTES, facts)
 
@@ -183,21 +183,21 @@ def without_people(provenance: Mapping[str, Any]) -> dict[str, Any]:
         return named.sub("…", value) if isinstance(value, str) else value
 
     counted = {key: provenance[key] for key in _PEOPLE if isinstance(provenance.get(key), int)}
-    kept = {key: plain(value) for key, value in provenance.items() if key not in _PEOPLE}
-    return kept | counted | {key: len(found) for key, found in people.items()}
+    others = {key: plain(value) for key, value in provenance.items() if key not in _PEOPLE}
+    return others | counted | {key: len(codes) for key, codes in people.items()}
 
 
 def c_names(labels: Sequence[str]) -> tuple[str, ...]:
     """Convert labels to distinct suffixes of C identifiers: ``Back stroke 1`` becomes ``BACK_STROKE_1``."""
-    found: list[str] = []
+    suffixes: list[str] = []
     for label in labels:
         plain = "".join(c if c.isascii() and c.isalnum() else " " for c in label)
         name = "_".join(plain.upper().split()) or "GESTURE"
         number, free = 2, name
-        while free in found:
+        while free in suffixes:
             number, free = number + 1, f"{name}_{number}"
-        found.append(free)
-    return tuple(found)
+        suffixes.append(free)
+    return tuple(suffixes)
 
 
 def _header(facts: Mapping[str, Any]) -> str:

@@ -126,8 +126,8 @@ class FrameGenerator:
                 spoilt = np.array([garbage_channel])
             for channel in spoilt:
                 values[channel] = self._garbage(int(channel))
-            for held, value in (stuck or {}).items():
-                values[held] = value
+            for stuck_channel, value in (stuck or {}).items():
+                values[stuck_channel] = value
             if rng.random() >= lost:
                 self.put(values)
             if rng.random() >= equal:
@@ -198,8 +198,8 @@ class FrameGenerator:
         for _ in range(n // 4):
             first = np.rint(np.clip(self.mean, self.low, self.high)).astype(np.int64)
             second = first.copy()
-            for channel, found in edges.items():
-                edge, swing = int(self.rng.choice(found)), int(self.rng.integers(0, 40))
+            for channel, values_at_edges in edges.items():
+                edge, swing = int(self.rng.choice(values_at_edges)), int(self.rng.integers(0, 40))
                 first[channel], second[channel] = edge + swing, edge - 1 - swing
             for values in (first, second):
                 self.put(np.clip(values, self.low, self.high))
@@ -213,13 +213,13 @@ class FrameGenerator:
         for i, channel in direct.items():
             around[:, i] = np.arange(-_SEARCHED, _SEARCHED) + round(float(self.mean[channel]))
         codes = inputs.apply(around)
-        found = {}
+        by_channel = {}
         for i, channel in direct.items():
             edges = around[1:, i][codes[1:, i] != codes[:-1, i]]
             inside = edges[(edges > self.low[channel] + 41) & (edges < self.high[channel] - 41)]
             if len(inside):
-                found[channel] = inside
-        return found
+                by_channel[channel] = inside
+        return by_channel
 
     def _garbage(self, channel: int) -> int:
         """Return a value out of the channel's range, if 32 bits hold one."""
@@ -271,8 +271,7 @@ Ints = NDArray[np.int64]
 
 def column(rows: NDArray[Any], name: str, kind: int = ANSWER) -> NDArray[Any]:
     """Return one column of the rows of a kind."""
-    found: NDArray[Any] = rows[rows[:, 0] == kind][:, COLUMNS[kind].index(name)]
-    return found
+    return np.asarray(rows[rows[:, 0] == kind][:, COLUMNS[kind].index(name)])
 
 
 def answers_of(model: IntegerModel, frames: Ints, silences: Container[int] = ()) -> NDArray[np.int32]:
@@ -404,7 +403,7 @@ def read_golden(folder: Path, channels: int, classes: int) -> tuple[Ints, NDArra
     Raises:
         BadInput: for a file that is missing or does not hold whole rows.
     """
-    found = []
+    tables = []
     for name, columns, kind in ((FRAMES, 1 + channels, "<i4"), (ANSWERS, HEAD + 2 * classes, "<i4")):
         path = folder / name
         try:
@@ -416,7 +415,7 @@ def read_golden(folder: Path, channels: int, classes: int) -> tuple[Ints, NDArra
                 f"The golden vectors '{path}' have {len(data)} bytes, which are no whole rows of {columns} numbers: "
                 "export the model again."
             )
-        found.append(np.frombuffer(data, dtype=kind).reshape(-1, columns))
-    frames = found[0].astype(np.int64)
+        tables.append(np.frombuffer(data, dtype=kind).reshape(-1, columns))
+    frames = tables[0].astype(np.int64)
     frames[:, 0] &= 0xFFFFFFFF
-    return frames, found[1].astype(np.int32)
+    return frames, tables[1].astype(np.int32)

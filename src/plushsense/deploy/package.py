@@ -207,7 +207,7 @@ def firmware(layout: Layout, scaler: Scaler, facts: Mapping[str, Any]) -> dict[s
 
 
 def _sources(layout: Layout) -> list[_ChannelSource]:
-    found: list[_ChannelSource] = []
+    sources: list[_ChannelSource] = []
     pads = iter(_PADS)
     axes = dict(_FIRST_AXIS)
     others = 0
@@ -215,18 +215,18 @@ def _sources(layout: Layout) -> list[_ChannelSource]:
         factor = _motion_factor(channel)
         if channel.kind in _PADDED and channel.step == 1.0:
             if channel.name in _TOTALS:
-                found.append(_ChannelSource("TOTAL", note=": the sum of all pads"))
+                sources.append(_ChannelSource("TOTAL", note=": the sum of all pads"))
             elif pad := next(pads, None):
-                found.append(_ChannelSource("TOUCH", *pad))
+                sources.append(_ChannelSource("TOUCH", *pad))
             else:
-                found.append(_ChannelSource("TOUCH", _NO_PAD, _NO_PAD, note=": NO PAD IS LEFT for it"))
+                sources.append(_ChannelSource("TOUCH", _NO_PAD, _NO_PAD, note=": NO PAD IS LEFT for it"))
         elif factor is not None and axes[channel.kind] < _FIRST_AXIS[channel.kind] + 3:
-            found.append(_ChannelSource("MOTION", axes[channel.kind], axes[channel.kind], factor))
+            sources.append(_ChannelSource("MOTION", axes[channel.kind], axes[channel.kind], factor))
             axes[channel.kind] += 1
         else:
-            found.append(_ChannelSource("OTHER", others, others, note=": see read_other()"))
+            sources.append(_ChannelSource("OTHER", others, others, note=": see read_other()"))
             others += 1
-    return found
+    return sources
 
 
 def _motion_factor(channel: Channel) -> int | None:

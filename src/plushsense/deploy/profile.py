@@ -56,16 +56,11 @@ class Core:
         )
 
 
-@dataclass(frozen=True)
-class _CoresFile:
-    cores: tuple[Core, ...]
-
-
 @cache
 def cores() -> tuple[Core, ...]:
     """Read the chips of ``cores.toml``."""
     path = Path(__file__).with_name("cores.toml")
-    return load_table(read_toml(path, "cores", BadInput), _CoresFile, path.name, BadInput).cores
+    return tuple(load_table(row, Core, path.name, BadInput) for row in read_toml(path, "cores", BadInput)["cores"])
 
 
 @dataclass(frozen=True)
@@ -172,8 +167,8 @@ class Cost:
     @property
     def ram_bytes(self) -> int:
         """Bytes of one toy, its memory and static data; without stack."""
-        kept = sum(part[name] for part in self.sections.values() for name in ("data", "bss"))
-        return self.toy_bytes + self.memory_bytes + kept
+        static = sum(part[name] for part in self.sections.values() for name in ("data", "bss"))
+        return self.toy_bytes + self.memory_bytes + static
 
     @property
     def heap(self) -> tuple[str, ...]:
@@ -313,13 +308,13 @@ def _whole(program: Program, step: int) -> tuple[list[int], Ints, Ints]:
 
 def _sections(target: str, file: Path) -> dict[str, int]:
     """Return the bytes of an object file by kind of section."""
-    found = dict.fromkeys(_SECTIONS, 0)
+    sizes = dict.fromkeys(_SECTIONS, 0)
     for line in tool_output([tool(target, "size"), "-A", str(file)]).splitlines():
         words = line.split()
         for name, begins in _SECTIONS.items():
             if len(words) == 3 and any(words[0] == b or words[0].startswith(b + ".") for b in begins):
-                found[name] += int(words[1])
-    return found
+                sizes[name] += int(words[1])
+    return sizes
 
 
 def _needs(target: str, file: Path) -> tuple[str, ...]:
@@ -330,14 +325,13 @@ def _needs(target: str, file: Path) -> tuple[str, ...]:
 
 def _stack_usage(file: Path) -> dict[str, int]:
     """Read the stack frame of each function from the compiler's report, largest first; refuse a dynamic one."""
-    found: dict[str, int] = {}
-    lines: Sequence[str] = file.read_text().splitlines() if file.is_file() else ()
-    for line in lines:
+    frames: dict[str, int] = {}
+    for line in file.read_text().splitlines() if file.is_file() else ():
         place, size, kind = line.split("\t")
         if kind != "static":
             raise BadInput(f"The stack of {place} is not known when compiling ({kind}): take out what makes it so.")
-        found[place.rsplit(":", 1)[-1]] = int(size)
-    return dict(sorted(found.items(), key=lambda item: -item[1]))
+        frames[place.rsplit(":", 1)[-1]] = int(size)
+    return dict(sorted(frames.items(), key=lambda item: -item[1]))
 
 
 SUMMARY = (
@@ -428,6 +422,7 @@ def profile(
         ToolError: when a requested target is not installed here, when none is, or when a compiler refuses
             what stands in the folder.
     """
+    progress = progress or (lambda done, total: None)
     folder = Path(folder)
     facts = read_facts(folder)
     export = Export(folder)
@@ -450,11 +445,9 @@ def profile(
     with tempfile.TemporaryDirectory(prefix="plushsense-profile-") as work:
         code = export.code(Path(work) / "code")
         for done, name in enumerate(installed):
-            if progress is not None:
-                progress(done, len(installed))
+            progress(done, len(installed))
             costs[name] = count(folder, name, facts, optimise, code=code)
-    if progress is not None:
-        progress(len(installed), len(installed))
+    progress(len(installed), len(installed))
     estimates = {
         core.name: estimate(core, cost.step, cost.flash_bytes, arch.step, float(facts["step_ms"]))
         for core in cores()

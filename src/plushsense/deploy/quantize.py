@@ -98,9 +98,9 @@ def calibrate(network: Network, x: NDArray[np.floating[Any]]) -> Ranges:
     low, high = np.quantile(x, [_INPUTS_OUTSIDE, 1 - _INPUTS_OUTSIDE], axis=(0, 2))
     seen: list[list[Floats]] = [[] for _ in network.arch.filters]
     for at in range(0, len(x), _BATCH):
-        for kept, z in zip(seen, network.rectified(x[at : at + _BATCH]), strict=True):
-            kept.append(z.reshape(-1, z.shape[2]))
-    rows = [np.concatenate(kept) for kept in seen]
+        for values, z in zip(seen, network.rectified(x[at : at + _BATCH]), strict=True):
+            values.append(z.reshape(-1, z.shape[2]))
+    rows = [np.concatenate(values) for values in seen]
     tops = tuple(np.quantile(row, 1 - _OUTSIDE, axis=0) for row in rows)
     inputs = np.asarray(x.mean(axis=(0, 2), dtype=np.float64))
     return Ranges(low, high, tops, (inputs, *(row.mean(axis=0) for row in rows)))
@@ -253,5 +253,5 @@ def integer_model(bundle: Bundle, decide: DecideSpec | None = None) -> IntegerMo
 def integer_probabilities(network: IntegerNetwork, x: NDArray[np.integer[Any]]) -> NDArray[np.float32]:
     """Compute the probabilities (N, K) of raw windows (N, C, T) with a deployed network, without smoothing."""
     rows = [softmax(logits) for logits in network.forward(x)]
-    found = np.array(rows, dtype=np.float32).reshape(len(x), network.arch.classes)
-    return found / np.float32(1 << PROBABILITY_BITS)
+    table = np.array(rows, dtype=np.float32).reshape(len(x), network.arch.classes)
+    return table / np.float32(1 << PROBABILITY_BITS)

@@ -42,14 +42,10 @@ class Target:
     counts: bool = True
 
 
-@dataclass(frozen=True)
-class _TargetsFile:
-    targets: tuple[Target, ...]
-
-
 def _read_targets() -> dict[str, Target]:
     path = Path(__file__).with_name("targets.toml")
-    listed = load_table(read_toml(path, "targets", ConfigError), _TargetsFile, path.name, ConfigError).targets
+    rows = read_toml(path, "targets", ConfigError)["targets"]
+    listed = [load_table(row, Target, path.name, ConfigError) for row in rows]
 
     def placed(words: tuple[str, ...]) -> tuple[str, ...]:
         return tuple(word.replace("{runtime}", str(RUNTIME)) for word in words)
@@ -196,10 +192,10 @@ def _object_name(source: Path, command: Sequence[str], include: Iterable[Path]) 
 def tool(target: str, name: str) -> str:
     """Return a tool that comes with the target's compiler, such as ``nm`` or ``size``; ToolError when it is missing."""
     compiler = target_named(target).compiler
-    found = compiler.removesuffix("gcc") + name
-    if shutil.which(found) is None:
-        raise ToolError(f"{found}, which comes with {compiler}, is not installed here: install Debian's binutils.")
-    return found
+    command = compiler.removesuffix("gcc") + name
+    if shutil.which(command) is None:
+        raise ToolError(f"{command}, which comes with {compiler}, is not installed here: install Debian's binutils.")
+    return command
 
 
 def tool_output(command: Sequence[str]) -> str:

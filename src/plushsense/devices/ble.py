@@ -194,19 +194,19 @@ class BleDevice(Device):
     async def _find(self) -> Any:
         """Scan for the device; connecting to an address without a scan is not reliable (bleak's manual)."""
         target = self._target
-        found: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
+        device_found: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
         names: dict[str, str] = {}
 
         def advertised(device: Any, data: Any) -> None:
             name = data.local_name or device.name or ""
             names[device.address] = name
             matches = _same(device.address, target.address) if target.address else name == target.name
-            if matches and not found.done():
-                found.set_result(device)
+            if matches and not device_found.done():
+                device_found.set_result(device)
 
         with contextlib.suppress(TimeoutError):
             async with _scanner(self._bleak, self._backends, advertised):
-                return await asyncio.wait_for(asyncio.shield(found), target.find_s)
+                return await asyncio.wait_for(asyncio.shield(device_found), target.find_s)
         there = [f"{name} ({address})" for address, name in sorted(names.items(), key=lambda kv: kv[1]) if name]
         if there:
             here = f"there are {', '.join(there[:8])}" + (f" and {len(there) - 8} more" if len(there) > 8 else "")

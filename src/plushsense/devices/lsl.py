@@ -237,7 +237,7 @@ def search_streams(scan_s: float) -> DeviceListing:
     """List all LSL streams."""
     streams = {s.uid(): s for s in load_pylsl().resolve_streams(scan_s)}.values()
     names = Counter(s.name() for s in streams)
-    found = [
+    devices = [
         DeviceInfo(
             stream_url(s, unique_name=names[s.name()] == 1),
             "lsl",
@@ -246,7 +246,7 @@ def search_streams(scan_s: float) -> DeviceListing:
         )
         for s in streams
     ]
-    return DeviceListing(sorted(found, key=lambda d: (d.name, d.url)))
+    return DeviceListing(sorted(devices, key=lambda d: (d.name, d.url)))
 
 
 def open_lsl(address: DeviceAddress, layout: Layout) -> LslDevice:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import importlib
 import math
 import os
+import pkgutil
 import re
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -158,7 +158,7 @@ def open_device(
     address = parse_url(os.fspath(url))
     chosen: Layout | str = address.query.get("layout") or layout or DEFAULT_LAYOUT
     resolved = chosen if isinstance(chosen, Layout) else load_layout(chosen)
-    open_address = _loaded(SCHEMES[address.scheme])
+    open_address = pkgutil.resolve_name(SCHEMES[address.scheme])
 
     def opened() -> Device:
         device = open_address(address, resolved)
@@ -169,12 +169,6 @@ def open_device(
     if not reconnect:
         return opened()
     return ReconnectingDevice(address.url, resolved, opened, for_s=reconnect_s, ends=address.scheme in _ENDING)
-
-
-def _loaded(name: str) -> Callable[..., Any]:
-    module, function = name.split(":")
-    loaded: Callable[..., Any] = getattr(importlib.import_module(module), function)
-    return loaded
 
 
 SCAN_S = 3.0
@@ -218,7 +212,7 @@ def list_devices(scan_s: float = SCAN_S) -> DeviceListing:
 
     def look(what: str, search: str) -> None:
         try:
-            results[what] = _loaded(search)(scan_s)
+            results[what] = pkgutil.resolve_name(search)(scan_s)
         except MissingExtraError as refusal:
             results[what] = DeviceListing(notes=[f"{what}: not looked at. {refusal}"])
         except PlushSenseError as refusal:

@@ -149,21 +149,21 @@ class ReconnectingDevice(Device):
                 self._awake.wait(RETRY_S)
                 pause = False
                 continue
-            found: Device | Exception
+            result: Device | Exception
             try:
-                found = self._open_inner()
+                result = self._open_inner()
             except DeviceError:
                 pause = True
                 continue
             except Exception as cause:  # noqa: BLE001, RUF100
-                found = cause
+                result = cause
             with self._lock:
                 if not self.closed:
-                    self._found = found
+                    self._found = result
                     self._awake.set()
                     return
-            if isinstance(found, Device):
-                found.close()
+            if isinstance(result, Device):
+                result.close()
 
     def _wait(self) -> list[Frame] | None:
         if not self._awake.wait(self.wait_s):
@@ -178,21 +178,21 @@ class ReconnectingDevice(Device):
         with self._lock:
             if self.closed:
                 return None
-            found, self._found = self._found, None
-            if isinstance(found, Device):
-                self.inner = found
+            result, self._found = self._found, None
+            if isinstance(result, Device):
+                self.inner = result
                 self.state = "connected"
                 self.counters.reconnects += 1
-        if isinstance(found, Exception):
+        if isinstance(result, Exception):
             self.close()
-            raise found
+            raise result
         return []
 
     def _shut(self) -> None:
         self._awake.set()
         with self._lock:
-            found, self._found = self._found, None
+            result, self._found = self._found, None
             inner = self.inner
-        for device in (inner, found):
+        for device in (inner, result):
             if isinstance(device, Device):
                 device.close()

@@ -140,9 +140,10 @@ def personalise(
     original = restore_original(bundle) if bundle.personal else bundle
     examples = Examples(original.network().features(original.scaler.apply(x)), y, recording)
     weight, bias = (np.asarray(original.weights[name], dtype=np.float64) for name in _DENSE)
-    kept = examples.take(np.isin(y, gestures_with_enough(y, recording, spec.least)))
+    enough = [k for k in np.unique(y) if len(np.unique(recording[y == k])) >= spec.least]
+    used_examples = examples.take(np.isin(y, enough))
     labels = original.gestures.labels
-    used = tuple(labels[k] for k in np.unique(kept.y))
+    used = tuple(labels[k] for k in np.unique(used_examples.y))
     # With fewer recorded gestures, the others suffer: on makeability up to 5 of 10 cost nobody more than one recording.
     needed = max(2, -(-len(labels) // 2))
     if len(used) < needed:
@@ -152,12 +153,12 @@ def personalise(
             f"with {spec.least} recordings each are needed, better all; there are {len(used)}. Record more of: "
             f"{missing}."
         )
-    own = judge(softmax(kept.features @ weight.T + bias), kept.y, kept.recording)
-    tried = [(s, _left_out(weight, bias, kept, s)) for s in spec.strengths]
-    strength, found = min(tried, key=lambda each: float(each[1].losses.mean()))
-    fell = own.losses - found.losses
+    own = judge(softmax(used_examples.features @ weight.T + bias), used_examples.y, used_examples.recording)
+    tried = [(s, _left_out(weight, bias, used_examples, s)) for s in spec.strengths]
+    strength, adapted_scores = min(tried, key=lambda each: float(each[1].losses.mean()))
+    fell = own.losses - adapted_scores.losses
     least = spec.margin * float(fell.std(ddof=1)) / np.sqrt(len(fell))
-    before, after = own.judged, found.judged
+    before, after = own.judged, adapted_scores.judged
     figures = (
         f"of {before.recordings} own recordings, each left out once, {after.right} instead of {before.right} are "
         f"read right, log loss {after.log_loss:.3f} instead of {before.log_loss:.3f}"
@@ -170,21 +171,18 @@ def personalise(
     if fell.mean() <= least or after.right <= before.right:
         reason = f"it would not clearly help: {figures}"
         return Personal(bundle, False, reason, strength, before, after, used, without)
-    moved = fit_dense(weight, bias, kept, strength)
+    dense = dict(zip(_DENSE, fit_dense(weight, bias, used_examples, strength), strict=True))
     table = {
         "subject": subject,
         "recordings": before.recordings,
         "gestures": list(used),
         "strength": strength,
         "leave_one_recording_out": {"before": before.to_dict(), "after": after.to_dict()},
+        "original": {name: np.asarray(original.weights[name]).tolist() for name in _DENSE},
     }
-    adapted = _with_dense(original, *moved, table)
+    weights = {**original.weights, **{name: part.astype(np.float32) for name, part in dense.items()}}
+    adapted = replace(original, weights=weights, personal=table)
     return Personal(adapted, True, figures, strength, before, after, used, without)
-
-
-def gestures_with_enough(y: Index, recording: Index, least: int) -> list[int]:
-    """Return the classes of which there are at least ``least`` recordings."""
-    return [int(k) for k in np.unique(y) if len(np.unique(recording[y == k])) >= least]
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,12 +271,6 @@ def _together(logits: Floats) -> Floats:
     """Return the logarithm of the summed exponentials over the last axis."""
     top = logits.max(axis=-1, keepdims=True)
     return np.asarray(np.log(np.exp(logits - top).sum(axis=-1)) + top[..., 0])
-
-
-def _with_dense(bundle: Bundle, weight: Floats, bias: Floats, table: Mapping[str, Any]) -> Bundle:
-    dense = {"dense.weight": weight.astype(np.float32), "dense.bias": bias.astype(np.float32)}
-    before = {name: np.asarray(bundle.weights[name]).tolist() for name in _DENSE}
-    return replace(bundle, weights={**bundle.weights, **dense}, personal={**table, "original": before})
 
 
 def restore_original(bundle: Bundle) -> Bundle:

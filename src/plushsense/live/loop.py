@@ -129,7 +129,9 @@ class LiveRun(Iterator[Decision]):
                 self.over = True
                 break
             for decision in decisions:
-                self._note_latency(time.perf_counter() - arrived)
+                self.latency_s = time.perf_counter() - arrived
+                self._late += self.latency_s > self.classifier.step_s
+                self.latencies_s.append(self.latency_s)
                 decided.append(self._noted(decision))
         return decided
 
@@ -139,11 +141,6 @@ class LiveRun(Iterator[Decision]):
         self._no_signal += decision.state == "no signal"
         self._events += sum(event.what == "begun" for event in decision.events)
         return decision
-
-    def _note_latency(self, latency_s: float) -> None:
-        self.latency_s = latency_s
-        self._late += latency_s > self.classifier.step_s
-        self.latencies_s.append(latency_s)
 
     def summary(self) -> LiveSummary:
         """Return the figures so far."""

@@ -79,18 +79,13 @@ def _number(text: str, at: int, what: str, symbol: bool = True) -> tuple[int, in
         end += 1
     if end == at:
         ends = at == len(text) or text[at] in "_,"
-        found = "nothing stands here" if ends else f"unknown token {text[at]!r}"
-        fail(f"{found}: {what} is expected, a whole number from 1", text, at, symbol)
+        problem = "nothing stands here" if ends else f"unknown token {text[at]!r}"
+        fail(f"{problem}: {what} is expected, a whole number from 1", text, at, symbol)
     if text[at:end].strip("0") == "":
         fail(f"{what} is 0: the smallest is 1", text, at, symbol)
     if end - at > 9 or int(text[at:end]) > MAX_NUMBER:
         fail(f"{what} is too large: the largest is {MAX_NUMBER}", text, at, symbol)
     return int(text[at:end]), end
-
-
-def layer_start(spec: str, layer: int) -> int:
-    """Return the place in the symbol at which a layer (from 0) begins."""
-    return sum(len(part) + 1 for part in spec.split("_")[:layer])
 
 
 def fail(why: str, text: str, at: int, symbol: bool = True) -> NoReturn:
@@ -232,7 +227,7 @@ class Arch:
                 f"{len(shape)} layers but only {len(counts)} filter counts ({given}): "
                 f"give one count a layer, for example {example}",
                 spec,
-                layer_start(spec, len(counts)),
+                sum(len(part) + 1 for part in spec.split("_")[: len(counts)]),
             )
         layers = tuple(ConvLayer(k, d, f) for (k, d), f in zip(shape, counts, strict=False))
         return cls(layers, channels, classes, cast(Padding, padding), cast(Norm, norm), window, step, pool)

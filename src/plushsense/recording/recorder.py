@@ -6,6 +6,7 @@ Commands return at once; their effects are in `plushsense.recording.states`.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -22,6 +23,8 @@ from plushsense.recording.session import OpenSession, check_session, check_subje
 from plushsense.recording.session_files import SessionHead
 from plushsense.recording.states import RecorderState, RecorderStatus, RecordingMachine, StepResult, key_of, write_error
 from plushsense.recording.writer import BackgroundWriter, StreamFile
+
+_NO_DESCRIPTOR = "Too many files are open on this computer: saving waits until some are closed. Nothing is lost."
 
 
 class Recorder(RecordingMachine):
@@ -58,11 +61,6 @@ class Recorder(RecordingMachine):
             )
 
     @property
-    def over(self) -> str:
-        """Why the toy sends no more data; "" while it may."""
-        return self._over
-
-    @property
     def begins_ms(self) -> int | None:
         """The toy's clock at the end of the countdown; None without a countdown, or before the first frame."""
         with self._changed:
@@ -97,7 +95,7 @@ class Recorder(RecordingMachine):
             self.session.log,
             synchronous=self._speed != 1.0,
             on_fail=self._fail,
-            on_wait=self._wait_for_descriptor,
+            on_wait=partial(self.show_message, _NO_DESCRIPTOR),
         )
         with self._changed:
             self._log(

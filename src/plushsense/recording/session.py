@@ -109,10 +109,10 @@ def next_session(person: Path) -> str:
     return new_session(person)
 
 
-def new_session(person: Path) -> str:
-    """Return an unused number for a new session."""
+def new_session(person: Path, prefix: str = "") -> str:
+    """Return an unused name for a new session: ``prefix`` and a number."""
     taken = {p.name for p in person.iterdir()} if person.is_dir() else set()
-    return next(str(number) for number in itertools.count(1) if str(number) not in taken)
+    return next(name for number in itertools.count(1) if (name := f"{prefix}{number}") not in taken)
 
 
 class OpenSession:
@@ -219,23 +219,24 @@ def _repair(folder: Path, layout: Layout, log: LogFile) -> SessionProgress:
     for path in sorted(folder.iterdir()):
         # ".new" was written by earlier versions.
         if path.name.endswith((PART, ".new")):
-            log.write([_event("mended", file=path.name, bytes=path.stat().st_size, how="unfinished file removed")])
+            log.write([new_event("mended", file=path.name, bytes=path.stat().st_size, how="unfinished file removed")])
             path.unlink()
     _repair_takes(folder, progress, log, made)
     for path in sorted(folder.glob(f"*{SIDECAR}")):
         csv = path.with_suffix(".csv")
         # The sidecar of a recording that was finished once is kept: the recording may come back.
         if path.name != SESSION_HEAD and csv.name not in made and not csv.exists():
-            log.write([_event("mended", file=path.name, how="sidecar without a recording removed")])
+            log.write([new_event("mended", file=path.name, how="sidecar without a recording removed")])
             path.unlink()
     if started is not None and started not in progress.takes:
-        log.write([_event("unfinished", gesture=started[0], repetition=started[1])])
+        log.write([new_event("unfinished", gesture=started[0], repetition=started[1])])
         progress.repairs.append(f"'{started[0]}', {started[1]}, was interrupted: record it again")
     return progress
 
 
-def _event(what: str, **more: Any) -> SessionEvent:
-    return SessionEvent(what, now_ms(), more)
+def new_event(what: str, **details: Any) -> SessionEvent:
+    """Return an event of the present moment."""
+    return SessionEvent(what, now_ms(), details)
 
 
 def _key(more: dict[str, Any]) -> Key | None:
@@ -293,8 +294,10 @@ def _repair_stream(path: Path, layout: Layout, progress: SessionProgress, log: L
                 last += block
             size += len(block)
         if size > whole:
-            kept = last[:_KEPT_BYTES].decode("ascii", "backslashreplace")
-            log.write([_event("mended", file=path.name, how="torn last line cut off", bytes=size - whole, text=kept)])
+            torn = last[:_KEPT_BYTES].decode("ascii", "backslashreplace")
+            log.write(
+                [new_event("mended", file=path.name, how="torn last line cut off", bytes=size - whole, text=torn)]
+            )
             file.truncate(whole)
             os.fsync(file.fileno())
             progress.repairs.append(f"the incomplete last line of {path.name} was removed ({size - whole} bytes)")
@@ -320,7 +323,7 @@ def _repair_takes(folder: Path, progress: SessionProgress, log: LogFile, made: d
         data = path.read_bytes()
         if not data.endswith(b"\n") or data.count(b"\n") != name.rows + 1:
             os.replace(path, path.with_name(path.name + TORN))
-            log.write([_event("mended", file=path.name, how=f"not whole: renamed to end in {TORN}")])
+            log.write([new_event("mended", file=path.name, how=f"not whole: renamed to end in {TORN}")])
             progress.repairs.append(f"'{path.name}' is incomplete: record it again")
             if key is not None and progress.takes.get(key) == path.name:
                 del progress.takes[key]
@@ -330,7 +333,7 @@ def _repair_takes(folder: Path, progress: SessionProgress, log: LogFile, made: d
         if path.name in made:
             # It was missing, was recorded again, and is back: the newer one is used.
             key = made[path.name]
-            log.write([_event("redo", file=path.name, gesture=key[0], repetition=key[1], why="made again")])
+            log.write([new_event("redo", file=path.name, gesture=key[0], repetition=key[1], why="made again")])
             progress.discarded.setdefault(key, []).insert(0, path.name)
             continue
         try:
@@ -340,16 +343,16 @@ def _repair_takes(folder: Path, progress: SessionProgress, log: LogFile, made: d
             key = None
         if key is None:
             continue
-        events = [_event("take", file=path.name, gesture=key[0], repetition=key[1], rows=name.rows, found=True)]
+        events = [new_event("take", file=path.name, gesture=key[0], repetition=key[1], rows=name.rows, found=True)]
         if key in progress.takes:
-            events.append(_event("redo", file=progress.takes[key], gesture=key[0], repetition=key[1]))
+            events.append(new_event("redo", file=progress.takes[key], gesture=key[0], repetition=key[1]))
             progress.discarded.setdefault(key, []).append(progress.takes[key])
         log.write(events)
         progress.takes[key] = path.name
         progress.skipped.discard(key)
     for key, file in list(progress.takes.items()):
         if not (folder / file).exists():
-            log.write([_event("mended", file=file, how="the recording is gone", gesture=key[0], repetition=key[1])])
+            log.write([new_event("mended", file=file, how="the recording is gone", gesture=key[0], repetition=key[1])])
             progress.repairs.append(f"'{file}' is missing: record it again")
             del progress.takes[key]
 
@@ -371,11 +374,16 @@ class SessionSummary:
     finished: bool = False
     error: str = ""
 
+    @property
+    def name(self) -> str:
+        """Subject and session, as in ``S01/1``."""
+        return f"{self.folder.parent.name}/{self.folder.name}"
+
 
 def list_sessions(out: Path) -> list[SessionSummary]:
     """Return all sessions in ``out``, the newest first; unreadable ones are included with the reason."""
-    found = [summarize_session(path.parent) for path in sorted(out.glob(f"*/*/{SESSION_HEAD}"))]
-    return sorted(found, key=lambda s: -(s.head.started_ms if s.head is not None else 0))
+    sessions = [summarize_session(path.parent) for path in sorted(out.glob(f"*/*/{SESSION_HEAD}"))]
+    return sorted(sessions, key=lambda s: -(s.head.started_ms if s.head is not None else 0))
 
 
 def summarize_session(folder: Path) -> SessionSummary:

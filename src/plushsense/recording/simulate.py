@@ -99,13 +99,13 @@ def _receive(
     device_ms = np.concatenate([e.device_ms for e in episodes])
     # The recorder writes the last integer of a line unchanged: the delay for firmware without a clock.
     written = device_ms if DEVICE_MS in layout.wire else np.concatenate([e.delay_ms for e in episodes])
-    kept = rng.random(len(values)) >= world.lost + world.garbled
+    arrives = rng.random(len(values)) >= world.lost + world.garbled
     begin = host_ms + (int(rng.integers(0, 20_000_000)) if first else 10)
     # The host's clock drifts a little, and frames arrive 0 to 6 ms late.
     passed = (device_ms - device_ms[0]) * (1.0 + 4e-5 * rng.standard_normal())
     host = begin + np.maximum.accumulate(np.rint(passed + 6.0 * rng.random(len(passed))).astype(np.int64))
-    row_of = np.concatenate(([0], np.cumsum(kept)))
-    return Frames(values[kept], written[kept], host[kept]), row_of, int(np.sum(~kept))
+    row_of = np.concatenate(([0], np.cumsum(arrives)))
+    return Frames(values[arrives], written[arrives], host[arrives]), row_of, int(np.sum(~arrives))
 
 
 def _joined(one: Frames, other: Frames) -> Frames:

@@ -231,7 +231,10 @@ class AutoRecording:
 
 
 class RecordingMachine:
-    """The state machine of a session; `Recorder` adds the commands and describes the arguments."""
+    """The state machine of a session; `Recorder` adds the commands and describes the arguments.
+
+    ``over`` states why the toy sends no more data; "" while it may.
+    """
 
     def __init__(
         self,
@@ -259,7 +262,7 @@ class RecordingMachine:
         self._state: RecorderState = "idle"
         self._paused = False
         self._message = ""
-        self._over = ""
+        self.over = ""
         self._failed = ""
         self._closing = False
         self._received: list[Frame] = []
@@ -356,11 +359,11 @@ class RecordingMachine:
         else:
             self._log("finished", recordings=len(self._plan.takes), skipped=len(self._plan.skipped))
             self._paused = False
-            self._enter("stopped" if self._over else "finished", message)
+            self._enter("stopped" if self.over else "finished", message)
 
     def _ready(self, message: str) -> None:
-        if self._over:
-            self._enter("stopped", self._over)
+        if self.over:
+            self._enter("stopped", self.over)
         else:
             self._enter("paused" if self._paused else "idle", message)
 
@@ -419,7 +422,7 @@ class RecordingMachine:
         with self._notifying():
             if self._closing:
                 return
-            self._over = over
+            self.over = over
             if self._state == "recording":
                 self._stop("toy")
             elif self._state not in ("saving", "stopped"):
@@ -481,12 +484,6 @@ class RecordingMachine:
             self._plan.record(key, file)
             self._changes.append("take")
             self._advance(message)
-
-    def _wait_for_descriptor(self) -> None:
-        with self._notifying():
-            self._show_message(
-                "Too many files are open on this computer: saving waits until some are closed. Nothing is lost."
-            )
 
     def _fail(self, cause: Exception) -> None:
         with contextlib.suppress(OSError):

@@ -44,7 +44,7 @@ from plushsense.core.layouts import Layout
 from plushsense.runtime.decisions import Rules
 from plushsense.runtime.events import AFFECT_CODES, NO_GESTURE
 from plushsense.runtime.fixed import PROBABILITY_BITS, LogitScale, Requantize
-from plushsense.runtime.gate import JERK, GateSettings
+from plushsense.runtime.gate import JERK
 from plushsense.runtime.integer import IntegerNetwork
 
 MAGIC = b"PLSH"
@@ -133,7 +133,7 @@ class IntegerModel:
         """Return what follows the head as (description, bytes) pairs."""
         arch, layout = self.network.arch, self.layout
         units_per_ms = self._units_per_ms
-        found = [
+        sections = [
             (
                 "layers, channels, inputs, classes; step, blocks; span; period, gap, units a ms; smoothing, layout",
                 struct.pack(
@@ -154,36 +154,36 @@ class IntegerModel:
             )
         ]
         for name, low, high in zip(layout.names, layout.valid_min_int, layout.valid_max_int, strict=True):
-            found.append((f"channel '{name}': valid from {low} to {high}", struct.pack("<ii", low, high)))
+            sections.append((f"channel '{name}': valid from {low} to {high}", struct.pack("<ii", low, high)))
         derived = {d.name: tuple(layout.index(part) for part in d.of) for d in layout.derived}
         scale = self.network.inputs
         for i, name in enumerate(layout.inputs):
             parts = derived.get(name) or (layout.index(name),)
             row = (int(getattr(scale, n)[i]) for n in ("offset", "bias", "multiplier", "before", "after"))
             plan = bytes([name in derived, len(parts), *parts])
-            found.append((f"input '{name}': where from; offset, bias, multiplier, shifts", plan))
-            found.append(("", struct.pack("<iiHBB", *row)))
+            sections.append((f"input '{name}': where from; offset, bias, multiplier, shifts", plan))
+            sections.append(("", struct.pack("<iiHBB", *row)))
         for n, (layer, read, part) in enumerate(zip(arch.layers, arch.inputs, self.network.layers, strict=True), 1):
             shape = struct.pack("<HHHH", layer.kernel, layer.dilation, read, layer.filters)
             what = f"kernel {layer.kernel}, dilation {layer.dilation}, reads {read} channels, {layer.filters} filters"
-            found.append((f"layer {n}: {what}", shape))
-            found.append((f"layer {n}: bias, multiplier, shifts of each filter", _scales(part.bias, part.scale)))
+            sections.append((f"layer {n}: {what}", shape))
+            sections.append((f"layer {n}: bias, multiplier, shifts of each filter", _scales(part.bias, part.scale)))
             for first, group in enumerate(grouped_weights(part.weights)):
                 last = min(GROUP * first + GROUP, layer.filters)
                 what = f"layer {n}: weights of filters {GROUP * first + 1} to {last}, tap by tap"
-                found.append((what, group.tobytes()))
+                sections.append((what, group.tobytes()))
         dense = self.network.dense
-        found.append(("dense layer: bias, multiplier, shifts of each class", _scales(dense.bias, dense.scale)))
-        found.append(
+        sections.append(("dense layer: bias, multiplier, shifts of each class", _scales(dense.bias, dense.scale)))
+        sections.append(
             ("dense layer: weights of each class", (dense.weights.astype(np.int16) + 128).astype(np.uint8).tobytes())
         )
         affects = bytes(AFFECT_CODES[g.affect] + (IDLE_BIT if g.idle else 0) for g in self.gestures.gestures)
-        found.append(("affect of each class, 4 more when it is idle", affects))
+        sections.append(("affect of each class, 4 more when it is idle", affects))
         for gesture in self.gestures.gestures:
             idle = ", idle" if gesture.idle else ""
-            found.append((f"class '{gesture.label}', {gesture.affect}{idle}", gesture.label.encode() + b"\0"))
-        found.append((f"title '{arch.title}'", arch.title.encode() + b"\0"))
-        return found + _rules(self.rules)
+            sections.append((f"class '{gesture.label}', {gesture.affect}{idle}", gesture.label.encode() + b"\0"))
+        sections.append((f"title '{arch.title}'", arch.title.encode() + b"\0"))
+        return sections + _rules(self.rules)
 
     def to_bytes(self) -> bytes:
         """Return the image."""
@@ -195,25 +195,25 @@ def _rules(rules: Rules) -> list[tuple[str, bytes]]:
     events, health, gate = rules.events, rules.health, rules.gate
     settings = asdict(events)
     plan = b"".join(struct.pack("<h" if name == "known" else "<H", value) for name, value in settings.items())
-    found = [(f"events: {', '.join(settings)}", plan)]
+    sections = [(f"events: {', '.join(settings)}", plan)]
     times = struct.pack("<HHHBB", health.fault_ms, health.still_ms, health.recover_ms, bool(health.low), 0)
-    found.append(("health: fault, still, recover (ms), whether limits follow", times))
+    sections.append(("health: fault, still, recover (ms), whether limits follow", times))
     if health.low:
         limits = b"".join(struct.pack("<ii", *pair) for pair in zip(health.low, health.high, strict=True))
-        found.append(("health: lowest and highest value of each channel that touches reach", limits))
+        sections.append(("health: lowest and highest value of each channel that touches reach", limits))
     if not gate.rules:
-        return [*found, ("gate: no signals, no rules", bytes(2))]
-    found.append(("gate: signals, rules", bytes([len(gate.signals), len(gate.rules)])))
+        return [*sections, ("gate: no signals, no rules", bytes(2))]
+    sections.append(("gate: signals, rules", bytes([len(gate.signals), len(gate.rules)])))
     for n, s in enumerate(gate.signals, 1):
         row_head = bytes([s.kind, len(s.inputs), *s.inputs, s.lag, s.shift, s.baseline, s.noise])
         what = f"gate: signal {n}, {'jerk' if s.kind == JERK else 'level'}; inputs, lag, shift, baseline, noise, floor"
-        found.append((what, row_head + struct.pack("<I", s.floor)))
+        sections.append((what, row_head + struct.pack("<I", s.floor)))
     for n, r in enumerate(gate.rules, 1):
         row_head = struct.pack("<BBBBH", len(r.terms), r.affect, r.gesture, r.within, r.deaf)
-        found.append((f"gate: rule {n}: terms, affect, gesture, within, deaf", row_head))
+        sections.append((f"gate: rule {n}: terms, affect, gesture, within, deaf", row_head))
         terms = b"".join(struct.pack("<BbBBI", t.signal, t.sign, t.times, 0, t.threshold) for t in r.terms)
-        found.append((f"gate: rule {n}: signal, sign, times, threshold of each term", terms))
-    return found
+        sections.append((f"gate: rule {n}: signal, sign, times, threshold of each term", terms))
+    return sections
 
 
 def layout_check(layout: Layout) -> int:
@@ -242,16 +242,12 @@ def memory_bytes(model: IntegerModel) -> int:
     if health.low or health.still_ms:
         pieces.append(4 * channels)  # the frame before
     if gate.rules:
-        pieces.append(4 * arch.channels * (gate_past(gate) + 1))  # inputs
+        past = max((s.lag for s in gate.signals if s.kind == JERK), default=1)
+        pieces.append(4 * arch.channels * (past + 1))  # inputs
         pieces.append(12 * len(gate.signals))  # baseline, noise, size
         terms = sum(len(rule.terms) for rule in gate.rules)
         pieces += [2 * terms, terms]  # how long each holds, how many in a row
     return sum(_filled(piece) for piece in pieces)
-
-
-def gate_past(gate: GateSettings) -> int:
-    """Return the number of samples that the gate looks back: the longest lag."""
-    return max((s.lag for s in gate.signals if s.kind == JERK), default=1)
 
 
 def _filled(n: int) -> int:

@@ -166,7 +166,10 @@ class Moment:
 
 
 class SampleReader:
-    """Reads the even samples of one stream: gate, network, decision, events."""
+    """Reads the even samples of one stream: gate, network, decision, events.
+
+    ``samples`` counts them since the start or the last break.
+    """
 
     def __init__(self, network: LogitStream, gestures: GestureSet, rules: Rules, smoothing: int) -> None:
         arch = network.arch
@@ -188,23 +191,18 @@ class SampleReader:
     def _restart(self) -> None:
         self._network.reset()
         self._gate.reset()
-        self._samples = 0
+        self.samples = 0
         self._block: list[list[int]] = []  # inputs since the last step: one call of the network for all of them
 
     @property
     def warming(self) -> bool:
         """Whether fewer samples than the span have come since the start or the last break."""
-        return self._samples < self._span
+        return self.samples < self._span
 
     @property
     def in_event(self) -> bool:
         """Whether an event is open."""
         return self._events.open
-
-    @property
-    def samples(self) -> int:
-        """Number of samples since the start or the last break."""
-        return self._samples
 
     def read(self, items: Iterable[Sample | Break]) -> Iterator[Moment]:
         """Read samples and breaks; yield the moments that they bring about."""
@@ -221,7 +219,7 @@ class SampleReader:
 
     def _sample(self, time_us: int, inputs: list[int], suspect: bool) -> list[Moment]:
         moments: list[Moment] = []
-        self._samples += 1
+        self.samples += 1
         fired = self._gate.push(inputs, suspect)
         if fired >= 0:
             rule = self._rules[fired]
@@ -229,7 +227,7 @@ class SampleReader:
             if updates:
                 moments.append(Moment("gate", time_us, updates, rule))
         self._block.append(inputs)
-        if self._samples % self._step == self._phase:
+        if self.samples % self._step == self._phase:
             moments.append(self._decide(time_us, suspect))
         return moments
 

@@ -1,13 +1,15 @@
-"""Scores of events against true intervals: detections, latency, and the cost of errors.
+"""Scores of reported events against true gestures: detections, latency, and the cost of errors.
 
-After Ward, Lukowicz and Gellersen, *Performance metrics for activity recognition*, ACM TIST 2(1), 2011, article 6,
-event analysis. Labels are gestures, families or affects: one level at a time.
+The counts are those of the event analysis of Ward, Lukowicz and Gellersen, *Performance metrics for activity
+recognition*, ACM TIST 2(1), 2011, article 6. Labels are gestures, families or affects; one of these levels is scored at
+a time. A *truth* is a true gesture, an interval with a label.
 
-*Overlap.* A truth lasts from ``start_s`` to ``stop_s``. An event belongs to it when it lasts into it, or begins in it
-or at most ``late_s`` after its end (a reaction to a blow of 0.2 s cannot come sooner), but not after the next
-truth of the same label has begun. An event lasts from when its label was *reported* until its end.
+*Overlap.* An event lasts from the time at which its label was reported to its end. It belongs to a truth if it begins
+before the truth and ends in it or later, or if it begins in the truth or at most ``late_s`` after its end, because a
+reaction to a hit of 0.2 s cannot be faster. It does not belong to a truth if the next truth of the same label has begun
+before the event.
 
-Of each label by itself, with the events and truths of that label that overlap:
+The categories of truths and events of one label that belong together:
 
 ========================  =============================================================================================
 of a truth                of an event
@@ -20,10 +22,10 @@ fragmented and merged     fragmenting and merging
 correct: none of these    correct: none of these
 ========================  =============================================================================================
 
-So every truth and every event is counted once in its column; ``hits`` are truths with an event, ``matched`` events
-with a truth. An event of a wrong label is an insertion and leaves a deletion if nothing else was right. An insertion is
-``confused`` where it overlaps a truth of another label, else ``outside``. An event without a label (a gate, which
-reports an affect, when gestures are scored) is ``unnamed`` where there is any truth: neither right nor wrong.
+Each truth and each event is in one category. ``hits`` are truths with an event, ``matched`` are events with a truth. An
+event with a wrong label is an insertion, and its truth a deletion if no other event was right. An insertion that
+overlaps a truth of another label is ``confused``, any other ``outside``. An event without a label (a gate reports only
+an affect, when gestures are scored) that overlaps a truth is ``unnamed``, neither right nor wrong.
 """
 
 from __future__ import annotations
@@ -41,7 +43,7 @@ LATE_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """A truth, or an event from when its label was reported; ``label`` "" means none on this level."""
+    """A labelled interval: a truth, or an event from the time of its report; ``label`` may be "" for an event."""
 
     start_s: float
     stop_s: float
@@ -50,9 +52,10 @@ class Interval:
 
 @dataclass
 class Tally:
-    """Counts of one label, or of several added up; ``latencies`` in seconds, one for each hit.
+    """Counts of the categories of one label, or the sums over several labels.
 
-    ``early``: hits whose event was reported before the onset; their latency counts as 0.
+    ``latencies`` are the seconds from the onset to the first right event of each hit. ``early`` are hits whose event
+    was reported before the onset; their latency is 0.
     """
 
     truths: int = 0
@@ -95,7 +98,7 @@ class Tally:
 
     @property
     def f1(self) -> float | None:
-        """Harmonic mean of both: 0 without named events, None without truths and events."""
+        """Harmonic mean of recall and precision: 0 without named events, None without truths and events."""
         if not self.truths and not self.events:
             return None
         recall, precision = self.recall or 0.0, self.precision or 0.0
@@ -119,7 +122,7 @@ class Tally:
         }
 
     def kept(self) -> dict[str, Any]:
-        """Return all fields as plain values: what a journal keeps, and `Tally(**kept)` restores."""
+        """Return all fields as plain values, from which ``Tally(**values)`` restores the tally."""
         return {f.name: getattr(self, f.name) for f in fields(self)}
 
 
@@ -179,10 +182,10 @@ def tally(truths: Sequence[Interval], events: Sequence[Interval], late_s: float 
     merged: list[bool] = (same & (per_event > 1)[None, :]).any(axis=1).tolist()
     fragmenting: list[bool] = (same & (per_truth > 1)[:, None]).any(axis=0).tolist()
     anything = [bool(n) for n in over.sum(axis=0)]
-    found: Tallies = {}
+    tallies: Tallies = {}
 
     def at(label: str) -> Tally:
-        return found.setdefault(label, Tally())
+        return tallies.setdefault(label, Tally())
 
     for i, truth in enumerate(truths):
         row = at(truth.label)
@@ -212,7 +215,7 @@ def tally(truths: Sequence[Interval], events: Sequence[Interval], late_s: float 
             row.fragmenting += split and not joined
             row.merging += joined and not split
             row.fragmenting_merging += split and joined
-    return found
+    return tallies
 
 
 def outside_insertions(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Mapping
-from contextlib import AbstractContextManager, closing, nullcontext
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -32,10 +32,13 @@ Progress = Callable[[int, int, dict[str, Any]], None]
 class FittedNetwork:
     """A trained network.
 
-    ``weights`` as ``models/reference`` takes them; ``history`` one row an epoch: epoch (from 1), train_loss,
-    train_accuracy (means over the epoch's batches, as they were trained on), validation_loss, validation_accuracy
-    (None without validation), learning_rate; ``best_epoch`` the one whose weights these are; ``kept`` the weights
-    after the epochs in ``keep``; ``state`` where it can go on from, without early stopping.
+    Attributes:
+        weights: by name, as `plushsense.models.reference.Network` takes them.
+        history: a row for each epoch: epoch (from 1), train_loss and train_accuracy (means over the batches, measured
+            while training), validation_loss and validation_accuracy (None without validation), learning_rate.
+        best_epoch: the epoch of ``weights``.
+        kept: weights after the epochs of ``keep``.
+        state: state to resume the training from; None with early stopping.
     """
 
     weights: dict[str, NDArray[np.float32]]
@@ -58,12 +61,16 @@ def fit(
     save: Callable[[FitState], None] | None = None,
     save_every_s: float = 60.0,
 ) -> FittedNetwork:
-    """Train ``arch`` on ``train``; ``validation`` decides when to stop. The same seed gives the same weights.
+    """Train a network; the same seed gives the same weights.
 
-    ``keep``: epochs after which the weights are kept as well. At a constant rate a long training passes through the
-    end of every shorter one. ``start``: go on from there, with the same windows and settings but more epochs; what
-    comes out is to the last bit what a training without a stop gives. ``save`` gets such a state now and then, with
-    early stopping, too.
+    Args:
+        train: windows to train on.
+        validation: windows that decide when to stop; None or none: all epochs are trained.
+        keep: epochs after which a copy of the weights is stored. With a constant learning rate, these are the weights
+            of trainings with fewer epochs.
+        start: state to resume from, with the same windows and settings but more epochs; the result equals that of an
+            uninterrupted training bit for bit.
+        save: called with such a state every ``save_every_s`` seconds, also with early stopping.
 
     Raises:
         TrainingError: when the windows do not fit the network, or the loss is no longer a number.
@@ -84,7 +91,8 @@ def fit(
         )
     # The fast engine has its own threads, each with one of PyTorch's.
     threads = 1 if is_fast(arch, device) else spec.threads
-    with torch.random.fork_rng(devices=[]), _repeatable(device), torch_threads(threads):
+    repeatable = torch.backends.cudnn.flags(enabled=True, deterministic=True)
+    with torch.random.fork_rng(devices=[]), repeatable, torch_threads(threads):
         torch.manual_seed(spec.seed)
         fresh = Net(arch)
         if start is not None:
@@ -140,13 +148,13 @@ def _state(
     kept: Mapping[int, dict[str, NDArray[np.float32]]],
     best: dict[str, NDArray[np.float32]] | None = None,
 ) -> FitState:
-    held = [adam.state[p] for p in net.parameters if p in adam.state]
+    moments = [adam.state[p] for p in net.parameters if p in adam.state]
     return FitState(
         epoch=len(history),
-        steps=int(held[0]["step"]) if held else 0,
+        steps=int(moments[0]["step"]) if moments else 0,
         weights=net.export_weights(),
-        means=[one["exp_avg"].cpu().numpy().copy() for one in held],
-        squares=[one["exp_avg_sq"].cpu().numpy().copy() for one in held],
+        means=[one["exp_avg"].cpu().numpy().copy() for one in moments],
+        squares=[one["exp_avg_sq"].cpu().numpy().copy() for one in moments],
         random=order.get_state().numpy().copy(),
         history=[dict(row) for row in history],
         kept=dict(kept),
@@ -185,8 +193,7 @@ def predict(
     x, _ = _tensors(windows, scaler, arch, place)
     with torch_threads(1):
         reader = engine(arch, net, place, 1, 1)
-        found: NDArray[np.float32] = F.softmax(reader.logits(x), dim=1).cpu().numpy()
-    return found
+        return np.asarray(F.softmax(reader.logits(x), dim=1).cpu().numpy())
 
 
 def _train(
@@ -268,10 +275,3 @@ def _device(name: str) -> torch.device:
     if name == "cuda" and not torch.cuda.is_available():
         raise TrainingError("There is no CUDA device to train on: use the device 'auto' or 'cpu'.")
     return torch.device(name)
-
-
-def _repeatable(device: torch.device) -> AbstractContextManager[Any]:
-    if device.type != "cuda":
-        return nullcontext()
-    flags: AbstractContextManager[Any] = torch.backends.cudnn.flags(enabled=True, deterministic=True)
-    return flags

@@ -149,8 +149,8 @@ def _straight(x: Tensor, rounded: Tensor) -> Tensor:
 
 def _whole(x: Tensor) -> Tensor:
     """Round to the 8-bit range; values outside it have no gradient."""
-    held = x.clamp(0.0, 255.0)
-    return _straight(held, torch.floor(held + 0.5))
+    clamped = x.clamp(0.0, 255.0)
+    return _straight(clamped, torch.floor(clamped + 0.5))
 
 
 def _rounded(w: Tensor, b: Tensor, unit: Tensor, start: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:

@@ -67,8 +67,7 @@ class RecurrentReader:
             parts = [F.softmax(self.net(x[at]), dim=1) for at in slices(len(x), _READ)]
         if not parts:
             return np.zeros((0, len(windows.labels)), dtype=np.float32)
-        found: NDArray[np.float32] = torch.cat(parts).cpu().numpy()
-        return found
+        return np.asarray(torch.cat(parts).cpu().numpy())
 
 
 def fit_recurrent(

@@ -227,11 +227,12 @@ def fit_decisions(
         fitted = fit_gate(dataset, bundle.gestures, everybody, false_alarms_per_hour=false_alarms_per_hour)
         spec, gate = replace(spec, gate=fitted.plan), fitted.report
     streams = marked_streams(bundle, dataset, people, spec)
+    idle = [k for k, gesture in enumerate(bundle.gestures.gestures) if gesture.idle]
     report: dict[str, Any] = {
         "people": len(people),
         "streams": len(streams),
         "hours": round(sum(h.trace.seconds for h in streams) / 3600, 3),
-        "gestures": sum(_is_gesture(bundle, t) for h in streams for t in h.truths),
+        "gestures": sum(t.gesture not in (OTHER, *idle) for h in streams for t in h.truths),
         "simulated": dataset.head.simulated,
     }
     if streams:
@@ -265,10 +266,6 @@ def fit_decisions(
     if gate is not None:
         report["gate"] = gate
     return replace(spec, fitted=report)
-
-
-def _is_gesture(bundle: Bundle, truth: Truth) -> bool:
-    return truth.gesture != OTHER and not bundle.gestures.gestures[truth.gesture].idle
 
 
 def _round(value: float) -> float | None:

@@ -170,10 +170,10 @@ def fit_gate(
     believed = True
     for affect in dict.fromkeys(g.affect for g in gestures.gestures if g.energetic):
         labels = [g.label for g in gestures.gestures if g.energetic and g.affect == affect]
-        found, used = _rules_of(candidates, labels, spec)
+        rules_found, used = _rules_of(candidates, labels, spec)
         believed = believed and used
         gesture = gestures.index(labels[0]) if len(labels) == 1 else NO_GESTURE
-        for rule in found:
+        for rule in rules_found:
             terms = []
             for column, threshold in rule.terms:
                 signal, sign = candidates.candidates[column]
@@ -203,18 +203,18 @@ def _rules_of(candidates: _Candidates, labels: list[str], spec: GateSpec) -> tup
         heights, hours = candidates.heights(labels, believed)
         n_trials = len(np.unique(heights.trials))
         left = int(hours * spec.false_alarms_per_hour)
-        found: list[FoundRule] = []
-        while len(found) < spec.rules:
+        rules: list[FoundRule] = []
+        while len(rules) < spec.rules:
             rule = best_rule(heights, left, candidates.layout.rate_hz)
-            least = spec.least * n_trials if not found else max(2.0, spec.gain * n_trials)
+            least = spec.least * n_trials if not rules else max(2.0, spec.gain * n_trials)
             if rule is None or rule.near < least:
                 break
-            found.append(rule)
+            rules.append(rule)
             left -= rule.alarms
             heights = heights.without(rule)
-        hits = sum(rule.hits for rule in found)
+        hits = sum(rule.hits for rule in rules)
         if hits > best[0] + spec.worth * n_trials:
-            best = hits, found, believed
+            best = hits, rules, believed
         if hits >= 0.9 * n_trials or not candidates.between:
             break
     return best[1], best[2]
@@ -231,8 +231,8 @@ class _Candidates:
         self.between = material.hours(BETWEEN) > 0
         self._xs = [s.x for s in material.stretches]
         candidates = self._signs(self._floors(signals_of(layout, spec), spec))
-        kept = self._promising(candidates, spec)
-        self.candidates = [candidates[k] for k in kept]
+        promising = self._promising(candidates, spec)
+        self.candidates = [candidates[k] for k in promising]
         self._sizes = [self._lasting(sizes) for sizes in self._signed(self._xs, self.candidates)]
 
     def _signed(self, xs: list[NDArray[np.int64]], candidates: list[tuple[Signal, int]]) -> list[Ints32]:
@@ -249,10 +249,10 @@ class _Candidates:
         for back in range(1, self.times):
             lasting[back:] = np.minimum(lasting[back:], sizes[:-back])
             lasting[:back] = 0
-        held = lasting.copy()
+        highest = lasting.copy()
         for back in range(1, self.within + 1):
-            held[back:] = np.maximum(held[back:], lasting[:-back])
-        return held
+            highest[back:] = np.maximum(highest[back:], lasting[:-back])
+        return highest
 
     def _floors(self, signals: list[Signal], spec: GateSpec) -> list[Signal]:
         """Return each signal at each floor, held within the range of the gate."""
@@ -298,14 +298,14 @@ class _Candidates:
         lax = min(len(calms), 1 + 20 * (1 + int(spec.false_alarms_per_hour * len(calms) / 7200)))
         needed = np.partition(calms, len(calms) - lax, axis=0)[len(calms) - lax] if len(calms) else 0
         order = np.argsort(-(roughs > needed).mean(axis=0), kind="stable").tolist()
-        kept: list[int] = []
+        best: list[int] = []
         seen: list[Signal] = []
         for k in order:
             signal = replace(candidates[k][0], floor=1)
-            if seen.count(signal) < _FLOORS and len(kept) < _MOST:
-                kept.append(k)
+            if seen.count(signal) < _FLOORS and len(best) < _MOST:
+                best.append(k)
                 seen.append(signal)
-        return kept
+        return best
 
     def heights(self, labels: list[str], between: bool) -> tuple[Heights, float]:
         """Return the sizes on which rules for ``labels`` are chosen, and the hours of calm samples among them."""

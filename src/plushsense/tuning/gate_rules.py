@@ -64,13 +64,13 @@ def material_of(dataset: Dataset, gestures: GestureSet, subjects: Collection[str
     stretches: list[Stretch] = []
 
     def kind(r: RecordingInfo) -> int:
-        found = gestures.find(r.gesture)
-        if r.id not in in_time or found is None or found.free_choice:
+        gesture = gestures.find(r.gesture)
+        if r.id not in in_time or gesture is None or gesture.free_choice:
             return LEFT_OUT
-        if found.energetic:
-            trials.append((r.id, found.label))
+        if gesture.energetic:
+            trials.append((r.id, gesture.label))
             return len(trials) - 1
-        calm.append((r.id, found.label))
+        calm.append((r.id, gesture.label))
         return CALM
 
     def add(subject: str, segments: list[Segment], rows: list[tuple[int, int, RecordingInfo]], rest: int) -> None:
@@ -156,10 +156,10 @@ class Heights:
         loud = (calm >= least).any(axis=1)
         return cls(calm[loud], chunks[loud], rough, trials, delays, least, apart)
 
-    def without(self, found: FoundRule) -> Heights:
+    def without(self, rule: FoundRule) -> Heights:
         """Return the heights without the chunks and trials in which a rule fires already."""
-        calm = ~np.isin(self.chunks, self.chunks[found.holds(self.calm)])
-        rough = ~np.isin(self.trials, self.trials[found.holds(self.rough)])
+        calm = ~np.isin(self.chunks, self.chunks[rule.holds(self.calm)])
+        rough = ~np.isin(self.trials, self.trials[rule.holds(self.rough)])
         left = self.rough[rough], self.trials[rough], self.delays[rough]
         return Heights(self.calm[calm], self.chunks[calm], *left, self.least, self.apart)
 
@@ -223,11 +223,11 @@ def best_rule(heights: Heights, alarms: int, rate_hz: float) -> FoundRule | None
         seen.add((first, second))
         if len(seen) > _SHORTLIST:
             break
-        found = _settle(heights, first, threshold, second, alarms)
-        if found is not None:
-            worth = found.near / n_trials - _PER_SECOND * found.delay / rate_hz
+        rule = _settle(heights, first, threshold, second, alarms)
+        if rule is not None:
+            worth = rule.near / n_trials - _PER_SECOND * rule.delay / rate_hz
             if best is None or worth > best[0]:
-                best = worth, found
+                best = worth, rule
     return best[1] if best else None
 
 
@@ -248,15 +248,15 @@ def _settle(heights: Heights, first: int, threshold: int, second: int, alarms: i
             return None
         middle = round((needed * float(np.percentile(passing, 1))) ** 0.5)
         terms[column] = max(needed, min(int(passing.min()), middle))
-    found = FoundRule(tuple(terms.items()))
-    right = found.holds(heights.rough)
+    rule = FoundRule(tuple(terms.items()))
+    right = rule.holds(heights.rough)
     trials, at = np.unique(heights.trials[right], return_index=True)
-    careless = found.times(_NEARBY[0]).alarms_in(heights)
+    careless = rule.times(_NEARBY[0]).alarms_in(heights)
     if not len(trials) or careless > _CARELESS * alarms + 1:
         return None
-    near = [len(np.unique(heights.trials[found.times(f).holds(heights.rough)])) for f in _NEARBY]
+    near = [len(np.unique(heights.trials[rule.times(f).holds(heights.rough)])) for f in _NEARBY]
     delay = float(np.median(heights.delays[right][at]))
-    return FoundRule(found.terms, len(trials), float(np.mean(near)), found.alarms_in(heights), delay)
+    return FoundRule(rule.terms, len(trials), float(np.mean(near)), rule.alarms_in(heights), delay)
 
 
 def _highest(heights: Ints32, groups: Whole) -> tuple[Ints32, Whole]:

@@ -194,8 +194,8 @@ def _positions(
             elif labels[at] == FREE:
                 free.append(_Place(x, segment, at))
                 lively.append(float(moved[at - 1]))
-    kept = np.sort(np.argsort(lively, kind="stable")[: len(free) - round(spec.busy_share * len(free))])
-    return held, [free[at] for at in kept.tolist()]
+    quietest = np.sort(np.argsort(lively, kind="stable")[: len(free) - round(spec.busy_share * len(free))])
+    return held, [free[at] for at in quietest.tolist()]
 
 
 def position_labels(

@@ -135,12 +135,12 @@ def resample(frames: Frames, layout: Layout) -> list[Segment]:
     step = np.diff(time)
     breaks = np.flatnonzero((step < 0) | (step > layout.gap_ms * 1000)) + 1
     edges = [0, *breaks.tolist(), len(time)]
-    found = []
+    segments = []
     for first, last in itertools.pairwise(edges):
         segment = _segment(time[first:last], frames.values[first:last], layout, first)
         if segment is not None:
-            found.append(segment)
-    return found
+            segments.append(segment)
+    return segments
 
 
 def hold_valid(values: NDArray[np.int64], layout: Layout) -> tuple[NDArray[np.int64], int, int]:
@@ -152,15 +152,15 @@ def hold_valid(values: NDArray[np.int64], layout: Layout) -> tuple[NDArray[np.in
     source = np.maximum.accumulate(np.where(good, rows, -1), axis=0)
     usable = np.flatnonzero((source >= 0).all(axis=1))
     first = int(usable[0]) if len(usable) else len(values)
-    held = np.take_along_axis(values, np.maximum(source, 0), axis=0)
-    return held, first, int((~good).sum())
+    valid_values = np.take_along_axis(values, np.maximum(source, 0), axis=0)
+    return valid_values, first, int((~good).sum())
 
 
 def _segment(time: NDArray[np.int64], values: NDArray[np.int64], layout: Layout, offset: int) -> Segment | None:
-    held, first, invalid = hold_valid(values, layout)
+    valid_values, first, invalid = hold_valid(values, layout)
     if first >= len(time):
         return None
-    time, held = time[first:], held[first:]
+    time, valid_values = time[first:], valid_values[first:]
     period = layout.period_us
     # Equal stamps: the first row closes an interval, the last one opens the next.
     opens = np.flatnonzero(np.append(np.diff(time) > 0, True))
@@ -169,12 +169,12 @@ def _segment(time: NDArray[np.int64], values: NDArray[np.int64], layout: Layout,
     due = np.arange(time[0], time[-1] + 1, period, dtype=np.int64)
     right = np.searchsorted(moments, due, side="left")
     left = np.maximum(right - 1, 0)
-    a = held[opens[left]]
-    b = held[closes[right]]
+    a = valid_values[opens[left]]
+    b = valid_values[closes[right]]
     between = np.maximum(moments[right] - moments[left], 1)[:, None]
     into = (2 * (due - moments[left]))[:, None]
     data = a + ((b - a) * into + between) // (2 * between)
-    data[0] = held[0]
+    data[0] = valid_values[0]
     return Segment(
         data,
         int(time[0]),

@@ -217,14 +217,14 @@ def cut_windows(
 def drop_long_recordings(recordings: list[RecordingInfo], spec: WindowSpec) -> tuple[list[RecordingInfo], list[str]]:
     """Split recordings into those to cut and descriptions of those that were not stopped in time."""
     usual = usual_rows((r.gesture, r.stop - r.start) for r in recordings)
-    kept, left_out = [], []
+    in_time, left_out = [], []
     for r in recordings:
         own_file = r.file.startswith(f"{RECORDINGS}/")
         if spec.longest_factor and own_file and r.stop - r.start > spec.longest_factor * usual[r.gesture]:
             left_out.append(f"{r.id}: {r.stop - r.start} rows where {r.gesture} usually has {usual[r.gesture]:.0f}")
         else:
-            kept.append(r)
-    return kept, left_out
+            in_time.append(r)
+    return in_time, left_out
 
 
 def recordings_in_time(recordings: list[RecordingInfo], spec: WindowSpec | None = None) -> list[RecordingInfo]:
@@ -275,7 +275,7 @@ def shared_gestures(dataset: Dataset, share: float = 0.9) -> tuple[GestureSet, d
     recorded without a person.
     """
     people = dataset.subjects
-    kept, left_out = [], {}
+    shared, left_out = [], {}
     for gesture in dataset.gestures.gestures:
         made = {r.subject for r in dataset.used if r.gesture == gesture.label}
         if gesture.free_choice:
@@ -283,7 +283,7 @@ def shared_gestures(dataset: Dataset, share: float = 0.9) -> tuple[GestureSet, d
         elif not made:
             left_out[gesture.label] = "no recording"
         elif gesture.nobody or len(made & set(people)) >= share * len(people):
-            kept.append(gesture.label)
+            shared.append(gesture.label)
         else:
             left_out[gesture.label] = f"made by {len(made & set(people))} of {len(people)} people"
-    return dataset.gestures.subset(kept), left_out
+    return dataset.gestures.subset(shared), left_out

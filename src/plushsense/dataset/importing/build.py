@@ -40,8 +40,8 @@ DEVICE_NAME = re.compile(r"^(con|prn|aux|nul|com[0-9¹²³]|lpt[0-9¹²³]|conin
 
 def folder_name(code: str, otherwise: str = UNKNOWN_SUBJECT) -> str:
     """Return a code as a folder name that is valid on any system and cannot leave the data set."""
-    kept = "".join(c if c.isalnum() or c in "-_. " else "_" for c in code).strip(" .")
-    return f"{kept}_" if DEVICE_NAME.match(kept) else kept or otherwise
+    name = "".join(c if c.isalnum() or c in "-_. " else "_" for c in code).strip(" .")
+    return f"{name}_" if DEVICE_NAME.match(name) else name or otherwise
 
 
 def session_folder(session: str) -> str:
@@ -50,15 +50,15 @@ def session_folder(session: str) -> str:
     return f"session-{name}" if name.startswith(DUPLICATE_FOLDER) else name
 
 
-def refuse_merged(found: Sequence[SourceFile], there: Iterable[str] = ()) -> None:
+def refuse_merged(files: Sequence[SourceFile], there: Iterable[str] = ()) -> None:
     """Refuse codes of people or sessions that would share a folder name.
 
     ``there`` are the folders of people that a data set has already.
     """
     codes = {(folder.casefold(), ""): folder for folder in there}
     not_met = set(codes)
-    folders = [("people", f.subject, folder_name(f.subject), "") for f in found]
-    folders += [("sessions", f.session, session_folder(f.session), folder_name(f.subject)) for f in found if f.session]
+    folders = [("people", f.subject, folder_name(f.subject), "") for f in files]
+    folders += [("sessions", f.session, session_folder(f.session), folder_name(f.subject)) for f in files if f.session]
     for what, code, folder, within in folders:
         if len(folder.encode("utf-8")) > _LONGEST:
             raise DatasetError(f"The code '{code[:40]}…' is too long: codes of {what} have {_LONGEST} bytes at most.")
@@ -96,30 +96,30 @@ class Copier:
     companions: dict[str, list[Path]] = field(default_factory=dict)
     """Sources of the companions of each copied file."""
 
-    def copy(self, found: SourceFile) -> str:
+    def copy(self, file: SourceFile) -> str:
         """Copy one file and return "", or the reason why not; companions come after the file that they belong to."""
         try:
-            raw = found.source.read_bytes()
+            raw = file.source.read_bytes()
         except OSError as cause:
             return f"cannot be read: {cause.strerror or cause}"
         content = hashlib.sha256(raw).hexdigest()
-        if (existing := self.contents.get((found.kind, content))) is not None:
-            self.already[found.source] = existing
+        if (existing := self.contents.get((file.kind, content))) is not None:
+            self.already[file.source] = existing
             return ""
-        folder = self._folder(found)
+        folder = self._folder(file)
         if folder is None:
-            return ORPHAN.format(found.beside.name if found.beside else "")
-        companion = found.kind == COMPANIONS
-        name = found.source.name
+            return ORPHAN.format(file.beside.name if file.beside else "")
+        companion = file.kind == COMPANIONS
+        name = file.source.name
         place, again = folder, 1
         while (key := key_of(f"{place}/{name}", companion=companion)) in self.taken:
             if self.taken[key] == content:
                 if companion or self.contents:
-                    self.already[found.source] = f"{place}/{name}"
+                    self.already[file.source] = f"{place}/{name}"
                     return ""
                 return TWICE
             if (longer := self._continues(f"{place}/{name}", raw)) is False:
-                self.already[found.source] = f"{place}/{name}"
+                self.already[file.source] = f"{place}/{name}"
                 return ""
             if longer:
                 self.grown.add(f"{place}/{name}")
@@ -130,9 +130,9 @@ class Copier:
         target = self.work / place / name
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_bytes(raw)
-        self.copied[found.source] = f"{place}/{name}"
-        if companion and found.beside is not None:
-            self.companions.setdefault(self.copied.get(found.beside, ""), []).append(found.source)
+        self.copied[file.source] = f"{place}/{name}"
+        if companion and file.beside is not None:
+            self.companions.setdefault(self.copied.get(file.beside, ""), []).append(file.source)
         return ""
 
     def _continues(self, file: str, raw: bytes) -> bool | None:
@@ -150,13 +150,13 @@ class Copier:
         begins = shorter[: shorter.rfind(b"\n") + 1]
         return longer is raw if begins and longer.startswith(begins) else None
 
-    def _folder(self, found: SourceFile) -> str | None:
+    def _folder(self, file: SourceFile) -> str | None:
         """Return the folder of the data set that a file goes to; None for a companion whose file was not copied."""
-        if found.beside is not None:
-            main = self.copied.get(found.beside) or self.already.get(found.beside)
+        if file.beside is not None:
+            main = self.copied.get(file.beside) or self.already.get(file.beside)
             return None if main is None else main.rpartition("/")[0]
-        folder = f"{STREAMS if found.kind == COMPANIONS else found.kind}/{folder_name(found.subject)}"
-        return f"{folder}/{session_folder(found.session)}" if found.session else folder
+        folder = f"{STREAMS if file.kind == COMPANIONS else file.kind}/{folder_name(file.subject)}"
+        return f"{folder}/{session_folder(file.session)}" if file.session else folder
 
 
 def key_of(path: str, *, companion: bool) -> str:
@@ -230,8 +230,8 @@ class ImportedFiles:
             elif found.source in copier.copied:
                 self._origin[copier.copied[found.source]] = found
 
-    def reject(self, found: SourceFile, reason: str) -> None:
-        self.rejected.append({"file": found.origin, "reason": reason})
+    def reject(self, file: SourceFile, reason: str) -> None:
+        self.rejected.append({"file": file.origin, "reason": reason})
 
     def drop(self, unreadable: Mapping[str, str]) -> None:
         """Remove unreadable files and their companions from the work folder."""

@@ -219,9 +219,9 @@ class ImportOptions:
     columns: Mapping[str, str] = field(default_factory=dict)
     limits: UnpackLimits = field(default_factory=UnpackLimits)
 
-    def known_layout(self, found: Layout | None = None) -> Layout:
+    def known_layout(self, own: Layout | None = None) -> Layout:
         """Return the layout that was found or requested; raise ConfigError if there is none."""
-        if (layout := found or self.layout) is None:
+        if (layout := own or self.layout) is None:
             raise ConfigError(
                 f"--layout is needed, since only sessions of plushsense record name theirs: accepted are "
                 f"{', '.join(layout_names())}, or a TOML file of your own."
@@ -251,14 +251,14 @@ def scan_folder(source: Path, options: ImportOptions, *, around: Path | None = N
     plain = [f for f in rest if f.suffix.lower() != ".xdf"]
     mapping = None if options.mapping is None else dict(options.mapping)
     shape = "labelled-rows" if layout.is_labelled else "gesture-recorder"
-    found = (
+    classified = (
         refused
         + list(classify_session_files(sessions, in_session))
         + classify_files(shape, source, plain, mapping, gestures)
     )
-    found = [replace(f, origin=printable_path(f.source.relative_to(source))) for f in found]
+    classified = [replace(f, origin=printable_path(f.source.relative_to(source))) for f in classified]
     people, notes = people_of(sessions)
-    search = SourceScan(layout, gestures, shape if rest else "sessions", found, people, notes=notes)
+    search = SourceScan(layout, gestures, shape if rest else "sessions", classified, people, notes=notes)
     for file in (f for f in rest if f.suffix.lower() == ".xdf"):
         name = printable_path(file.relative_to(source))
         person = None if file.parent == around else file.parent.resolve().name

@@ -148,13 +148,13 @@ def _nobodys_folders(files: Iterable[Path], gestures: GestureSet | None) -> set[
     return with_nobody - with_people
 
 
-def _refuse_unclear_people(source: Path, found: Iterable[SourceFile], *, nested: bool) -> None:
+def _refuse_unclear_people(source: Path, files: Iterable[SourceFile], *, nested: bool) -> None:
     """Refuse folders that do not identify the person, so that people are neither merged nor split.
 
     With ``nested``, also refuse a folder of recordings inside another one.
     """
     folders: dict[str, Path] = {}
-    for f in found:
+    for f in files:
         if not f.kind or f.subject in (NOBODY, UNKNOWN_SUBJECT):
             continue
         other = folders.setdefault(f.subject.casefold(), f.source.parent)
@@ -245,10 +245,10 @@ def classify_files(
     Raises:
         DatasetError: when the folders do not identify the person.
     """
-    found = list(CLASSIFIERS[shape](source, files, subjects, gestures))
+    classified = list(CLASSIFIERS[shape](source, files, subjects, gestures))
     if subjects is None:
-        _refuse_unclear_people(source, found, nested=shape == "gesture-recorder")
-    return found
+        _refuse_unclear_people(source, classified, nested=shape == "gesture-recorder")
+    return classified
 
 
 def read_mapping(path: Path) -> dict[str, str]:

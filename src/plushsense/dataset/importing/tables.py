@@ -193,11 +193,11 @@ def choose_columns(there: list[str], layout: Layout, given: Mapping[str, str], d
     for role, names in candidates.items():
         if role in given:
             names = (given[role],)
-        found = next((n.strip().casefold() for n in names if n.strip().casefold() in plain), None)
-        if found is not None and plain.count(found) > 1:
-            raise FileFormatError(f"'{display_name}' has two columns '{found}': rename one of them")
-        if found is not None:
-            chosen[role] = there[plain.index(found)]
+        match = next((n.strip().casefold() for n in names if n.strip().casefold() in plain), None)
+        if match is not None and plain.count(match) > 1:
+            raise FileFormatError(f"'{display_name}' has two columns '{match}': rename one of them")
+        if match is not None:
+            chosen[role] = there[plain.index(match)]
         elif role in given or role in ("label", "time") or role in layout.names:
             if not any(plain):
                 raise FileFormatError(f"'{display_name}' begins with no line of column names: a table needs a header")
@@ -287,8 +287,7 @@ def _parquet_numbers(pl: Any, column: Any) -> NDArray[np.float64]:
     if column.dtype.is_temporal():
         microseconds = column.dt.total_microseconds() if column.dtype == pl.Duration else column.dt.epoch("us")
         column = microseconds.cast(pl.Float64) / 1000.0
-    numbers: NDArray[np.float64] = column.cast(pl.Float64, strict=False).fill_null(float("nan")).to_numpy()
-    return numbers
+    return np.asarray(column.cast(pl.Float64, strict=False).fill_null(float("nan")).to_numpy())
 
 
 def milliseconds(name: str, times: NDArray[np.float64], rate_hz: float) -> tuple[float, str]:

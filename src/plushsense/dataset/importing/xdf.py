@@ -87,8 +87,8 @@ def _named(text: str, gestures: GestureSet | None) -> str:
     begin = _BEGIN.match(text)
     named = (begin["a"] or begin["b"]) if begin else text
     if gestures is not None:
-        found = gestures.find(text) or gestures.find(named)
-        return found.label if found else ""
+        gesture = gestures.find(text) or gestures.find(named)
+        return gesture.label if gesture else ""
     return "" if _END.match(named) or len(named) > LONGEST_LABEL // 2 else named
 
 

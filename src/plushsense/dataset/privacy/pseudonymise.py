@@ -389,8 +389,8 @@ def find_traces(
         # A layout's title can resemble a code; names and ids must not contain one.
         if content.person in old:
             yield path, content.person
-        for found in (*names.find_in(path), *dates_in(path)):
-            yield path, found
+        for trace in (*names.find_in(path), *dates_in(path)):
+            yield path, trace
         data = (folder / path).read_bytes()
         stamps = np.array(_TIMES.findall(data), dtype="S14").astype(np.int64)
         at = np.searchsorted(known, stamps).clip(max=max(len(known) - 1, 0))
@@ -402,5 +402,5 @@ def find_traces(
             text = data.decode("utf-8", "replace")
             # The index's stamp holds the time at which the new files were written.
             found_in = [*names.find_in(text), *(() if content.path.name == STAMP else dates_in(text))]
-        for found in dict.fromkeys(found_in):
-            yield path, found
+        for trace in dict.fromkeys(found_in):
+            yield path, trace

@@ -164,8 +164,8 @@ class Redactor:
         if isinstance(value, dict):
             # The text cut off a torn line can be a fragment of a date.
             torn = value.get("what") == _MENDED
-            kept = {k: v for k, v in value.items() if not (torn and k == "text")}
-            return {self.text(str(k)): self.value(v, str(k), where) for k, v in kept.items()}
+            remaining = {k: v for k, v in value.items() if not (torn and k == "text")}
+            return {self.text(str(k)): self.value(v, str(k), where) for k, v in remaining.items()}
         if isinstance(value, list):
             return [self.value(v, key, where) for v in value]
         if isinstance(value, str):

@@ -162,11 +162,11 @@ def check_folder(
     root: Path, *, thorough: bool = False, packed: bool = False, progress: StageProgress | None = None
 ) -> ValidationResult:
     """Validate the folder of a package; ``packed``: it was unpacked from a zip."""
+    progress = progress or (lambda stage, done, total: None)
     checked = ValidationResult()
     package = PackageView(root, thorough, packed)
     for number, (name, validator) in enumerate(VALIDATORS.items()):
-        if progress is not None:
-            progress(f"validating: {name}", number, len(VALIDATORS))
+        progress(f"validating: {name}", number, len(VALIDATORS))
         began = time.perf_counter()
         package.problems, package.looked_at = [], ""
         try:
@@ -186,8 +186,7 @@ def check_folder(
                 "seconds": round(time.perf_counter() - began, 2),
             }
         )
-    if progress is not None:
-        progress("validating", len(VALIDATORS), len(VALIDATORS))
+    progress("validating", len(VALIDATORS), len(VALIDATORS))
     return checked
 
 

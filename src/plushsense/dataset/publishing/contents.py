@@ -31,7 +31,6 @@ from plushsense.core.recorder_csv import (
 )
 from plushsense.dataset.index import DUPLICATE_FOLDER, build_index
 from plushsense.dataset.marks import MARKS, Mark, MarkState, read_marks
-from plushsense.dataset.publishing.description import DATA
 from plushsense.dataset.store import (
     HEAD,
     PEOPLE,
@@ -129,25 +128,20 @@ class PackageContents:
     notes: tuple[str, ...]
 
 
-def write_contents(
-    dataset: Dataset, root: Path, head: DatasetHead, options: PublishOptions, progress: Progress | None = None
-) -> PackageContents:
-    """Write the published data set into ``root/data``; every file is read back and compared.
+class ContentsWriter:
+    """Writes the published data set into the new ``folder``; every file is read back and compared.
 
     Raises:
         DatasetError: when nothing would be left, or a file does not come back as it was.
     """
-    return _ContentsWriter(dataset, root / DATA, head, options, progress).run()
 
-
-class _ContentsWriter:
     def __init__(
-        self, dataset: Dataset, folder: Path, head: DatasetHead, options: PublishOptions, progress: Progress | None
+        self, dataset: Dataset, folder: Path, head: DatasetHead, options: PublishOptions, progress: Progress
     ) -> None:
         self.source = dataset
         self.folder = folder
         self.options = options
-        self.progress = progress or (lambda done, total: None)
+        self.progress = progress
         self.labelled = dataset.layout.is_labelled
         self.notes: list[str] = []
         if self.labelled and not options.streams:
@@ -162,13 +156,14 @@ class _ContentsWriter:
         columns = (*clocks, *dataset.layout.names, *(("label",) if self.labelled else ()))
         self.layout = replace(dataset.layout, csv=CsvFormat(columns, columns, ","))
         self.head = replace(head, layout=self.layout, source="")
-        held = {_folder_of(r.file) for r in self.kept} | {_folder_of(s.file) for s in self.streams}
-        self.codes = {folder: public for folder, public in public_codes(dataset).items() if folder in held}
+        folders = {_folder_of(r.file) for r in self.kept} | {_folder_of(s.file) for s in self.streams}
+        self.codes = {folder: public for folder, public in public_codes(dataset).items() if folder in folders}
         self.shifts = self._shifts()
         self.sessions = self._sessions()
         self.taken: set[str] = set()
 
-    def run(self) -> PackageContents:
+    def write(self) -> PackageContents:
+        """Write all files and return what was written."""
         infos: list[StreamInfo | RecordingInfo] = [*self.streams, *([] if self.labelled else self.kept)]
         files: dict[str, str] = {}
         for done, info in enumerate(infos, 1):

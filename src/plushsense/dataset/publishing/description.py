@@ -114,8 +114,8 @@ class Description:
     @property
     def name(self) -> str:
         """A short name for files and identifiers."""
-        kept = "".join(c if c.isascii() and c.isalnum() else "-" for c in self.dataset.head.name.lower())
-        return "-".join(part for part in kept.split("-") if part) or "dataset"
+        plain = "".join(c if c.isascii() and c.isalnum() else "-" for c in self.dataset.head.name.lower())
+        return "-".join(part for part in plain.split("-") if part) or "dataset"
 
     @property
     def version(self) -> str:

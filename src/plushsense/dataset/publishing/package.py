@@ -7,6 +7,7 @@ import time
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from datetime import date
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,12 @@ from plushsense.core.files import new_folder
 from plushsense.core.gestures import NOBODY
 from plushsense.core.recorder_csv import SIMULATION_MARK
 from plushsense.dataset.about import Contact
-from plushsense.dataset.publishing.checking import StageProgress, ValidationResult, check_folder
-from plushsense.dataset.publishing.contents import PublishOptions, write_contents
+from plushsense.dataset.publishing.checking import EXTRA, StageProgress, ValidationResult, check_folder
+from plushsense.dataset.publishing.contents import ContentsWriter, PublishOptions
 from plushsense.dataset.publishing.croissant import CROISSANT_FILE, croissant
 from plushsense.dataset.publishing.description import (
     CHECKSUMS,
+    DATA,
     LICENCE,
     README,
     REIDENTIFICATION,
@@ -47,7 +49,6 @@ from plushsense.dataset.publishing.metadata import (
 from plushsense.dataset.publishing.tables import list_package_files, write_checksums, write_tables, write_zip
 from plushsense.dataset.store import HEAD, UNKNOWN_SUBJECT, Dataset, DatasetHead, PersonInfo
 
-EXTRA = "publish"
 # In smaller groups, age group and gender alone may identify a person.
 FEWEST_ALIKE = 3
 _VERSION = re.compile(r"(0|[1-9]\d*)\.(0|[1-9]\d*)\.(0|[1-9]\d*)([-+][0-9A-Za-z.+-]+)?")
@@ -185,7 +186,7 @@ def publish(
     options = options or PublishOptions()
     day = published or date.today().isoformat()
     with new_folder(out, DatasetError) as work:
-        contents = write_contents(dataset, work, head, options, lambda done, total: progress("writing", done, total))
+        contents = ContentsWriter(dataset, work / DATA, head, options, partial(progress, "writing")).write()
         d = Description(
             contents.dataset,
             find_licence(head.licence),
@@ -215,17 +216,17 @@ def publish(
     )
 
 
-def _write_texts(work: Path, d: Description, source: Dataset, found: Reidentification | None) -> None:
-    write_text(work / README, readme(d, found.short if found else None))
+def _write_texts(work: Path, d: Description, source: Dataset, reidentification: Reidentification | None) -> None:
+    write_text(work / README, readme(d, reidentification.short if reidentification else None))
     own = next((source.path / name for name in _LICENCE_FILES if (source.path / name).is_file()), None)
     text = own.read_text(encoding="utf-8", errors="replace") if own else fill_template("LICENSE.txt.j2", d)
     write_text(work / LICENCE, text)
     if d.simulated:
         write_text(work / SIMULATION_MARK, f"{SIMULATION}\n")
-    if found is not None:
+    if reidentification is not None:
         banner = f"**{SIMULATION}**\n\n" if d.simulated else ""
-        write_text(work / REIDENTIFICATION, banner + found.report)
-        write_json(work / REIDENTIFICATION_JSON, found.figures)
+        write_text(work / REIDENTIFICATION, banner + reidentification.report)
+        write_json(work / REIDENTIFICATION_JSON, reidentification.figures)
 
 
 def _write_metadata(work: Path, d: Description) -> None:

@@ -17,7 +17,7 @@ from plushsense.dataset.quality.measurements import (
     RecordingSummary,
     gesture_of,
 )
-from plushsense.dataset.store import UNKNOWN_SUBJECT, RecordingInfo
+from plushsense.dataset.store import UNKNOWN_SUBJECT, RecordingInfo, StreamInfo
 
 _ENOUGH = 4
 _FLAT_ROWS = 20
@@ -107,22 +107,16 @@ def flat(w: DatasetSummary) -> Iterator[Issue]:
             channels=(int(c),),
             severity="warning",
         )
-    for o, row in zip(long, constant, strict=True):
-        dead = np.flatnonzero(row & ~always)
+    for o in (*long, *(s for s in w.streams if s.rows >= _FLAT_ROWS)):
+        dead = np.flatnonzero((o.runs >= o.rows) & ~always)
         if len(dead):
+            stream = isinstance(o.info, StreamInfo)
             yield Issue(
-                f"{_channels(names, dead)} {'has' if len(dead) == 1 else 'have'} one value throughout",
-                ((o.first_row, o.first_row + o.rows),),
+                f"{_channels(names, dead)} {'has' if len(dead) == 1 else 'have'} one value throughout"
+                f"{' the session' if stream else ''}",
+                () if stream else ((o.first_row, o.first_row + o.rows),),
                 tuple(dead.tolist()),
                 o.info.id,
-            )
-    for o in w.streams:
-        dead = np.flatnonzero((o.runs >= o.rows) & ~always)
-        if o.rows >= _FLAT_ROWS and len(dead):
-            yield Issue(
-                f"{_channels(names, dead)} {'has' if len(dead) == 1 else 'have'} one value throughout the session",
-                channels=tuple(dead.tolist()),
-                about=o.info.id,
             )
 
 
@@ -138,17 +132,17 @@ def stuck(w: DatasetSummary) -> Iterator[Issue]:
     names = w.dataset.layout.names
     limit = np.maximum(w.limits.stuck_s * 1000, 10 * w.usual_run_ms)
     for o, least in [(o, limit) for o in w.recordings] + [(o, 4 * limit) for o in w.streams]:
-        held = o.runs * o.period_ms
-        found = np.flatnonzero((held > least) & (o.runs < o.rows))
-        if not len(found):
+        run_ms = o.runs * o.period_ms
+        affected = np.flatnonzero((run_ms > least) & (o.runs < o.rows))
+        if not len(affected):
             continue
-        c = int(found[np.argmax(held[found])])
+        c = int(affected[np.argmax(run_ms[affected])])
         first = int(o.run_at[c]) + o.first_row
         yield Issue(
-            f"{_channels(names, found)} {'holds' if len(found) == 1 else 'hold'} one value for up to "
-            f"{held[c] / 1000:.1f} s (from row {first + 1}); usual is {w.usual_run_ms[c] / 1000:.2f} s",
+            f"{_channels(names, affected)} {'holds' if len(affected) == 1 else 'hold'} one value for up to "
+            f"{run_ms[c] / 1000:.1f} s (from row {first + 1}); usual is {w.usual_run_ms[c] / 1000:.2f} s",
             ((first, first + int(o.runs[c])),),
-            tuple(found.tolist()),
+            tuple(affected.tolist()),
             o.info.id,
             "error" if o.runs[c] > 0.5 * o.rows else None,
         )
@@ -167,20 +161,20 @@ def saturated(w: DatasetSummary) -> Iterator[Issue]:
     most = np.maximum(w.limits.saturated_s * 1000, 4 * w.usual_top_ms)
     for o in w.recordings:
         at_rail = shared & (np.abs(o.top) >= _RAIL * rail)
-        held = o.top_runs * o.period_ms
-        long = np.where(at_rail, held >= most / 2, held >= most) & (o.top_runs >= 3)
+        run_ms = o.top_runs * o.period_ms
+        long = np.where(at_rail, run_ms >= most / 2, run_ms >= most) & (o.top_runs >= 3)
         often = at_rail & (o.top_rows >= 10) & (o.top_rows >= _OFTEN * o.rows)
         moving = (o.spread > 0.5 * usual) & (o.spread > 0) & (o.runs < o.rows)
-        found = np.flatnonzero((long | often) & moving)
-        if not len(found):
+        affected = np.flatnonzero((long | often) & moving)
+        if not len(affected):
             continue
-        c = int(found[np.argmax(held[found])])
+        c = int(affected[np.argmax(run_ms[affected])])
         first = int(o.top_at[c]) + o.first_row
         yield Issue(
-            f"{_channels(names, found)} {'stays' if len(found) == 1 else 'stay'} at the highest or lowest value, "
-            f"{names[c]} for {held[c]:.0f} ms at {o.top[c]:g} (from row {first + 1}), {o.top_rows[c]} rows in all",
+            f"{_channels(names, affected)} {'stays' if len(affected) == 1 else 'stay'} at the highest or lowest value, "
+            f"{names[c]} for {run_ms[c]:.0f} ms at {o.top[c]:g} (from row {first + 1}), {o.top_rows[c]} rows in all",
             ((first, first + int(o.top_runs[c])),),
-            tuple(found.tolist()),
+            tuple(affected.tolist()),
             o.info.id,
         )
 
@@ -198,13 +192,13 @@ def drift(w: DatasetSummary) -> Iterator[Issue]:
         quarter = len(lows) // 4
         change = np.median(lows[-quarter:], axis=0) - np.median(lows[:quarter], axis=0)
         share = np.divide(change, touched, out=np.zeros_like(change), where=touched > 0)
-        found = np.array([c for c in level if abs(share[c]) > w.limits.drift], dtype=np.int64)
-        if len(found):
-            c = int(found[np.argmax(np.abs(share[found]))])
+        affected = np.array([c for c in level if abs(share[c]) > w.limits.drift], dtype=np.int64)
+        if len(affected):
+            c = int(affected[np.argmax(np.abs(share[affected]))])
             yield Issue(
-                f"the baseline of {_channels(layout.names, found)} drifts over {key}, {layout.names[c]} by "
+                f"the baseline of {_channels(layout.names, affected)} drifts over {key}, {layout.names[c]} by "
                 f"{change[c]:+.0f}: {abs(share[c]) * 100:.0f} % of its signal when touched",
-                channels=tuple(found.tolist()),
+                channels=tuple(affected.tolist()),
                 about=about,
             )
 
@@ -299,16 +293,11 @@ def several_gestures(w: DatasetSummary) -> Iterator[Issue]:
 
 def duplicate(w: DatasetSummary) -> Iterator[Issue]:
     """Find recordings or streams with the same values, whatever their clocks; the first by name is the original."""
-    first: dict[bytes, str] = {}
-    for o in sorted(w.recordings, key=lambda o: o.info.id):
-        if (o.runs >= o.rows).all():
-            continue  # Constant recordings are equal without being copies.
-        original = first.setdefault(o.content, o.info.id)
-        if original != o.info.id:
-            yield Issue(f"the same content as {original}", about=o.info.id)
-    seen: dict[str, str] = {}
-    for o in w.streams:
-        original = seen.setdefault(o.info.sha256, o.info.id)
+    # Constant recordings are equal without being copies.
+    varying = (o for o in w.recordings if not (o.runs >= o.rows).all())
+    originals: dict[bytes | str, str] = {}
+    for o in (*sorted(varying, key=lambda o: o.info.id), *w.streams):
+        original = originals.setdefault(o.content or o.info.sha256, o.info.id)
         if original != o.info.id:
             yield Issue(f"the same content as {original}", about=o.info.id)
 

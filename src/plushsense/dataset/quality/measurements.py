@@ -6,7 +6,6 @@ import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,16 +95,16 @@ class Examination:
     @cached_property
     def gaps(self) -> NDArray[np.int64]:
         """Rows after which frames are missing for longer than `gap_ms`."""
-        found = np.setdiff1d(np.flatnonzero(self.steps > self.gap_ms), self.jumps)
-        if not self.uneven or not len(found):
-            return found
+        gaps = np.setdiff1d(np.flatnonzero(self.steps > self.gap_ms), self.jumps)
+        if not self.uneven or not len(gaps):
+            return gaps
         # With uneven stamps, a delay that the following frames catch up is no gap: compare the time of the rows
         # around with their number.
         rate = measured_rate_hz(self.frames.device_ms)
         time, reach = self.frames.device_ms, 15
-        low, high = np.maximum(found - reach, 0), np.minimum(found + 1 + reach, len(time) - 1)
+        low, high = np.maximum(gaps - reach, 0), np.minimum(gaps + 1 + reach, len(time) - 1)
         late = (time[high] - time[low]) - (high - low) * 1000.0 / rate
-        return found[late > self.gap_ms]
+        return gaps[late > self.gap_ms]
 
     def row(self, at: int) -> int:
         """Return the number of a row in its file, from 1."""
@@ -192,8 +191,7 @@ def _activity(values: NDArray[np.float64], hop: int, level: NDArray[np.bool_]) -
     if level.any():
         raised = (high + low)[:, level] / 2
         moved[:, level] = np.maximum(moved[:, level], raised - np.percentile(raised, 10, axis=0))
-    made: NDArray[np.float32] = moved.astype(np.float32)
-    return made
+    return np.asarray(moved, dtype=np.float32)
 
 
 def summarize(info: RecordingInfo | StreamInfo, frames: Frames, layout: Layout) -> RecordingSummary:
@@ -264,37 +262,29 @@ class DatasetSummary:
     def noise(self) -> NDArray[np.float64]:
         """Activity of each channel at rest, (C,): the quiet moments of the quietest recordings."""
         quiet = [np.percentile(o.activity, 10, axis=0) for o in self.recordings if len(o.activity)]
-        floor: NDArray[np.float64] = np.percentile(quiet or np.zeros((1, self.dataset.layout.n_channels)), 5, axis=0)
-        return floor
+        return np.asarray(np.percentile(quiet or np.zeros((1, self.dataset.layout.n_channels)), 5, axis=0))
 
     @cached_property
     def scale(self) -> NDArray[np.float64]:
         """Activity of each channel when it is touched, (C,), which makes channels of all kinds comparable."""
         peaks = [np.percentile(o.activity, 95, axis=0) for o in self.recordings if len(o.activity)]
-        table = np.asarray(peaks or np.zeros((1, self.dataset.layout.n_channels)), dtype=np.float64)
-        high: NDArray[np.float64] = np.percentile(table, 90, axis=0)
+        high = np.asarray(np.percentile(peaks or np.zeros((1, self.dataset.layout.n_channels)), 90, axis=0), np.float64)
         return np.maximum(high - _NOISE * self.noise, np.maximum(_MOVED * self.noise, 1.0))
 
     def activity(self, o: RecordingSummary) -> NDArray[np.float64]:
         """Return the activity in each block of a recording over all channels, beyond their noise, (B,)."""
         beyond = np.maximum(o.activity - _NOISE * self.noise, 0.0) / self.scale
-        total: NDArray[np.float64] = np.sqrt(np.square(beyond).sum(axis=1))
-        return total
+        return np.asarray(np.sqrt(np.square(beyond).sum(axis=1)))
 
     @cached_property
     def usual_run_ms(self) -> NDArray[np.float64]:
         """The median over the recordings of each channel's longest stretch of one value in ms, (C,)."""
-        return _median([o.runs * o.period_ms for o in self.recordings])
+        return np.asarray(np.median([o.runs * o.period_ms for o in self.recordings], axis=0))
 
     @cached_property
     def usual_top_ms(self) -> NDArray[np.float64]:
         """The same for stretches at the highest or lowest value."""
-        return _median([o.top_runs * o.period_ms for o in self.recordings])
-
-
-def _median(rows: Sequence[NDArray[Any]]) -> NDArray[np.float64]:
-    middle: NDArray[np.float64] = np.median(rows, axis=0)
-    return middle
+        return np.asarray(np.median([o.top_runs * o.period_ms for o in self.recordings], axis=0))
 
 
 def gesture_of(o: RecordingSummary) -> str:

@@ -6,8 +6,8 @@ clock, the derived channels, the validity rule and the smoothing.
 
 from __future__ import annotations
 
-import importlib
 import json
+import pkgutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -102,8 +102,7 @@ def convert(bundle: Bundle, path: str | Path, format_name: str, *, windows: NDAr
         BundleError: when the result does not give the network's answers; for int8, a bundle without calibration.
     """
     check_format(format_name)
-    module, function = CONVERTERS[format_name].converter.split(":")
-    converter = getattr(importlib.import_module(f"{__name__}.{module}"), function)
+    converter = pkgutil.resolve_name(f"{__name__}.{CONVERTERS[format_name].converter}")
     result: Conversion = converter(ConversionJob.of(bundle, windows))
     path = Path(path)
     try:
@@ -166,8 +165,7 @@ def made_up_windows(bundle: Bundle, n: int = 24) -> Windows:
     )
     scaler = bundle.scaler
     unit = 1 / np.where(scaler.scale == 0, 1.0, scaler.scale)
-    raw: Windows = np.rint(scaler.offset[:, None] + scaled * unit[:, None]).astype(np.int64)
-    return raw
+    return np.asarray(np.rint(scaler.offset[:, None] + scaled * unit[:, None]), dtype=np.int64)
 
 
 def scaling(scaler: Scaler) -> tuple[Floats, Floats, Floats]:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import BundleError, need
 from plushsense.deploy.convert import LOGITS, Conversion, ConversionJob, Floats, compared, describe
-from plushsense.deploy.convert.onnx import IR_VERSION, OPSET, OnnxGraph
+from plushsense.deploy.convert.onnx import OnnxGraph
 from plushsense.deploy.quantize import Ranges, folded, refuse_undeployable
 from plushsense.models.bundle import Bundle
 
@@ -44,18 +44,7 @@ def plain_model(bundle: Bundle) -> Any:
     w, b = (g.constant(name, values) for name, values in zip("wb", dense, strict=True))
     z = g.add("Flatten", "pooled", g.add("GlobalAveragePool", "mean", z), axis=1)
     g.add("Gemm", LOGITS, z, w, b, name="dense", transB=1)
-    onnx, real = g.onnx, g.onnx.TensorProto.FLOAT
-    graph = onnx.helper.make_graph(
-        g.nodes,
-        "plushsense",
-        [onnx.helper.make_tensor_value_info(SCALED, real, [1, arch.channels, arch.span])],
-        [onnx.helper.make_tensor_value_info(LOGITS, real, [1, arch.classes])],
-        g.constants,
-    )
-    opset = [onnx.helper.make_opsetid("", OPSET)]
-    model = onnx.helper.make_model(graph, ir_version=IR_VERSION, opset_imports=opset)
-    onnx.checker.check_model(model, full_check=True)
-    return model
+    return g.model({SCALED: [1, arch.channels, arch.span]}, {LOGITS: [1, arch.classes]})
 
 
 def to_espdl(job: ConversionJob, target: str) -> Conversion:
@@ -126,12 +115,10 @@ def _quantized(
         run = executor.TorchExecutor(graph, device="cpu")
         logits = np.concatenate([run(w)[0].numpy() for w in windows])
         data = out.read_bytes()
-    held = need("esp_ppq.parser.espdl.FlatBuffers.Dl.Model", "espdl")
-    kinds = [] if data[:4] != MAGIC else _kinds(held.Model.GetRootAs(data, HEAD_BYTES).Graph())
+    kinds: list[str] = []
+    if data[:4] == MAGIC:
+        graph = need("esp_ppq.parser.espdl.FlatBuffers.Dl.Model", "espdl").Model.GetRootAs(data, HEAD_BYTES).Graph()
+        kinds = [graph.Node(i).OpType().decode() for i in range(graph.NodeLength())]
     if kinds.count("Conv") != len(bundle.arch.layers):
         raise BundleError(f"esp-ppq wrote no usable .espdl file ({len(data)} bytes, operators {kinds}): report this.")
     return data, logits
-
-
-def _kinds(graph: Any) -> list[str]:
-    return [graph.Node(i).OpType().decode() for i in range(graph.NodeLength())]

@@ -35,6 +35,7 @@ from plushsense.runtime.integer import IntegerNetwork
 
 OPSET = 18
 IR_VERSION = 9
+Shape = list[str | int]
 
 
 class OnnxGraph:
@@ -57,26 +58,24 @@ class OnnxGraph:
         """Add a constant with one value a channel, shaped for windows (N, C, T)."""
         return self.constant(name, values[:, None])
 
-    def model(self, bundle: Bundle) -> bytes:
-        """Return the checked graph from RAW to PROBABILITIES as bytes."""
-        onnx, arch = self.onnx, bundle.arch
-        real = onnx.TensorProto.FLOAT
-        graph = onnx.helper.make_graph(
-            self.nodes,
-            "plushsense",
-            [onnx.helper.make_tensor_value_info(RAW, real, ["N", arch.channels, arch.span])],
-            [onnx.helper.make_tensor_value_info(n, real, ["N", arch.classes]) for n in (LOGITS, PROBABILITIES)],
-            self.constants,
-        )
-        model = onnx.helper.make_model(
-            graph,
-            producer_name="plushsense",
-            ir_version=IR_VERSION,
-            opset_imports=[onnx.helper.make_opsetid("", OPSET)],
-            doc_string=f"Touch gestures, {arch.title}",
-        )
-        onnx.helper.set_model_props(model, describe(bundle))
-        onnx.checker.check_model(model, full_check=True)
+    def model(self, inputs: dict[str, Shape], outputs: dict[str, Shape], **settings: Any) -> Any:
+        """Return the checked graph as an ONNX model; inputs and outputs are names and shapes of float32 tensors."""
+        helper, real = self.onnx.helper, self.onnx.TensorProto.FLOAT
+        ends = [[helper.make_tensor_value_info(n, real, s) for n, s in part.items()] for part in (inputs, outputs)]
+        graph = helper.make_graph(self.nodes, "plushsense", *ends, self.constants)
+        opset = [helper.make_opsetid("", OPSET)]
+        model = helper.make_model(graph, ir_version=IR_VERSION, opset_imports=opset, **settings)
+        self.onnx.checker.check_model(model, full_check=True)
+        return model
+
+    def to_bytes(self, bundle: Bundle) -> bytes:
+        """Return the graph from RAW to LOGITS and PROBABILITIES as the bytes of a file."""
+        arch = bundle.arch
+        inputs: dict[str, Shape] = {RAW: ["N", arch.channels, arch.span]}
+        classes: Shape = ["N", arch.classes]
+        about = {"producer_name": "plushsense", "doc_string": f"Touch gestures, {arch.title}"}
+        model = self.model(inputs, {LOGITS: classes, PROBABILITIES: classes}, **about)
+        self.onnx.helper.set_model_props(model, describe(bundle))
         return bytes(model.SerializeToString(deterministic=True))
 
 
@@ -104,7 +103,7 @@ def float_model(bundle: Bundle) -> bytes:
     w, b = (g.constant(n, bundle.weights[n]) for n in ("dense.weight", "dense.bias"))
     g.add("Gemm", LOGITS, z, w, b, transB=1)
     g.add("Softmax", PROBABILITIES, LOGITS, axis=-1)
-    return g.model(bundle)
+    return g.to_bytes(bundle)
 
 
 def _padding(g: OnnxGraph, i: int, arch: Arch, layer: ConvLayer, z: str) -> tuple[str, list[int]]:
@@ -135,9 +134,8 @@ def integer_model(bundle: Bundle, network: IntegerNetwork) -> bytes:
     zero = g.constant("code.zero", np.array(0, dtype=np.uint8))
 
     def codes(z: str, name: str) -> str:
-        return g.add(
-            "DequantizeLinear", f"{name}.read", g.add("QuantizeLinear", f"{name}.codes", z, one, zero), one, zero
-        )
+        z = g.add("QuantizeLinear", f"{name}.codes", z, one, zero)
+        return g.add("DequantizeLinear", f"{name}.read", z, one, zero)
 
     def parted(name: str, whole: NDArray[Any], scales: NDArray[np.float64]) -> str:
         scale = g.constant(f"{name}.scale", scales.astype(np.float32))
@@ -150,10 +148,8 @@ def integer_model(bundle: Bundle, network: IntegerNetwork) -> bytes:
     z = codes(g.add("Add", "scaled", z, g.columns("input.start", start)), "input")
     for i, (layer, part) in enumerate(zip(arch.layers, network.layers, strict=True)):
         sizes = sum_scales(part.scale.multiplier, part.scale.before, part.scale.after)
-        w, b = (
-            parted(f"conv{i}.weight", part.weights, sizes),
-            parted(f"conv{i}.bias", part.bias.astype(np.int32), sizes),
-        )
+        w = parted(f"conv{i}.weight", part.weights, sizes)
+        b = parted(f"conv{i}.bias", part.bias.astype(np.int32), sizes)
         z = g.add("Conv", f"conv{i}", z, w, b, dilations=[layer.dilation], kernel_shape=[layer.kernel])
         z = codes(g.add("Relu", f"relu{i}", z), f"layer{i}")
     z = _mean(g, z)
@@ -161,12 +157,11 @@ def integer_model(bundle: Bundle, network: IntegerNetwork) -> bytes:
     sizes = sum_scales(dense.scale.multiplier, dense.scale.before, dense.scale.after) / 256
     w = parted("dense.weight", dense.weights, sizes * arch.pooled)
     z = g.add("Gemm", "dense", z, w, g.constant("dense.bias", (dense.bias * sizes).astype(np.float32)), transB=1)
-    low, high = (
-        g.constant(f"logits.{n}", np.array(v, dtype=np.float32)) for n, v in (("low", -LIMIT), ("high", LIMIT))
-    )
+    low = g.constant("logits.low", np.array(-LIMIT, dtype=np.float32))
+    high = g.constant("logits.high", np.array(LIMIT, dtype=np.float32))
     g.add("Clip", LOGITS, z, low, high)
     g.add("Softmax", PROBABILITIES, LOGITS, axis=-1)
-    return g.model(bundle)
+    return g.to_bytes(bundle)
 
 
 def answers(model: bytes, windows: NDArray[Any]) -> NDArray[np.float32] | None:

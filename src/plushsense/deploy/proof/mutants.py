@@ -35,16 +35,12 @@ class SourceMutant:
     when: Literal["always", "dilated", "magnitude", "ranged", "smoothed", "stepped", "ties"] = "always"
 
 
-@dataclass(frozen=True)
-class _MutantFile:
-    mutants: tuple[SourceMutant, ...]
-
-
 @cache
 def source_mutants() -> tuple[SourceMutant, ...]:
     """Read the mutants of plushsense.c from ``mutants.toml``."""
     path = Path(__file__).with_name("mutants.toml")
-    return load_table(read_toml(path, "mutants", BadInput), _MutantFile, path.name, BadInput).mutants
+    rows = read_toml(path, "mutants", BadInput)["mutants"]
+    return tuple(load_table(row, SourceMutant, path.name, BadInput) for row in rows)
 
 
 _FIXED_BYTES, _SCALE_BYTES = 28, 8
@@ -70,21 +66,23 @@ def mutants_of(image: bytes, source: str) -> list[Mutant]:
         BadInput: when a text to replace does not occur in the C exactly once.
     """
     at = _ImageOffsets(image)
-    found = []
+    mutants = []
     for n, layer in enumerate([*at.layers, at.dense], 1):
         what = f"layer {n}" if layer is not at.dense else "the dense layer"
         weight, filter_ = layer.largest_weight()
-        found.append(_in_image("weight", f"one weight of {what} by one", image, weight, "B"))
+        mutants.append(_in_image("weight", f"one weight of {what} by one", image, weight, "B"))
         shift = layer.scales_at + _SCALE_BYTES * filter_ + 7
-        found.append(_in_image("shift", f"one shift of {what} by one", image, shift, "B", _MOST_SHIFT))
-    found.append(_in_image("shift", "one input's shift by one", image, at.inputs[0] + 11, "B", _MOST_SHIFT))
-    found.append(_in_image("constant", "the longest gap by one", image, HEAD_BYTES + _GAP_AT, "I", by=at.units_per_ms))
+        mutants.append(_in_image("shift", f"one shift of {what} by one", image, shift, "B", _MOST_SHIFT))
+    mutants.append(_in_image("shift", "one input's shift by one", image, at.inputs[0] + 11, "B", _MOST_SHIFT))
+    mutants.append(
+        _in_image("constant", "the longest gap by one", image, HEAD_BYTES + _GAP_AT, "I", by=at.units_per_ms)
+    )
     where = HEAD_BYTES + _SMOOTHING_AT
-    found.append(_in_image("constant", "the smoothing's weight by one", image, where, "H", 1 << PROBABILITY_BITS))
+    mutants.append(_in_image("constant", "the smoothing's weight by one", image, where, "H", 1 << PROBABILITY_BITS))
     ranged = [n for n, (_, high) in enumerate(at.ranges) if high < _INT32]
     for n in ranged[:1]:
         where = HEAD_BYTES + _FIXED_BYTES + 8 * n + 4
-        found.append(_in_image("constant", f"the valid range of channel {n + 1} by one", image, where, "i"))
+        mutants.append(_in_image("constant", f"the valid range of channel {n + 1} by one", image, where, "i"))
     shows = {
         "always": True,
         "dilated": any(layer.dilation > 1 for layer in at.layers),
@@ -105,8 +103,8 @@ def mutants_of(image: bytes, source: str) -> list[Mutant]:
                 "PlushSense, or undo your changes to that file."
             )
         if shows[each.when]:
-            found.append(Mutant(each.kind, each.name, source=source.replace(each.find, each.replace)))
-    return found
+            mutants.append(Mutant(each.kind, each.name, source=source.replace(each.find, each.replace)))
+    return mutants
 
 
 def _in_image(kind: Kind, name: str, image: bytes, at: int, form: str, most: int | None = None, by: int = 1) -> Mutant:

@@ -1,8 +1,9 @@
-"""Test scenarios: an export's network with other decision rules, so that every line of the rules in its C is run.
+"""Test scenarios: variants of an exported model whose decision rules fire often, to test the rules in the C.
 
-The rules of a trained model rarely fire, and on generated frames maybe never: a wrong line would pass unnoticed. A
-scenario keeps the layers and inputs, but shifts and scales the logits so that every class is the best at some time,
-assigns other idle classes and affects, and derives the thresholds of health, gate and events from the frames.
+On generated frames the rules of a trained model rarely fire, so that an error in their C would not be detected. A
+scenario keeps the layers and the input scale of the model. It shifts and scales the logits so that every class is the
+best one at some time, changes which classes are idle and their affects, and chooses the thresholds of health, gate and
+events from quantiles of the generated frames.
 """
 
 from __future__ import annotations
@@ -53,8 +54,13 @@ _AFFECTS: tuple[tuple[str, bool], ...] = (
 class _ScenarioSettings:
     """Settings of a scenario.
 
-    ``gate``: whether there is one; ``often``: whether it fires often. ``near``: the leave share is that of entering, so
-    that events end; otherwise it is far lower, so that other events replace them.
+    Attributes:
+        gate: whether the model has a gate.
+        often: whether the gate fires often.
+        near: whether events end below the share at which they begin; otherwise they end far below it, so that most are
+            replaced by other events.
+        end, hold: lowest and highest value of these event settings, in steps.
+        smoothing: weight of a new step, in steps of 2^-15.
     """
 
     gate: bool
@@ -75,7 +81,13 @@ SCENARIO_SETTINGS = (
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
-    """A model, generated frames (n, 1 + C), frames before a silence, and the expected rows (m, 12 + 2 K)."""
+    """A test case for the C: a model, frames to feed to it, and the expected answers.
+
+    Attributes:
+        frames: (n, 1 + C), the time in ms and the channels.
+        silences: indices of the frames after which a silence is reported.
+        rows: (m, 12 + 2 K), as `answers_of` computes them.
+    """
 
     model: IntegerModel
     frames: Ints
@@ -101,9 +113,9 @@ def all_outcomes() -> set[str]:
 
 def covered(scenario: Scenario) -> set[str]:
     """Return those of `all_outcomes` that a scenario covers."""
-    rows, found = scenario.rows.astype(np.int64), set()
+    rows, outcomes = scenario.rows.astype(np.int64), set()
     answered = column(rows, "answer")[column(rows, "state") == TRACKING]
-    found |= {ANSWERS[k] for k in set(answered.tolist())}
+    outcomes |= {ANSWERS[k] for k in set(answered.tolist())}
     at = {name: n for n, name in enumerate(COLUMNS[EVENT])}
     state, warm, ended = COLUMNS[ANSWER].index("state"), False, None
     frame = COLUMNS[ANSWER].index("frame")
@@ -113,19 +125,19 @@ def covered(scenario: Scenario) -> set[str]:
             warm = row[state] == TRACKING
         elif row[0] == HEALTH:
             fault, suspect = row[state] == 2, row[5]
-            found.add("fault" if fault else "suspect only" if suspect else "recovery")
+            outcomes.add("fault" if fault else "suspect only" if suspect else "recovery")
         else:
             what, source = row[at["what"]], row[at["source"]]
-            found.add(f"{KINDS[what]} by {SOURCES[source]}")
+            outcomes.add(f"{KINDS[what]} by {SOURCES[source]}")
             if what == BEGUN:
                 if source == GATE and not warm:
-                    found.add("gate while warming")
+                    outcomes.add("gate while warming")
                 if row[at["gesture"]] == NO_GESTURE:
-                    found.add("unnamed")
+                    outcomes.add("unnamed")
                 if row[at["affect"]] == 0:
-                    found.add("without affect")
+                    outcomes.add("without affect")
                 if ended is not None and row[at["ms"]] - ended > 0:
-                    found.add("resting")
+                    outcomes.add("resting")
             if what == ENDED:
                 ended = row[at["ms"]]
                 if (
@@ -134,14 +146,14 @@ def covered(scenario: Scenario) -> set[str]:
                     and after[at["what"]] == BEGUN
                     and after[frame] == row[frame]
                 ):
-                    found.add("replaced by the gate" if after[at["source"]] == GATE else "replaced")
+                    outcomes.add("replaced by the gate" if after[at["source"]] == GATE else "replaced")
                 elif after is not None and after[0] == HEALTH and after[frame] == row[frame] and after[state] == 2:
-                    found.add("lost in a fault")
+                    outcomes.add("lost in a fault")
                 elif row[frame] in scenario.silences and row[at["since"]] == row[at["ms"]]:
-                    found.add("lost in silence")
+                    outcomes.add("lost in silence")
                 elif after is not None and after[HEAD - 2] > row[HEAD - 2]:
-                    found.add("lost in a gap")
-    return found
+                    outcomes.add("lost in a gap")
+    return outcomes
 
 
 def _scenario(plain: IntegerModel, scaler: Scaler, settings: _ScenarioSettings, seed: int) -> Scenario:

@@ -56,16 +56,16 @@ def frames_of(dataset: Dataset, layout: Layout, *, subjects: Sequence[str] = (),
     # The shortest first: the others make up for what they lack.
     for left, at in zip(range(len(pieces), 0, -1), np.argsort(lengths, kind="stable"), strict=True):
         takes[at] = min(lengths[at], max(0, -(-(rows - int(takes.sum())) // left)))
-    found: list[Ints] = []
+    parts: list[Ints] = []
     now = _PAUSE_MS
     for piece, take in zip(pieces, takes.tolist(), strict=True):
         if not take:
             continue
         part = piece.slice(0, take)
         ms = part.device_ms.astype(np.int64) - int(part.device_ms[0]) + now
-        found.append(np.column_stack([ms & 0xFFFFFFFF, np.clip(part.values, _LOW, _HIGH)]))
+        parts.append(np.column_stack([ms & 0xFFFFFFFF, np.clip(part.values, _LOW, _HIGH)]))
         now = int(ms[-1]) + layout.gap_ms + _PAUSE_MS
-    return np.concatenate(found) if found else np.empty((0, 1 + len(layout.channels)), dtype=np.int64)
+    return np.concatenate(parts) if parts else np.empty((0, 1 + len(layout.channels)), dtype=np.int64)
 
 
 def _pieces(dataset: Dataset, subjects: Sequence[str]) -> Iterator[Frames]:
@@ -154,9 +154,9 @@ class Export:
             raise BadInput(f"'{self.folder / FACTS}' has the smoothing {smoothing!r}: export the model again.")
         self.model: IntegerModel = replace(model, smoothing=smoothing)
         self._code = code_files(self.model, self.bundle)
-        found = {name: self._require_file(name).read_bytes() for name in self._code}
-        self.changed = tuple(name for name, content in self._code.items() if found[name] != content)
-        self.image, self.source = found[IMAGE], found[LIBRARY[1]]
+        files = {name: self._require_file(name).read_bytes() for name in self._code}
+        self.changed = tuple(name for name, content in self._code.items() if files[name] != content)
+        self.image, self.source = files[IMAGE], files[LIBRARY[1]]
         self._scenarios: dict[int, list[Vectors]] = {}
         arch = self.model.network.arch
         frames, answers = read_golden(self.folder / GOLDEN, len(self.model.layout.channels), arch.classes)

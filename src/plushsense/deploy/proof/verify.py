@@ -66,12 +66,12 @@ def settings_of(target: str) -> list[Setting]:
     """Return the settings with which a target's programs are compiled."""
     if target != "host":
         return [Setting(target, optimise=o) for o in ("-O2", "-Os")]
-    found = [Setting(target, cc, o) for cc in ("gcc", "clang") for o in ("-O0", "-O2", "-O3")]
-    found += [Setting(target, cc, "-O1", (*STRICT, *SANITIZERS)) for cc in ("gcc", "clang")]
+    settings = [Setting(target, cc, o) for cc in ("gcc", "clang") for o in ("-O0", "-O2", "-O3")]
+    settings += [Setting(target, cc, "-O1", (*STRICT, *SANITIZERS)) for cc in ("gcc", "clang")]
     # -std=c99 is not for C++; exceptions would need its library.
-    found.append(Setting(target, "gcc", "-O2", (*STRICT[1:], "-fno-exceptions"), cpp=True))
-    found.append(Setting(target, "gcc", "-O2", image=True))
-    return found
+    settings.append(Setting(target, "gcc", "-O2", (*STRICT[1:], "-fno-exceptions"), cpp=True))
+    settings.append(Setting(target, "gcc", "-O2", image=True))
+    return settings
 
 
 @dataclass(frozen=True)
@@ -231,8 +231,8 @@ def verify(
             selected = []
         first_of = {target: next(s for s in settings if s.target == target) for target in chosen}
         pairs = [(mutant, first_of[target]) for mutant in selected for target in chosen]
-        shown = cases[: 1 + bool(scenarios)]
-        for each in pool.map(runner.run_mutant, *zip(*pairs, strict=True), repeat(shown)) if pairs else ():
+        mutant_cases = cases[: 1 + bool(scenarios)]
+        for each in pool.map(runner.run_mutant, *zip(*pairs, strict=True), repeat(mutant_cases)) if pairs else ():
             results.append(each)
             report()
         # A mutant that needs a rare sequence of steps may show in other scenarios.
@@ -258,7 +258,7 @@ def verify(
 
 def _choose(targets: Sequence[str], only: Callable[[Setting], bool]) -> tuple[list[Setting], list[tuple[str, str]]]:
     """Return the settings that can run here, and the others with the reason."""
-    found: list[Setting] = []
+    runnable: list[Setting] = []
     not_run: list[tuple[str, str]] = []
     for name in dict.fromkeys(targets or TARGETS):
         settings = [s for s in settings_of(target_named(name).name) if only(s)]
@@ -266,17 +266,17 @@ def _choose(targets: Sequence[str], only: Callable[[Setting], bool]) -> tuple[li
         here = [s for s in settings if not lacks[s]]
         if targets and not here:
             require(name)
-        found += here
+        runnable += here
         if not here:
             not_run.append((name, next(iter(lacks.values()), "no setting was selected")))
         else:
             not_run += [(f"{name}, {s.compiler} {s.options}", why) for s, why in lacks.items() if why]
-    if not found:
+    if not runnable:
         raise ToolError(
             "Nothing can be checked here, because no compiler is installed: install one "
             f"({'; '.join(f'{name}: {why}' for name, why in not_run)})."
         )
-    return found, not_run
+    return runnable, not_run
 
 
 def _lacks(setting: Setting) -> str:

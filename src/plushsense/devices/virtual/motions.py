@@ -158,8 +158,7 @@ def sense(
     acc = (canvas.down + canvas.shake) * climate.axis * world.acc_counts_per_g
     acc += world.acc_noise_counts * rng.standard_normal((n, 3))
     raw = np.column_stack((total, zones, np.clip(acc, -32768, 32767)))
-    whole: NDArray[np.int64] = np.rint(raw).astype(np.int64)
-    return whole
+    return np.asarray(np.rint(raw), dtype=np.int64)
 
 
 PICK_S, PUT_S, APPROACH_S, LEAVE_S = 0.8, 0.8, 0.30, 0.25
@@ -175,8 +174,12 @@ def samples(seconds: float) -> int:
 class RepetitionPlan:
     """The timing of one repetition of a gesture, in samples from the start of its episode.
 
-    The hand works for ``n`` samples from ``at`` on; ``lap``: the toy is on the lap instead of in the hands;
-    ``steadied``: the other hand lies on the toy on the table; ``light_grip``: how firm either then is.
+    Attributes:
+        record_start, record_stop: part that a recorder started and stopped by hand would hold.
+        at, n: first sample and number of samples of the movement.
+        lap: whether a toy "in the hands" lies on the lap.
+        steadied: whether the other hand lies on a toy on the table.
+        light_grip: firmness of the grip in these two cases.
     """
 
     record_start: int
@@ -188,18 +191,17 @@ class RepetitionPlan:
     light_grip: float
 
 
+@dataclass(frozen=True)
 class Hands:
     """Simulate the holding hands of one person."""
 
-    def __init__(self, who: Person, world: World, rng: np.random.Generator) -> None:
-        self._who = who
-        self._world = world
-        self._rng = rng
+    _who: Person
+    _world: World
+    _rng: np.random.Generator
 
     def upright(self) -> Floats:
         """Draw how the toy stands on the table: direction of gravity, (3,)."""
-        stand: Floats = _UPRIGHT + 0.06 * self._rng.standard_normal(3)
-        return stand
+        return np.asarray(_UPRIGHT + 0.06 * self._rng.standard_normal(3))
 
     def light(self) -> float:
         """Draw the strength of a light grip: of a hand that steadies the toy, or of a toy on the lap."""
@@ -236,9 +238,9 @@ class Hands:
                 level += (plan.light_grip - grip) * here
                 sway *= 1.0 - (1.0 - world.light_sway) * here
             level *= np.exp(0.15 * rng.standard_normal() * here)
-        held = ramp(n, pick, 35) * (1.0 - ramp(n, put + 25, 40))
-        self._grip(canvas, level * held)
-        self._sway(canvas, sway * held)
+        lifted = ramp(n, pick, 35) * (1.0 - ramp(n, put + 25, 40))
+        self._grip(canvas, level * lifted)
+        self._sway(canvas, sway * lifted)
         lift = 0.12 + 0.16 * rng.random()
         canvas.shake[:, 2] += lift * np.sin(2 * math.pi * np.clip((np.arange(n) - pick) / samples(PICK_S), 0, 1))
         canvas.shake[:, 2] -= 0.6 * lift * np.sin(2 * math.pi * np.clip((np.arange(n) - put) / samples(PUT_S), 0, 1))
@@ -267,9 +269,14 @@ class Hands:
 
 @dataclass(frozen=True)
 class Performance:
-    """One performance of a gesture: person, family, place in the canvas, force and tempo.
+    """One performance of a gesture by a person.
 
-    ``at`` and ``n``: the hand works for ``n`` samples from ``at`` on.
+    Attributes:
+        family: the gesture without its number, such as "Tail tap".
+        in_hands: whether the toy is held in the hands.
+        at, n: first sample of the movement in the canvas, and number of samples.
+        force, tempo: relative to what is usual for this person.
+        shift: offset of the place along the toy's back, in addition to the person's own.
     """
 
     person: Person
@@ -283,6 +290,7 @@ class Performance:
 
 
 def _edges(n: int, rise_s: float = 0.12) -> Floats:
+    """Return a window (n,) that rises from 0 to 1 within ``rise_s`` and falls again at the end."""
     length = max(1, min(n // 3, round(rise_s * RATE_HZ)))
     return ramp(n, 0, length) * (1.0 - ramp(n, n - length, length))
 
@@ -411,10 +419,6 @@ def _hug(canvas: Canvas, trial: Performance, rng: np.random.Generator, world: Wo
     canvas.knock(trial.at + 20, np.array([0.5, 0.2, 0.6]), 0.25 * trial.force, 1.5, 0.25)
 
 
-def _hold(canvas: Canvas, trial: Performance, rng: np.random.Generator, world: World) -> None:
-    """Add nothing: the session simulates the grip."""
-
-
 Motion = Callable[[Canvas, Performance, np.random.Generator, World], None]
 
 MOTIONS: dict[str, tuple[str, Motion]] = {
@@ -427,7 +431,7 @@ MOTIONS: dict[str, tuple[str, Motion]] = {
     "Tail hit": ("hit_s", _hit),
     "Tail pull": ("pull_s", _pull),
     "Hold strong": ("hold_s", _hug),
-    "Hold in hands": ("hold_s", _hold),
+    "Hold in hands": ("hold_s", lambda c, t, r, w: None),  # the session simulates the grip
 }
 """The field of `World` that has a family's duration, and the function that simulates it."""
 

@@ -35,43 +35,35 @@ class ToyCounters:
     connections: int = 0
 
 
+@dataclass
 class _Outlet:
     """Non-blocking output that waits for a slow reader, drops lines without one, and never sends part of a line."""
 
-    def __init__(
-        self,
-        write: Callable[[bytes], int],
-        fileno: int,
-        *,
-        absent: bool = False,
-        stall_s: float = _STALL_S,
-        unread: Callable[[], int] | None = None,
-    ) -> None:
-        self._write = write
-        self._fileno = fileno
-        self._absent = absent
-        self._stall_s = stall_s
-        self._unread = unread
-        self._rest = b""
+    write: Callable[[bytes], int]
+    fileno: int
+    stall_s: float
+    absent: bool = False
+    unread: Callable[[], int] | None = None
+    _rest: bytes = b""
 
     def send(self, data: bytes, stop: threading.Event) -> bool:
         """Send lines; False when they were dropped. OSError when the reader's end is gone."""
         whole = self._rest + data
         pending = whole
-        deadline = time.monotonic() + (0.0 if self._absent else self._stall_s)
-        if self._unread is not None and not self._absent:
-            while self._unread() > _FAST_QUEUE and time.monotonic() < deadline and not stop.wait(0.0005):
+        deadline = time.monotonic() + (0.0 if self.absent else self.stall_s)
+        if self.unread is not None and not self.absent:
+            while self.unread() > _FAST_QUEUE and time.monotonic() < deadline and not stop.wait(0.0005):
                 pass
         while pending:
             try:
-                pending = pending[self._write(pending) :]
-                self._absent = False
+                pending = pending[self.write(pending) :]
+                self.absent = False
             except BlockingIOError:
                 left = deadline - time.monotonic()
                 if left > 0.0 and not stop.is_set():
-                    select.select([], [self._fileno], [], min(left, 0.05))
+                    select.select([], [self.fileno], [], min(left, 0.05))
                     continue
-                self._absent = True
+                self.absent = True
                 sent = whole[: len(whole) - len(pending)]
                 if sent:
                     begun = not sent.endswith(b"\n")
@@ -150,7 +142,7 @@ class ToyServer:
                         continue
                     client.setblocking(False)
                     client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                    outlet = _Outlet(client.send, client.fileno(), stall_s=self._stall_s)
+                    outlet = _Outlet(client.send, client.fileno(), self._stall_s)
                     counters.connections += 1
                 if client is None or outlet is None:
                     return False
@@ -196,8 +188,8 @@ class ToyServer:
             outlet = _Outlet(
                 lambda data: os.write(master, data),
                 master,
+                self._stall_s,
                 absent=not fast,
-                stall_s=self._stall_s,
                 unread=(lambda: _unread(slave)) if fast else None,
             )
             self.on_ready(f"serial://{os.ttyname(slave)}")

@@ -40,6 +40,16 @@ GESTURES = (
 )  # fmt: skip
 """The 17 gestures of the paper that a person makes, in class order."""
 
+
+def check_gesture(label: str) -> None:
+    """Raise ConfigError for a gesture that simulated people cannot perform."""
+    known = (AT_REST, *GESTURES)
+    if label not in known:
+        raise ConfigError(
+            f"The virtual toy's people know no gesture '{label}'; they know {', '.join(known)}.{nearest(label, known)}"
+        )
+
+
 _POSTURES = np.array([(0, 0, 1.0), (0, 0, -1.0), (0, 1.0, 0.1), (0, -1.0, 0.1), (1.0, 0, 0.2), (-1.0, 0, 0.2)])
 
 
@@ -110,14 +120,10 @@ class VirtualSession:
 
     def perform(self, label: str, repetitions: int = 1) -> Episode:
         """Perform a gesture of plush-18 a number of times; "At rest" turns the toy over and leaves it alone."""
+        check_gesture(label)
         if label == AT_REST:
             return self._rest(repetitions)
         family, in_hands = split_label(label)
-        if label not in GESTURES:
-            raise ConfigError(
-                f"The virtual toy's people know no gesture '{label}'; they know {AT_REST}, {', '.join(GESTURES)}."
-                f"{nearest(label, (AT_REST, *GESTURES))}"
-            )
         rng, who, world = self._rng, self._who, self.world
         plans, at, picked_once = [], samples(0.6), in_hands and family != "Hold in hands"
         first_pick = at

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from plushsense.core.errors import ConfigError, nearest
+from plushsense.core.errors import ConfigError
 from plushsense.core.layouts import DELAY_MS, DEVICE_MS, Layout
 from plushsense.devices.base import Frame, PacedDevice, now_ms
 from plushsense.devices.opening import DeviceAddress
-from plushsense.devices.virtual.motions import AT_REST, PICK_S, split_label
-from plushsense.devices.virtual.session import GESTURES, Episode, VirtualSession
+from plushsense.devices.virtual.motions import PICK_S, split_label
+from plushsense.devices.virtual.session import GESTURES, Episode, VirtualSession, check_gesture
 from plushsense.devices.virtual.world import CHANNELS, WORLD, World, draw_person
 from plushsense.devices.wire import LineParser
 
@@ -129,13 +129,8 @@ class ToySpec:
         for name, value in (("lost", self.lost), ("garbled", self.garbled), ("glitch", self.glitch)):
             if value is not None and not 0.0 <= value <= 0.9:
                 raise ConfigError(f"The virtual toy's {name} is {value}; a share from 0 to 0.9 is accepted.")
-        known = (AT_REST, *GESTURES)
         for label in self.gestures:
-            if label not in known:
-                raise ConfigError(
-                    f"The virtual toy's people know no gesture '{label}'; they know {', '.join(known)}."
-                    f"{nearest(label, known)}"
-                )
+            check_gesture(label)
 
 
 def channel_columns(layout: Layout) -> list[int]:
@@ -235,7 +230,8 @@ _BLOCK = 200
 class VirtualDevice(PacedDevice):
     """A virtual toy in this process, with the same bytes and the same parser as a real one.
 
-    ``performed`` lists the gestures that its person made; ``on_performed`` is called with each.
+    ``performed`` lists the gestures that its person made; ``on_performed`` is called with each. ``first_ms`` is the
+    device clock at the first line, from which a live run counts its times; None before it.
 
     Args:
         speed: 1 real time, 0 as fast as frames are taken.
@@ -252,13 +248,8 @@ class VirtualDevice(PacedDevice):
         self._prompt: Prompt | None = None
         self._parser = LineParser(layout, self.counters)
         self._seconds = seconds
-        self._first_ms: int | None = None
+        self.first_ms: int | None = None
         self._next: ToyLine | None = None
-
-    @property
-    def first_ms(self) -> int | None:
-        """The device clock at the first line, from which a live run counts its times; None before it."""
-        return self._first_ms
 
     def play_ahead(self) -> None:
         """Compute all lines now, so that reading is as fast as with a real toy. It needs ``seconds``.
@@ -291,9 +282,9 @@ class VirtualDevice(PacedDevice):
         if self._next is None:
             self._next = next(self._lines)
         at = self._next.device_ms
-        if self._first_ms is None:
-            self._first_ms = at
-        return None if self._seconds and at - self._first_ms >= self._seconds * 1000.0 else at
+        if self.first_ms is None:
+            self.first_ms = at
+        return None if self._seconds and at - self.first_ms >= self._seconds * 1000.0 else at
 
     def read(self) -> list[Frame] | None:
         """Return the frames that are due, waiting at most about ``wait_s``; return None after ``seconds``."""

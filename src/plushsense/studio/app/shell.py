@@ -124,8 +124,7 @@ class Page:
             box = ui.row().classes(f"ps-message ps-message-{kind} w-full items-center no-wrap").props(f'role="{role}"')
             with tag(box, "message"):
                 ui.label(sentence).classes("flex-grow")
-                close = ui.button(icon="close", on_click=lambda: self.say("")).props("flat round dense color=inherit")
-                close.props(f'aria-label="{self.words("shell.close")}"')
+                icon_button("close", self.words("shell.close"), lambda: self.say(""), "flat round dense color=inherit")
 
     @contextmanager
     def show_errors(self) -> Iterator[None]:
@@ -306,6 +305,37 @@ def heading(text: str, level: int) -> ui.label:
 def scroll_region(label: str) -> ui.element:
     """Add a box in which wide content scrolls sideways; it can be reached by keyboard."""
     return named(ui.element("div").classes("ps-scroll-x").props('role="region" tabindex="0"'), label)
+
+
+def button(
+    name: str,
+    label: str,
+    call: Callable[..., Any] | None = None,
+    look: str = "outline",
+    *,
+    about: str = "",
+    **more: Any,
+) -> ui.button:
+    """Add a button with text.
+
+    Args:
+        name: as for `tag`, or "".
+        call: called at a click.
+        look: Quasar properties, such as "outline", "flat", or "unelevated" for the main action.
+        about: the object of the action, which screen readers read after the label.
+        more: further arguments of `ui.button`.
+    """
+    element = ui.button(label, on_click=call, **more).props(f"no-caps {look}")
+    if about:
+        named(element, f"{label}: {about}")
+    return tag(element, name) if name else element
+
+
+def icon_button(
+    icon: str, label: str, call: Callable[..., Any], look: str = "flat round dense", **more: Any
+) -> ui.button:
+    """Add a button that displays an icon; screen readers read ``label``."""
+    return named(ui.button(icon=icon, on_click=call, **more).props(look), label)
 
 
 def focus(element: ui.element) -> None:

@@ -33,22 +33,20 @@ class Samples(NamedTuple):
 
 
 class SampleBuffer:
-    """The newest ``size`` samples of ``channels`` values; one thread writes, any thread reads."""
+    """The newest ``size`` samples of ``channels`` values; one thread writes, any thread reads.
+
+    ``count`` is the number of samples ever received: the position after the newest.
+    """
 
     def __init__(self, channels: int, size: int) -> None:
         self._seconds = np.zeros(size)
         self._values = np.zeros((size, channels))
         self._clocks = np.zeros((size, 2), dtype=np.int64)
         self._lock = threading.Lock()
-        self._count = 0
+        self.count = 0
         self._first_ms: int | None = None
         self._seen_ms = 0
         self._offset_ms = 0
-
-    @property
-    def count(self) -> int:
-        """Number of samples ever received: the position after the newest."""
-        return self._count
 
     def add(self, frames: list[Frame]) -> None:
         """Append frames; after a reset of the device clock, the time continues from its last value."""
@@ -60,17 +58,17 @@ class SampleBuffer:
                 if frame.device_ms < self._seen_ms:
                     self._offset_ms += self._seen_ms - frame.device_ms
                 self._seen_ms = frame.device_ms
-                at = self._count % size
+                at = self.count % size
                 self._seconds[at] = (frame.device_ms - self._first_ms + self._offset_ms) / 1000.0
                 self._values[at] = frame.values
                 self._clocks[at] = frame.host_ms, frame.device_ms
-                self._count += 1
+                self.count += 1
 
     def since(self, place: int, most: int = 1 << 30) -> Samples:
         """Return the samples after position ``place``, at most the newest ``most``."""
         with self._lock:
             at = self._places(place, most)
-            return Samples(self._seconds[at], self._values[at], self._count)
+            return Samples(self._seconds[at], self._values[at], self.count)
 
     def frames(self, seconds: float) -> list[Frame]:
         """Return the frames of the last ``seconds``, as they were received."""
@@ -82,8 +80,8 @@ class SampleBuffer:
 
     def _places(self, place: int, most: int) -> NDArray[np.int64]:
         size = len(self._seconds)
-        first = max(place, self._count - min(size, most), 0)
-        return np.arange(first, self._count) % size
+        first = max(place, self.count - min(size, most), 0)
+        return np.arange(first, self.count) % size
 
 
 class TappedDevice(Device):

@@ -17,7 +17,7 @@ from nicegui.events import GenericEventArguments
 
 from plushsense.core.gestures import plain_label
 from plushsense.studio.app.jobs import DONE, REFUSED, RUNNING, Jobs, StudioJob
-from plushsense.studio.app.shell import Kind, Page, html, named, on_change, scroll_region, tag
+from plushsense.studio.app.shell import Kind, Page, button, html, icon_button, named, on_change, scroll_region, tag
 from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import Workspace
 
@@ -321,8 +321,7 @@ class WorkPanel:
                 with ui.column().classes("ps-card w-full"):
                     with ui.row().classes("w-full items-center"):
                         text(title_of(words, job), "h2", "col-grow")
-                        stop = ui.button(words("export.stop"), icon="stop", on_click=lambda job=job: self._stop(job))
-                        tag(stop.props("outline no-caps"), "stop")
+                        button("stop", words("export.stop"), lambda job=job: self._jobs.stop(job.id), icon="stop")
                     # Not a status element: screen readers would read out every step.
                     where = ui.label("").classes("ps-dim")
                     bar = ui.linear_progress(0.0, show_value=False, size="12px")
@@ -336,8 +335,8 @@ class WorkPanel:
                 )
                 with tag(row.props(f'role="{"alert" if bad else "status"}"'), "ended"):
                     ui.label(message).classes("flex-grow").style("overflow-wrap: anywhere")
-                    close = ui.button(icon="close", on_click=lambda: self._close(last.id))
-                    close.props(f'flat round dense color=inherit aria-label="{words("shell.close")}"')
+                    look = "flat round dense color=inherit"
+                    icon_button("close", words("shell.close"), lambda: self._close(last.id), look)
 
     def _update(self, job: StudioJob) -> None:
         bar, where = self._bars[job.id]
@@ -349,6 +348,3 @@ class WorkPanel:
     def _close(self, identity: str) -> None:
         self._closed.add(identity)
         self.refresh()
-
-    def _stop(self, job: StudioJob) -> None:
-        self._jobs.stop(job.id)

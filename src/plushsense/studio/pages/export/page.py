@@ -17,7 +17,7 @@ from plushsense.deploy.targets import TARGETS
 from plushsense.models.bundle import Bundle
 from plushsense.studio.app.guard import download_address, path_in
 from plushsense.studio.app.jobs import Jobs, StudioJob
-from plushsense.studio.app.shell import Page, address, html, moment, query, set_address, tag
+from plushsense.studio.app.shell import Page, address, button, html, moment, query, set_address, tag
 from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import EXPORTS, plain_name
 from plushsense.studio.pages.export.exports import BundleFacts, ExportFacts, exports_of, formats, newest_job, targets
@@ -59,7 +59,7 @@ def show_cost(page: Page, work: WorkPanel, export: ExportFacts, counted: StudioJ
             assert counted is not None
             _display_cost(words, profile, moment(counted.ended_s))
         if not current or "refused" in profile:
-            tag(ui.button(words("export.count"), on_click=start).props("outline no-caps"), "count")
+            button("count", words("export.count"), start)
 
 
 def _display_cost(words: Words, profile: dict[str, Any], when: str) -> None:
@@ -185,8 +185,8 @@ class VerificationCard:
                 self._dataset = ui.select(options, value="", label=words("export.recorded")).classes("w-full")
                 self._faults = tag(ui.checkbox(words("export.faults")), "faults")
                 self._trust = tag(ui.checkbox(words("export.trust")), "trust")
-            button = ui.button(words("export.verify"), icon="fact_check", on_click=self._start).props("no-caps")
-            tag(button, "verify").set_enabled(bool(self._chosen))
+            start = button("verify", words("export.verify"), self._start, "", icon="fact_check")
+            start.set_enabled(bool(self._chosen))
             proof = newest_job(self.page.workspace.part(Jobs), "verify", self.export.folder)
             if proof is not None:
                 self._display(proof)
@@ -336,8 +336,7 @@ class _Exporting:
             self._name = tag(ui.input(words("export.name")).props("maxlength=64").classes("w-full"), "name")
             with ui.expansion(words("export.more")).classes("w-full"):
                 await self._more()
-            self._button = ui.button(words("export.do"), icon="memory", on_click=self._start).props("no-caps")
-            tag(self._button, "do")
+            self._button = button("do", words("export.do"), self._start, "", icon="memory")
             await self._choose(first)
 
     def _label(self, path: Path) -> str:
@@ -360,19 +359,19 @@ class _Exporting:
         self._dataset = ui.select(options, value="", label=words("export.calibrate_on")).classes("w-full")
 
     async def _choose(self, path: str) -> None:
-        found = await run.io_bound(lambda: BundleFacts.of(Path(path)))
-        assert found is not None
-        self.bundle = found
+        chosen = await run.io_bound(lambda: BundleFacts.of(Path(path)))
+        assert chosen is not None
+        self.bundle = chosen
         self._about.clear()
         with self._about:
-            if found.bundle is None:
-                tag(notice(found.problem, "error"), "bundle-problem")
+            if chosen.bundle is None:
+                tag(notice(chosen.problem, "error"), "bundle-problem")
             else:
-                if found.simulated:
+                if chosen.simulated:
                     notice(self.words("shell.simulation"))
-                facts(self._facts_of(found.bundle, found.bytes))
-                if found.cannot:
-                    tag(notice(found.cannot, "error"), "bundle-cannot")
+                facts(self._facts_of(chosen.bundle, chosen.bytes))
+                if chosen.cannot:
+                    tag(notice(chosen.cannot, "error"), "bundle-cannot")
         self._name.set_value(self._free_name(Path(path).stem))
         self._allow()
 
@@ -447,8 +446,8 @@ class _Exporting:
         words = self.words
         with self.page.show_errors():
             folder = path_in(self.workspace, EXPORTS, name)
-            found = await run.io_bound(lambda: ExportFacts.of(folder))
-            assert found is not None
+            export = await run.io_bound(lambda: ExportFacts.of(folder))
+            assert export is not None
             jobs = self.workspace.part(Jobs)
             made = newest_job(jobs, "export", folder)
             counted = max(
@@ -461,16 +460,16 @@ class _Exporting:
             self._detail.clear()
             with self._detail:
                 text(words("export.one", name=name), "h2")
-                if found.problem:
-                    notice(found.problem, "error")
+                if export.problem:
+                    notice(export.problem, "error")
                     return
                 show_facts(
                     self.page,
-                    found,
-                    made if made and made.result.get("profile", {}).get("digest") == found.digest else None,
+                    export,
+                    made if made and made.result.get("profile", {}).get("digest") == export.digest else None,
                 )
-                show_cost(self.page, self.work, found, counted)
-                await VerificationCard(self.page, self.work, found).build()
+                show_cost(self.page, self.work, export, counted)
+                await VerificationCard(self.page, self.work, export).build()
                 show_next(self.page)
 
     # All exports ----------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from plushsense.core.layouts import layout_names
 from plushsense.models.bundle import Bundle
 from plushsense.studio.app.guard import UPLOAD_BYTES
 from plushsense.studio.app.jobs import INCOMING, RUNNING, Jobs
-from plushsense.studio.app.shell import Page, address, html, named, on_change, tag
+from plushsense.studio.app.shell import Page, address, button, html, on_change, tag
 from plushsense.studio.app.toys import PERSONS, Toys
 from plushsense.studio.app.workspace import BUNDLES, DATASETS, WORK
 from plushsense.studio.pages.home.overview import NextStep, Overview, WorkspaceSummary, next_step
@@ -38,14 +38,12 @@ def toy_section(page: Page, toys: Toys) -> None:  # noqa: C901
             options = {n: words("home.person", n=n) for n in range(1, PERSONS + 1)}
             who = ui.select(options, value=7, label=words("home.virtual_person")).classes("ps-wide")
             tag(who, "person")
-            virtual = ui.button(words("home.choose_virtual"), on_click=lambda: choose(toys.person, int(who.value)))
-            tag(virtual.props("unelevated no-caps"), "virtual")
+            button("virtual", words("home.choose_virtual"), lambda: choose(toys.person, int(who.value)), "unelevated")
         others = ui.column().classes("w-full ps-small-gap")
         with ui.row().classes("items-end ps-small-gap w-full"):
             other = ui.input(words("home.address"), placeholder="tcp://192.168.1.20:3333").classes("ps-wide")
             tag(other, "address")
-            use = ui.button(words("home.use"), on_click=lambda: choose(toys.choose, str(other.value or "")))
-            tag(use.props("outline no-caps"), "use")
+            button("use", words("home.use"), lambda: choose(toys.choose, str(other.value or "")))
 
     testing = False
 
@@ -64,7 +62,7 @@ def toy_section(page: Page, toys: Toys) -> None:  # noqa: C901
                 tag(ui.label(words("home.chosen", url=workspace.toy)).classes("ps-break text-weight-bold"), "chosen")
                 if toys.simulated:
                     simulation_badge(page)
-            tag(ui.button(words("home.test"), on_click=test).props("outline no-caps"), "test")
+            button("test", words("home.test"), test)
 
     async def test() -> None:
         nonlocal testing
@@ -103,8 +101,7 @@ def toy_section(page: Page, toys: Toys) -> None:  # noqa: C901
                     with ui.column().classes("ps-no-gap"):
                         ui.label(name or url).classes("ps-break")
                         ui.label(" · ".join(t for t in (url if name else "", about) if t)).classes("ps-dim ps-break")
-                    button = ui.button(words("home.choose"), on_click=lambda url=url: choose(toys.choose, url))
-                    named(button.props(SMALL), f"{words('home.choose')}: {name or url}")
+                    button("", words("home.choose"), lambda url=url: choose(toys.choose, url), SMALL, about=name or url)
             if toys.searching:
                 with ui.row().classes("items-center ps-small-gap").props('role="status"'):
                     ui.spinner(size="1.2em").props("aria-hidden=true")
@@ -114,8 +111,7 @@ def toy_section(page: Page, toys: Toys) -> None:  # noqa: C901
                 ui.label(words("home.none_found")).classes("ps-dim")
             for note in toys.listing.notes:
                 ui.label(note).classes("ps-dim ps-note")
-            again = ui.button(words("home.look_again" if toys.searched else "home.look"), on_click=toys.search)
-            tag(again.props(SMALL), "look")
+            button("look", words("home.look_again" if toys.searched else "home.look"), toys.search, SMALL)
 
     def update() -> None:
         show_chosen()
@@ -214,8 +210,8 @@ def uploads(page: Page, jobs: Jobs, on_bundle: Callable[[], Awaitable[None]]) ->
         )
         # Quasar's uploader is not accessible: a separate button opens its file dialog.
         tag(uploader.props("accept=.zip,.plush").style("display: none"), "upload")
-        choose = ui.button(words("home.choose_file"), icon="upload_file").props("outline no-caps")
-        tag(choose, "choose-file").on("click", js_handler=f"() => runMethod({uploader.id}, 'pickFiles', [])")
+        choose = button("choose-file", words("home.choose_file"), icon="upload_file")
+        choose.on("click", js_handler=f"() => runMethod({uploader.id}, 'pickFiles', [])")
 
 
 def _move_bundle(stored: Path, place: Path, name: str) -> None:
@@ -257,7 +253,7 @@ def invitation(page: Page) -> None:
                 text = ui.input(words("home.invite_address"), value=invite()).props("readonly")
                 tag(text.classes("w-full ps-mono"), "invitation")
 
-        tag(ui.button(words("home.invite_new"), on_click=show).props("outline no-caps"), "invite-new")
+        button("invite-new", words("home.invite_new"), show)
 
 
 MAKING = ("simulate", "import")
@@ -341,11 +337,9 @@ class NextStepCard:
             with ui.row().classes("items-center w-full"):
                 tag(ui.label(words(f"home.next_{step.key}", **step.values)), "next-sentence").classes("text-lg")
                 if text := words.get(f"home.next_{step.key}_button"):
-                    button = ui.button(text, on_click=lambda: self._do(step))
-                    tag(button.props("unelevated size=lg color=primary no-caps"), "next-button")
+                    button("next-button", text, lambda: self._do(step), "unelevated size=lg color=primary")
                 if second := {"try": "record", "live": "export"}.get(step.key):
-                    button = ui.button(words(f"home.next_{second}_button"))
-                    button.props("outline no-caps").on_click(lambda: ui.navigate.to(address(second)))
+                    button("", words(f"home.next_{second}_button"), lambda: ui.navigate.to(address(second)))
 
     def _do(self, step: NextStep) -> None:
         if step.key == "try":

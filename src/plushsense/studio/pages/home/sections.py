@@ -9,11 +9,11 @@ from typing import Any
 from nicegui import ui
 
 from plushsense.studio.app.jobs import DONE, REFUSED, RUNNING, STOPPED, Jobs, StudioJob
-from plushsense.studio.app.shell import Page, address, html, moment, named, tag
+from plushsense.studio.app.shell import Page, address, button, html, moment, named, tag
 from plushsense.studio.app.workspace import DATASETS, WORK
 from plushsense.studio.pages.home.overview import DatasetEntry, SessionEntry, WorkspaceSummary
 
-SMALL = 'outline no-caps padding="4px 12px"'
+SMALL = 'outline padding="4px 12px"'
 """Properties of the buttons in rows."""
 PAGE_OF = {
     "check": "review",
@@ -95,8 +95,7 @@ class DatasetSection:
             with ui.row().classes("items-center ps-small-gap"):
                 page_links(page, ("review", "train", "publish"), entry.name, dataset=entry.path)
                 if not any(j.state == RUNNING for j in checks):
-                    check = ui.button(words("home.check"), on_click=lambda: self._check(entry))
-                    named(check.props(SMALL), f"{words('home.check')}: {entry.name}")
+                    button("", words("home.check"), lambda: self._check(entry), SMALL, about=entry.name)
 
     def _check(self, entry: DatasetEntry) -> None:
         with self._page.show_errors():
@@ -160,16 +159,14 @@ class SessionSection:
                     box.on_value_change(lambda e, entry=entry: self._choose(entry, bool(e.value)))
             with ui.row().classes("items-end ps-small-gap w-full"):
                 name = tag(ui.input(words("home.name")).classes("ps-wide"), "new-name")
-                make = ui.button(words("home.make"), on_click=lambda: self._make(batch, str(name.value or "")))
-                tag(make.props("unelevated no-caps"), "make")
+                button("make", words("home.make"), lambda: self._make(batch, str(name.value or "")), "unelevated")
             first = batch[0]
             fitting = [d for d in datasets if (d.simulated, d.layout) == (first.simulated, first.layout)]
             if fitting:
                 with ui.row().classes("items-end ps-small-gap w-full"):
                     names = {str(d.path): d.name for d in fitting}
                     to = ui.select(names, value=next(iter(names)), label=words("home.add_to")).classes("ps-wide")
-                    add = ui.button(words("home.add"), on_click=lambda: self._add(batch, str(to.value)))
-                    tag(add.props("outline no-caps"), "add")
+                    button("add", words("home.add"), lambda: self._add(batch, str(to.value)))
 
     def _describe(self, entry: SessionEntry) -> str:
         words = self._page.words
@@ -274,9 +271,7 @@ class JobList:
             with self._page.show_errors():
                 action()
 
-        label = self._page.words(f"home.{key}")
-        button = ui.button(label, on_click=clicked).props(SMALL)
-        tag(named(button, f"{label}: {job.title}"), f"job-{key}")
+        button(f"job-{key}", self._page.words(f"home.{key}"), clicked, SMALL, about=job.title)
 
     def _progress(self, job: StudioJob) -> tuple[str, float | None]:
         """Return the progress as text, and as a share if it is known."""

@@ -24,7 +24,7 @@ from plushsense.devices.base import Counters, Frame, LossCounter, now_ms
 from plushsense.models.bundle import Bundle
 from plushsense.recording.plan import Protocol, Step
 from plushsense.recording.recorder import speed_of, with_speed
-from plushsense.recording.session import OpenSession, check_subject
+from plushsense.recording.session import OpenSession, check_subject, new_event, new_session
 from plushsense.recording.session_files import SIDECAR, SessionEvent, SessionHead, read_events
 from plushsense.recording.states import store_take
 from plushsense.recording.takes import FrameReceiver, RecordingTake, gap_entry
@@ -245,7 +245,7 @@ class Clips:
             running.writer.add_frames([r.frame for r in received], running.receiver.toy_ms)
             for gap in (r.gap for r in received):
                 if gap is not None:
-                    running.writer.submit(_event("gap", **gap))
+                    running.writer.submit(new_event("gap", **gap))
             running.ended = running.receiver.toy_ms >= 1000.0 * LONGEST_S
         if running.ended:
             threading.Thread(target=self.end, args=(running,), daemon=True).start()
@@ -258,14 +258,10 @@ class Clips:
     def _open(self, reader: LiveReader, device: TappedDevice, bundle: Bundle, subject: str) -> _Running:
         """Create the session of a new clip; the caller holds the lock."""
         person = self._workspace.inside(self._workspace.recordings / check_subject(subject.strip()))
-        taken = {p.name for p in person.iterdir()} if person.is_dir() else set()
-        number = 1
-        while f"live-{number}" in taken:
-            number += 1
         choice = reader.choice
         head = SessionHead(
             subject=person.name,
-            session=f"live-{number}",
+            session=new_session(person, "live-"),
             started_ms=now_ms(),
             layout=device.layout.to_dict(),
             protocol=_protocol(bundle).to_dict(),
@@ -278,7 +274,7 @@ class Clips:
         try:
             # Marked as finished, so that the recorder does not resume it as the last session of the person.
             session.log.write(
-                [_event("open", software=_SOFTWARE, device=device.url, speed=speed, row=0), _event("finished")]
+                [new_event("open", software=_SOFTWARE, device=device.url, speed=speed, row=0), new_event("finished")]
             )
         except OSError as cause:
             session.close()
@@ -362,7 +358,7 @@ class Clips:
             raise ConfigError(f"The clip '{key}' has no label yet: choose a part of it and its gesture.")
         summary = import_recordings(clip.folder, self._workspace.inside(dataset), add_to=True)
         with contextlib.closing(OpenSession(clip.folder)) as session, contextlib.suppress(OSError):
-            session.log.write([_event("added", dataset=dataset.name, recordings=summary.added["recordings"])])
+            session.log.write([new_event("added", dataset=dataset.name, recordings=summary.added["recordings"])])
         self.changed.notify()
         return summary
 
@@ -376,11 +372,7 @@ def _layout(head: SessionHead, folder: Path) -> Layout:
 
 
 def _close_event(receiver: FrameReceiver) -> SessionEvent:
-    return _event("close", rows=receiver.rows, lost=receiver.lost, seconds=round(receiver.toy_ms / 1000.0, 2))
-
-
-def _event(what: str, **details: Any) -> SessionEvent:
-    return SessionEvent(what, now_ms(), details)
+    return new_event("close", rows=receiver.rows, lost=receiver.lost, seconds=round(receiver.toy_ms / 1000.0, 2))
 
 
 def _protocol(bundle: Bundle) -> Protocol:

@@ -16,7 +16,7 @@ from nicegui import ui
 from plushsense.core.gestures import GestureSet
 from plushsense.core.recorder_csv import Frames
 from plushsense.dataset.store import DatasetHead
-from plushsense.studio.app.shell import LINES, Page, html, moment, named, on_change, section, tag
+from plushsense.studio.app.shell import LINES, Page, button, html, moment, named, on_change, section, tag
 from plushsense.studio.pages.live.clips import Clip, Clips
 from plushsense.studio.pages.live.reader import LiveReader
 from plushsense.studio.widgets.elements import Plot
@@ -67,9 +67,9 @@ def _recording_controls(page: Page, reader: LiveReader, clips: Clips) -> None:
         person = tag(ui.input(words("live.person"), placeholder="S01").props("maxlength=40"), "person")
         seconds = ui.select({s: words("live.seconds", s=s) for s in _KEEP_S}, value=10, label=words("live.keep_last"))
         tag(seconds, "keep-seconds").classes("w-32")
-        keep = tag(ui.button(words("live.keep"), icon="bookmark_add").props("unelevated no-caps"), "keep")
-        begin = tag(ui.button(words("live.record"), icon="fiber_manual_record").props("outline no-caps"), "record")
-        end = tag(ui.button(words("live.record_end"), icon="stop").props("unelevated no-caps"), "record-end")
+        keep = button("keep", words("live.keep"), None, "unelevated", icon="bookmark_add")
+        begin = button("record", words("live.record"), icon="fiber_manual_record")
+        end = button("record-end", words("live.record_end"), None, "unelevated", icon="stop")
         end.style("background: #a3310a !important; color: #fff !important")
         length = tag(ui.label("").props('role="timer"').classes("ps-dim"), "record-length")
 
@@ -146,8 +146,8 @@ def _row(page: Page, clips: Clips, clip: Clip, edit: Callable[[], Awaitable[None
         ui.label(state).classes("flex-grow")
         if clip.head.simulated:
             ui.label(words("live.simulated_short")).classes("ps-simulated")
-        button = ui.button(words("live.clip_open"), on_click=edit).props("flat dense no-caps")
-        named(button, f"{words('live.clip_open')} {clip.key}").set_enabled(clip.key != clips.recording)
+        opener = button("", words("live.clip_open"), edit, "flat dense")
+        named(opener, f"{words('live.clip_open')} {clip.key}").set_enabled(clip.key != clips.recording)
 
 
 class _ClipEditor:
@@ -195,10 +195,8 @@ class _ClipEditor:
                 [], label=words("live.clip_gesture"), with_input=True, new_value_mode="add-unique"
             ).classes("col-12 col-sm-4")
             tag(self._gesture, "clip-gesture")
-            label = ui.button(words("live.clip_label"), icon="label", on_click=self._label)
-            tag(label.props("unelevated no-caps"), "clip-label")
-            self._add_button = ui.button(words("live.clip_add"), icon="playlist_add", on_click=self._add)
-            tag(self._add_button.props("outline no-caps"), "clip-add")
+            button("clip-label", words("live.clip_label"), self._label, "unelevated", icon="label")
+            self._add_button = button("clip-add", words("live.clip_add"), self._add, icon="playlist_add")
         self._page = replace(page, _messages=ui.column().classes("w-full ps-messages"))
         self._add_button.set_enabled(bool(clip.labels))
         self._update_gestures()
@@ -237,10 +235,10 @@ class _ClipEditor:
         """Return the row nearest to a time."""
         return int(np.abs(self._seconds - second).argmin()) if len(self._seconds) else 0
 
-    def _picked(self, x: float, button: str, shift: bool) -> None:
+    def _picked(self, x: float, pressed: str, shift: bool) -> None:
         """Set the start at the first click, and the end at the next one, or with the right button or shift."""
         row = self._row(x)
-        if button == "right" or shift or (self._next_end and row > self._first):
+        if pressed == "right" or shift or (self._next_end and row > self._first):
             self._last, self._next_end = row + 1, False
         else:
             self._first, self._next_end = row, True

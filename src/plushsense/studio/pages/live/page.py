@@ -18,7 +18,17 @@ from plushsense.live.reactions import reaction_names
 from plushsense.recording.recorder import is_virtual
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.studio.app.guard import is_loopback
-from plushsense.studio.app.shell import AFFECT_COLOURS, AFFECT_SIGNS, LINES, Page, on_change, query, query_path, tag
+from plushsense.studio.app.shell import (
+    AFFECT_COLOURS,
+    AFFECT_SIGNS,
+    LINES,
+    Page,
+    button,
+    on_change,
+    query,
+    query_path,
+    tag,
+)
 from plushsense.studio.app.toys import Toys
 from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import VIRTUAL, Workspace
@@ -210,9 +220,9 @@ class LiveView(Element, component="live_view.js"):
         return scene
 
     def _seen(self, event: GenericEventArguments) -> None:
-        held = self._feed.holds
+        held_back = self._feed.holds
         self._feed.seen(int(event.args["n"]))
-        if held:
+        if held_back:
             # A toy that went silent meanwhile causes no further change, so what was held back is sent now.
             self.push()
 
@@ -312,9 +322,9 @@ def _controls(page: Page, reader: LiveReader) -> None:  # noqa: C901
         names |= {name: words.get(f"live.reactions_{name}", name) for name in reaction_names()}
         reactions = tag(ui.select(names, value=choice.reactions, label=words("live.reactions")), "reactions")
     with ui.row().classes("w-full items-center ps-small-gap"):
-        start = tag(ui.button(words("live.start"), icon="play_arrow").props("unelevated no-caps"), "start")
-        stop = tag(ui.button(words("live.stop"), icon="stop").props("outline no-caps"), "stop")
-        look = tag(ui.button(words("live.look"), icon="search", on_click=toys.search).props("flat no-caps"), "look")
+        start = button("start", words("live.start"), None, "unelevated", icon="play_arrow")
+        stop = button("stop", words("live.stop"), icon="stop")
+        look = button("look", words("live.look"), toys.search, "flat", icon="search")
         virtual = tag(ui.checkbox(words("live.simulated"), value=choice.simulated), "simulated")
         busy = tag(ui.spinner(size="1.6em").props("aria-hidden=true"), "busy")
     busy.set_visibility(False)

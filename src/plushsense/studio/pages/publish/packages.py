@@ -24,7 +24,7 @@ from plushsense.dataset.publishing.tables import list_package_files
 from plushsense.dataset.store import Dataset, read_people
 from plushsense.studio.app.guard import download_address
 from plushsense.studio.app.jobs import DONE, Jobs, StudioJob
-from plushsense.studio.app.shell import Page, address, html, moment, set_address, tag
+from plushsense.studio.app.shell import Page, address, button, html, moment, set_address, tag
 from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import PACKAGES, Workspace
 from plushsense.studio.widgets.elements import WorkPanel, link, notice, size, table, text, verdict
@@ -228,23 +228,23 @@ class PackagesSection:
         with self.page.show_errors():
             if name not in (await run.io_bound(lambda: packages_of(self.workspace)) or []):
                 raise ConfigError(f"There is no package '{name}' in this studio: choose one from the list.")
-            found = await run.io_bound(lambda: PackageFacts.of(self.workspace, name))
-            assert found is not None
-            job = newest_validation(self.workspace.part(Jobs), found)
+            package = await run.io_bound(lambda: PackageFacts.of(self.workspace, name))
+            assert package is not None
+            job = newest_validation(self.workspace.part(Jobs), package)
             set_address(address("publish", name=name))
             self._detail.clear()
             with self._detail:
                 text(words("publish.one", name=name), "h2")
-                if found.simulated:
+                if package.simulated:
                     notice(words("shell.simulation"))
-                self._answers(found, job)
+                self._answers(package, job)
                 with tag(ui.column().classes("ps-card w-full"), "recognised"):
                     text(words("publish.recognised"), "h3")
-                    for sentence in reidentification_text(words, found.reidentification):
+                    for sentence in reidentification_text(words, package.reidentification):
                         text(sentence)
-                self._contents(found)
+                self._contents(package)
 
-    def _answers(self, found: PackageFacts, job: StudioJob | None) -> None:
+    def _answers(self, package: PackageFacts, job: StudioJob | None) -> None:
         words = self.words
         with tag(ui.column().classes("ps-card w-full"), "answers"):
             text(words("publish.answers"), "h3")
@@ -258,8 +258,8 @@ class PackagesSection:
                 for each in [*job.result.get("warnings", ()), *job.result.get("notes", ())]:
                     notice(f"{words('publish.note')} {each}", "info")
             self._thorough = tag(ui.checkbox(words("publish.with_thorough")), "check-thorough")
-            again = ui.button(words("publish.check"), icon="fact_check", on_click=lambda: self._check(found))
-            tag(again.props("outline no-caps"), "check").set_enabled("publish" not in self.lacking)
+            check = button("check", words("publish.check"), lambda: self._check(package), icon="fact_check")
+            check.set_enabled("publish" not in self.lacking)
 
     def _validators(self, result: dict[str, Any]) -> None:
         words = self.words
@@ -267,8 +267,9 @@ class PackagesSection:
         for each in result["validators"]:
             good, name = not each["problems"], each["validator"]
             about = words(f"publish.v_{name}") if name in VALIDATORS else ""
-            found = words("publish.problems_found", n=each["problems"])
-            mark = verdict(good, words("publish.passed") if good else found)
+            mark = verdict(
+                good, words("publish.passed") if good else words("publish.problems_found", n=each["problems"])
+            )
             rows.append((name, mark, about, each["looked_at"]))
         head = [words(f"publish.{k}") for k in ("validator", "answer", "looks_at", "looked_at")]
         tag(table(words("publish.validators_caption"), head, rows), "validators")
@@ -281,45 +282,45 @@ class PackagesSection:
             if len(problems) > _MAX_PROBLEMS:
                 text(words("publish.more_problems", n=len(problems) - _MAX_PROBLEMS), classes="ps-dim")
 
-    async def _check(self, found: PackageFacts) -> None:
+    async def _check(self, package: PackageFacts) -> None:
         self.page.say("")
         with self.page.show_errors():
-            spec = {"place": str(self.workspace.inside(found.place)), "thorough": bool(self._thorough.value)}
+            spec = {"place": str(self.workspace.inside(package.place)), "thorough": bool(self._thorough.value)}
             await self.work.start("validate", spec)
 
-    def _contents(self, found: PackageFacts) -> None:
+    def _contents(self, package: PackageFacts) -> None:
         words = self.words
         with tag(ui.column().classes("ps-card w-full"), "contents"):
             text(words("publish.contents"), "h3")
-            rows = [(name, f"{files:,}", size(total)) for name, (files, total) in found.contents.items()]
-            files, total = (sum(each) for each in zip(*found.contents.values(), strict=True)) if rows else (0, 0)
+            rows = [(name, f"{files:,}", size(total)) for name, (files, total) in package.contents.items()]
+            files, total = (sum(each) for each in zip(*package.contents.values(), strict=True)) if rows else (0, 0)
             with ui.expansion(words("publish.files", n=f"{files:,}", size=size(total))).classes("w-full"):
                 head = [words(f"publish.{k}") for k in ("file", "files_count", "size")]
                 table(words("publish.contents_caption"), head, rows, (1, 2))
-            if found.citation:
+            if package.citation:
                 text(words("publish.cite"), "h3")
-                tag(text(found.citation), "citation")
-                if "doi.org" not in found.citation:
+                tag(text(package.citation), "citation")
+                if "doi.org" not in package.citation:
                     text(words("publish.no_doi"), classes="ps-dim")
             text(words("publish.take"), "h3")
-            if found.zip is not None:
-                message = words("publish.download", size=size(found.zip.stat().st_size))
-                download = ui.link(message, download_address(PACKAGES, found.name)).classes("ps-link")
+            if package.zip is not None:
+                message = words("publish.download", size=size(package.zip.stat().st_size))
+                download = ui.link(message, download_address(PACKAGES, package.name)).classes("ps-link")
                 tag(download.props("download"), "download")
             else:
                 notice(words("publish.no_zip"))
             text(words("publish.by_hand"))
-            text(str(found.place), classes="ps-path")
+            text(str(package.place), classes="ps-path")
 
 
-def newest_validation(jobs: Jobs, found: PackageFacts) -> StudioJob | None:
+def newest_validation(jobs: Jobs, package: PackageFacts) -> StudioJob | None:
     """Return the newest job that validated this package since it was written."""
-    places = {str(p) for p in (found.folder, found.zip) if p is not None}
+    places = {str(p) for p in (package.folder, package.zip) if p is not None}
     return next(
         (
             j
             for j in jobs.all("publish", "validate")
-            if j.state == DONE and j.spec.get("place") in places and j.ended_s >= found.made_s - 1.0
+            if j.state == DONE and j.spec.get("place") in places and j.ended_s >= package.made_s - 1.0
         ),
         None,
     )

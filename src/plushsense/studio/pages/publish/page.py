@@ -13,7 +13,7 @@ from plushsense.dataset.publishing.description import LICENCES
 from plushsense.dataset.publishing.package import complete_head
 from plushsense.dataset.store import Dataset, DatasetHead
 from plushsense.studio.app.jobs import Jobs, StudioJob
-from plushsense.studio.app.shell import Page, address, query, tag
+from plushsense.studio.app.shell import Page, address, button, query, tag
 from plushsense.studio.app.workspace import DATASETS, PACKAGES, plain_name
 from plushsense.studio.pages.publish.packages import KEYS, DatasetFacts, PackagesSection, missing_extras
 from plushsense.studio.widgets.elements import WorkPanel, facts, notice, scroll_to, style, text, titles
@@ -72,21 +72,21 @@ class PseudonymsForm:
     """
 
     def __init__(
-        self, page: Page, found: DatasetFacts, start: Callable[[str, str, list[str], bool], Awaitable[None]]
+        self, page: Page, chosen: DatasetFacts, start: Callable[[str, str, list[str], bool], Awaitable[None]]
     ) -> None:
         words, self._start = page.words, start
-        simulated = found.dataset is not None and found.dataset.head.simulated
-        if not found.own_codes and not found.own_dates:
+        simulated = chosen.dataset is not None and chosen.dataset.head.simulated
+        if not chosen.own_codes and not chosen.own_dates:
             tag(text(words("publish.renamed_already"), classes="ps-dim"), "renamed-already")
             return
-        codes = ", ".join(found.own_codes[:_MAX_CODES]) + (" …" if len(found.own_codes) > _MAX_CODES else "")
+        codes = ", ".join(chosen.own_codes[:_MAX_CODES]) + (" …" if len(chosen.own_codes) > _MAX_CODES else "")
         with tag(ui.column().classes("w-full"), "advice"):
             notice(words("publish.advice", codes=codes or "–"), "info" if simulated else "warning")
         with tag(ui.expansion(words("publish.rename")).classes("w-full"), "rename"):
             text(words("publish.rename_about"))
-            name = page.workspace.free_name(DATASETS, f"{found.path.name}-shared")
+            name = page.workspace.free_name(DATASETS, f"{chosen.path.name}-shared")
             self._name = tag(ui.input(words("publish.rename_name"), value=name).props("maxlength=64"), "rename-name")
-            key = ui.input(words("publish.rename_key"), value=f"{found.path.name}-people.csv").props("maxlength=64")
+            key = ui.input(words("publish.rename_key"), value=f"{chosen.path.name}-people.csv").props("maxlength=64")
             self._key = tag(key, "rename-key")
             for field in (self._name, self._key):
                 field.classes("w-full")
@@ -94,8 +94,7 @@ class PseudonymsForm:
             self._listed = tag(ui.textarea(words("publish.rename_words")).props("autogrow").classes("w-full"), "words")
             self._drop = tag(ui.checkbox(words("publish.rename_drop")), "drop-notes")
             notice(words("publish.rename_safe"))
-            do = ui.button(words("publish.rename_do"), icon="masks", on_click=self._go).props("outline no-caps")
-            tag(do, "rename-do")
+            button("rename-do", words("publish.rename_do"), self._go, icon="masks")
 
     async def _go(self) -> None:
         listed = [line.strip() for line in (self._listed.value or "").splitlines() if line.strip()]
@@ -156,24 +155,23 @@ class _Publishing:
 
     async def _choose(self, path: str) -> None:
         words = self.words
-        found = await run.io_bound(lambda: DatasetFacts.of(Path(path)))
-        assert found is not None
-        self.dataset = found
+        chosen = await run.io_bound(lambda: DatasetFacts.of(Path(path)))
+        assert chosen is not None
+        self.dataset = chosen
         self._rest.clear()
         with self._rest:
-            if found.dataset is None:
-                tag(notice(found.problem, "error"), "dataset-problem")
+            if chosen.dataset is None:
+                tag(notice(chosen.problem, "error"), "dataset-problem")
                 return
-            if found.dataset.head.simulated:
+            if chosen.dataset.head.simulated:
                 notice(words("shell.simulation"))
-            tag(facts(self._facts_of(found.dataset)), "dataset-facts")
-            PseudonymsForm(self.page, found, self._pseudonymise)
-            self.statements = StatementsForm(self.page, found.path, found.dataset.head)
-            self._choices(found)
-            name = ui.input(words("publish.name"), value=self._free_name(found.path.name)).props("maxlength=64")
+            tag(facts(self._facts_of(chosen.dataset)), "dataset-facts")
+            PseudonymsForm(self.page, chosen, self._pseudonymise)
+            self.statements = StatementsForm(self.page, chosen.path, chosen.dataset.head)
+            self._choices(chosen)
+            name = ui.input(words("publish.name"), value=self._free_name(chosen.path.name)).props("maxlength=64")
             self._name = tag(name.classes("w-full"), "name")
-            button = ui.button(words("publish.do"), icon="inventory_2", on_click=self._start).props("no-caps")
-            self._button = tag(button, "do")
+            self._button = button("do", words("publish.do"), self._start, "", icon="inventory_2")
         self._allow()
 
     def _facts_of(self, dataset: Dataset) -> list[tuple[str, str]]:
@@ -188,7 +186,7 @@ class _Publishing:
             (words("publish.place"), str(dataset.path)),
         ]
 
-    def _choices(self, found: DatasetFacts) -> None:
+    def _choices(self, chosen: DatasetFacts) -> None:
         words = self.words
         text(words("publish.choices"), "h3")
         self._switches: dict[str, ui.checkbox] = {}
@@ -199,17 +197,14 @@ class _Publishing:
         if "baselines" in self.lacking:
             self._switches["reidentification"].set_value(False)
             self._switches["reidentification"].set_enabled(False)
-            tag(
-                notice(words("publish.missing_baselines")),
-                "missing-baselines",
-            )
+            tag(notice(words("publish.missing_baselines")), "missing-baselines")
         self._columns: dict[str, ui.checkbox] = {}
-        if found.columns:
+        if chosen.columns:
             text(words("publish.columns"), classes="ps-dim")
-            self._columns = {c: tag(ui.checkbox(c), f"column-{c}") for c in found.columns}
+            self._columns = {c: tag(ui.checkbox(c), f"column-{c}") for c in chosen.columns}
         self._keep = tag(ui.checkbox(words("publish.with_key")), "with-key")
         text(words("publish.with_key_about"), classes="ps-dim").style("margin: -12px 0 0 40px")
-        field = ui.input(words("publish.key"), value=f"{found.path.name}.key").props("maxlength=64").classes("w-full")
+        field = ui.input(words("publish.key"), value=f"{chosen.path.name}.key").props("maxlength=64").classes("w-full")
         self._key = tag(field.bind_visibility_from(self._keep, "value"), "key")
         where = text(words("publish.key_place", folder=str(self.workspace.folder / KEYS)), classes="ps-dim")
         where.bind_visibility_from(self._keep, "value")
@@ -222,11 +217,11 @@ class _Publishing:
             self._button.set_enabled("publish" not in self.lacking and not self.work.running("publish"))
 
     async def _start(self) -> None:
-        found = self.dataset
-        assert found is not None
+        chosen = self.dataset
+        assert chosen is not None
         self.page.say("")
         with self.page.show_errors():
-            dataset = self.workspace.inside(found.path)
+            dataset = self.workspace.inside(chosen.path)
             place = self.workspace.new(PACKAGES, self._name.value or "")
             if place.with_name(f"{place.name}.zip").exists():
                 raise ConfigError(f"'{place.name}.zip' exists already: give another name, nothing is replaced.")
@@ -253,12 +248,12 @@ class _Publishing:
         return self.workspace.new(KEYS, name)
 
     async def _pseudonymise(self, name: str, key: str, words: list[str], drop_notes: bool) -> None:
-        found = self.dataset
-        assert found is not None
+        chosen = self.dataset
+        assert chosen is not None
         self.page.say("")
         with self.page.show_errors():
             spec: dict[str, Any] = {
-                "dataset": str(self.workspace.inside(found.path)),
+                "dataset": str(self.workspace.inside(chosen.path)),
                 "place": str(self.workspace.new(DATASETS, name)),
                 "key": str(self._key_path(key)),
                 "words": words,

@@ -29,7 +29,6 @@ from plushsense.recording.recorder import (
 )
 from plushsense.recording.session import OpenSession, SessionSummary, is_finished, list_sessions
 from plushsense.recording.session_files import SESSION_HEAD, SessionHead
-from plushsense.recording.states import RecorderStatus, StepResult
 from plushsense.studio.app.toys import TappedDevice
 from plushsense.studio.app.workspace import VIRTUAL, ChangeSignal, Workspace
 
@@ -62,14 +61,6 @@ class ActiveSession:
     def head(self) -> SessionHead:
         """The head of the session."""
         return self.recorder.session.head
-
-    def status(self) -> RecorderStatus:
-        """Return the recorder's current status."""
-        return self.recorder.status()
-
-    def steps(self) -> tuple[StepResult, ...]:
-        """Return all steps of the plan, each with its recording."""
-        return self.recorder.steps()
 
     def press(self, key: str, seen: str) -> bool:
         """Run a command if the status is still the one that was displayed; return whether it was run.
@@ -156,7 +147,7 @@ class RecordController:
     def _active_of(self, request: SessionRequest, subject: str) -> ActiveSession | None:
         """Return the active session of a person, if any; end finished sessions of this person or toy."""
         for session in self.active_sessions():
-            ended = session.status().state in ("finished", "stopped")
+            ended = session.recorder.status().state in ("finished", "stopped")
             if ended and (session.head.subject == subject or session.request.device == request.device):
                 self._end(session)
             elif session.head.subject == subject:
@@ -274,7 +265,7 @@ class RecordController:
             device.close()
             raise
         session = ActiveSession(
-            _name(folder),
+            f"{folder.parent.name}/{folder.name}",
             recorder,
             device,
             replace(request, subject=head.subject),
@@ -285,7 +276,3 @@ class RecordController:
             self._active[session.name] = session
         self.changed.notify()
         return session
-
-
-def _name(folder: Path) -> str:
-    return f"{folder.parent.name}/{folder.name}"

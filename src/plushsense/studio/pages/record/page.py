@@ -12,7 +12,7 @@ from plushsense.devices.opening import list_devices
 from plushsense.recording.plan import DEFAULT, wordings
 from plushsense.recording.recorder import PROTOCOL, SessionRequest, is_virtual
 from plushsense.recording.session import SessionSummary
-from plushsense.studio.app.shell import Page, address, html, named, query, tag
+from plushsense.studio.app.shell import Page, address, button, html, named, query, tag
 from plushsense.studio.app.words import Words
 from plushsense.studio.pages.record.controller import ActiveSession, RecordController
 from plushsense.studio.pages.record.session import show_session, summary
@@ -47,9 +47,11 @@ async def show_start(page: Page, controller: RecordController, requested: str, e
         requested: a session that the address names and that is not open; ``ended``: one that was just closed.
     """
     sessions = await run.io_bound(controller.sessions) or []
-    mine = {_name(s): s for s in sessions}
+    mine = {s.name: s for s in sessions}
     if ended in mine:
-        _report_ended(page, mine[ended])
+        session = mine[ended]
+        counts = {"name": ended, "done": session.done, "steps": session.steps}
+        page.say(page.words("record.ended_whole" if session.finished else "record.ended_part", **counts), "good")
     elif requested in mine and not mine[requested].finished:
         page.say(page.words("record.not_open", name=requested), "warning")
     elif requested:
@@ -64,27 +66,18 @@ async def show_start(page: Page, controller: RecordController, requested: str, e
             ui.link(page.words("record.import_them"), "/").classes("ps-link")
 
 
-def _report_ended(page: Page, session: SessionSummary) -> None:
-    counts = {"name": _name(session), "done": session.done, "steps": session.steps}
-    page.say(page.words("record.ended_whole" if session.finished else "record.ended_part", **counts), "good")
-
-
-def _name(session: SessionSummary) -> str:
-    return f"{session.folder.parent.name}/{session.folder.name}"
-
-
 def _open_ones(page: Page, controller: RecordController) -> None:
     for session in controller.active_sessions():
         with tag(ui.row().classes("ps-card w-full items-center"), "open-session"):
             ui.label(page.words("record.open_now", name=session.name)).classes("flex-grow text-bold")
-            there = page.words("record.show")
-            button = ui.button(there, on_click=lambda s=session: ui.navigate.to(address("record", session=s.name)))
-            named(button.props("no-caps unelevated"), f"{there}: {session.name}")
+            there = address("record", session=session.name)
+            show = page.words("record.show")
+            button("", show, lambda to=there: ui.navigate.to(to), "unelevated", about=session.name)
 
 
 def _unfinished(page: Page, controller: RecordController, sessions: list[SessionSummary]) -> None:
     words = page.words
-    left = [s for s in sessions if not s.finished and controller.get(_name(s)) is None]
+    left = [s for s in sessions if not s.finished and controller.get(s.name) is None]
     if not left:
         return
     with ui.column().classes("ps-card w-full"):
@@ -99,7 +92,7 @@ def _unfinished(page: Page, controller: RecordController, sessions: list[Session
 
 
 def _one_unfinished(page: Page, controller: RecordController, session: SessionSummary) -> None:
-    words, name = page.words, _name(session)
+    words, name = page.words, session.name
     with tag(ui.row().classes("w-full items-center"), f"unfinished-{name}"):
         if session.head is None or session.protocol is None:
             ui.label(f"{name}: {session.error}").classes("flex-grow")
@@ -114,14 +107,13 @@ def _one_unfinished(page: Page, controller: RecordController, session: SessionSu
         titles = {u: toy_name(words, u) for u in toys}
         toy = ui.select(titles, value=toys[0], label=words("record.toy")).style("width: 24rem; max-width: 100%")
         named(toy.props("outlined dense"), f"{words('record.toy')}: {name}")
-        button = ui.button(words("record.go_on")).props("no-caps unelevated")
-        named(button, f"{words('record.go_on')}: {name}")
-        button.on_click(lambda: _open_session(page, button, lambda: controller.resume(name, str(toy.value))))
+        go_on = button("", words("record.go_on"), None, "unelevated", about=name)
+        go_on.on_click(lambda: _open_session(page, go_on, lambda: controller.resume(name, str(toy.value))))
 
 
-async def _open_session(page: Page, button: ui.button, work: Callable[[], ActiveSession]) -> None:
+async def _open_session(page: Page, begin: ui.button, work: Callable[[], ActiveSession]) -> None:
     """Open the toy, which may take a while, and go to the session; show why if that is refused."""
-    button.disable()
+    begin.disable()
     page.say(page.words("record.opening"))
     try:
         with page.show_errors():
@@ -129,7 +121,7 @@ async def _open_session(page: Page, button: ui.button, work: Callable[[], Active
             if session is not None:
                 ui.navigate.to(address("record", session=session.name))
     finally:
-        button.enable()
+        begin.enable()
 
 
 class _Form:
@@ -153,7 +145,7 @@ class _Form:
             with ui.row().classes("w-full items-start"):
                 toys = controller.toys()
                 self._toy = self._select({u: toy_name(words, u) for u in toys}, "toy", toys[0])
-                self._look = ui.button(words("record.look"), on_click=self._look_for_toys).props("no-caps outline")
+                self._look = button("", words("record.look"), self._look_for_toys)
                 self._other = self._input("other_toy", "other_toy_hint")
             with ui.element("details").classes("w-full"):
                 summary(words("record.more"))
@@ -162,8 +154,7 @@ class _Form:
                     self._layout = self._select(layouts, "layout", "")
                     self._simulated = ui.checkbox(words("record.is_virtual"))
                     self._anew = ui.checkbox(words("record.anew"))
-            self._begin = ui.button(words("record.begin"), on_click=self._begin_session)
-            tag(self._begin, "begin").props("no-caps unelevated size=lg")
+            self._begin = button("begin", words("record.begin"), self._begin_session, "unelevated size=lg")
         self._choose_words()
 
     def _input(self, key: str, hint: str) -> ui.input:
@@ -194,17 +185,17 @@ class _Form:
         self._look.disable()
         self._page.say(words("record.looking", s=f"{_SCAN_S:g}"))
         try:
-            found = await run.io_bound(list_devices, _SCAN_S)
+            listing = await run.io_bound(list_devices, _SCAN_S)
         finally:
             self._look.enable()
-        if found is None:
+        if listing is None:
             return
         known = dict.fromkeys(self._controller.toys())
         options = {u: toy_name(words, u) for u in known} | {
-            d.url: f"{d.name} · {d.url}" for d in found.devices if d.url not in known
+            d.url: f"{d.name} · {d.url}" for d in listing.devices if d.url not in known
         }
         self._toy.set_options(options, value=self._toy.value)
-        self._page.say(" ".join([words("record.found", n=len(options)), *found.notes]))
+        self._page.say(" ".join([words("record.found", n=len(options)), *listing.notes]))
 
     def _request(self) -> SessionRequest:
         toy = str(self._other.value or "").strip() or str(self._toy.value)

@@ -12,7 +12,7 @@ from nicegui import run, ui
 from nicegui.element import Element
 
 from plushsense.recording.states import RecorderStatus
-from plushsense.studio.app.shell import LINES, Keys, Page, address, focus, html, named, on_change, on_click, tag
+from plushsense.studio.app.shell import LINES, Keys, Page, address, button, focus, html, named, on_change, on_click, tag
 from plushsense.studio.app.words import Words
 from plushsense.studio.pages.record.controller import ActiveSession, RecordController
 from plushsense.studio.widgets.elements import Plot, own_picture, picture
@@ -134,7 +134,7 @@ class StepList:
         self._states: list[str] = []
         self._seen = ""
         words = page.words
-        steps = session.steps()
+        steps = session.recorder.steps()
         with tag(ui.element("details").classes("ps-card w-full"), "steps"):
             summary(words("record.steps"))
             if len(steps) > _MAX_STEPS:
@@ -152,9 +152,9 @@ class StepList:
             self._states = [""] * len(steps)
 
     def _button(self, number: int, go: Callable[[int, str], Any]) -> ui.button:
-        button = tag(ui.button().props("no-caps outline dense"), f"step-{number}").style("min-width: 3.2rem")
-        on_click(button, lambda seen: go(number, seen))
-        return button
+        step = button(f"step-{number}", "", look="outline dense").style("min-width: 3.2rem")
+        on_click(step, lambda seen: go(number, seen))
+        return step
 
     def draw(self, status: RecorderStatus) -> None:
         """Update the state of each step if anything has changed."""
@@ -162,7 +162,7 @@ class StepList:
             return
         self._seen = status.seen
         words = self._page.words
-        for n, result in enumerate(self._session.steps()):
+        for n, result in enumerate(self._session.recorder.steps()):
             state = "made" if result.file else "skipped" if result.skipped else "open"
             now = n == status.step.number and status.state not in ("finished", "stopped")
             key = f"{state}{now}"
@@ -289,25 +289,20 @@ class _View:
     def _controls(self) -> None:
         words = self._page.words
         with ui.row().classes("ps-current w-full items-center").style("gap: 10px"):
-            self._main = tag(ui.button(color=None).props("no-caps unelevated"), "main")
+            self._main = button("main", "", look="unelevated", color=None)
             self._main.style("font-size: 1.6rem; min-width: 260px; min-height: 72px")
             on_click(self._main, self._main_clicked, once=True)
             self._small: dict[str, ui.button] = {}
             for key, name in {"r": "redo", "s": "skip", "b": "back", "p": "pause"}.items():
-                button = tag(ui.button(words(f"record.{name}")).props("no-caps outline"), name)
-                button.style("min-height: 48px")
-                on_click(button, partial(self._press, key))
-                self._small[key] = button
+                self._small[key] = button(name, words(f"record.{name}")).style("min-height: 48px")
+                on_click(self._small[key], partial(self._press, key))
             ui.space()
-            self._end_button = ui.button(words("record.end"), on_click=self._ask_end)
-            tag(self._end_button, "end").props("no-caps flat").style("min-height: 48px")
+            self._end_button = button("end", words("record.end"), self._ask_end, "flat").style("min-height: 48px")
         self._ending = tag(ui.row().classes("ps-message ps-message-warning w-full items-center"), "ending")
         with self._ending:
             self._end_text = ui.label().classes("flex-grow")
-            yes = ui.button(words("record.end_yes"), on_click=self._end, color="deep-orange-10")
-            tag(yes.props("no-caps unelevated"), "end-yes")
-            self._no = ui.button(words("record.end_no"), on_click=self._stay, color=None).props("no-caps outline")
-            tag(self._no, "end-no")
+            button("end-yes", words("record.end_yes"), self._end, "unelevated", color="deep-orange-10")
+            self._no = button("end-no", words("record.end_no"), self._stay, color=None)
         self._ending.set_visibility(False)
 
     def _finished(self) -> None:
@@ -326,8 +321,7 @@ class _View:
         with ui.row().classes("w-full items-center no-wrap"):
             self._note = tag(ui.input(label=words("record.note")).props("maxlength=500 name=note"), "note")
             self._note.classes("flex-grow").on("keydown.enter", self._store_note)
-            keep = ui.button(words("record.keep_note"), on_click=self._store_note).props("no-caps outline")
-            tag(keep, "keep-note")
+            button("keep-note", words("record.keep_note"), self._store_note)
 
     # Commands -------------------------------------------------------------------------------------------------
 
@@ -342,7 +336,7 @@ class _View:
     async def _main_clicked(self, seen: str) -> None:
         state = seen.partition(".")[0]
         if state in ("finished", "stopped"):
-            if self._left or self._session.status().state == state:
+            if self._left or self._session.recorder.status().state == state:
                 await (self._end() if state == "finished" else self._reopen())
         else:
             self._press("p" if state == "paused" else " ", seen)
@@ -357,7 +351,7 @@ class _View:
 
     def _ask_end(self) -> None:
         words = self._page.words
-        recording = self._session.status().state == "recording"
+        recording = self._session.recorder.status().state == "recording"
         self._end_text.text = words("record.end_running" if recording else "record.end_really")
         self._ending.set_visibility(True)
         focus(self._no)
@@ -404,7 +398,7 @@ class _View:
             reopened = self._controller.get(self._session.name) is not None
             ui.navigate.to(address("record", **{"session" if reopened else "ended": self._session.name}))
             return
-        s = self._session.status()
+        s = self._session.recorder.status()
         self._keys.show(s.seen)
         self._draw_plan(s)
         self._draw_state(s)

@@ -10,7 +10,7 @@ import numpy as np
 from nicegui import ui
 from nicegui.element import Element
 
-from plushsense.studio.app.shell import AFFECT_COLOURS, AFFECT_SIGNS, LINES, tag
+from plushsense.studio.app.shell import AFFECT_COLOURS, AFFECT_SIGNS, LINES, button, icon_button, named, tag
 from plushsense.studio.pages.review.controller import ReviewController
 from plushsense.studio.pages.review.signals import ACTIVITY, ALL, GestureOverlay
 from plushsense.studio.pages.review.table_view import SIGNS, ask_reason, finding_button, finding_text
@@ -173,9 +173,9 @@ class GestureOverlayView:
                 with ui.row().classes("items-center no-wrap w-full"):
                     dash = ui.element("span").style("width: 22px; height: 4px; flex: none")
                     dash.style(f"background: {colours[c.recording]}")
-                    button = ui.button(f"{c.recording}: {c.why}", on_click=lambda c=c: desk.open(c.recording))
-                    button.props("no-caps flat dense align=left").style("overflow-wrap: anywhere; text-align: left")
-                    button.classes("flex-grow")
+                    text = f"{c.recording}: {c.why}"
+                    name = button("", text, lambda c=c: desk.open(c.recording), "flat dense align=left")
+                    name.style("overflow-wrap: anywhere; text-align: left").classes("flex-grow")
             if len(outliers) > _MAX_OUTLIERS:
                 ui.label(words("review.more_outliers", n=len(outliers) - _MAX_OUTLIERS)).classes("ps-dim")
 
@@ -246,8 +246,7 @@ class RecordingView:
                                 ui.label(words(f"review.key_{'next' if does == 'accept' and not trims else does}"))
 
     def _button(self, key: str, action: Any, name: str, look: str = "outline") -> ui.button:
-        button = ui.button(self.desk.words(f"review.{key}"), on_click=action).props(f"no-caps {look}")
-        return tag(button.classes("ps-act"), name)
+        return button(name, self.desk.words(f"review.{key}"), action, look).classes("ps-act")
 
     def _actions(self, trims: bool) -> None:
         desk = self.desk
@@ -265,9 +264,8 @@ class RecordingView:
             side.props(f'no-caps dense unelevated aria-label="{words("review.sets")}"').classes("ps-toggle")
             tag(side, "side").on_value_change(lambda e: setattr(self, "side", str(e.value)))
             for sign, by in (("−10", -10), ("−1", -1), ("+1", 1), ("+10", 10)):
-                button = ui.button(sign, on_click=lambda by=by: self.step(by, self.side == STOP))
-                button.props(f'no-caps outline dense aria-label="{words("review.step", by=sign)}"').classes("ps-act")
-                tag(button, f"step{by}")
+                step = button(f"step{by}", sign, lambda by=by: self.step(by, self.side == STOP), "outline dense")
+                named(step.classes("ps-act"), words("review.step", by=sign))
             self._button("drop", self._drop, "drop", "outline dense")
             self.untrim = self._button("untrim", self._untrim, "untrim", "outline dense")
             ends = ui.switch(words("review.ends"), value=self.desk.ends, on_change=lambda e: self._ends(bool(e.value)))
@@ -282,8 +280,8 @@ class RecordingView:
             toggle.props(f'no-caps dense unelevated aria-label="{words("review.group")}"').classes("ps-toggle")
             tag(toggle, "group").on_value_change(lambda e: self._grouped(str(e.value)))
             for key, (icon, factor) in _ZOOMS.items():
-                button = ui.button(icon=icon, on_click=lambda factor=factor: self.plot.zoom(factor))
-                tag(button.props(f'flat round dense aria-label="{words(f"review.{key}")}"').classes("ps-act"), key)
+                zoom = icon_button(icon, words(f"review.{key}"), lambda factor=factor: self.plot.zoom(factor))
+                tag(zoom.classes("ps-act"), key)
 
     def _kind(self, kind: str) -> str:
         return self.desk.words.get(f"review.kind_{kind}", kind)

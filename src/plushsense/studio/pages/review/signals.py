@@ -61,12 +61,6 @@ class RecordingSignals:
     values: NDArray[np.float64]
     activity: NDArray[np.float64]
 
-    @property
-    def groups(self) -> list[str]:
-        """Groups of curves that can be plotted: all channels, the channels of one kind, or the activity."""
-        kinds = list(dict.fromkeys(c.kind for c in self.layout.channels))
-        return [ALL, *(kinds if len(kinds) > 1 else []), ACTIVITY]
-
     @cached_property
     def _centred(self) -> NDArray[np.float64]:
         whole = np.isnan(self.values).all(axis=0)

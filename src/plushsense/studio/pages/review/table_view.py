@@ -9,7 +9,7 @@ from nicegui import ui
 from nicegui.element import Element
 
 from plushsense.dataset.quality.findings import Finding
-from plushsense.studio.app.shell import AFFECT_SIGNS, tag
+from plushsense.studio.app.shell import AFFECT_SIGNS, button, icon_button, tag
 from plushsense.studio.app.words import Words
 from plushsense.studio.pages.review.controller import SORTS, ReviewController
 from plushsense.studio.pages.review.review import ReviewedRecording
@@ -55,7 +55,7 @@ def finding_button(desk: ReviewController, finding: Finding, recording: str = ""
         await desk.decide(recording or desk.current, lambda: desk.review.reopen_finding(desk.visit, finding, desk.name))
 
     key, action = ("reopen", reopen) if finding.accepted else ("accept_finding", lambda: ask_reason(desk, finding))
-    return ui.button(desk.words(f"review.{key}"), on_click=action).props("no-caps flat dense")
+    return button("", desk.words(f"review.{key}"), action, "flat dense")
 
 
 def ask_reason(desk: ReviewController, finding: Finding | None = None) -> None:
@@ -87,16 +87,15 @@ def ask_reason(desk: ReviewController, finding: Finding | None = None) -> None:
             with ui.row().classes("gap-2"):
                 for number, key in enumerate(_EXCLUDING if finding is None else _ACCEPTING):
                     reason = words(f"review.because_{key}")
-                    button = ui.button(reason, on_click=lambda reason=reason: answer(reason)).props("no-caps outline")
-                    if number == 0:
-                        button.props("autofocus")
+                    look = "outline autofocus" if number == 0 else "outline"
+                    button("", reason, lambda reason=reason: answer(reason), look)
             field = ui.input(words("review.own_reason")).classes("w-full")
             tag(field, "own-reason").on("keydown.enter", lambda: answer(field.value or ""))
             error = tag(ui.label().props("role=alert").classes("ps-message-error"), "reason-error")
             with ui.row().classes("w-full justify-end"):
-                ui.button(words("review.cancel"), on_click=dialog.close).props("no-caps flat")
+                button("", words("review.cancel"), dialog.close, "flat")
                 go = words("review.exclude_go") if finding is None else words("review.accept_finding")
-                tag(ui.button(go, on_click=lambda: answer(field.value or "")).props("no-caps unelevated"), "reason-go")
+                button("reason-go", go, lambda: answer(field.value or ""), "unelevated")
     dialog.on("hide", dialog.delete)
     dialog.open()
 
@@ -125,15 +124,13 @@ class RecordingTableView:
         with tag(ui.column().classes("w-full"), "list") as self.place:
             with ui.row().classes("w-full items-center gap-2"):
                 self.range = tag(ui.label().classes("ps-number").props("role=status"), "range")
-                self.before = ui.button(icon="chevron_left", on_click=lambda: self.turn(-1)).props("flat round")
-                self.before.props(f'aria-label="{words("review.page_before")}"')
-                self.after = ui.button(icon="chevron_right", on_click=lambda: self.turn(1)).props("flat round")
-                self.after.props(f'aria-label="{words("review.page_after")}"')
+                before, after = words("review.page_before"), words("review.page_after")
+                self.before = icon_button("chevron_left", before, lambda: self.turn(-1), "flat round")
+                self.after = icon_button("chevron_right", after, lambda: self.turn(1), "flat round")
                 ui.space()
-                start = ui.button(words("review.start"), on_click=self._start).props("no-caps unelevated color=primary")
-                tag(start, "start")
-                tag(ui.button(words("review.undo"), on_click=desk.undo).props("no-caps outline"), "undo-list")
-                self.again = tag(ui.button(on_click=self._check).props("no-caps outline"), "check-again")
+                button("start", words("review.start"), self._start, "unelevated color=primary")
+                button("undo-list", words("review.undo"), desk.undo)
+                self.again = button("check-again", "", self._check)
             self.table = tag(ReviewTable(words, self._sort, desk.open), "table")
             with tag(ui.expansion().classes("w-full"), "elsewhere") as self.elsewhere:
                 self.others = ui.column().classes("w-full")

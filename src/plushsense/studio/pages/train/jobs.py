@@ -16,7 +16,7 @@ from plushsense.dataset.store import HEAD
 from plushsense.models.arch import parse_symbol
 from plushsense.scoring.splits import parse_split
 from plushsense.studio.app.jobs import DONE, REFUSED, RUNNING, STOPPED, Jobs, StudioJob
-from plushsense.studio.app.shell import LINES, Page, address, html, moment, named, section, tag
+from plushsense.studio.app.shell import LINES, Page, address, button, html, moment, named, section, tag
 from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import BUNDLES, Workspace
 from plushsense.studio.pages.train.results import (
@@ -312,8 +312,7 @@ class JobsSection:
             _badge(w, job.state)
             ui.label(f"{w(f'train.kinds.{job.task}')}: {job.title}").classes("flex-grow")
             ui.label(moment(job.begun_s)).classes("ps-dim")
-            show = ui.button(w("train.show"), on_click=lambda: self.open(job.id)).props("flat dense no-caps")
-            named(show, f"{w('train.show')}: {job.title}")
+            button("", w("train.show"), lambda: self.open(job.id), "flat dense", about=job.title)
 
     def open(self, identity: str) -> None:
         """Display the card of a job."""
@@ -429,14 +428,11 @@ class _Card:
         job, w = self._job, self._words
         with ui.row():
             if job.state == RUNNING:
-                stop = ui.button(w("train.stop"), icon="stop", on_click=lambda: self._jobs.stop(job.id))
-                tag(stop.props("outline no-caps"), "stop")
+                button("stop", w("train.stop"), lambda: self._jobs.stop(job.id), icon="stop")
             else:
                 if job.state in (STOPPED, REFUSED):
-                    resume = ui.button(w("train.resume"), icon="play_arrow", on_click=lambda: self._jobs.resume(job.id))
-                    tag(resume.props("outline no-caps"), "resume")
-                hide = ui.button(w("train.hide"), on_click=lambda: self._jobs.close(job.id)).props("flat no-caps")
-                named(hide, f"{w('train.hide')}: {job.title}")
+                    button("resume", w("train.resume"), lambda: self._jobs.resume(job.id), icon="play_arrow")
+                button("", w("train.hide"), lambda: self._jobs.close(job.id), "flat", about=job.title)
 
     def _result(self) -> None:
         job, r, w = self._job, self._job.result, self._words
@@ -455,8 +451,8 @@ class _Card:
                 identity += f"#{r['best'][0]['trial']}"
             if job.task == SEARCH:
                 identity += f"#{r['winner']['trial']}"
-            show = ui.button(w("train.open_result"), on_click=lambda: self._jobs.open_result(identity))
-            tag(show.props("flat dense no-caps"), "open-result")
+            show = w("train.open_result")
+            button("open-result", show, lambda: self._jobs.open_result(identity), "flat dense")
 
 
 def result_text(w: Words, job: StudioJob) -> str:

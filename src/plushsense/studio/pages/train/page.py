@@ -12,7 +12,7 @@ from plushsense.core.errors import PlushSenseError
 from plushsense.models.arch import DEFAULT_FILTERS, DEFAULT_SYMBOL, NORMS, PADDINGS
 from plushsense.scoring.splits import parse_split
 from plushsense.studio.app.jobs import DONE, RUNNING, Jobs, StudioJob
-from plushsense.studio.app.shell import Page, html, on_change, query_path, section, tag
+from plushsense.studio.app.shell import Page, button, html, on_change, query_path, section, tag
 from plushsense.studio.pages.train.jobs import (
     EVALUATE,
     KINDS,
@@ -98,10 +98,8 @@ class TrainingForm:
     def _buttons(self) -> None:
         w = self._words
         with ui.row().classes("items-center"):
-            estimate = ui.button(w("train.estimate"), icon="schedule", on_click=self._estimate).props("outline no-caps")
-            tag(estimate, "estimate")
-            start = ui.button(w("train.start"), icon="play_arrow", on_click=self._start).props("unelevated no-caps")
-            tag(start, "start")
+            button("estimate", w("train.estimate"), self._estimate, icon="schedule")
+            button("start", w("train.start"), self._start, "unelevated", icon="play_arrow")
         self._plan = tag(ui.column().classes("w-full ps-small-gap").props('role="status"'), "plan")
         with ui.expansion(w("train.command"), icon="terminal").classes("w-full"):
             self._command = tag(ui.label().classes("ps-code"), "command")

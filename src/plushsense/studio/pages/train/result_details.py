@@ -11,7 +11,7 @@ from nicegui import run, ui
 
 from plushsense.core.gestures import NOBODY
 from plushsense.dataset.store import UNKNOWN_SUBJECT
-from plushsense.studio.app.shell import AFFECT_SIGNS, Page, address, heading, html, scroll_region, tag
+from plushsense.studio.app.shell import AFFECT_SIGNS, Page, address, heading, html, icon_button, scroll_region, tag
 from plushsense.studio.app.words import Words
 from plushsense.studio.pages.review.review import Reviews
 from plushsense.studio.pages.train.results import (
@@ -66,8 +66,7 @@ class ResultDetailsView:
                 heading(title, 3).classes("text-weight-bold", remove="text-lg")
                 html(score_labels(w, row.leaky, row.simulated))
                 ui.space()
-                close = ui.button(icon="close", on_click=self._close, color=None).props("flat round dense")
-                close.props(f'aria-label="{w("train.close")}"')
+                icon_button("close", w("train.close"), self._close, color=None)
             if row.leaky:
                 ui.label(w("train.leaky_about"))
             if row.kind == TRAINING:

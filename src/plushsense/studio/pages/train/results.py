@@ -310,12 +310,9 @@ class StoredResults:
                     path = folder / name
                     if path.is_file():
                         yield from self._once(path, read, dataset) or ()
-        known = self._known()
+        known = {self._workspace.title(path): str(path) for path in reversed(self._workspace.datasets())}
         for path in self._workspace.bundles():
             yield from self._once(path, of_bundle, known) or ()
-
-    def _known(self) -> dict[str, str]:
-        return {self._workspace.title(path): str(path) for path in reversed(self._workspace.datasets())}
 
     def row(self, identity: str) -> ResultRow:
         """Return the result with an id; raise BadInput if there is none."""

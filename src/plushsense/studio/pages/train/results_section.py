@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import time
@@ -238,12 +239,9 @@ def comparable_groups(rows: Sequence[ResultRow], kind: Callable[[str], str]) -> 
         if len(group) < 2:
             continue
         data, which, split, context = key[:4]
-        name = plain = " · ".join((data, kind(which), split, context))
-        number = 1
-        while name in groups:
-            number += 1
-            name = f"{plain} ({number})"
-        groups[name] = group
+        name = " · ".join((data, kind(which), split, context))
+        numbered = (f"{name} ({number})" for number in itertools.count(2))
+        groups[next(n for n in itertools.chain((name,), numbered) if n not in groups)] = group
     return groups
 
 
