@@ -6,7 +6,7 @@ import argparse
 import importlib
 import tomllib
 from collections.abc import Mapping
-from importlib import resources
+from pathlib import Path
 from typing import Any
 
 # Lists of names in help texts, by placeholder: module and attribute.
@@ -25,9 +25,7 @@ class _Words(dict[str, str]):
         return ", ".join(getattr(importlib.import_module(module), name))
 
 
-_TABLES: dict[str, dict[str, Any]] = tomllib.loads(
-    resources.files("plushsense.cli").joinpath("verbs.toml").read_text(encoding="utf-8")
-)
+_TABLES: dict[str, dict[str, Any]] = tomllib.loads(Path(__file__).with_name("verbs.toml").read_text(encoding="utf-8"))
 VERBS = {name: table for name, table in _TABLES.items() if "summary" in table}
 """The table of every verb, by name."""
 
