@@ -356,7 +356,7 @@ class _Runner:
         if mutant.source is not None:
             (copy / LIBRARY[1]).write_text(mutant.source, _ENCODING)
         # On the host compiling takes longer than running.
-        optimise = "-O1" if setting.target == "host" else "-O2"
+        optimise = "-O0" if setting.target == "host" else "-O2"
         plain = replace(setting, optimise=optimise, flags=("-std=c99",), image=mutant.image is not None)
         streams = streams[: 1 if mutant.image is not None else None]
         # Mutants of the rules show in the scenarios first.
