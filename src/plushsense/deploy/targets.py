@@ -151,16 +151,16 @@ def build(
     own = [optimise, *flags, *(f"-D{name}={value}" for name, value in (defines or {}).items())]
     with tempfile.TemporaryDirectory(prefix="plushsense-", dir=out_dir) as work:
         objects = []
+        compiling = [compiler, *machine.flags, *own]
         for n, source in enumerate(sources):
-            compiling = [compiler, *machine.flags, *own]
-            objects.append(
-                cache / _object_name(source, compiling, include) if cache else out_dir / f"{n}-{source.stem}.o"
-            )
+            name = _object_name(source, compiling, include) if cache else f"{n}-{source.stem}.o"
+            objects.append((cache or out_dir) / name)
             if cache and objects[-1].exists():
                 continue
-            command = [*compiling, f"-I{RUNTIME}", *included, "-c", str(source.resolve())]
-            made = Path(work) / "made.o"
-            _compile([*command, "-o", str(made)], Path(work), source.name)
+            # Programs that are built at the same time share the cache: a file appears there complete.
+            made = Path(work) / "made.o" if cache else objects[-1]
+            command = [*compiling, f"-I{RUNTIME}", *included, "-c", str(source.resolve()), "-o", str(made)]
+            _compile(command, Path(work), source.name)
             made.replace(objects[-1])
         around = [str(RUNTIME / name) for name in machine.runtime]
         if blobs:
