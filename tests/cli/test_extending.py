@@ -41,7 +41,7 @@ def run(args):
 
 
 def test_a_layout_and_a_gesture_set_are_one_file_each(
-    cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     package = tmp_path / "core"
     shutil.copytree(Path(plushsense.core.__file__).parent / "data", package / "data")
@@ -59,6 +59,10 @@ def test_a_layout_and_a_gesture_set_are_one_file_each(
     table.write_text("\n".join(["who,gesture,time_ms,pitch,roll", *rows]) + "\n")
     ds, model, export = tmp_path / "DS", tmp_path / "m.plush", tmp_path / "export"
     assert "tilt-2" in cli("import", table, ds, "--layout", "tilt").err
+    with pytest.raises(SystemExit):
+        cli("import", "--help")
+    described = capsys.readouterr().out
+    assert "tilt-2" in described and "nod-2" in described
     columns = ("--column", "subject=who", "--layout", "tilt-2", "--gestures", "nod-2")
     assert cli("import", table, ds, *columns, "--json").json["recordings"] == 6
     trained = cli("train", ds, "--out", model, "--filters", "4,4,4", "--epochs", "1", "--json")

@@ -81,6 +81,12 @@ def test_a_strength_that_is_refused(text: str) -> None:
         parse_augmentation(text)
 
 
+def test_a_strength_without_a_unit_is_refused_in_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(AUGMENTATIONS, "dropout", Augmentation(lambda strength, channels: None, 0.9))
+    with pytest.raises(ConfigError, match=r"write dropout:NUMBER with 0 \(off\) to 0\.9\.$"):
+        parse_augmentation("dropout:1")
+
+
 def test_an_unknown_augmentation_is_refused() -> None:
     with pytest.raises(ConfigError, match="Did you mean 'random-rotation'"):
         TrainSpec(augment=("random-rotaton:4",))

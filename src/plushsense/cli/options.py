@@ -9,9 +9,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-# Lists of names in help texts, by placeholder: module and attribute.
+# Lists of names in help texts, by placeholder: module, and a collection or a function that returns one.
 _LISTS = {
     "checks": ("plushsense.dataset.quality.checking", "CHECKS"),
+    "layouts": ("plushsense.core.layouts", "layout_names"),
+    "gesture_sets": ("plushsense.core.gestures", "gesture_set_names"),
     "targets": ("plushsense.deploy.targets", "TARGETS"),
 }
 _TYPES = {"int": int, "float": float}
@@ -22,7 +24,8 @@ class _Words(dict[str, str]):
 
     def __missing__(self, placeholder: str) -> str:
         module, name = _LISTS[placeholder]
-        return ", ".join(getattr(importlib.import_module(module), name))
+        names = getattr(importlib.import_module(module), name)
+        return ", ".join(names() if callable(names) else names)
 
 
 _TABLES: dict[str, dict[str, Any]] = tomllib.loads(Path(__file__).with_name("verbs.toml").read_text(encoding="utf-8"))

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.core.errors import GestureError, nearest
-from plushsense.core.toml import load_table, read_named
+from plushsense.core.toml import builtin_names, load_table, read_named
 
 AFFECTS = ("positive", "neutral", "negative", "none")
 NOBODY = "none"
@@ -55,7 +55,10 @@ class Gesture:
 
 @dataclass(frozen=True)
 class GestureSet:
-    """An ordered set of gestures; the order is the class index."""
+    """An ordered set of gestures; the order is the class index.
+
+    A TOML file has the keys ``name`` and ``gestures``, a list of tables with the keys of `Gesture`.
+    """
 
     name: str
     gestures: tuple[Gesture, ...]
@@ -139,6 +142,11 @@ class GestureSet:
             spellings.setdefault(plain_label(label), label)
         gestures = tuple(Gesture(s, free_choice=plain_label(s) == "custom") for s in sorted(spellings.values()))
         return cls(name, gestures, inferred=True)
+
+
+def gesture_set_names() -> tuple[str, ...]:
+    """Return the names of the built-in gesture sets."""
+    return builtin_names("gestures")
 
 
 def load_gestures(name_or_path: str | Path) -> GestureSet:

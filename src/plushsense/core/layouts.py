@@ -81,6 +81,10 @@ class CsvFormat:
 class Layout:
     """The channels of a toy, their order on the wire and in files, and the inputs of a network.
 
+    The attributes are the keys of a TOML file. It may omit ``title`` (default: the name), ``derived`` (none),
+    ``inputs`` (all channels), ``vectors`` (none), ``gap_ms`` (100), and ``csv`` or keys of it (``host_ms``,
+    ``device_ms`` and the channels, separated by commas).
+
     Attributes:
         wire: names of channels, ``device_ms`` (the device clock) and ``delay_ms`` (since the frame before).
         vectors: triples of channels that are the axes of one vector, such as an accelerometer.

@@ -326,7 +326,7 @@ def compare_deployed(
         predictions, deployed: of the same windows, in the same order.
 
     Returns:
-        ``accuracy`` and ``macro_f1`` of the deployed network; ``loss``, the difference float minus int8 of each person
+        the metrics of the deployed network by key; ``loss``, the difference float minus int8 of each person
         (or fold, see ``over``) with the interval of its mean; ``agreement``, the share of the windows with the same
         class; ``probability_difference``, the mean over the windows of the largest difference; ``rows``, one for each
         person or fold.

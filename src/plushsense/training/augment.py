@@ -1,6 +1,7 @@
 """Augmentations: changes of training windows that could have been recorded with the toy held or worn otherwise.
 
-A setting names them in a list, each with its strength: ``augment = ["random-rotation:45"]``.
+A setting names them in a list, each with its strength: ``augment = ["random-rotation:45"]``. It replaces the list
+of the preset.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-# Returns changed copies of scaled windows (N, C, T), drawing its random numbers from the generator.
+# Returns changed copies of scaled windows (N, C, T), drawing its random numbers from the generator. The generator is on
+# the CPU, the windows are on `Channels.device`.
 Transform = Callable[["Tensor", "torch.Generator"], "Tensor"]
 
 
@@ -72,11 +74,15 @@ def random_rotation(degrees: float, channels: Channels) -> Transform | None:
 
 
 class Augmentation(NamedTuple):
-    """An augmentation: ``make`` prepares it for the windows, or returns None where it would change nothing."""
+    """An augmentation: ``make`` prepares it for the windows, or returns None where it would change nothing.
+
+    ``make`` is called with a strength above 0 and up to ``strongest``. ``unit`` is the unit of the strength in
+    messages; "" for a number without one, such as a probability.
+    """
 
     make: Callable[[float, Channels], Transform | None]
     strongest: float
-    unit: str
+    unit: str = ""
 
 
 # An augmentation is a function and a line here.
@@ -99,9 +105,8 @@ def parse_augmentation(text: str) -> tuple[str, float]:
     except ValueError:
         strength = math.nan
     if not 0.0 <= strength <= known.strongest:
-        raise ConfigError(
-            f"Augmentation '{text}': write {name}:NUMBER with 0 (off) to {known.strongest:g} {known.unit}."
-        )
+        unit = f" {known.unit}" if known.unit else ""
+        raise ConfigError(f"Augmentation '{text}': write {name}:NUMBER with 0 (off) to {known.strongest:g}{unit}.")
     return name, strength
 
 

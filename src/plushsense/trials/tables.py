@@ -104,7 +104,7 @@ class TrialColumn:
         type: str, int, float or bool.
         value: called with the trial; returns None where there is no value yet.
         name: the heading in lists of trials; without one the column is in the files only.
-        kind: format in lists.
+        kind: format in lists (see `plushsense.reports.table.Kind`).
         score: whether the values depend on the split, so that a leaky split is marked.
         terminal: whether the command line lists it as well as the page.
     """

@@ -3,7 +3,7 @@
     [windows]     window_s, step_s, context, longest_factor
     [anywhere]    every_s, onset_s, after_s, settle_s, idle_share, busy_share
     [model]       arch, filters, padding, norm, step_s, pool_s
-    [training]    preset, epochs, batch, learning_rate, halve_every, patience, seed, augment, …
+    [training]    preset, epochs, batch, learning_rate, halve_every, patience, stop_on, augment, seed, device, threads
     [evaluation]  split, classes, train_context, workers, seed
     [live]        smoothing_s
 

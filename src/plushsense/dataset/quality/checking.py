@@ -22,10 +22,10 @@ from plushsense.dataset.store import Dataset, Progress, RecordingInfo, StreamInf
 class Check:
     """A quality check.
 
-    ``run`` is a function of `recordings`, which examines one recording or stream at a time, or of `comparisons`, which
-    compares all of them. ``scope`` lists the subjects of its findings: recording, stream, subject, dataset. With
-    ``at_import`` it also runs at every import, and its messages become flags of the index. ``stream_action`` replaces
-    ``action`` for a stream.
+    ``run`` is a function of `recordings`, which takes an `Examination` of one recording or stream, or of `comparisons`,
+    which takes the `DatasetSummary` and compares all of them; the module in which it is defined decides. ``scope``
+    lists the subjects of its findings: recording, stream, subject, dataset. With ``at_import`` it also runs at every
+    import, and its messages become flags of the index. ``stream_action`` replaces ``action`` for a stream.
     """
 
     run: Callable[[Any], Iterator[Issue]]

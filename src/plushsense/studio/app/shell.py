@@ -74,8 +74,12 @@ PAGES = {
     "export": "/export",
     "publish": "/publish",
 }
-"""The registry of pages: name to path, in the order of the navigation bar. A page is a folder ``pages/<name>`` whose
-module ``page`` has a function ``show(page)``, one line here, and the texts ``pages.<name>`` and ``<name>.title``."""
+"""The registry of pages: name to path, in the order of the navigation bar.
+
+A page is one line here and a folder ``pages/<name>`` whose module ``page`` has a function ``show(page)``, which adds
+the content below the title. Its texts are in ``pages/<name>/<language>.toml`` for each of `LANGUAGES`, or in
+``app/words``; required are ``pages.<name>`` (in the navigation bar) and ``<name>.title``.
+"""
 
 AFFECT_SIGNS = {"positive": "+", "neutral": "○", "negative": "−", "none": "·"}
 """Affect is never marked by colour alone, but also by a sign and a word."""
