@@ -94,7 +94,7 @@ class Cases:
         except BadInput:
             return
         before, after = (
-            judge(b.network().probabilities(b.scaler.apply(test.x)), test.y, test.recording).judged.right
+            judge(b.network().probabilities(b.scaler.apply(test.x)), test.y, test.recording).scores.right
             for b in (bundle, done.bundle)
         )
         self.rows.setdefault(name, []).append((done.accepted, after - before))

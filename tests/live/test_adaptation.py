@@ -52,7 +52,7 @@ def touched(bundle: Bundle, seed: int = 1, each: int = 3, spec: PersonalSpec | N
 
 def right(bundle: Bundle, seed: int = 2) -> float:
     x, y, recording = gestures(seed, 10)
-    found = judge(bundle.network().probabilities(bundle.scaler.apply(x)), y, recording).judged
+    found = judge(bundle.network().probabilities(bundle.scaler.apply(x)), y, recording).scores
     return found.right / found.recordings
 
 

@@ -6,9 +6,10 @@ import contextlib
 import importlib.util
 import os
 import shutil
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -17,7 +18,7 @@ from support.requirements import missing
 from support.sharing import built_once
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page
+    from playwright.sync_api import Browser, BrowserContext, Page
 
 
 @pytest.fixture
@@ -25,8 +26,8 @@ def studio(tmp_path: Path) -> Iterator[Callable[..., Studio]]:
     """``studio("--device", URL, home=...)`` starts one; all are stopped at the end, and none may have failed inside."""
     begun: list[Studio] = []
 
-    def start(*options: str, home: Path | None = None, open_files: int = 0) -> Studio:
-        begun.append(Studio(home or tmp_path / "home", options, open_files=open_files).start())
+    def start(*options: str, home: Path | None = None, **more: Any) -> Studio:
+        begun.append(Studio(home or tmp_path / "home", options, **more).start())
         return begun[-1]
 
     yield start
@@ -53,27 +54,51 @@ def chromium() -> Iterator[Browser]:
         browser.close()
 
 
-@pytest.fixture
-def look(chromium: Browser) -> Iterator[Callable[..., Look]]:
-    """``look(size, dark, language)`` gives a browser; at the end none may have asked for anything foreign."""
-    made: list[Look] = []
+@pytest.fixture(scope="module")
+def profiles(chromium: Browser) -> dict[tuple[str, bool], list[BrowserContext]]:
+    """Browser profiles that wait for the next test, by language and touch screen.
 
-    def new(size: tuple[int, int] = DESK, dark: bool = False, language: str = "en", touch: bool = False) -> Look:
-        context = chromium.new_context(
-            viewport={"width": size[0], "height": size[1]},
-            color_scheme="dark" if dark else "light",
-            locale=language,
-            has_touch=touch,
-            reduced_motion="reduce",
+    In a new profile the browser compiles the scripts of the first page, which takes longer than most tests.
+    """
+    return defaultdict(list)
+
+
+@pytest.fixture
+def look(chromium: Browser, profiles: dict[tuple[str, bool], list[BrowserContext]]) -> Iterator[Callable[..., Look]]:
+    """``look(size, dark, language)`` gives a browser without cookies; at the end none may have asked for anything
+    foreign. ``own`` makes a profile for this test alone, which it may change."""
+    made: list[tuple[Look, tuple[str, bool] | None]] = []
+
+    def new(
+        size: tuple[int, int] = DESK, dark: bool = False, language: str = "en", touch: bool = False, own: bool = False
+    ) -> Look:
+        waiting = [] if own else profiles[language, touch]
+        context = (
+            waiting.pop()
+            if waiting
+            else chromium.new_context(
+                locale=language,
+                has_touch=touch,
+                reduced_motion="reduce",
+                viewport={"width": size[0], "height": size[1]},
+                color_scheme="dark" if dark else "light",
+            )
         )
-        one = Look(context)
-        context.on("request", lambda r: one.asked.append(r.url))
-        made.append(one)
+        one = Look(context, size, dark)
+        context.on("request", one.ask)
+        made.append((one, None if own else (language, touch)))
         return one
 
     yield new
-    for one in made:
-        one.context.close()
+    for one, shared in made:
+        one.context.remove_listener("request", one.ask)
+        for page in one.context.pages:
+            page.close()
+        if shared is None:
+            one.context.close()
+        else:
+            one.context.clear_cookies()
+            profiles[shared].append(one.context)
         foreign = [u for u in one.asked if not is_own(u)]
         assert foreign == [], f"the page asked for something foreign: {foreign}"
 

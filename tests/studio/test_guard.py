@@ -318,13 +318,13 @@ def test_a_tablet_comes_in_by_its_address_once(studio: Fixture, look: Fixture) -
     one = studio("--host", "0.0.0.0")
     query = urlsplit(one.url).query
     at = f"http://127.0.0.1:{one.port}"
-    tablet = look((820, 1180))
+    tablet = look((820, 1180), own=True)
     page = tablet.open(f"{at}/?{query}")
     assert "token" not in page.url
     assert "token" not in page.evaluate("document.referrer + performance.getEntries().map(e => e.name).join(' ')")
     page.go_back()
     assert "token" not in page.url
-    second = look()
+    second = look(own=True)
     stranger = second.context.new_page()
     answer = stranger.goto(f"{at}/?{query}")
     assert answer is not None and answer.status == 401
@@ -339,7 +339,7 @@ def test_a_tablet_comes_in_by_its_address_once(studio: Fixture, look: Fixture) -
 def test_a_link_on_another_page_lets_a_visitor_in(studio: Fixture, look: Fixture) -> None:
     one = studio("--host", "0.0.0.0")
     query = urlsplit(one.url).query
-    browser = look()
+    browser = look(own=True)
     page = browser.context.new_page()
     # Another site: its links are followed without the cookie that was just given.
     browser.context.route("http://localhost:1/", lambda r: r.fulfill(body="<h1>mail</h1>", content_type="text/html"))

@@ -146,7 +146,7 @@ def test_redo_skip_back_pause_and_going_to_a_step(studio: Fixture, look: Fixture
 
 
 def test_two_tabs_show_and_press_the_same_once(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
-    server, browser = studio(*SPEED), look()
+    server, browser = studio(*SPEED), look(own=True)
     frozen: list[bool] = [False]
     held: list[Callable[[], None]] = []
 
@@ -206,7 +206,7 @@ def test_two_tabs_show_and_press_the_same_once(studio: Fixture, look: Fixture, t
 
 
 def test_a_lost_connection_loses_nothing(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
-    server, browser = studio(*SPEED), look()
+    server, browser = studio(*SPEED), look(own=True)
     page = begun(browser.open(server.url + "/record"), server.url, "S01")
     showing(page, "idle.0.")
     page.keyboard.press("Space")
@@ -251,10 +251,10 @@ def test_a_studio_that_is_gone_is_not_shown_as_recording(studio: Fixture, look: 
     marked(page, "state").get_by_text("RECORDING. Press again").wait_for()
     assert axe(page) == []
     # One that stands still keeps the connection open and answers nothing.
-    server.process.send_signal(signal.SIGSTOP)
+    server.signal(signal.SIGSTOP)
     lost = page.get_by_role("alert").get_by_text("The recording may still be running")
     lost.wait_for()
-    server.process.send_signal(signal.SIGCONT)
+    server.signal(signal.SIGCONT)
     lost.wait_for(state="detached")
     marked(page, "state").get_by_text("RECORDING. Press again").wait_for()
     server.kill()

@@ -81,7 +81,7 @@ def test_language_and_light_are_kept(empty: str, look: Fixture) -> None:
 @pytest.mark.parametrize("chosen", ["", "light", "dark"])
 def test_no_flash_of_the_wrong_light(dark: bool, chosen: str, empty: str, look: Fixture) -> None:
     """What stands there before any script has run is of the right light already."""
-    browser = look(dark=dark)
+    browser = look(dark=dark, own=True)
     if chosen:
         browser.context.add_cookies([{"name": LIGHT_COOKIE, "value": chosen, "url": empty}])
     browser.context.route("**/*.js", lambda route: route.abort())

@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import asyncio
 import json
+import multiprocessing
 import os
 import signal
-import subprocess
+import socket
 import sys
 import threading
 from collections.abc import Coroutine
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 from urllib.parse import urlsplit
 
+from plushsense.studio.app.shell import PAGES
+
 if TYPE_CHECKING:
-    from playwright.sync_api import BrowserContext, Page
+    from playwright.sync_api import BrowserContext, Page, Request
 
 T = TypeVar("T")
 TESTS = Path(__file__).parents[1]
@@ -37,6 +42,51 @@ _SETTLE_MS = 200
 DESK, TABLET = (1280, 800), (820, 1180)
 
 
+# Importing takes longer than starting: a server process imports once, and every studio is forked from it.
+_FORKING = multiprocessing.get_context("forkserver")
+_FORKING.set_forkserver_preload(
+    ["nicegui", "plushsense.studio.app.serve", *(f"plushsense.studio.pages.{name}.page" for name in PAGES)]
+)
+
+
+def _run_studio(
+    words: list[str], folder: str, out: Connection, errors: Connection, open_files: int, without: tuple[str, ...]
+) -> None:
+    """Run ``plushsense studio`` in this process, with its output to two pipes."""
+    import resource
+
+    from plushsense.cli.main import main
+
+    # Nothing that a test of the whole suite sets must reach it.
+    for name in [k for k in os.environ if k.startswith(("NICEGUI_", "PYTEST_"))]:
+        del os.environ[name]
+    # NiceGUI does not serve from what it takes for the process of a pool.
+    multiprocessing.current_process().name = "MainProcess"
+    os.dup2(out.fileno(), 1)
+    os.dup2(errors.fileno(), 2)
+    sys.stdout, sys.stderr = (open(n, "w", encoding="utf-8", closefd=False) for n in (1, 2))
+    os.chdir(folder)
+    sys.modules.update(dict.fromkeys(without))  # type: ignore[arg-type]
+    if open_files:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (open_files, open_files))
+    sys.exit(main(words))
+
+
+# Outside of the range from which systems take ports for outgoing connections.
+_PORT = 20_000 + os.getpid() % 10_000
+
+
+def _free_port() -> int:
+    """Return the same port as long as it is free, so that browsers need not compile the pages' scripts again."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", _PORT))
+        except OSError:
+            return 0
+    return _PORT
+
+
 @dataclass
 class Studio:
     """`plushsense studio` in a process of its own. ``start`` it again after ``kill`` on the same folder and port."""
@@ -45,28 +95,32 @@ class Studio:
     options: tuple[str, ...] = ()
     url: str = ""
     port: int = 0
-    process: subprocess.Popen[str] | None = None
+    process: BaseProcess | None = None
     errors: list[str] = field(default_factory=list)
     open_files: int = 0
     """The limit on its open files; 0: the tests' own."""
+    without: tuple[str, ...] = ()
+    """Modules that it shall not find."""
+    _pipes: list[Connection] = field(default_factory=list)
 
     def start(self) -> Studio:
         """Wait until it answers."""
-        command = [sys.executable, "-m", "plushsense.cli.main", "studio", "--home", str(self.home)]
-        command += ["--port", str(self.port), "--no-show", "--json", *self.options]
-        if self.open_files:
-            command = ["/bin/sh", "-c", 'ulimit -n "$0" && exec "$@"', str(self.open_files), *command]
-        # Nothing that a test of the whole suite sets must reach it.
-        env = {k: v for k, v in os.environ.items() if not k.startswith(("NICEGUI_", "PYTEST_"))}
-        self.process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=self.home.parent, env=env
-        )
-        errors = self.process.stderr
-        assert self.process.stdout is not None and errors is not None
-        threading.Thread(target=lambda: self.errors.extend(errors), daemon=True).start()
+        self.port = self.port or _free_port()
+        words = ["studio", "--home", str(self.home), "--port", str(self.port), "--no-show", "--json", *self.options]
+        out, its_out = _FORKING.Pipe(duplex=False)
+        errors, its_errors = _FORKING.Pipe(duplex=False)
+        self._pipes = [out, errors]
+        arguments = (words, str(self.home.parent), its_out, its_errors, self.open_files, self.without)
+        self.process = _FORKING.Process(target=_run_studio, args=arguments)
+        self.process.start()
+        its_out.close()
+        its_errors.close()
+        lines = os.fdopen(os.dup(errors.fileno()), encoding="utf-8")
+        threading.Thread(target=lambda: self.errors.extend(lines), daemon=True).start()
         timer = threading.Timer(_START_S, self.process.kill)
         timer.start()
-        line = self.process.stdout.readline()
+        with os.fdopen(os.dup(out.fileno()), encoding="utf-8") as answer:
+            line = answer.readline()
         timer.cancel()
         assert line, f"the studio did not start: {''.join(self.errors)}"
         self.url = json.loads(line)["url"].rstrip("/")
@@ -77,30 +131,41 @@ class Studio:
         """As a power cut."""
         assert self.process is not None
         self.process.kill()
-        self.process.wait(20.0)
+        self.process.join(20.0)
+
+    def signal(self, number: int) -> None:
+        """Send a signal to it."""
+        assert self.process is not None and self.process.pid is not None
+        os.kill(self.process.pid, number)
 
     def stop(self) -> None:
         """As Ctrl-C."""
-        if self.process is not None and self.process.poll() is None:
-            self.process.send_signal(signal.SIGINT)
-            try:
-                self.process.wait(20.0)
-            except subprocess.TimeoutExpired:
-                self.process.kill()
-                self.process.wait(20.0)
+        if self.process is not None and self.process.is_alive():
+            self.signal(signal.SIGINT)
+            self.process.join(20.0)
+            if self.process.is_alive():
+                self.kill()
 
 
 @dataclass
 class Look:
-    """One browser with an empty profile, and what it asked for and complained about."""
+    """A browser profile without cookies, and what it asked for and complained about."""
 
     context: BrowserContext
+    size: tuple[int, int] = DESK
+    dark: bool = False
     asked: list[str] = field(default_factory=list)
     complaints: list[str] = field(default_factory=list)
+
+    def ask(self, request: Request) -> None:
+        """Note what is asked for."""
+        self.asked.append(request.url)
 
     def open(self, url: str) -> Page:
         """A new tab at this address, its connection to the studio standing."""
         page = self.context.new_page()
+        page.set_viewport_size({"width": self.size[0], "height": self.size[1]})
+        page.emulate_media(color_scheme="dark" if self.dark else "light", reduced_motion="reduce")
         page.set_default_timeout(_WAIT_MS)
         page.on("console", lambda m: self.complaints.append(m.text) if m.type == "error" else None)
         page.on("pageerror", lambda e: self.complaints.append(str(e)))

@@ -7,7 +7,7 @@
     │   ├── GestureError        a gesture set
     │   ├── FileFormatError     a recording file
     │   ├── DatasetError        a data set folder
-    │   │   └── ForgottenError  a person was removed meanwhile
+    │   │   └── ForgottenError  a person was removed in the meantime
     │   ├── BundleError         a model bundle
     │   ├── ArrayError          arrays given from Python; also a ValueError
     │   └── ConfigError         a setting, a flag, a configuration file
@@ -40,7 +40,7 @@ class BadInput(PlushSenseError):
 
 
 class ArchError(BadInput):
-    """An architecture symbol that does not parse or does not fit."""
+    """An architecture that cannot be parsed or has invalid settings."""
 
 
 class LayoutError(BadInput):
@@ -68,7 +68,7 @@ class BundleError(BadInput):
 
 
 class ArrayError(BadInput, ValueError):
-    """Arrays that cannot be used; a ValueError too, as users of scikit-learn expect."""
+    """Arrays that cannot be used; also a ValueError, as users of scikit-learn expect."""
 
 
 class ConfigError(BadInput):
@@ -84,7 +84,7 @@ class TrainingError(PlushSenseError):
 
 
 class DivergedError(TrainingError):
-    """A training whose loss is not a number, which the same settings give on every machine."""
+    """A training whose loss is not a number; the same settings would fail again."""
 
 
 class ToolError(PlushSenseError):
@@ -109,17 +109,17 @@ class MissingExtraError(PlushSenseError):
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
-    """Return a suggestion that ends an error message, or "" when no known word is close."""
+    """Return the suggestion of a similar word to append to an error message, or "" if there is none."""
     lowered = {k.lower(): k for k in known}
-    found = difflib.get_close_matches(word.lower(), list(lowered), n=1, cutoff=0.6)
-    return f" Did you mean '{lowered[found[0]]}'?" if found else ""
+    matches = difflib.get_close_matches(word.lower(), list(lowered), n=1, cutoff=0.6)
+    return f" Did you mean '{lowered[matches[0]]}'?" if matches else ""
 
 
 def check_known(value: object, known: Iterable[str], what: str, error: type[BadInput]) -> None:
-    """Raise ``error`` for a value that is not among the known ones, with the nearest of them.
+    """Raise ``error`` for a value that is not among the known ones, and suggest a similar one.
 
     Args:
-        what: the value, as in "Unknown preset".
+        what: kind of the value, such as "preset".
     """
     known = tuple(known)
     if value not in known:
@@ -130,7 +130,7 @@ def need(module: str, extra: str) -> ModuleType:
     """Import ``module``, which the optional dependency group ``extra`` provides.
 
     Raises:
-        MissingExtraError: with the exact install command, when the package is not there.
+        MissingExtraError: if the package is not installed, with the command to install it.
     """
     try:
         return importlib.import_module(module)

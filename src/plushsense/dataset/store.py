@@ -2,12 +2,12 @@
 
 dataset.toml                 version, name, licence, consent statement; the layout and gesture set in full
 recordings/<subject>/*.csv   raw recordings, never rewritten
-streams/<subject>/*.csv      raw session streams; a file with a label on every row is a stream too
+streams/<subject>/*.csv      raw session streams, or files with a label on every row
 marks.jsonl                  decisions about recordings, append-only (`dataset.marks`)
-recordings.csv, streams.csv  the index: rebuilt from the above, replaced atomically
-index.json                   stamp of the files that the index was made from; if they changed, it is rebuilt
-subjects.csv                 the people by code: age group, gender, consent reference; never names
-forgotten.jsonl              a line for each person who was removed, without the person
+recordings.csv, streams.csv  index of the files above, replaced atomically
+index.json                   fingerprint of the indexed files; if it differs, the index is rebuilt
+subjects.csv                 people by code: age group, gender, consent reference; never names
+forgotten.jsonl              a line for each removed person, without identifying them
 cache/                       can be deleted
 """
 
@@ -46,7 +46,7 @@ UNKNOWN_SUBJECT = "unknown"
 FORGOTTEN = "forgotten.jsonl"
 UNDER_WAY = "forgetting.json"
 LOCK = MARKS + ".lock"
-# Far longer than the removal of a large cache from a slow disk.
+# Much longer than it takes to delete a large cache on a slow disk.
 _LOCK_S = 600.0
 _PEOPLE_COLUMNS = ("subject", "age_group", "gender", "consent")
 
@@ -56,10 +56,10 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Generation:
-    """The state of a data set between two removals of people, so that no result of a removed person is written.
+    """The number of people removed from a data set so far, to prevent that results of a removed person are written.
 
-    `forget` holds the data set's lock while it removes a person, and appends a line to ``forgotten.jsonl``. Code that
-    writes results takes the same lock and compares the number of lines with that at the time the data set was opened.
+    `forget` holds the data set's lock while it removes a person and appends a line to ``forgotten.jsonl``. Code that
+    writes results holds the same lock and checks that the number of lines is that at the time of opening the data set.
     """
 
     folder: Path
@@ -67,14 +67,14 @@ class Generation:
 
     @classmethod
     def of(cls, folder: Path) -> Generation:
-        """Return the present generation of the data set in ``folder``; read it before any of the data."""
+        """Return the current generation of the data set in ``folder``; call it before any data is read."""
         try:
             return cls(folder, (folder / FORGOTTEN).read_bytes().count(b"\n"))
         except (FileNotFoundError, NotADirectoryError):
             return cls(folder, 0)
 
     def check(self) -> None:
-        """Raise ForgottenError if a person was removed since, or a removal is not finished."""
+        """Raise ForgottenError if a person has been removed since, or a removal is not finished."""
         if self.of(self.folder) != self:
             raise ForgottenError(
                 f"A person was removed from '{self.folder}' (plushsense forget) while this ran, so its results were "
@@ -88,13 +88,13 @@ class Generation:
 
     @contextmanager
     def writing(self) -> Iterator[None]:
-        """Hold the data set's lock while something derived from it is written; do not nest.
+        """Hold the data set's lock while derived data is written, after `check`; do not nest.
 
-        On a read-only disk, or one without locks, only `check` is made.
+        On a read-only disk, or one without locks, only `check` is called.
 
         Raises:
-            ForgottenError: as `check`.
-            DatasetError: when another program holds the lock for too long.
+            ForgottenError: like `check`.
+            DatasetError: if another program holds the lock for too long.
         """
         lock = FileLock(self.folder / LOCK, timeout=_LOCK_S)
         try:
@@ -150,9 +150,9 @@ def _cell(value: object) -> str:
 class RecordingInfo(_Row):
     """A row of the recording index.
 
-    Its rows are ``first_row`` to ``first_row + rows`` of ``file``; ``start`` to ``stop`` of these remain after
-    trimming. In ``stream`` they begin at ``stream_row`` (−1: not found there). ``start_ms`` is the device clock at the
-    first row, ``epoch_ms`` the wall clock.
+    The recording is rows ``first_row`` to ``first_row + rows`` of ``file``, of which ``start`` to ``stop`` remain after
+    trimming. It begins at ``stream_row`` of ``stream`` (−1: not found). ``start_ms`` is the device clock at the first
+    row, ``epoch_ms`` the wall clock.
     """
 
     id: str
@@ -274,7 +274,7 @@ class _HeadFile:
 class Dataset:
     """A data set, opened for reading.
 
-    ``generation`` guards results derived from it; pass the one from before any file was read.
+    ``generation`` protects results derived from it (see `Generation`); get it before any file is read.
     """
 
     def __init__(
@@ -320,7 +320,7 @@ class Dataset:
         return self._frames(read_recording, recording.file).slice(recording.start, recording.stop)
 
     def read_stream(self, stream: str) -> Frames:
-        """Read the rows of one session stream and cache them, since recordings are read stream by stream."""
+        """Read the rows of one session stream; the last one is cached, as recordings are read stream by stream."""
         if self._cached is None or self._cached[0] != stream:
             info = next((s for s in self.streams if s.id == stream), None)
             if info is None:
@@ -332,7 +332,7 @@ class Dataset:
         try:
             return read(self.path / file, self.layout).frames
         except FileFormatError:
-            # A file that is missing since the data set was opened may have been removed with its person.
+            # The file may have been deleted because its person was removed.
             self.generation.check()
             raise
 
@@ -340,7 +340,7 @@ class Dataset:
 
     @cached_property
     def hash(self) -> str:
-        """SHA-256 over the layout and every used recording: content, person, gesture, trim."""
+        """SHA-256 of the layout, the streams and all used recordings: content, person, gesture, trimming."""
         digest = hashlib.sha256(json.dumps(self.layout.to_dict(), sort_keys=True).encode())
         for r in sorted(self.used, key=lambda r: r.id):
             digest.update(
@@ -354,14 +354,14 @@ class Dataset:
         """Return counts for a report: people, recordings, streams, duration by gesture."""
         by_gesture = []
         for gesture in self.gestures.gestures:
-            mine = [r for r in self.used if r.gesture == gesture.label]
-            seconds = sorted((r.stop - r.start) / r.rate_hz for r in mine if r.rate_hz > 0)
+            recordings = [r for r in self.used if r.gesture == gesture.label]
+            seconds = sorted((r.stop - r.start) / r.rate_hz for r in recordings if r.rate_hz > 0)
             by_gesture.append(
                 {
                     "label": gesture.label,
                     "affect": gesture.affect,
-                    "recordings": len(mine),
-                    "subjects": len({r.subject for r in mine} - {NOBODY, UNKNOWN_SUBJECT}),
+                    "recordings": len(recordings),
+                    "subjects": len({r.subject for r in recordings} - {NOBODY, UNKNOWN_SUBJECT}),
                     "median_s": round(seconds[len(seconds) // 2], 2) if seconds else None,
                 }
             )
@@ -398,7 +398,7 @@ class Dataset:
 
 @dataclass(frozen=True)
 class PersonInfo:
-    """What is known of a person, by code: unknown values are "", ``more`` holds columns that the user added."""
+    """Information about a person; unknown values are "", ``more`` holds columns that the user added."""
 
     subject: str
     age_group: str = ""
@@ -408,10 +408,10 @@ class PersonInfo:
 
 
 def read_people(path: Path) -> dict[str, PersonInfo]:
-    """Read the people of a file (or of the data set folder ``path``) by code; empty if there is no such file.
+    """Read a people's file, or that of the data set folder ``path``, by code; empty if there is no such file.
 
     Raises:
-        DatasetError: for a file without a column ``subject``, a row without a code, or a code on two rows.
+        DatasetError: if the column ``subject`` is missing, or a code is missing or repeated.
     """
     path = path / PEOPLE if path.is_dir() else path
     people: dict[str, PersonInfo] = {}
@@ -437,14 +437,14 @@ def read_people(path: Path) -> dict[str, PersonInfo]:
 
 
 def read_csv_rows(path: Path, what: str) -> tuple[list[str], list[tuple[int, dict[str, str]]]]:
-    """Read a CSV file that a user wrote, with ``,`` or ``;`` between the cells.
+    """Read a CSV file that a user wrote, separated by ``,`` or ``;``.
 
     Returns:
-        The columns in lower case, and each row's line number and cells by column; missing cells are "".
+        The columns in lower case, and the line number and cells by column of each row; missing cells are "".
 
     Raises:
         FileNotFoundError: when there is no such file.
-        DatasetError: for a file that cannot be read, with ``what`` as its purpose.
+        DatasetError: for a file that cannot be read; ``what`` describes the file in the message.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
@@ -464,11 +464,11 @@ def read_csv_rows(path: Path, what: str) -> tuple[list[str], list[tuple[int, dic
 
 def write_people(folder: Path, people: Iterable[PersonInfo]) -> None:
     """Replace the people's file of the data set in ``folder``, sorted by code."""
-    listed = sorted(people, key=lambda p: p.subject)
-    more = list(dict.fromkeys(key for p in listed for key in p.more))
+    by_code = sorted(people, key=lambda p: p.subject)
+    more = list(dict.fromkeys(key for p in by_code for key in p.more))
     out = io.StringIO()
     writer = csv.DictWriter(out, [*_PEOPLE_COLUMNS, *more], lineterminator="\n", restval="")
     writer.writeheader()
-    for p in listed:
+    for p in by_code:
         writer.writerow(p.more | {key: getattr(p, key) for key in _PEOPLE_COLUMNS})
     write_file(folder / PEOPLE, out.getvalue())

@@ -1,4 +1,4 @@
-"""The export folder: the C library, the model as C data, golden vectors and a JSON file of facts."""
+"""Write the export folder: the C library, the model as C data, golden vectors, and facts about the model as JSON."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ BUNDLE = "model.plush"
 LIBRARY = ("plushsense.h", "plushsense.c")
 MODEL = ("plush_model.h", "plush_model.c")
 GOLDEN = "golden"
-TOY_BYTES = 452  # of a plush_toy where pointers have 32 bits (a test compiles it)
+TOY_BYTES = 452  # size of a plush_toy with 32-bit pointers (a test compiles it)
 _PEOPLE = ("subjects", "validation_subjects")
 
 Extra = Callable[[Path, dict[str, Any]], object]
@@ -36,8 +36,8 @@ Extra = Callable[[Path, dict[str, Any]], object]
 class ExportResult:
     """Result of an export; ``files`` are relative to ``folder``.
 
-    ``flash_bytes`` is the model's data (the code comes on top: ``plushsense profile`` measures it), ``ram_bytes`` the
-    memory of one toy with its struct, where pointers have 32 bits.
+    ``flash_bytes`` is the size of the model, without the code (which ``plushsense profile`` measures); ``ram_bytes`` is
+    the memory of one toy including its struct, with 32-bit pointers.
     """
 
     folder: Path
@@ -58,16 +58,16 @@ class ExportResult:
 
 
 def emit(model: IntegerModel, bundle: Bundle, out: str | Path, extras: Sequence[Extra] = ()) -> ExportResult:
-    """Write an export folder, atomically.
+    """Write an export folder atomically.
 
     Args:
-        model: what the toy will compute with, made from ``bundle``.
-        bundle: written to the folder, for names, scores and the float engine, without the people it was trained on.
+        model: model for the toy, made from ``bundle``.
+        bundle: also written to the folder (names, scores, float network), without the codes of the training people.
         out: a folder that does not exist yet, or is empty.
         extras: functions that add files to the finished folder (packages for build systems, other formats).
 
     Raises:
-        BadInput: when the folder holds something already, or cannot be written.
+        BadInput: if the folder is not empty, or cannot be written.
     """
     out = Path(out)
     with new_folder(out, BadInput) as part:
@@ -84,7 +84,7 @@ def read_facts(folder: str | Path) -> dict[str, Any]:
     """Read the facts of an export folder.
 
     Raises:
-        BadInput: when the folder is no export, or its facts cannot be read.
+        BadInput: if the folder is no export, or its facts cannot be read.
     """
     path = Path(folder) / FACTS
     try:
@@ -112,10 +112,10 @@ def _write(model: IntegerModel, bundle: Bundle, folder: Path) -> dict[str, Any]:
 
 
 def code_files(model: IntegerModel, bundle: Bundle) -> dict[str, bytes]:
-    """Return the contents of the library and model files of an export, by name.
+    """Return the contents of the C and model files of an export, by name.
 
-    Everything that a program of an export is compiled from: C sources, headers and the model's bytes. They depend on
-    the model and on names in the bundle alone, so that a folder that was given away can be compared with them.
+    A program is compiled from these files only. They depend only on the model and on names in the bundle, so that they
+    can be compared with the files of an export of unknown origin.
     """
     library = files("plushsense.deploy") / "c"
     image = model.to_bytes()
@@ -166,7 +166,7 @@ def _facts(model: IntegerModel, bundle: Bundle, model_bytes: int) -> dict[str, A
 
 
 def without_people(provenance: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a bundle's provenance with the number of people instead of their names; idempotent."""
+    """Return a bundle's provenance with the number of people instead of their codes; idempotent."""
     people = {
         key: {str(n) for n in provenance[key]} - {NOBODY} for key in _PEOPLE if isinstance(provenance.get(key), list)
     }
@@ -188,7 +188,7 @@ def without_people(provenance: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def c_names(labels: Sequence[str]) -> tuple[str, ...]:
-    """Convert labels to distinct suffixes of C identifiers: ``Back stroke 1`` becomes ``BACK_STROKE_1``."""
+    """Convert labels to unique suffixes of C identifiers: ``Back stroke 1`` becomes ``BACK_STROKE_1``."""
     suffixes: list[str] = []
     for label in labels:
         plain = "".join(c if c.isascii() and c.isalnum() else " " for c in label)

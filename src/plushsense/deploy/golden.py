@@ -1,6 +1,6 @@
-"""Generated frames for golden vectors and test scenarios, and the expected answers to them.
+"""Generate frames for golden vectors and test scenarios, and compute the expected answers.
 
-No recording is used, because an export is given away and must not contain anybody's recording.
+No recordings are used, because exports are given to others and must not contain a person's data.
 """
 
 from __future__ import annotations
@@ -37,12 +37,11 @@ def golden_frames(
 ) -> Ints:
     """Generate frames (n, 1 + C) that cover the edge cases; the first column is the toy's clock in ms.
 
-    Each part lasts longer than ``span``, so that every restart is followed by answers: touches and blows with a
-    jittering clock and lost frames; values out of range (also from the start, where there is no valid one yet); gaps
-    just bridged and just too long; equal stamps; a clock that starts again; channels at the ends of their range, and
-    jumping between them; sensors that fail and recover according to the ``health`` settings; the clock's wrap at 2^32.
-    With the scale of the ``inputs``, also samples in the middle between two whole numbers of which one is read as the
-    next 8-bit number: there a wrong rounding shows.
+    The parts are touches and blows with clock jitter and lost frames; values out of range (also before the first valid
+    one); gaps that are just short enough and just too long; equal time stamps; a clock that is reset; channels at the
+    ends of their ranges and jumping between them; sensors that fail and recover by the ``health`` settings; the clock's
+    wrap at 2^32. If ``inputs`` is given, also interpolated samples half-way between two values with different 8-bit
+    codes, where a rounding error has effect. Each part is longer than ``span``, so that answers follow every restart.
     """
     generator = FrameGenerator(layout, scaler, np.random.default_rng(seed))
     part = span + 150
@@ -69,7 +68,7 @@ def golden_frames(
 
 
 class FrameGenerator:
-    """Generator of frames; ``now`` is the time of the next one in ms."""
+    """Generates frames into ``rows``; ``now`` is the time of the next one in ms."""
 
     def __init__(self, layout: Layout, scaler: Scaler, rng: np.random.Generator) -> None:
         self.layout, self.rng = layout, rng
@@ -77,16 +76,16 @@ class FrameGenerator:
         self.mean, self.spread = measured(layout, scaler)
         self.rows: list[list[int]] = []
         self.now = 1000
-        self._owed = 0.0
+        self._fraction = 0.0
         self._walk = np.zeros(len(self.mean))
         self._blow = np.zeros(len(self.mean))
         self._phase = rng.uniform(0, 6, len(self.mean))
 
     def pace(self) -> int:
         """Return the milliseconds to the next frame, one period on average."""
-        self._owed += self.layout.period_us / 1000
-        whole = int(self._owed)
-        self._owed -= whole
+        self._fraction += self.layout.period_us / 1000
+        whole = int(self._fraction)
+        self._fraction -= whole
         return whole
 
     def wait(self, ms: int) -> None:
@@ -107,10 +106,10 @@ class FrameGenerator:
         garbage_channel: int | None = None,
         stuck: dict[int, int] | None = None,
     ) -> None:
-        """Add ``n`` frames similar to gestures: a slow drift, a rhythm at times, noise, and decaying impacts.
+        """Add ``n`` frames similar to gestures: a slow drift, temporary oscillation, noise, and decaying impacts.
 
-        ``lost``, ``garbage`` (of a channel), ``equal`` (stamps) and ``blows`` are the probabilities in each frame;
-        ``stuck`` maps channels to the value that they keep.
+        ``lost``, ``garbage`` (for each channel), ``equal`` (time stamps) and ``blows`` are probabilities per frame;
+        ``stuck`` maps channels to constant values.
         """
         rng, c = self.rng, len(self.mean)
         for k in range(n):
@@ -146,8 +145,8 @@ class FrameGenerator:
     def troubles(self, health: HealthSettings, after: int) -> None:
         """Add sensor failures long enough to be detected, each followed by recovery and ``after`` frames of touches.
 
-        A channel out of range or stuck beyond what touches reach, first for a moment only; then all of them frozen;
-        then too few good frames for a recovery, and a gap during the failure.
+        A channel is out of range, or stuck outside the range of touches, first only briefly; then all channels are
+        frozen. There are also too few good frames for a recovery, and a gap during a failure.
         """
         few, enough = self.frames_of(health.fault_ms) // 2, self.frames_of(health.fault_ms + health.recover_ms) + 20
         back = self.frames_of(health.recover_ms) + after
@@ -172,7 +171,7 @@ class FrameGenerator:
             self.touches(back, blows=0.02)
 
     def _beyond(self, health: HealthSettings) -> dict[int, int]:
-        """Return a channel and a value at which it counts as stuck, or one out of range where no value does."""
+        """Return a channel and a value at which it counts as stuck, or, if there is none, one out of range."""
         for channel, (high, most) in enumerate(zip(health.high, self.high.tolist(), strict=False)):
             if high < most:
                 return {channel: min(int(most), high + 3)}
@@ -182,7 +181,7 @@ class FrameGenerator:
         return {0: self._garbage(0)}
 
     def extremes(self, n: int, kind: str) -> None:
-        """Add frames at the ends of the valid ranges, every other one beside them, so that none counts as stuck."""
+        """Add frames at the ends of the valid ranges; every other one is 1 away, so that none counts as stuck."""
         for k in range(n):
             top = kind == "high" or (kind == "jump" and bool(k // 3 % 2))
             beside = np.minimum(k % 2, self.high - self.low)
@@ -190,9 +189,9 @@ class FrameGenerator:
             self.now += self.pace()
 
     def halves(self, n: int, inputs: InputScale) -> None:
-        """Add frames two periods apart for n samples, so that interpolated ones lie half a step beside an edge."""
-        apart, rest = divmod(2 * self.layout.period_us, 1000)
-        if rest or not 0 < apart <= self.layout.gap_ms:
+        """Add frames two periods apart, for ``n`` samples, so that interpolated values lie half a step from an edge."""
+        interval_ms, rest = divmod(2 * self.layout.period_us, 1000)
+        if rest or not 0 < interval_ms <= self.layout.gap_ms:
             return
         edges = self._edges(inputs)
         for _ in range(n // 4):
@@ -203,10 +202,10 @@ class FrameGenerator:
                 first[channel], second[channel] = edge + swing, edge - 1 - swing
             for values in (first, second):
                 self.put(np.clip(values, self.low, self.high))
-                self.now += apart
+                self.now += interval_ms
 
     def _edges(self, inputs: InputScale) -> dict[int, Ints]:
-        """Return by input channel the values near its mean at which the 8-bit code changes."""
+        """Return, for each input channel, the values near its mean at which the 8-bit code changes."""
         names = self.layout.inputs
         around = np.zeros((2 * _SEARCHED, len(names)), dtype=np.int64)
         direct = {i: self.layout.index(n) for i, n in enumerate(names) if n in self.layout.names}
@@ -222,14 +221,14 @@ class FrameGenerator:
         return by_channel
 
     def _garbage(self, channel: int) -> int:
-        """Return a value out of the channel's range, if 32 bits hold one."""
+        """Return a value out of the channel's range, if there is one in 32 bits."""
         low, high = int(self.low[channel]), int(self.high[channel])
         outside = [v for v in (low - 1, high + 1, *_INT32) if not low <= v <= high and _INT32[0] <= v <= _INT32[1]]
         return int(self.rng.choice(outside)) if outside else int(self.rng.integers(low, high))
 
 
 def measured(layout: Layout, scaler: Scaler) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return mean and spread of each measured channel, as the scaler of the inputs has them."""
+    """Return mean and spread of each measured channel, from the scaler of the inputs."""
     c = len(layout.channels)
     mean, spread = np.zeros(c), np.full(c, 100.0)
     derived = {d.name: d.of for d in layout.derived}
@@ -244,7 +243,7 @@ def measured(layout: Layout, scaler: Scaler) -> tuple[NDArray[np.float64], NDArr
 
 FRAMES, ANSWERS = "frames.bin", "answers.bin"
 ANSWER, EVENT, HEALTH = range(3)
-# The columns of a row by its kind; those of logits and probabilities follow, 0 but in an answer.
+# The columns of each kind of row; logits and probabilities follow, which are 0 except in answers.
 COLUMNS = {
     ANSWER: (
         *("kind", "frame", "ms", "sample", "state", "gesture", "affect", "confidence", "answer", "known"),
@@ -263,8 +262,8 @@ HEAD = len(COLUMNS[ANSWER])
 WARMING, TRACKING, FAULT = range(3)
 _KINDS = {
     ANSWER: "an answer",
-    EVENT: "something that happened to an event",
-    HEALTH: "health says something else than at the frame before",
+    EVENT: "a change of an event",
+    HEALTH: "a change of the sensor health",
 }
 Ints = NDArray[np.int64]
 
@@ -275,16 +274,16 @@ def column(rows: NDArray[Any], name: str, kind: int = ANSWER) -> NDArray[Any]:
 
 
 def answers_of(model: IntegerModel, frames: Ints, silences: Container[int] = ()) -> NDArray[np.int32]:
-    """Compute the rows (m, 12 + 2 K) int32 that the toy answers to frames (n, 1 + C); the first column is ms.
+    """Compute the rows (m, 12 + 2 K) int32 that the toy returns for frames (n, 1 + C), whose first column is in ms.
 
-    A row is an answer, something that happened to an event, or a change of what health says; its columns are those of
-    `COLUMNS`, then the K logits in steps of 1/256 and the K smoothed probabilities in steps of 2^-27, which are 0 but
-    in an answer of a toy that tracks, as everything from gesture to known. ``frame`` is the row of the frame that
-    brought it about, ``restarts`` and ``invalid`` the counts until then; times and counts wrap at 2^32. What happens to
-    an event in a step stands before the step's answer, what health says after all else of its frame.
+    A row is an answer, a change of an event, or a change of the sensor health. It has the columns of `COLUMNS`, then K
+    logits in steps of 1/256 and K smoothed probabilities in steps of 2^-27. These and the columns ``gesture`` to
+    ``known`` are 0 in an answer before the toy tracks. ``frame`` is the index of the frame that caused the row,
+    ``restarts`` and ``invalid`` are the counts up to then; times and counts wrap at 2^32. Changes of events come before
+    the answer of the same step, changes of health after all other rows of the frame.
 
     Args:
-        silences: the frames after which a silence is reported (``plush_silence``).
+        silences: indices of the frames after which a silence is reported (``plush_silence``).
     """
     toy = _toy(model)
     table = _RowTable(toy, model)
@@ -293,14 +292,14 @@ def answers_of(model: IntegerModel, frames: Ints, silences: Container[int] = ())
 
 
 def answers_over_swaps(parts: Sequence[tuple[IntegerModel, Ints]]) -> list[NDArray[np.int32]]:
-    """Return what the toy answers when models for the same channels are swapped in mid-stream (``plush_swap``).
+    """Compute the toy's rows when models with the same channels are swapped during a stream (``plush_swap``).
 
     Args:
         parts: each model with the frames (n, 1 + C) that it reads.
 
     Returns:
-        The rows of each part as of `answers_of`. An event that is open at a swap ends with it: the row stands at the
-        end of the part, as of the next frame. Frames and counts go on, and the toy is warming.
+        The rows of each part, as from `answers_of`. A swap ends an open event: its row is the last one of the part and
+        has the index of the next frame. Frame indices and counts continue, and the toy is warming again.
     """
     toy, frame, tables = _toy(parts[0][0]), 0, []
     for n, (model, frames) in enumerate(parts, 1):
@@ -319,7 +318,7 @@ def _toy(model: IntegerModel) -> ToyMachine:
 
 
 class _RowTable:
-    """Rows of the output of a toy; ``frame`` is the number of the current frame."""
+    """Collects rows of the output of a toy; ``frame`` is the index of the current frame."""
 
     def __init__(self, toy: ToyMachine, model: IntegerModel, frame: int = 0) -> None:
         self.toy, self.frame = toy, frame
@@ -327,7 +326,7 @@ class _RowTable:
         self.rows: list[list[int]] = []
 
     def read(self, frames: Ints, silences: Container[int] = ()) -> None:
-        """Feed frames to the toy and add all that comes of them."""
+        """Feed frames to the toy and add the resulting rows."""
         health = self.toy.frames.health
         for ms, *values in frames.tolist():
             before = health.fault, health.suspect
@@ -345,7 +344,7 @@ class _RowTable:
         return (rows & 0xFFFFFFFF).astype(np.uint32).view(np.int32)
 
     def add(self, moment: Moment) -> None:
-        """Add the updates of a moment, and its answer if it is a step."""
+        """Add the changes of events at a moment, and the answer if it is a step."""
         for u in moment.updates:
             self._add(EVENT, self._ms(u.now), u.number, u.kind, u.gesture, u.affect, u.source, self._ms(u.since))
         if moment.cause != "step":
@@ -374,7 +373,7 @@ class _RowTable:
 
 
 def write_golden(model: IntegerModel, scaler: Scaler, folder: Path) -> list[Path]:
-    """Write the golden vectors with a README into a folder, and return the paths."""
+    """Write golden vectors and a README into a folder; return the paths."""
     span, inputs = model.network.arch.span, model.network.inputs
     frames = golden_frames(model.layout, scaler, span, inputs=inputs, health=model.rules.health)
     answers = answers_of(model, frames)
@@ -401,7 +400,7 @@ def read_golden(folder: Path, channels: int, classes: int) -> tuple[Ints, NDArra
     """Read the frames (n, 1 + C) and rows (m, 12 + 2 K) of a folder.
 
     Raises:
-        BadInput: for a file that is missing or does not hold whole rows.
+        BadInput: if a file is missing or its size is not a multiple of the row size.
     """
     tables = []
     for name, columns, kind in ((FRAMES, 1 + channels, "<i4"), (ANSWERS, HEAD + 2 * classes, "<i4")):

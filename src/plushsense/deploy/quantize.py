@@ -1,12 +1,11 @@
 """Quantization of a trained network: folded batch normalisation, 8-bit weights and activations, fixed-point scales.
 
-Folding is exact: a normalisation after ReLU moves into the next layer, and after the last layer through the mean into
-the dense layer. The 8-bit ranges of inputs and activations are measured on windows of the training people only
-(`calibrate`).
+Folding is exact: each normalisation moves into the weights of the next layer, the last one into those of the dense
+layer. `calibrate` measures the 8-bit ranges of inputs and activations, on windows of the training people only.
 
-The mean error that rounding the weights causes is computed from the mean input of each layer and subtracted in its
-bias. On makeability this lowers the share of windows on which int8 and float disagree from 4 % to 1.5 %: inputs lie
-around code 128, so that the error of a weight is multiplied by 128.
+The bias of each layer compensates the mean error caused by the rounding of its weights, which is computed from the mean
+input. Input codes lie around 128, by which a weight's error is multiplied; so on makeability this lowers the share of
+windows on which int8 and float disagree from 4 % to 1.5 %.
 """
 
 from __future__ import annotations
@@ -38,13 +37,13 @@ from plushsense.windows.features import Scaler
 
 Floats = NDArray[np.float64]
 
-# Part of every journalled result: raise it when the same windows and weights would give other integers.
+# Part of the key of stored results: increase it when the same windows and weights give other integers.
 QUANTIZE_VERSION = 1
 
 _BATCH = 16  # windows
 
-# Share of the training values that may lie outside the ranges. More values of new people do, and clipping costs more
-# than coarser steps: on 5 of makeability's 27 folds these changed the answers least (Kullback-Leibler, 5e-4).
+# Share of the training values outside the ranges. For new people it is larger, and clipping costs more than coarser
+# steps. Chosen on 5 of makeability's 27 folds, by the smallest change of the outputs (Kullback-Leibler, 5e-4).
 _INPUTS_OUTSIDE = 1e-4
 _OUTSIDE = 1e-5
 
@@ -71,7 +70,7 @@ class Ranges:
         """Read ranges from plain values.
 
         Raises:
-            BundleError: for a key that is missing.
+            BundleError: for a missing key or values that are no numbers.
         """
         try:
             low, high = (np.asarray(table[name], dtype=np.float64) for name in ("low", "high"))
@@ -86,7 +85,7 @@ class Ranges:
             raise BundleError(f"The calibration in the bundle cannot be read ({cause}): train again.") from None
 
     def check(self, arch: Arch) -> None:
-        """Raise BundleError for ranges of another network."""
+        """Raise BundleError if the ranges do not fit the network ``arch``."""
         needed = [arch.channels, arch.channels, *arch.filters, arch.channels, *arch.filters]
         parts = [self.low, self.high, *self.tops, *self.means]
         if [p.shape for p in parts] != [(n,) for n in needed] or not all(np.isfinite(p).all() for p in parts):
@@ -96,18 +95,18 @@ class Ranges:
 def calibrate(network: Network, x: NDArray[np.floating[Any]]) -> Ranges:
     """Measure the ranges of scaled training windows (N, C, T) in every layer of the network."""
     low, high = np.quantile(x, [_INPUTS_OUTSIDE, 1 - _INPUTS_OUTSIDE], axis=(0, 2))
-    seen: list[list[Floats]] = [[] for _ in network.arch.filters]
+    activations: list[list[Floats]] = [[] for _ in network.arch.filters]
     for at in range(0, len(x), _BATCH):
-        for values, z in zip(seen, network.rectified(x[at : at + _BATCH]), strict=True):
+        for values, z in zip(activations, network.rectified(x[at : at + _BATCH]), strict=True):
             values.append(z.reshape(-1, z.shape[2]))
-    rows = [np.concatenate(values) for values in seen]
+    rows = [np.concatenate(values) for values in activations]
     tops = tuple(np.quantile(row, 1 - _OUTSIDE, axis=0) for row in rows)
     inputs = np.asarray(x.mean(axis=(0, 2), dtype=np.float64))
     return Ranges(low, high, tops, (inputs, *(row.mean(axis=0) for row in rows)))
 
 
 def refuse_undeployable(arch: Arch) -> None:
-    """Raise ArchError for a network that cannot be deployed, with the reason and the nearest one that can."""
+    """Raise ArchError for a network that cannot be deployed, with the reason and the option to train it with."""
     if arch.padding != "stream":
         raise ArchError(
             f"{arch.title} has the padding '{arch.padding}', with which a decision cannot be made sample by sample: "
@@ -161,25 +160,25 @@ def quantize(arch: Arch, weights: Mapping[str, NDArray[Any]], scaler: Scaler, ra
 
 
 def _codes(mean: Floats, start: Floats, unit: Floats) -> Floats:
-    """Return the mean 8-bit code of a layer's input (0 where a filter is switched off)."""
+    """Return the mean 8-bit code of each input of a layer (0 for a constant one)."""
     return np.divide(mean - start, unit, out=np.zeros_like(mean), where=unit != 0)
 
 
-def _eight_bits(w: Floats, b: Floats, read: Floats) -> tuple[NDArray[np.int8], NDArray[np.int64], Floats]:
+def _eight_bits(w: Floats, b: Floats, mean_input: Floats) -> tuple[NDArray[np.int8], NDArray[np.int64], Floats]:
     """Quantize weights (F, C, …) and biases (F,) per filter: the largest weight becomes ±127.
 
-    ``read`` (C,) is the mean input; the bias compensates the mean error of the rounded weights.
+    ``mean_input`` (C,) is the mean input; the bias compensates the mean error of the rounded weights.
     """
     rows = np.abs(w).reshape(len(w), -1).max(axis=1)
-    size = np.maximum(np.maximum(rows / 127, np.abs(b) / (1 << 29)), 1e-30)
-    units = size.reshape(-1, *[1] * (w.ndim - 1))
-    whole = np.rint(w / units).astype(np.int8)
-    lost = (w - whole * units).reshape(*w.shape[:2], -1).sum(axis=2) @ read
-    return whole, np.rint((b + lost) / size).astype(np.int64), size
+    scale = np.maximum(np.maximum(rows / 127, np.abs(b) / (1 << 29)), 1e-30)
+    scales = scale.reshape(-1, *[1] * (w.ndim - 1))
+    whole = np.rint(w / scales).astype(np.int8)
+    mean_error = (w - whole * scales).reshape(*w.shape[:2], -1).sum(axis=2) @ mean_input
+    return whole, np.rint((b + mean_error) / scale).astype(np.int64), scale
 
 
 def _split(ratios: Floats, full: int) -> NDArray[np.int64]:
-    """Return columns (before, multiplier, after) of each ratio; a sum of full / ratio gives ``full``."""
+    """Return rows before, multiplier and after (3, F) of `split_ratio`, for sums up to ``full`` / ratio."""
     return np.array([split_ratio(float(r), full / float(r)) for r in ratios], dtype=np.int64).T
 
 
@@ -194,21 +193,21 @@ def _input_scale(scaler: Scaler, low: Floats, unit: Floats) -> InputScale:
     return InputScale(*np.array(rows, dtype=np.int64).T)
 
 
-_MOST = 1024  # windows
+_MAX_WINDOWS = 1024
 
 
 def calibration(
     arch: Arch, weights: Mapping[str, NDArray[np.float32]], scaler: Scaler, x: NDArray[np.integer[Any]]
 ) -> dict[str, Any]:
-    """Return the calibration of raw training windows (N, C, T) for the bundle: plain values without samples.
+    """Calibrate on raw training windows (N, C, T); return plain values for the bundle, without samples.
 
-    Empty for a network that cannot be deployed, and without windows.
+    Empty for a network that cannot be deployed, or without windows.
     """
     if not deployable(arch) or not len(x):
         return {}
-    # Evenly spaced over all windows, so that every person is among them.
-    some = np.unique(np.linspace(0, len(x) - 1, min(len(x), _MOST)).round().astype(np.int64))
-    return calibrate(Network(arch, weights), scaler.apply(x[some, :, x.shape[2] - arch.span :])).to_dict()
+    # Evenly spaced, so that every person is included.
+    chosen = np.unique(np.linspace(0, len(x) - 1, min(len(x), _MAX_WINDOWS)).round().astype(np.int64))
+    return calibrate(Network(arch, weights), scaler.apply(x[chosen, :, x.shape[2] - arch.span :])).to_dict()
 
 
 def calibrated(bundle: Bundle, x: NDArray[np.integer[Any]]) -> Bundle:
@@ -224,7 +223,7 @@ def calibrated(bundle: Bundle, x: NDArray[np.integer[Any]]) -> Bundle:
 
 
 def integer_network(bundle: Bundle) -> IntegerNetwork:
-    """Return the bundle's network in integers; deterministic.
+    """Quantize the bundle's network; deterministic.
 
     Raises:
         ArchError: for a network that cannot be deployed; BundleError: for a bundle without calibration.
@@ -239,7 +238,7 @@ def integer_network(bundle: Bundle) -> IntegerNetwork:
 
 
 def integer_model(bundle: Bundle, decide: DecideSpec | None = None) -> IntegerModel:
-    """Return all that the toy computes with; ``decide`` None: the bundle's own decision settings.
+    """Build the model that the toy runs. ``decide``: decision settings, by default those of the bundle.
 
     Raises:
         ArchError, BundleError: as for `integer_network`; ConfigError: for unknown decision settings.

@@ -1,8 +1,7 @@
-"""Cross-validation: one training for each fold through the journal, all predictions kept, then scored.
+"""Cross-validate a model: train once for each fold, or load the fold from the journal, and score all predictions.
 
-Training is passed in as a picklable callable, so that this package needs no PyTorch and folds run in parallel. Windows
-to train on and to score may be cut from the same recordings with different contexts: the split is made over recordings
-and so is the same for both.
+Training is passed in as a picklable callable, so that this package needs no PyTorch and folds can run in parallel. The
+split is made over recordings, so that the windows to train on and those to score may have different contexts.
 """
 
 from __future__ import annotations
@@ -31,12 +30,12 @@ _VERSION = 1
 
 
 def fold_windows(train: WindowSet, score: WindowSet, split: Split, seed: int = 0) -> list[Fold]:
-    """Return the folds of ``split`` as windows: train and validation index ``train``, test indexes ``score``.
+    """Return the folds of ``split`` as indices of windows: train and validation into ``train``, test into ``score``.
 
-    No window that touches a tested recording in its stream is trained or validated on.
+    Unless the split is leaky, windows that overlap a test recording in its stream are not used for training.
 
     Raises:
-        BadInput: when the two sets do not belong together, or the split cannot be made of them.
+        BadInput: when the two sets have different labels or inputs, or are too small for the split.
     """
     if train.labels != score.labels or train.inputs != score.inputs:
         raise BadInput("The windows to train on and those to score differ in gestures or channels: cut both alike.")
@@ -66,7 +65,7 @@ def fold_windows(train: WindowSet, score: WindowSet, split: Split, seed: int = 0
 
 @dataclass(frozen=True)
 class _Recordings:
-    """The recordings (R,) of both sets; rows in a stream as ids and (R, 2), −1 where there is none."""
+    """The recordings (R,) of both sets; ``stream_rows`` (R, 2) are −1 for a recording that lies in no stream."""
 
     ids: NDArray[np.str_]
     subject: NDArray[np.str_]
@@ -80,18 +79,18 @@ class _Recordings:
         subject, stream = (np.concatenate([getattr(s, name) for s in sets]) for name in ("subject", "stream"))
         y = np.concatenate([s.y for s in sets])
         rows = np.concatenate([s.recording_rows for s in sets])
-        # Of all windows of a recording, take one whose place in a stream is known.
+        # Of all windows of a recording, take one with known rows in a stream, if there is one.
         order = np.lexsort((rows[:, 0] < 0, ids))
         unique, first = np.unique(ids[order], return_index=True)
         pick = order[first]
         return cls(unique, subject[pick], y[pick], stream[pick], rows[pick])
 
     def place(self, windows: WindowSet) -> Index:
-        """Return the recording of each window as an index into these, (N,)."""
+        """Return the index of each window's recording, (N,)."""
         return np.searchsorted(self.ids, _ids(windows)).astype(np.int64)
 
     def rows(self, index: Index) -> tuple[NDArray[np.str_], Index]:
-        """Return stream and rows of some recordings, as `purge` takes them."""
+        """Return stream and rows of the recordings at ``index``, as arguments of `purge`."""
         return self.stream[index], self.stream_rows[index]
 
 
@@ -115,7 +114,7 @@ def _require_windows(fold: Fold, recordings: Fold, split: Split) -> None:
 
 @dataclass(frozen=True)
 class FoldOutput:
-    """The outcome of one training: probabilities (N, K) of the test windows, history, seconds, best epoch.
+    """The outcome of one training: probabilities (N, K) of the test windows, history, seconds and best epoch.
 
     ``deployed`` (N, K): probabilities of the same network in 8 bits; None where they are not computed.
     """
@@ -136,7 +135,7 @@ class FitPredict(Protocol):
     def __call__(
         self, train: WindowSet, validation: WindowSet, test: WindowSet, progress: EpochProgress, /
     ) -> FoldOutput:
-        """Train and predict; ``progress`` is called with (epoch, epochs at most, the epoch's row)."""
+        """Train and predict; call ``progress`` with (epoch, maximum epochs, row of the history)."""
         ...
 
 
@@ -157,7 +156,7 @@ class Evaluation:
     predictions_path: Path | None = None
 
     def write_predictions(self, path: str | Path) -> Path:
-        """Write every prediction to a Parquet file, and remember where."""
+        """Write all predictions to a Parquet file and set ``predictions_path``."""
         self.predictions_path = write_predictions(path, self.predictions)
         return self.predictions_path
 
@@ -196,22 +195,22 @@ def evaluate(
     seed: int = 0,
     progress: Callable[[JobProgress], None] | None = None,
 ) -> Evaluation:
-    """Train and score each fold of ``split``.
+    """Train and score a model on each fold of ``split``.
 
     Args:
         train_windows, score_windows: the same recordings, possibly cut with another context; one set for both is fine.
         split: "leave-one-subject-out", "by-subject:5", "by-recording:5", "windows:5", "windows:holdout".
-        journal: where finished folds are kept, and looked for first.
+        journal: where finished folds are stored, and looked up first.
         key: with a journal, everything that ``fit_predict`` depends on besides windows and folds (network, schedule,
             its seed).
         workers: folds at a time, each in a process of its own.
-        cluster: address of a Ray cluster that does the folds instead.
-        seed: of the split.
+        cluster: address of a Ray cluster that runs the folds instead.
+        seed: seed of the split.
         progress: called when a fold reports an epoch, with (epoch, epochs, row of the history) as its message, or is
             done.
 
     Raises:
-        BadInput: for a split that cannot be made; PlushSenseError: what ``fit_predict`` raises.
+        BadInput: for a split that cannot be made; any error that ``fit_predict`` raises.
     """
     if journal is not None and key is None:
         raise ConfigError("A journal needs a key that identifies what is trained: give evaluate(..., key={...}).")
@@ -295,13 +294,13 @@ class _FoldWork:
 
 
 def context_of(windows: WindowSet) -> str:
-    """Return the kind of context: "anywhere" or "stream" where any window has a real past, else "loop" or "inside"."""
+    """Return the first of the contexts "anywhere", "stream", "loop" and "inside" that any window has."""
     present = set(np.unique(windows.context).tolist())
     return next((kind for kind in ("anywhere", "stream", "loop") if kind in present), "inside")
 
 
 def windows_fingerprint(windows: WindowSet) -> str:
-    """Return the hash of a set's content, for the ids of jobs on it."""
+    """Return a hash of the windows, for the ids of jobs that use them."""
     digest = hashlib.sha256(repr((windows.x.shape, windows.labels, windows.recording_ids)).encode())
     for array in (windows.x, windows.y, windows.recording):
         digest.update(np.ascontiguousarray(array).data)
@@ -309,7 +308,7 @@ def windows_fingerprint(windows: WindowSet) -> str:
 
 
 def fold_fingerprint(fold: Fold) -> str:
-    """Return the hash of the windows that a fold trains on, validates on and tests."""
+    """Return a hash of the window indices of a fold."""
     digest = hashlib.sha256()
     for index in (fold.train, fold.validation, fold.test):
         digest.update(len(index).to_bytes(8, "little") + index.astype("<i8").tobytes())
@@ -322,7 +321,7 @@ def compare_deployed(
     """Compare the deployed network with the float one, as plain values.
 
     Args:
-        before, after: the figures of both (see `plushsense.evaluation.scores.compute_scores`).
+        before, after: scores of the float and the deployed network, from `compute_scores`.
         predictions, deployed: of the same windows, in the same order.
 
     Returns:
@@ -337,15 +336,15 @@ def compare_deployed(
     keys = tuple(metrics.column_metrics())
     rows = []
     for one, other in zip(before[before["over"]], after[after["over"]], strict=True):
-        mine = of == one[name]
-        row = {name: one[name], "windows": int(mine.sum())}
+        selected = of == one[name]
+        row = {name: one[name], "windows": int(selected.sum())}
         for score in keys:
             before_score, after_score = one[score], other[score]
             loss = None if before_score is None or after_score is None else float(before_score - after_score)
             row |= {score: before_score, f"{score}_int8": after_score, f"{score}_loss": loss}
-        rows.append(row | {"agreement": float(same[mine].mean()) if mine.any() else None})
+        rows.append(row | {"agreement": float(same[selected].mean()) if selected.any() else None})
     counted = predictions.subject != NOBODY if people else np.ones(len(same), dtype=np.bool_)
-    apart = np.abs(predictions.probabilities - deployed.probabilities).max(axis=1)
+    differences = np.abs(predictions.probabilities - deployed.probabilities).max(axis=1)
     return {
         **{score: after[score] for score in keys},
         "loss": {
@@ -354,6 +353,6 @@ def compare_deployed(
         },
         "over": before["over"],
         "agreement": float(same[counted].mean()) if counted.any() else None,
-        "probability_difference": float(apart[counted].mean()) if counted.any() else None,
+        "probability_difference": float(differences[counted].mean()) if counted.any() else None,
         "rows": rows,
     }

@@ -1,8 +1,7 @@
 """Predictions of an evaluation, their files, and the scores computed from them.
 
-Where people are kept apart, means are over people, and recordings of nobody (subject "none": the toy at rest) are
-reported separately; otherwise means are over folds. Pooled scores, classes and confusions count every scored window,
-as the paper does.
+With a split by people, means are over people, and recordings of nobody (subject "none": the toy at rest) are reported
+separately; otherwise means are over folds. Pooled scores, classes and confusions count every window, as in the paper.
 """
 
 from __future__ import annotations
@@ -30,8 +29,8 @@ _P = "p_"
 class Predictions:
     """The predictions of an evaluation: one row for each scored window, fold after fold.
 
-    ``recording`` is the recording's id, ``window`` the window's number within it (from 0), ``context`` what its past
-    is, ``truth`` and ``predicted`` class indices into ``labels``, ``probabilities`` (N, K) float32.
+    ``recording`` is the recording's id, ``window`` the window's number within it (from 0), ``context`` the kind of data
+    before it, ``truth`` and ``predicted`` class indices into ``labels``, ``probabilities`` (N, K) float32.
     """
 
     labels: tuple[str, ...]
@@ -48,7 +47,7 @@ class Predictions:
 
     @property
     def predicted(self) -> NDArray[np.int64]:
-        """The class of the highest probability, (N,)."""
+        """The class with the highest probability, (N,)."""
         best: NDArray[np.int64] = np.argmax(self.probabilities, axis=1).astype(np.int64)
         return best
 
@@ -56,10 +55,10 @@ class Predictions:
 def gather_predictions(
     windows: WindowSet, folds: Sequence[tuple[str, Index]], probabilities: Sequence[NDArray[np.float32]]
 ) -> Predictions:
-    """Collect the predictions of all folds: (name, index of the windows it tested) and the probabilities of each."""
+    """Collect the predictions of all ``folds``, given as (name, index of test windows), and their probabilities."""
     order = np.concatenate([test for _, test in folds])
     ids = np.array(windows.recording_ids, dtype=np.str_)
-    # The windows of a recording are in the order of time.
+    # The windows of a recording are in order of time.
     by_recording = np.argsort(windows.recording, kind="stable")
     sorted_recording = windows.recording[by_recording]
     number = np.empty(len(windows), dtype=np.int64)
@@ -77,9 +76,9 @@ def gather_predictions(
 
 
 def write_predictions(path: str | Path, predictions: Predictions) -> Path:
-    """Write subject, recording, window, context, fold, truth, predicted and a ``p_<label>`` a class, as Parquet.
+    """Write predictions to a Parquet file, with a column ``p_<label>`` for each class.
 
-    Truth and prediction are written as labels. The file is replaced in one step.
+    Truth and prediction are written as labels. The file is replaced atomically.
 
     Raises:
         MissingExtraError: without polars (extra ``train``).
@@ -105,7 +104,7 @@ def write_predictions(path: str | Path, predictions: Predictions) -> Path:
 
 
 def read_predictions(path: str | Path) -> Predictions:
-    """Read a file of `write_predictions`.
+    """Read a file that `write_predictions` wrote.
 
     Raises:
         MissingExtraError: without polars (extra ``train``); BadInput: for a missing file, or one of another kind.
@@ -137,7 +136,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class FoldRecord:
-    """A fold besides its predictions; ``windows`` are (trained on, validated on, tested)."""
+    """A fold without its predictions; ``windows`` counts those for training, validation and test."""
 
     name: str
     subjects: tuple[str, ...]
@@ -149,24 +148,25 @@ class FoldRecord:
 def compute_scores(
     predictions: Predictions, folds: list[FoldRecord], affects: tuple[str, ...], apart: bool
 ) -> dict[str, Any]:
-    """Compute all scores as plain values; what cannot be computed is None.
+    """Compute all scores as plain values; those that cannot be computed are None.
 
     Args:
-        affects: the affect of each class; apart: whether people are kept apart.
+        affects: the affect of each class.
+        apart: whether no person is in both training and test.
     """
     scorer = _Scorer(predictions)
     people = predictions.subject != NOBODY
     counted = people if apart else np.ones(len(people), dtype=np.bool_)
-    named = sorted(set(predictions.subject[people].tolist()))
+    people_codes = sorted(set(predictions.subject[people].tolist()))
     of_fold = [predictions.fold == fold.name for fold in folds]
-    of_person = [predictions.subject == person for person in named]
-    single = [scorer.figures(m) for m in (of_person if apart else [m & counted for m in of_fold])]
-    # The paper's average is over all 18 classes, so that recordings of nobody (the toy at rest) count in their fold.
+    of_person = [predictions.subject == person for person in people_codes]
+    parts = [scorer.figures(m) for m in (of_person if apart else [m & counted for m in of_fold])]
+    # The paper averages over all 18 classes, including recordings of nobody (the toy at rest).
     all_classes = [metrics.macro_f1(scorer.counts(m), all_classes=True) for m in of_fold]
     everything = scorer.counts(np.ones(len(people), dtype=np.bool_))
     affect_names, by_affect = metrics.grouped(everything, affects)
     return {
-        **{name: metrics.summary([f[name] for f in single]) for name in metrics.METRICS},
+        **{name: metrics.summary([f[name] for f in parts]) for name in metrics.METRICS},
         "macro_f1_all_classes": metrics.summary(all_classes),
         "over": "subjects" if apart else "folds",
         "by_recording": scorer.by_recording(counted),
@@ -180,21 +180,21 @@ def compute_scores(
         "by_context": scorer.by_context(counted),
         "nobody": None if people.all() else scorer.size(~people) | {"accuracy": scorer.figures(~people)["accuracy"]},
         "folds": [_fold(fold, scorer, mask & counted) for fold, mask in zip(folds, of_fold, strict=True)],
-        "subjects": [_person(name, scorer, m) for name, m in zip(named, of_person, strict=True)],
+        "subjects": [_person(name, scorer, m) for name, m in zip(people_codes, of_person, strict=True)],
     }
 
 
 class _Scorer:
-    """Computes scores of parts of the predictions, given as masks (N,)."""
+    """Computes scores of subsets of the predictions, given as masks (N,)."""
 
     def __init__(self, predictions: Predictions) -> None:
         self._all = predictions
         self._classes = len(predictions.labels)
-        self._read = predictions.predicted
+        self._predicted = predictions.predicted
         _, self._recording = np.unique(predictions.recording, return_inverse=True)
 
     def counts(self, mask: Mask) -> Counts:
-        return metrics.confusion(self._all.truth[mask], self._read[mask], self._classes)
+        return metrics.confusion(self._all.truth[mask], self._predicted[mask], self._classes)
 
     def figures(self, mask: Mask) -> dict[str, float]:
         return metrics.scores_of(self.counts(mask))
@@ -205,22 +205,22 @@ class _Scorer:
     def by_recording(self, mask: Mask) -> dict[str, Any]:
         """Return the scores of the vote over each recording's windows."""
         recording = self._recording[mask]
-        ids, read = metrics.vote(self._all.probabilities[mask], recording)
+        ids, predicted = metrics.vote(self._all.probabilities[mask], recording)
         _, first = np.unique(recording, return_index=True)
-        figures = metrics.scores_of(metrics.confusion(self._all.truth[mask][first], read, self._classes))
+        figures = metrics.scores_of(metrics.confusion(self._all.truth[mask][first], predicted, self._classes))
         return _plain(figures) | {"recordings": len(ids)}
 
     def by_context(self, mask: Mask) -> dict[str, Any]:
         table = {}
         for kind in ("stream", "inside", "loop"):
-            mine = mask & (self._all.context == kind)
-            if mine.any():
-                table[kind] = self.size(mine) | _plain({"accuracy": self.figures(mine)["accuracy"]})
+            selected = mask & (self._all.context == kind)
+            if selected.any():
+                table[kind] = self.size(selected) | _plain({"accuracy": self.figures(selected)["accuracy"]})
         return table
 
 
 def _plain(figures: dict[str, float]) -> dict[str, float | None]:
-    """Replace NaN, which JSON does not know, by None."""
+    """Replace NaN, which JSON cannot represent, by None."""
     return {name: float(value) if np.isfinite(value) else None for name, value in figures.items()}
 
 

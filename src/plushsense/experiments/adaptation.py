@@ -319,7 +319,7 @@ def adapt(
     if test is not None:
         original = restore_original(given) if before is not None else given
         predictors = (_float_predictor(original), _float_predictor(done.bundle if done.accepted else original))
-        one, other = (judge(predict(test), test.y, test.recording).judged for predict in predictors)
+        one, other = (judge(predict(test), test.y, test.recording).scores for predict in predictors)
         tested = (one, other)
     dataset.generation.check()
     return Adapted(done, person, use, tested, left_out, dataset.head.simulated)

@@ -1,7 +1,7 @@
-"""Jobs, and a journal of their results on disk, so that a finished job is not computed again.
+"""Jobs, and a journal that stores their results on disk, so that a finished job is not computed again.
 
-A job's id is the hash of what it depends on, so that a changed setting is another job. Files are replaced atomically: a
-run that is killed leaves complete results or none.
+A job's id is a hash of all that its result depends on, so that a changed setting makes another job. Files are replaced
+atomically: a run that is killed leaves complete results or none.
 """
 
 from __future__ import annotations
@@ -26,49 +26,49 @@ from plushsense.core.files import PART, replacing_file
 
 Report = Callable[[Any], None]
 
-# Read by the numeric libraries when they are loaded.
+# Numeric libraries read these when they are loaded.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 
 
 @dataclass(frozen=True)
 class Job:
-    """A job: its id in the journal, and the task that the work is given."""
+    """A job: its id in the journal, and the ``task`` argument of `JobWork`."""
 
     id: str
     task: Any
 
 
 class JobWork(Protocol):
-    """The work of every job: a picklable callable (a function of a module, a dataclass with ``__call__``)."""
+    """The function that computes jobs: a picklable callable, such as a module's function or a dataclass."""
 
     def __call__(self, shared: Any, task: Any, report: Report, /) -> Result:
         """Return the result of one job.
 
-        ``report`` takes any message on the way; it reaches ``on_report``.
+        ``report`` passes a message to ``on_report`` while the job runs.
         """
         ...
 
 
 class JobEvent(NamedTuple):
-    """A report of an engine on a job: that it started (again), a message, its result, or its exception."""
+    """An event of a job: it started (again), or sent a message, a result or an exception, which is ``what``."""
 
     job: Job
     kind: Literal["started", "report", "done", "failed"]
     what: Any = None
 
 
-# Returns the next job to start, or None when there are no more; called only when the job can start at once.
+# Returns the next job, or None if there are no more; called only when the job can start immediately.
 Take = Callable[[], Job | None]
 Engine = Iterator[JobEvent]
 
 
 def thread_settings(threads: int) -> dict[str, str]:
-    """Return the environment variables of a process that computes on so many threads."""
+    """Return the environment variables for a process that computes in ``threads`` threads."""
     return dict.fromkeys(_THREADS, str(threads))
 
 
 def portable(error: Exception) -> Exception:
-    """Return an exception that can be pickled, with the traceback of this process unless it is a `PlushSenseError`."""
+    """Make an exception picklable and add the traceback, which a `PlushSenseError` does not need."""
     trace = traceback.format_exc()
     if not isinstance(error, PlushSenseError):
         error.add_note(f"In a worker process:\n{trace}")
@@ -93,23 +93,23 @@ def job_id(job: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class Claim:
-    """A lock on a job for the process that works on it; it ends with the process at the latest."""
+    """A lock on a job for the process that runs it; it is released with the process at the latest."""
 
     _lock: BaseFileLock | None
 
     def release(self) -> None:
         if self._lock is not None:
-            # A process that opened the file before looks in the journal before it begins.
+            # A process that already opened this file will find the result in the journal before it starts the job.
             with suppress(OSError):
                 Path(self._lock.lock_file).unlink(missing_ok=True)
             self._lock.release()
 
 
 class Journal:
-    """A folder of results, made with the first one; it may be deleted at any time.
+    """A folder of results, created with the first one; it may be deleted at any time.
 
     Args:
-        writing: returns the context in which files are written; entering it raises PlushSenseError when that is no
+        writing: returns the context manager for writing files, which raises PlushSenseError on entry if writing is no
             longer allowed. It is pickled with the journal.
     """
 
@@ -121,7 +121,7 @@ class Journal:
         return f"Journal({str(self.folder)!r})"
 
     def path(self, job: str) -> Path:
-        """Return the file of a job."""
+        """Return the path of a job's result."""
         return self.folder / f"{job}.npz"
 
     def has(self, job: str) -> bool:
@@ -129,11 +129,11 @@ class Journal:
         return self.find(job) is not None
 
     def load(self, job: str) -> dict[str, Any]:
-        """Return the result of a job that is done; KeyError for one that is not."""
-        found = self.find(job)
-        if found is None:
+        """Return the result of a job; raise KeyError if it is not done."""
+        result = self.find(job)
+        if result is None:
             raise KeyError(job)
-        return found
+        return result
 
     def find(self, job: str) -> dict[str, Any] | None:
         """Return the result of a job; None when there is none or its file is damaged (then the job is not done)."""
@@ -141,18 +141,18 @@ class Journal:
             with np.load(self.path(job), allow_pickle=False) as file:
                 result = {name: file[name] for name in file.files}
             values = json.loads(result.pop(_JSON).tobytes())
-        # zipfile checks a CRC of every member; the exception for a damaged header depends on the byte.
+        # A damaged file raises any of these, depending on the position; zipfile checks a CRC of each member.
         except (OSError, EOFError, KeyError, ValueError, NotImplementedError, zipfile.BadZipFile):
             return None
         return result | values if isinstance(values, dict) else None
 
     def claim(self, job: str) -> Claim | None:
-        """Claim a job for this process; None when another process has it.
+        """Lock a job for this process; return None if another process has locked it.
 
-        On a file system without locks every process gets the job.
+        On a file system without locks, every process can claim it.
 
         Raises:
-            PlushSenseError: when the result could not be saved, as nothing may be written any more.
+            PlushSenseError: if writing is no longer allowed, so that the result could not be saved.
         """
         lock = FileLock(self.folder / f".{job}.lock", timeout=0, thread_local=False)
         try:
@@ -166,10 +166,10 @@ class Journal:
         return Claim(lock)
 
     def save(self, job: str, result: Result) -> None:
-        """Save the result of a job in one step. Arrays stay arrays; other values must fit JSON.
+        """Save the result of a job atomically. Values other than arrays must be JSON-serialisable.
 
         Raises:
-            PlushSenseError: when the folder cannot be written to, or nothing may be written there any more;
+            PlushSenseError: if the folder is not writable, or writing is no longer allowed.
             TypeError, ValueError: for values that cannot be saved.
         """
         arrays = {name: value for name, value in result.items() if isinstance(value, np.ndarray)}
@@ -181,7 +181,7 @@ class Journal:
                 with replacing_file(self.path(job)) as part, part.open("wb") as file:
                     np.savez(file, allow_pickle=False, **{_JSON: packed}, **arrays)
         except OSError as cause:
-            # Windows does not replace a file that is being read: then the result exists already.
+            # Windows does not replace a file that is open, but then the result exists already.
             if self.find(job) is None:
                 raise PlushSenseError(
                     f"A result cannot be kept in {self.folder} ({cause.strerror or cause}): make room or the folder "
@@ -189,7 +189,7 @@ class Journal:
                 ) from cause
 
     def prune(self, older_s: float) -> None:
-        """Delete results, and files left by killed processes, that are older than so many seconds."""
+        """Delete results, and files left by killed processes, that are older than ``older_s`` seconds."""
         with suppress(OSError):
             for path in [*self.folder.glob("*.npz"), *self.folder.glob(f".*{PART}")]:
                 with suppress(OSError):
@@ -197,20 +197,20 @@ class Journal:
                         path.unlink()
 
     def discard(self, job: str) -> None:
-        """Delete the result of a job, if there is one; on Windows only if no process reads it."""
+        """Delete the result of a job, if there is one; on Windows, not while a process reads it."""
         with suppress(OSError):
             self.path(job).unlink()
 
 
-# Kinds of journals in a data set's cache: finished trainings, and states of unfinished ones.
+# Folders of journals in a data set's cache: finished trainings, and states of unfinished ones.
 JOURNAL, UNFINISHED = "sweeps", "unfinished"
 
 
 def keep_if_possible(journal: Journal, job: str, state: Result) -> None:
-    """Save the state of a training; without space on the disk it is not saved, which only costs time later.
+    """Save the state of a training; ignore errors such as a full disk, which only cost time later.
 
     Raises:
-        ForgottenError: when one of its people was removed from the data set.
+        ForgottenError: if one of its people was removed from the data set.
     """
     try:
         journal.save(job, state)

@@ -42,7 +42,7 @@ class JobStep(NamedTuple):
 
 
 class BestScore(NamedTuple):
-    """A score, higher is better, and the name (and table row, if there is one) of what reached it."""
+    """A score (higher is better), with the name and, if there is one, the table row of the job that reached it."""
 
     score: float
     name: str
@@ -86,20 +86,20 @@ class ProgressStatus:
 
     @property
     def counts(self) -> str:
-        """The counts in one phrase: ``sweep: 2 of 4 trainings (1 from before), 1 failed``."""
+        """The counts as text: ``sweep: 2 of 4 trainings (1 from before), 1 failed``."""
         text = f"{self.title}: {self.done} of {self.total}{' ' * bool(self.unit)}{self.unit}"
         text += f" ({self.resumed} from before)" if self.resumed else ""
         return text + (f", {self.failed} failed" if self.failed else "")
 
     @property
     def times(self) -> str:
-        """The time passed, and an estimate of the time left."""
+        """The elapsed time, and an estimate of the remaining time, as text."""
         left = f", about {duration(self.left_s)} left" if self.left_s and self.done < self.total else ""
         return f"{duration(self.elapsed_s)}{left}"
 
     @property
     def line(self) -> str:
-        """Everything but the running jobs in one line, for a log."""
+        """The status without the running jobs as one line for a log."""
         return printable(", ".join([self.counts, f"{self.share:.0%}", self.times, *self.notes]))
 
     def render(self, height: int = 1000) -> RenderableType:
@@ -127,7 +127,7 @@ class ProgressStatus:
 class Reporter(ABC):
     """Base of both reporters: draws the display in a thread of its own.
 
-    Closing the terminal ends the display, never the work.
+    Closing the terminal ends the display but not the work.
     """
 
     def __init__(self, *, keep: bool, stream: TextIO | None) -> None:
@@ -146,7 +146,7 @@ class Reporter(ABC):
         self.close()
 
     def start(self) -> None:
-        """Start the display, unless it is running; another reporter's display ends."""
+        """Start the display, unless it is running, and end that of any other reporter."""
         global _active
         if self._thread is not None:
             return
@@ -188,12 +188,12 @@ class Reporter(ABC):
 
     def _write_lines(self, out: TextIO) -> None:
         written = self._began
-        over = False
-        while not over:
-            over = self._stop.wait(_REFRESH_S)
+        stopped = False
+        while not stopped:
+            stopped = self._stop.wait(_REFRESH_S)
             now = time.monotonic()
             lines = self._take_messages()
-            if now - written >= _LINE_S or (over and (self._keep or written > self._began)):
+            if now - written >= _LINE_S or (stopped and (self._keep or written > self._began)):
                 written = now
                 lines.append(self.status(now).line)
             if lines:
@@ -213,10 +213,10 @@ class Reporter(ABC):
             redirect_stdout=False,  # results go there
             redirect_stderr=out is sys.stderr,  # messages appear above the display
         )
-        over = False
+        stopped = False
         with live:
-            while not over:
-                over = self._stop.wait(_REFRESH_S)
+            while not stopped:
+                stopped = self._stop.wait(_REFRESH_S)
                 console.size = _measure(out)
                 for message in self._take_messages():
                     console.print(message, markup=False, soft_wrap=True)
@@ -229,7 +229,7 @@ class Reporter(ABC):
 
 
 class ProgressReporter(Reporter):
-    """Reports how many items of a piece of work are done; call it with ``(done, total)``.
+    """Shows how many items are done; call it with ``(done, total)``.
 
     The display starts with the first call and ends when all items are done, or with `close`.
     """
@@ -238,10 +238,10 @@ class ProgressReporter(Reporter):
         """Prepare the display.
 
         Args:
-            title: what is done, as "reading".
-            unit: plural noun of the items, as "folds".
+            title: the activity, such as "reading".
+            unit: plural noun of the items, such as "folds".
             keep: leave the last state on the terminal, and log it even if the work was short.
-            stream: default: standard error.
+            stream: where to write; by default standard error.
         """
         super().__init__(keep=keep, stream=stream)
         self._status = ProgressStatus(title, 0, 0, unit)
@@ -252,8 +252,8 @@ class ProgressReporter(Reporter):
         """Report that ``done`` of ``total`` items are done.
 
         Args:
-            detail: what else to display, as the last loss.
-            resumed: items of ``done`` that an earlier run finished; they say nothing about the speed of this one.
+            detail: further text to display, such as the last loss.
+            resumed: how many of ``done`` an earlier run finished; they do not count for the speed of this one.
             share: share of the work that is done, where it is not done / total; the time left is then not estimated.
         """
         self.start()
@@ -295,7 +295,7 @@ class JobsState:
     _most_parallel: int = 0
 
     def start(self, job: str, now: float) -> None:
-        """Mark a job as running from its beginning."""
+        """Mark a job as started at ``now``."""
         self._running[job] = now, None
         self._most_parallel = max(self._most_parallel, len(self._running))
 
@@ -317,7 +317,7 @@ class JobsState:
             self.best = best
 
     def fail(self, job: str, why: str) -> None:
-        """Mark a job as given up."""
+        """Mark a job as failed."""
         self._running.pop(job, None)
         self.failed[job] = why
 
@@ -328,20 +328,20 @@ class JobsState:
         return 1.0 if total <= 0 else 1.0 - sum(self._open().values()) / total
 
     def left_s(self, now: float) -> float | None:
-        """Estimate the time until all jobs are done; None while nothing is known about the speed.
+        """Estimate the time until all jobs are done; None while the speed is unknown.
 
-        Uses the cost per second of this run alone, and is at least what the longest open job needs on its own.
+        The speed is the finished cost per second of this run; the result is at least the time of the longest open job.
         """
         open_costs = self._open()
-        ahead = sum(open_costs.values())
-        if ahead <= 0:
+        open_cost = sum(open_costs.values())
+        if open_cost <= 0:
             return 0.0
-        # The work spent on failed jobs is unknown: they are left out on both sides.
-        fresh = sum(self.jobs[job].cost for job in self.done - self.resumed)
-        fresh += sum(self.jobs[job].cost - open_costs[job] for job in self._running)
-        if fresh <= 0 or now <= self.began:
+        # How far failed jobs came is unknown, so they count neither as finished nor as open.
+        finished_cost = sum(self.jobs[job].cost for job in self.done - self.resumed)
+        finished_cost += sum(self.jobs[job].cost - open_costs[job] for job in self._running)
+        if finished_cost <= 0 or now <= self.began:
             return None
-        return max(ahead, max(open_costs.values()) * self._most_parallel) / fresh * (now - self.began)
+        return max(open_cost, max(open_costs.values()) * self._most_parallel) / finished_cost * (now - self.began)
 
     def status(self, title: str, unit: str, score_name: str, now: float) -> ProgressStatus:
         """Return what to display at ``now``; the jobs that have run longest come first."""
@@ -435,7 +435,7 @@ class JobsReporter(Reporter):
         self._notify(job)
 
     def on_failed(self, job: Job, error: Exception) -> None:
-        """Mark a job as given up and write the reason above the display."""
+        """Mark a job as failed and write the reason above the display."""
         why = str(error) or type(error).__name__
         with self._lock:
             self.state.fail(job.id, why)
@@ -486,7 +486,7 @@ def _position(step: JobStep | None, elapsed_s: float) -> str:
 
 
 def _measure(stream: TextIO) -> ConsoleDimensions:
-    """Return the terminal's size; 80 × 24 where it does not know its own."""
+    """Return the terminal's size; 80 × 24 if it is unknown."""
     from rich.console import ConsoleDimensions
 
     try:

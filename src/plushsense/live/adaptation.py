@@ -1,18 +1,18 @@
-"""Adapt the last layer of a bundle to one person, from about a minute of that person's gestures.
+"""Adapt the last layer of a bundle to one person, with about a minute of that person's gestures.
 
-The convolution layers stay as they were trained. The dense layer is fitted again on their features (means over time) of
-the person's recordings: a logistic regression with a penalty of ``strength`` times the squared distance from the
-trained weights (the maximum a posteriori under a Gaussian prior around them). All gestures have the same weight, and so
-have all recordings of a gesture.
+The convolution layers do not change. The dense layer is fitted again on their features (means over time) of the
+person's recordings: a logistic regression with a penalty of ``strength`` times the squared distance from the trained
+weights (maximum a posteriori under a Gaussian prior around them). All gestures have the same weight, and so have all
+recordings of a gesture.
 
-The rows of gestures without recordings are not changed. The others are separated from each other and then shifted by
-one number, so that the logarithm of their summed exponentials stays the same on average over the person's recordings.
-Without that shift, gestures that were not recorded would be taken for recorded ones, and the decision settings would no
-longer fit the logits.
+The rows of gestures without recordings are not changed. The other rows are fitted among themselves; then one number is
+added to their biases, so that the log-sum-exp of their logits stays the same on average over the person's recordings.
+Otherwise gestures without recordings would be taken for recorded ones, and the decision settings would no longer fit
+the logits.
 
-The strength, and whether to adapt at all, are chosen on the person's own recordings, each predicted by a layer that was
-fitted without it. The bundle stays as it is unless more of them are then predicted correctly and their log loss clearly
-falls, and where they cannot be separated (because of wrong labels, for example). Only NumPy is needed.
+The strength, and whether to adapt at all, are decided by leave-one-out cross-validation on the person's recordings. The
+bundle is adapted only if more of them are predicted correctly, their log loss clearly falls, and they can be separated
+(not with wrong labels, for example). Only NumPy is needed.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Index = NDArray[np.int64]
 
 _DENSE = ("dense.weight", "dense.bias")
 _LEAST_PROBABILITY = 1e-9
-_ITERATIONS = 320  # of the weakest pull: 1e-4 of a logit from the optimum on makeability
+_ITERATIONS = 320  # logits are then within 1e-4 of the optimum on makeability, with the smallest strength
 
 
 @dataclass(frozen=True)
@@ -41,12 +41,12 @@ class PersonalSpec:
     """Settings of the adaptation of a bundle.
 
     Attributes:
-        strengths: penalties to choose from, in units of one
-            gesture: at 1, moving a weight by 1 costs half as much as a log loss of 1 on all recordings of a gesture.
-        least: a gesture with fewer recordings is left out; one is left out of two to choose the strength.
-        margin: by how many standard errors the log loss must fall for the bundle to be adapted.
-        separation: how far from guessing among the recorded gestures (0) to all right (1) the adapted layer must read
-            recordings that it was moved without.
+        strengths: penalties to choose from. At 1, a change of a weight by 1 costs half as much as a log loss of 1 on
+            all recordings of a gesture.
+        least: fewest recordings of a gesture to use it; at least 2, as cross-validation leaves one out.
+        margin: number of standard errors by which the log loss must fall.
+        separation: cross-validated accuracy that is needed, from that of guessing among the recorded gestures (0) to
+            all correct (1).
     """
 
     strengths: tuple[float, ...] = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
@@ -67,7 +67,7 @@ class PersonalSpec:
 
 @dataclass(frozen=True, eq=False)
 class Examples:
-    """N windows of one person: ``features`` (N, F), ``y`` (N,) class index, ``recording`` (N,) any number of each."""
+    """N windows of one person: ``features`` (N, F), class indices ``y`` (N,), ids of their ``recording`` (N,)."""
 
     features: Floats
     y: Index
@@ -80,7 +80,7 @@ class Examples:
 
 @dataclass(frozen=True)
 class RecordingScores:
-    """Scores of recordings; the probabilities of a recording are the mean over its windows."""
+    """Scores over recordings; the probabilities of a recording are the mean over its windows."""
 
     recordings: int
     right: int
@@ -98,11 +98,11 @@ class RecordingScores:
 
 @dataclass(frozen=True, eq=False)
 class Personal:
-    """Result of an adaptation: ``bundle`` is the adapted one, or the given one when ``accepted`` is false.
+    """Result of an adaptation: ``bundle`` is the adapted one, or the given one if ``accepted`` is false.
 
-    ``before`` and ``after`` are of the person's own recordings, each read by a layer moved without it (``after`` at the
-    strength that did best among them, which flatters a little); ``reason`` says in words why it was done or refused;
-    ``used`` and ``without`` are the labels of gestures that took part and that did not.
+    ``before`` and ``after`` are scores on the person's recordings; ``after`` is cross-validated, with the best of the
+    strengths, and therefore slightly optimistic. ``reason`` explains the decision as text. ``used`` and ``without`` are
+    the labels of gestures that were and were not used.
     """
 
     bundle: Bundle
@@ -124,14 +124,14 @@ def personalise(
     subject: str,
     spec: PersonalSpec | None = None,
 ) -> Personal:
-    """Adapt a bundle to one person, or return it unchanged where that does not help.
+    """Adapt a bundle to one person, or return it unchanged if that does not help.
 
     Args:
-        bundle: one that was adapted before is adapted anew, from what it was trained as.
-        x: raw windows (N, C, T) of the person, as `windows.cut` gives them.
+        bundle: an adapted bundle is first restored to its original weights.
+        x: raw windows (N, C, T) of the person, from `windows.cut`.
         y: (N,) class index of each, in the bundle's gestures.
-        recording: (N,) which recording each window belongs to.
-        subject: the person's code, which the bundle keeps; it keeps nothing else of them but the moved weights.
+        recording: (N,) id of the recording of each window.
+        subject: the person's code, which is stored in the bundle, as are the weights but no recordings.
 
     Raises:
         BadInput: when fewer than two gestures, or than half of the bundle's, have ``spec.least`` recordings.
@@ -140,11 +140,11 @@ def personalise(
     original = restore_original(bundle) if bundle.personal else bundle
     examples = Examples(original.network().features(original.scaler.apply(x)), y, recording)
     weight, bias = (np.asarray(original.weights[name], dtype=np.float64) for name in _DENSE)
-    enough = [k for k in np.unique(y) if len(np.unique(recording[y == k])) >= spec.least]
-    used_examples = examples.take(np.isin(y, enough))
+    recorded = [k for k in np.unique(y) if len(np.unique(recording[y == k])) >= spec.least]
+    used_examples = examples.take(np.isin(y, recorded))
     labels = original.gestures.labels
     used = tuple(labels[k] for k in np.unique(used_examples.y))
-    # With fewer recorded gestures, the others suffer: on makeability up to 5 of 10 cost nobody more than one recording.
+    # Fewer gestures make the others worse: on makeability, up to 5 of 10 cost nobody more than one recording.
     needed = max(2, -(-len(labels) // 2))
     if len(used) < needed:
         missing = ", ".join(label for label in labels if label not in used)
@@ -154,11 +154,11 @@ def personalise(
             f"{missing}."
         )
     own = judge(softmax(used_examples.features @ weight.T + bias), used_examples.y, used_examples.recording)
-    tried = [(s, _left_out(weight, bias, used_examples, s)) for s in spec.strengths]
+    tried = [(s, _cross_validate(weight, bias, used_examples, s)) for s in spec.strengths]
     strength, adapted_scores = min(tried, key=lambda each: float(each[1].losses.mean()))
     fell = own.losses - adapted_scores.losses
-    least = spec.margin * float(fell.std(ddof=1)) / np.sqrt(len(fell))
-    before, after = own.judged, adapted_scores.judged
+    needed_fall = spec.margin * float(fell.std(ddof=1)) / np.sqrt(len(fell))
+    before, after = own.scores, adapted_scores.scores
     figures = (
         f"of {before.recordings} own recordings, each left out once, {after.right} instead of {before.right} are "
         f"read right, log loss {after.log_loss:.3f} instead of {before.log_loss:.3f}"
@@ -168,7 +168,7 @@ def personalise(
     if after.right < (guess + (1.0 - guess) * spec.separation) * after.recordings:
         reason = f"the recordings cannot be told apart, so their labels or the sensors may be wrong: {figures}"
         return Personal(bundle, False, reason, strength, before, after, used, without)
-    if fell.mean() <= least or after.right <= before.right:
+    if fell.mean() <= needed_fall or after.right <= before.right:
         reason = f"it would not clearly help: {figures}"
         return Personal(bundle, False, reason, strength, before, after, used, without)
     dense = dict(zip(_DENSE, fit_dense(weight, bias, used_examples, strength), strict=True))
@@ -186,13 +186,15 @@ def personalise(
 
 
 @dataclass(frozen=True, eq=False)
-class _Read:
-    judged: RecordingScores
+class _Judged:
+    """Scores over all recordings, and the log loss of each, (R,)."""
+
+    scores: RecordingScores
     losses: Floats
 
 
-def judge(probabilities: NDArray[np.floating[Any]], y: Index, recording: Index) -> _Read:
-    """Score recordings by the probabilities (N, K) of their windows: counts, and the log loss of each recording."""
+def judge(probabilities: NDArray[np.floating[Any]], y: Index, recording: Index) -> _Judged:
+    """Score recordings by the mean of the probabilities (N, K) of their windows."""
     ids, first, place = np.unique(recording, return_index=True, return_inverse=True)
     mean = np.zeros((len(ids), probabilities.shape[1]))
     np.add.at(mean, place, probabilities)
@@ -200,21 +202,21 @@ def judge(probabilities: NDArray[np.floating[Any]], y: Index, recording: Index) 
     truth = y[first]
     losses = -np.log(np.maximum(mean[np.arange(len(ids)), truth], _LEAST_PROBABILITY))
     right = int((mean.argmax(axis=1) == truth).sum())
-    return _Read(RecordingScores(len(ids), right, float(losses.mean())), losses)
+    return _Judged(RecordingScores(len(ids), right, float(losses.mean())), losses)
 
 
 def fit_dense(weight: Floats, bias: Floats, examples: Examples, strength: float) -> tuple[Floats, Floats]:
-    """Return the dense layer (K, F), (K,) moved towards the examples."""
-    start, moved = _solved(weight, bias, examples, _weights(examples)[None], strength)
+    """Fit the dense layer to the examples and return its weights (K, F) and biases (K,)."""
+    start, moved = _fit_rows(weight, bias, examples, _weights(examples)[None], strength)
     start[np.unique(examples.y)] = moved[0]
     return start[:, :-1], start[:, -1]
 
 
-def _left_out(weight: Floats, bias: Floats, examples: Examples, strength: float) -> _Read:
-    """Score every recording by a layer that was fitted without it."""
+def _cross_validate(weight: Floats, bias: Floats, examples: Examples, strength: float) -> _Judged:
+    """Score each recording with a layer that was fitted without it (leave-one-out cross-validation)."""
     ids, place = np.unique(examples.recording, return_inverse=True)
     weights = np.stack([_weights(examples, without=i) for i in ids])
-    start, moved = _solved(weight, bias, examples, weights, strength)
+    start, moved = _fit_rows(weight, bias, examples, weights, strength)
     layers = np.repeat(start[None], len(ids), axis=0)
     layers[:, np.unique(examples.y)] = moved
     logits = np.einsum("nd,nkd->nk", _with_one(examples.features), layers[place])
@@ -222,7 +224,7 @@ def _left_out(weight: Floats, bias: Floats, examples: Examples, strength: float)
 
 
 def _weights(examples: Examples, without: int | None = None) -> Floats:
-    """Return the weight of each window: 1 for all of a gesture together, its recordings alike; one left out 0."""
+    """Return weights of windows that sum to 1 for each gesture, divided equally by recordings; 0 for ``without``."""
     weights = np.zeros(len(examples.y))
     for k in np.unique(examples.y):
         recordings = [r for r in np.unique(examples.recording[examples.y == k]) if r != without]
@@ -236,48 +238,47 @@ def _with_one(features: Floats) -> Floats:
     return np.concatenate([features, np.ones((len(features), 1))], axis=1)
 
 
-def _solved(
+def _fit_rows(
     weight: Floats, bias: Floats, examples: Examples, weights: Floats, strength: float
 ) -> tuple[Floats, Floats]:
-    """Return the trained layer (K, F + 1), and the moved rows of the example classes (J, S, F + 1) for J
-    ``weights`` (J, N).
+    """Return the trained layer (K, F + 1), and the S fitted rows of the classes in the examples, (J, S, F + 1).
 
-    Steps under a fixed bound of the curvature (Böhning 1992: half of the features' second moment), with Nesterov's
-    momentum, begun anew wherever it points uphill.
+    Fits one layer for each of the J ``weights`` (J, N), by steps with a fixed upper bound of the Hessian (Böhning 1992:
+    half of the features' second moment) and Nesterov momentum, which is restarted if it points uphill.
     """
     start = np.concatenate([weight, bias[:, None]], axis=1)
     present, y = np.unique(examples.y, return_inverse=True)
     x, truth = _with_one(examples.features), np.eye(len(present))[y]
     bound = 0.5 * np.einsum("jn,nd,ne->jde", weights, x, x, optimize=True) + strength * np.eye(x.shape[1])
     inverse = np.linalg.inv(bound)
-    here = ahead = np.repeat(start[present][None], len(weights), axis=0)
-    pace = np.ones((len(weights), 1, 1))
+    rows = ahead = np.repeat(start[present][None], len(weights), axis=0)
+    momentum = np.ones((len(weights), 1, 1))
     for _ in range(_ITERATIONS):
-        wrong = (softmax(x @ ahead.transpose(0, 2, 1)) - truth) * weights[:, :, None]
-        slope = wrong.transpose(0, 2, 1) @ x + strength * (ahead - start[present])
-        there = ahead - slope @ inverse
-        step = there - here
-        pace[(slope * step).sum(axis=(1, 2)) > 0] = 1.0
-        faster = (1.0 + np.sqrt(1.0 + 4.0 * pace * pace)) / 2.0
-        here, ahead, pace = there, there + (pace - 1.0) / faster * step, faster
+        errors = (softmax(x @ ahead.transpose(0, 2, 1)) - truth) * weights[:, :, None]
+        gradient = errors.transpose(0, 2, 1) @ x + strength * (ahead - start[present])
+        updated = ahead - gradient @ inverse
+        step = updated - rows
+        momentum[(gradient * step).sum(axis=(1, 2)) > 0] = 1.0
+        next_momentum = (1.0 + np.sqrt(1.0 + 4.0 * momentum * momentum)) / 2.0
+        rows, ahead, momentum = updated, updated + (momentum - 1.0) / next_momentum * step, next_momentum
         if float(np.abs(step).max()) < 1e-7:
             break
-    spoke = _together(x @ start[present].T) - _together(x @ here.transpose(0, 2, 1))
-    here[:, :, -1] += ((weights * spoke).sum(axis=1) / weights.sum(axis=1))[:, None]
-    return start, here
+    drift = _log_sum_exp(x @ start[present].T) - _log_sum_exp(x @ rows.transpose(0, 2, 1))
+    rows[:, :, -1] += ((weights * drift).sum(axis=1) / weights.sum(axis=1))[:, None]
+    return start, rows
 
 
-def _together(logits: Floats) -> Floats:
-    """Return the logarithm of the summed exponentials over the last axis."""
+def _log_sum_exp(logits: Floats) -> Floats:
+    """Compute the logarithm of the summed exponentials over the last axis."""
     top = logits.max(axis=-1, keepdims=True)
     return np.asarray(np.log(np.exp(logits - top).sum(axis=-1)) + top[..., 0])
 
 
 def restore_original(bundle: Bundle) -> Bundle:
-    """Return the bundle as it was before it was adapted, byte for byte.
+    """Undo an adaptation: return the bundle with exactly its original weights.
 
     Raises:
-        BundleError: for a bundle that was not adapted, or no longer holds what it was.
+        BundleError: for a bundle that was not adapted, or does not hold its original weights.
     """
     if not bundle.personal:
         raise BundleError("The bundle was not adapted to anybody: there is nothing to undo.")
@@ -293,5 +294,5 @@ def restore_original(bundle: Bundle) -> Bundle:
 
 
 def without_subject(personal: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a bundle's ``personal`` for an export: that it was adapted and how well that did, not to whom."""
+    """Return a bundle's ``personal`` for an export, without the person's code and the original weights."""
     return {key: value for key, value in personal.items() if key not in ("subject", "original")}

@@ -1,7 +1,7 @@
-"""The symbolic string of a network (``14d1_39d2_41d4``): parsed once, and all that can be counted from it.
+"""Parse the symbol of a network (``14d1_39d2_41d4``), and count its parameters, operations and memory.
 
-Layers are joined by ``_``; a number is the kernel length, ``d`` and a number the dilation (paper, 3.6.2).
-One block is Conv1d → ReLU → normalisation; after the blocks the mean over time, then one dense layer.
+Layers are joined by ``_``; each is a kernel length, and ``d`` with a dilation (paper, section 3.6.2). A layer is
+Conv1d → ReLU → normalisation; the mean over time and one dense layer follow the last one.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from plushsense.core.errors import ArchError, check_known
 from plushsense.core.toml import refuse_unknown
 
 MAX_LAYERS = 4
-MAX_NUMBER = 4096  # of a kernel, a dilation, a filter count: far above use, far below what would exhaust memory
+MAX_NUMBER = 4096  # of a kernel, a dilation, a filter count: limits memory; far above any useful value
 
 
 def parse_symbol(spec: str) -> tuple[tuple[int, int], ...]:
     """Return the (kernel, dilation) pairs of a symbol.
 
     Raises:
-        ArchError: showing the symbol and a caret under the place that does not fit.
+        ArchError: with the symbol and a caret under the first invalid character.
     """
     if not spec:
         fail("nothing is given: write kernel lengths joined by '_', as in 14d1_39d2_41d4", spec, 0)
@@ -47,7 +47,7 @@ def parse_symbol(spec: str) -> tuple[tuple[int, int], ...]:
 
 
 def parse_filters(text: str) -> tuple[int, ...]:
-    """Return the filter counts of ``"8,12,16"``; ArchError with a caret under what is not a whole number from 1."""
+    """Return the filter counts of ``"8,12,16"``; raise ArchError for anything but whole numbers from 1."""
     counts: list[int] = []
     at = 0
     while True:
@@ -73,13 +73,13 @@ def slashed(filters: Iterable[int]) -> str:
 
 
 def _number(text: str, at: int, what: str, symbol: bool = True) -> tuple[int, int]:
-    """Return the number that starts at ``at``, 1 to MAX_NUMBER, and the place after it."""
+    """Return the number that starts at ``at``, 1 to MAX_NUMBER, and the position after it."""
     end = at
     while end < len(text) and text[end] in "0123456789":
         end += 1
     if end == at:
-        ends = at == len(text) or text[at] in "_,"
-        problem = "nothing stands here" if ends else f"unknown token {text[at]!r}"
+        is_missing = at == len(text) or text[at] in "_,"
+        problem = "nothing stands here" if is_missing else f"unknown token {text[at]!r}"
         fail(f"{problem}: {what} is expected, a whole number from 1", text, at, symbol)
     if text[at:end].strip("0") == "":
         fail(f"{what} is 0: the smallest is 1", text, at, symbol)
@@ -89,7 +89,7 @@ def _number(text: str, at: int, what: str, symbol: bool = True) -> tuple[int, in
 
 
 def fail(why: str, text: str, at: int, symbol: bool = True) -> NoReturn:
-    """Raise ArchError: what is wrong, the text, and a caret under place ``at``."""
+    """Raise ArchError with the reason, the text, and a caret under position ``at``."""
     printable = "".join(c if c.isprintable() else "?" for c in text)
     what = "Architecture" if symbol else "Filters"
     raise ArchError(f"{what} '{printable}', place {at + 1}: {why}.\n    {printable}\n    {' ' * at}^")
@@ -128,7 +128,7 @@ TABLE3: dict[str, tuple[str, str, str, str]] = {
     "19d1_19d2_19d4_17d8": ("3.4k", "11.8k", "43.4k", "165k"),
 }
 PAPER_ARCHITECTURES: tuple[str, ...] = tuple(TABLE3)
-# The cell that our count cannot meet: 268 258 parameters, printed as 169k.
+# A misprint in the paper: this network has 268 258 parameters, not 169k.
 TABLE3_MISPRINT = ("100_151", (32, 48))
 
 
@@ -142,17 +142,17 @@ class ConvLayer:
 
     @property
     def reach(self) -> int:
-        """Samples before the current one that the layer sees: (kernel − 1) · dilation."""
+        """Number of samples before the current one that the layer reads: (kernel − 1) · dilation."""
         return (self.kernel - 1) * self.dilation
 
 
 @dataclass(frozen=True)
 class Arch:
-    """A network, complete but for its weights.
+    """The structure of a network, without its weights.
 
-    ``window`` and ``step`` are in samples. ``pool`` exists under ``stream`` only: the positions that the mean
-    runs over. Left at None it becomes the largest multiple of ``step`` that keeps the span within the window;
-    where the receptive field leaves no space for that, the window rounded down to a multiple of ``step``.
+    ``window`` and ``step`` are in samples. ``pool`` is the number of positions that the mean is taken over, only for
+    the padding ``stream``. By default it is the largest multiple of ``step`` with which the span fits into the window,
+    or, if the receptive field is too long for that, the window rounded down to a multiple of ``step``.
     """
 
     layers: tuple[ConvLayer, ...]
@@ -209,10 +209,10 @@ class Arch:
         step: int = 5,
         pool: int | None = None,
     ) -> Arch:
-        """Return a network from its symbol and its filter counts (``(8, 12)`` or ``"8,12"``; extra are ignored).
+        """Build a network from its symbol and its filter counts (``(8, 12)`` or ``"8,12"``; extra ones are ignored).
 
         Raises:
-            ArchError: with the symbol and a caret under the place, or saying which setting does not fit.
+            ArchError: for an invalid symbol (with a caret under the character) or setting.
         """
         shape = parse_symbol(spec)
         counts = (
@@ -234,7 +234,7 @@ class Arch:
 
     @property
     def symbol(self) -> str:
-        """The symbol, spelt as the paper does: dilations are written when any of them is not 1."""
+        """The symbol as the paper writes it: with dilations if any of them is not 1."""
         dilated = any(layer.dilation > 1 for layer in self.layers)
         return "_".join(f"{layer.kernel}d{layer.dilation}" if dilated else f"{layer.kernel}" for layer in self.layers)
 
@@ -250,12 +250,12 @@ class Arch:
 
     @property
     def inputs(self) -> tuple[int, ...]:
-        """Channels that each layer reads."""
+        """Number of input channels of each layer."""
         return (self.channels, *self.filters[:-1])
 
     @property
     def weight_shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shapes of all tensors of the network by name: the keys that a dict of weights must have, and no others."""
+        """Shape of each tensor of the network by name; a dict of weights has exactly these keys."""
         shapes: dict[str, tuple[int, ...]] = {}
         for i, (layer, read) in enumerate(zip(self.layers, self.inputs, strict=True)):
             shapes[f"conv{i}.weight"] = (layer.filters, read, layer.kernel)
@@ -268,28 +268,28 @@ class Arch:
 
     @property
     def parameters(self) -> int:
-        """Learnable numbers, as the paper's Table 3 counts them: without running means and variances."""
+        """Number of learnable parameters, as in the paper's Table 3: without running means and variances."""
         learnt = (s for name, s in self.weight_shapes.items() if not name.endswith((".mean", ".var")))
         return sum(int(np.prod(shape)) for shape in learnt)
 
     @property
     def receptive_field(self) -> int:
-        """Samples that one position of the last layer sees."""
+        """Number of samples that one position of the last layer depends on."""
         return 1 + sum(layer.reach for layer in self.layers)
 
     @property
     def pooled(self) -> int:
-        """Positions of the last layer that the mean runs over."""
+        """Number of positions of the last layer that the mean is taken over."""
         return self.window if self.pool is None else self.pool
 
     @property
     def span(self) -> int:
-        """Samples that a decision sees: receptive field + pool − 1 under ``stream``, the window otherwise."""
+        """Number of samples that a decision depends on: with ``stream`` receptive field + pool − 1, else the window."""
         return self.window if self.pool is None else self.receptive_field + self.pool - 1
 
     @property
     def positions(self) -> tuple[int, ...]:
-        """Positions that each layer computes when a decision is made from ``span`` samples at once."""
+        """Number of positions that each layer computes for one decision from ``span`` samples."""
         if self.padding != "stream":
             return (self.window,) * len(self.layers)
         after, left = [], self.span
@@ -305,7 +305,7 @@ class Arch:
 
     @property
     def macs_per_sample(self) -> int:
-        """Multiply-accumulates that one new sample costs when the network is fed sample by sample."""
+        """Multiply-accumulates for one new sample when the network runs sample by sample."""
         return sum(self.macs_per_position)
 
     @property
@@ -315,17 +315,17 @@ class Arch:
 
     @property
     def macs_per_step(self) -> int:
-        """Multiply-accumulates between two decisions: ``stream`` reads new samples, the others all again."""
+        """Multiply-accumulates for each decision: with ``stream`` of the new samples only, else of the whole window."""
         return self.step * self.macs_per_sample if self.padding == "stream" else self.macs_per_window
 
     @property
     def state_bytes_int8(self) -> int:
-        """Bytes that the network itself has to keep between samples with 8-bit activations.
+        """Bytes of state that the network keeps between samples with 8-bit activations.
 
-        ``stream``: a ring of reach + 1 samples before each layer, and pool / step block sums of 16 bits for
-        each feature. Otherwise the ring of the window, without the activations that are recomputed from it.
-        What a toy really needs is a little more (rings filled up to fours, the clock, sums, probabilities):
-        `plushsense.runtime.image.memory_bytes`.
+        ``stream``: a ring buffer of reach + 1 samples before each layer, and pool / step block sums of 16 bits for
+        each feature. Otherwise a ring buffer of the window, from which all activations are computed again.
+        `plushsense.runtime.image.memory_bytes` gives all memory of a toy: also padding of the buffers to a multiple of
+        4, the clock, sums and probabilities.
         """
         if self.pool is None:
             return self.window * self.channels
@@ -334,7 +334,7 @@ class Arch:
 
     @property
     def table3(self) -> str | None:
-        """Parameter count that the paper's Table 3 prints for this network ("13.2k"); None where it has none."""
+        """Parameter count of this network in the paper's Table 3 ("13.2k"); None if it is not in the table."""
         if (self.channels, self.classes) != (11, 18):
             return None
         for row, spec in enumerate(PAPER_FILTERS):
@@ -349,7 +349,7 @@ class Arch:
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> Arch:
-        """Return the network that ``to_dict`` described; raise ArchError for a missing, unknown or unfit key."""
+        """Build the network that ``to_dict`` described; raise ArchError for a missing, unknown or invalid key."""
         known = ("symbol", "filters", "channels", "classes", "padding", "norm", "window", "step", "pool")
         refuse_unknown(table, known, "an architecture", ArchError)
         missing = [key for key in known[:2] if key not in table]
@@ -364,8 +364,8 @@ class Arch:
 def reflected(length: int, left: int) -> NDArray[np.intp]:
     """Return the indices (left + length,) that extend ``length`` samples by ``left`` mirrored ones.
 
-    The edge sample is not repeated; where the samples do not suffice they are reflected again, as
-    ``numpy.pad`` does with mode ``reflect``.
+    The edge sample is not repeated; if there are too few samples they are reflected repeatedly, like
+    ``numpy.pad`` with mode ``reflect``.
     """
     folded = np.abs(np.arange(-left, length)) % (2 * (length - 1))
     return np.asarray(np.minimum(folded, 2 * (length - 1) - folded), dtype=np.intp)

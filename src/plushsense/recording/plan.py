@@ -17,7 +17,7 @@ ORDERS = {
     "round": "every gesture once, then every gesture again",
 }
 DEFAULT = "default"
-"""The wording used where the chosen one is missing; without it, the gesture's description is used."""
+"""Wording used where a prompt lacks the chosen one; if both are missing, the gesture's description is the prompt."""
 
 _LIMITS = {"countdown_s": (0.0, 60.0), "shortest_s": (0.0, 60.0), "longest_s": (1.0, 36_000.0)}
 
@@ -36,10 +36,10 @@ class Step:
 class Protocol:
     """The plan of a session.
 
-    ``gestures`` are labels in the order of recording, ``prompts`` the text that the person reads for each, ``words`` is
-    the chosen wording, ``order`` one of `ORDERS`, and ``nobody`` lists the gestures that are recorded without a person.
-    ``countdown_s`` is the time from the first press of the space bar to the first row. A second press within
-    ``shortest_s`` does not stop the recording, which ends automatically after ``longest_s``.
+    ``gestures`` are labels in recording order, ``prompts`` maps each to the text shown to the person, ``words`` is the
+    chosen wording of the prompts, ``order`` one of `ORDERS`, and ``nobody`` the gestures recorded without a person.
+    ``countdown_s`` is the time from the first press of the space bar to the first row. The second press stops the
+    recording, but not within ``shortest_s``; it ends automatically after ``longest_s``.
     """
 
     name: str
@@ -62,11 +62,11 @@ class Protocol:
 
     def steps(self) -> tuple[Step, ...]:
         """Return all planned recordings of the session, in order."""
-        times = range(1, self.repetitions + 1)
+        repetitions = range(1, self.repetitions + 1)
         if self.order == "round":
-            pairs = [(g, r) for r in times for g in self.gestures]
+            pairs = [(g, r) for r in repetitions for g in self.gestures]
         else:
-            pairs = [(g, r) for g in self.gestures for r in times]
+            pairs = [(g, r) for g in self.gestures for r in repetitions]
         return tuple(Step(n, g, r, self.prompts[g]) for n, (g, r) in enumerate(pairs))
 
     def to_dict(self) -> dict[str, Any]:
@@ -80,12 +80,12 @@ class Protocol:
         """Return the protocol that plain values describe: a TOML file, or the result of `to_dict`.
 
         Args:
-            where: to quote in messages.
-            words: the wording to read; None: the one that the table names, else "default".
-            beside: a folder in which the gesture set's file is looked for, too.
+            where: description of the source for error messages.
+            words: wording to use; None: the one that the table names, else "default".
+            beside: folder in which the file of the gesture set is looked up first.
 
         Raises:
-            ConfigError: for an unknown key, or a value that does not fit.
+            ConfigError: for an unknown key or an invalid value.
             GestureError: for a gesture that is not in the set.
         """
         file = load_table(table, _ProtocolFile, where, ConfigError)
@@ -109,7 +109,7 @@ class Protocol:
 
 @dataclass(frozen=True)
 class _ProtocolFile:
-    """The keys of a protocol in a file, or of `Protocol.to_dict`, where every gesture has its prompt."""
+    """Keys of a protocol file, and of `Protocol.to_dict`, in which ``prompts`` has one text for each gesture."""
 
     name: str
     gesture_set: str
@@ -126,32 +126,32 @@ class _ProtocolFile:
 
 
 def _resolved(file: _ProtocolFile, where: str, words: str, beside: Path | None) -> dict[str, Any]:
-    """Return the values that depend on the gesture set and the wording."""
+    """Return the fields of `Protocol` that depend on the gesture set and the wording."""
     title = file.title or file.name
-    given, labels = file.prompts, file.gestures or ()
-    if file.nobody is not None and labels and all(isinstance(given.get(label), str) for label in labels):
-        # From `to_dict`: the file of the gesture set may no longer exist.
-        return {"title": title, "prompts": {label: given[label] for label in labels}, "words": words}
-    own = beside / file.gesture_set if beside is not None and file.gesture_set.endswith(".toml") else None
-    gesture_set = load_gestures(own if own is not None and own.is_file() else file.gesture_set)
+    file_prompts, labels = file.prompts, file.gestures or ()
+    if file.nobody is not None and labels and all(isinstance(file_prompts.get(label), str) for label in labels):
+        # Written by `to_dict`: do not load the gesture set, whose file may no longer exist.
+        return {"title": title, "prompts": {label: file_prompts[label] for label in labels}, "words": words}
+    own_file = beside / file.gesture_set if beside is not None and file.gesture_set.endswith(".toml") else None
+    gesture_set = load_gestures(own_file if own_file is not None and own_file.is_file() else file.gesture_set)
     gestures = [gesture_set.get(label) for label in labels] or [g for g in gesture_set.gestures if not g.nobody]
     if len({g.label for g in gestures}) < len(gestures) or not gestures or file.gestures == ():
         raise ConfigError(f"The {where} must name every gesture once, and at least one: see its gestures.")
-    wordings = {DEFAULT, *(w for text in given.values() if isinstance(text, Mapping) for w in text)}
+    wordings = {DEFAULT, *(w for text in file_prompts.values() if isinstance(text, Mapping) for w in text)}
     if words not in wordings:
         raise ConfigError(
             f"The {where} has no wording '{words}'; it has {', '.join(sorted(wordings))}.{nearest(words, wordings)}"
         )
     prompts = {}
-    texts = {gesture_set.get(label).label: text for label, text in given.items()}
+    texts = {gesture_set.get(label).label: text for label, text in file_prompts.items()}
     for gesture in gestures:
         text = texts.get(gesture.label, {})
         if isinstance(text, Mapping):
             text = text.get(words) or text.get(DEFAULT) or gesture.description or gesture.label
         if not text.strip():
             raise ConfigError(f"The {where}: the prompt of '{gesture.label}' is {text!r}; it must be a text.")
-        named = parse_name(recording_filename(gesture.label, 0, 0))
-        if named is None or plain_label(named.label) != plain_label(gesture.label):
+        parsed = parse_name(recording_filename(gesture.label, 0, 0))
+        if parsed is None or plain_label(parsed.label) != plain_label(gesture.label):
             raise ConfigError(
                 f"The {where}: '{gesture.label}' cannot be part of a file name; "
                 'choose a label without  \\ / : * ? " < > | ( )  and without a point at its end.'
@@ -167,7 +167,7 @@ def protocol_names() -> tuple[str, ...]:
 
 
 def wordings(name_or_path: str | Path) -> tuple[str, ...]:
-    """Return the wordings of a protocol's prompts, `DEFAULT` first; raise ConfigError as `load_protocol`."""
+    """Return the wordings of a protocol's prompts, `DEFAULT` first; raise ConfigError like `load_protocol`."""
     table, _ = read_named(name_or_path, "protocols", "protocol", ConfigError)
     prompts = table.get("prompts")
     texts = prompts.values() if isinstance(prompts, Mapping) else ()
@@ -176,7 +176,7 @@ def wordings(name_or_path: str | Path) -> tuple[str, ...]:
 
 
 def load_protocol(name_or_path: str | Path, words: str | None = None) -> Protocol:
-    """Load a built-in protocol by name, or one of the user's own by the path of its TOML file.
+    """Load a built-in protocol by name, or any other by the path of its TOML file.
 
     Raises:
         ConfigError: for an unknown name or an unusable file.

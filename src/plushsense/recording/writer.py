@@ -23,7 +23,7 @@ from plushsense.recording.session_files import SESSION_LOG, SIDECAR, SessionEven
 
 
 def to_frames(frames: Sequence[Frame], channels: int) -> Frames:
-    """Convert a toy's frames to rows: ``values`` (T, channels)."""
+    """Convert a sequence of T frames to arrays, with ``values`` (T, channels)."""
     values = np.array([f.values for f in frames], dtype=np.int64).reshape(len(frames), channels)
     return Frames(
         values,
@@ -33,7 +33,7 @@ def to_frames(frames: Sequence[Frame], channels: int) -> Frames:
 
 
 def lacks_descriptor(cause: Exception) -> bool:
-    """Return whether no file descriptor was free, in the process or the system: that passes, a full disk does not."""
+    """Return whether the error is a lack of file descriptors, which is temporary, unlike a full disk."""
     return isinstance(cause, OSError) and cause.errno in (errno.EMFILE, errno.ENFILE)
 
 
@@ -43,21 +43,21 @@ class AppendedFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._file = path.open("ab", buffering=0)
-        self._good = self._file.seek(0, os.SEEK_END)
+        self._size = self._file.seek(0, os.SEEK_END)
 
     def append(self, data: bytes) -> None:
-        """Append lines and flush them to the disk; on OSError the file is as before."""
+        """Append lines and flush them to disk; on OSError the file is left as it was before."""
         try:
             left = memoryview(data)
             while left:
                 left = left[self._file.write(left) :]
             os.fsync(self._file.fileno())
         except OSError:
-            # Truncating works on a full disk, too.
+            # Remove a partial line; truncating works even on a full disk.
             with contextlib.suppress(OSError):
-                os.ftruncate(self._file.fileno(), self._good)
+                os.ftruncate(self._file.fileno(), self._size)
             raise
-        self._good += len(data)
+        self._size += len(data)
 
     def close(self) -> None:
         """Close the file."""
@@ -65,12 +65,12 @@ class AppendedFile:
 
 
 class StreamFile(AppendedFile):
-    """``fulldatastream.csv``: everything the toy sent, in the columns of the authors' recorder, without header."""
+    """``fulldatastream.csv``: all frames of the toy in the columns of the authors' recorder, without a header."""
 
     def __init__(self, path: Path, layout: Layout) -> None:
         super().__init__(path)
         self.layout = layout
-        # Delays refer to the row before, so its frame is kept.
+        # The delay of a row is the time since the row before, so keep the last frame.
         self._overlap = DELAY_MS in layout.csv.columns
         self._last: Frame | None = None
 
@@ -99,7 +99,7 @@ class LogFile(AppendedFile):
 def save_take(
     folder: Path, frames: Frames, layout: Layout, gesture: str, saved_ms: int, sidecar: dict[str, Any]
 ) -> Path:
-    """Write one recording and its sidecar, each whole or not at all; nothing is ever replaced.
+    """Write one recording and its sidecar, each atomically and never over an existing recording.
 
     The sidecar is written first, so that a crash leaves no recording without its sidecar; a sidecar without a recording
     is removed when the session is opened again.
@@ -124,25 +124,25 @@ def save_take(
 
 
 FLUSH_S = 0.5
-"""Longest delay before rows are written, by the computer's clock or the toy's, whichever is first."""
+"""Longest delay before rows are written, by the clock of the computer or of the toy, whichever is first."""
 
 CLOSING_S = 10.0
 """How long a closing writer keeps trying while no file descriptor is free."""
 
-_LOOK_S = 0.05
+_POLL_S = 0.05
 _RETRY_S = 0.2
 
 Job = Callable[[], None]
 
 
 class BackgroundWriter:
-    """Queue rows, events and jobs without waiting, and write them to the disk.
+    """Queues rows, events and jobs without blocking, and writes them to disk in two threads.
 
     Args:
         stream, log: open files; the writer closes the stream.
-        synchronous: write every row at once, and let `wait_written` wait for it; for a toy that runs faster than real
-            time, of which otherwise more than the last second could be lost.
-        on_fail: called once, in a thread of the writer, when something cannot be written; nothing is written then.
+        synchronous: write every row at once, and let `wait_written` block until then; for a simulated toy that runs
+            faster than real time, of which a crash could otherwise lose more than the last second.
+        on_fail: called once, in a thread of the writer, when something cannot be written; nothing more is written.
         on_wait: called in a thread of the writer when a write or a job is repeated because no file
             descriptor was free.
     """
@@ -186,23 +186,23 @@ class BackgroundWriter:
             self._changed.notify_all()
 
     def submit(self, job: SessionEvent | Job) -> None:
-        """Queue an event for the log, or a job, in order; a job waits for the rows added so far.
+        """Queue an event for the log, or a job that runs after the rows added so far are written; the order is kept.
 
-        A job that fails for want of a file descriptor is done again: it must have left nothing behind.
+        A job that fails for lack of a file descriptor is repeated, so it must undo what it did before it fails.
         """
         with self._changed:
             self._jobs.append((0 if isinstance(job, SessionEvent) else self._added, job))
             self._changed.notify_all()
 
     def wait_written(self) -> None:
-        """Wait until all rows are on disk when ``synchronous``, else return at once."""
+        """Wait until all rows are on disk if ``synchronous``; else return at once."""
         if self._synchronous:
             with self._changed:
                 while self._written < self._added and not (self._failed or self._closing):
-                    self._changed.wait(_LOOK_S)
+                    self._changed.wait(_POLL_S)
 
     def close(self) -> None:
-        """Write everything and end; jobs that are queued meanwhile are done, too."""
+        """Write everything and stop; jobs that are queued in the meantime are still run."""
         with self._changed:
             if not self._closing:
                 self._closing, self._closing_s = True, time.monotonic()
@@ -244,15 +244,15 @@ class BackgroundWriter:
     def _due(self) -> bool:
         if not self._rows:
             return False
-        waited = any(after > self._written for after, _ in self._jobs)
-        old = time.monotonic() - self._since_s >= FLUSH_S or self._toy_ms - self._since_ms >= 1000.0 * FLUSH_S
-        return old or waited or self._synchronous or self._closing
+        job_waits = any(after > self._written for after, _ in self._jobs)
+        is_late = time.monotonic() - self._since_s >= FLUSH_S or self._toy_ms - self._since_ms >= 1000.0 * FLUSH_S
+        return is_late or job_waits or self._synchronous or self._closing
 
     def _write_stream(self) -> None:
         while True:
             with self._changed:
                 while not (self._due() or self._closing or self._failed):
-                    self._changed.wait(_LOOK_S)
+                    self._changed.wait(_POLL_S)
                 if self._failed or not self._rows:
                     return
                 rows, self._rows = self._rows, []
@@ -267,11 +267,11 @@ class BackgroundWriter:
             job: Job | None = None
             with self._changed:
                 while not (self._closing or self._failed or (self._jobs and self._jobs[0][0] <= self._written)):
-                    self._changed.wait(_LOOK_S)
+                    self._changed.wait(_POLL_S)
                 if self._failed or (self._closing and not self._jobs):
                     return
                 if self._jobs[0][0] > self._written:
-                    self._changed.wait(_LOOK_S)
+                    self._changed.wait(_POLL_S)
                     continue
                 while self._jobs and isinstance(event := self._jobs[0][1], SessionEvent):
                     events.append(event)

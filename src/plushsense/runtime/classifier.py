@@ -1,6 +1,6 @@
-"""Classify a live stream: frames in, a `Decision` every step out.
+"""Classify a live stream of frames; return a `Decision` at every step.
 
-A `StreamReader` drives the one `plushsense.runtime.machine.ToyMachine` and puts its moments in words and seconds.
+A `StreamReader` runs a `plushsense.runtime.machine.ToyMachine` and converts its results to labels and seconds.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ _SMOOTH = float(1 << (PROBABILITY_BITS + SMOOTH_EXTRA_BITS))
 
 @dataclass(frozen=True, slots=True)
 class GestureEvent:
-    """Change of an event: there is one event for each gesture, with a beginning and an end.
+    """A change of an event. Each gesture of the person is one event with a beginning and an end.
 
     Attributes:
-        what: ``begun``, ``named`` (its gesture became sure) or ``ended``.
-        number: counts the events of a stream, from 1.
+        what: ``begun``, ``named`` (its gesture became certain) or ``ended``.
+        number: number of the event in the stream, from 1.
         affect: ``positive``, ``neutral``, ``negative`` or ``none``.
-        gesture: the label, or None while only the affect is sure.
-        source: who began it: ``gate``, the threshold rules, or ``cnn``, the network.
-        since_s: when it first was the candidate; of an end, when it was first missed.
-        t_s: when it is reported.
+        gesture: the label, or None while only the affect is certain.
+        source: what began the event: ``gate``, the threshold rules, or ``cnn``, the network.
+        since_s: first time at which the event was likely; for ``ended``, first time at which it no longer was.
+        t_s: time of the report.
     """
 
     what: Literal["begun", "named", "ended"]
@@ -56,21 +56,21 @@ State = Literal["warming", "tracking", "no signal", "sensor fault"]
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """Decision at one moment of a stream.
+    """The decision at one time of a stream.
 
     Attributes:
-        t_s: device time of the newest sample it saw, in seconds since the stream's first frame. A gap counts
-            in full; over a reset of the device clock the time goes on where it was.
-        gesture: the best label, sure or not, or None while there is no answer; of the gate, its rule's, or None.
+        t_s: device time of the newest sample that it depends on, in seconds since the stream's first frame. Gaps are
+            included; after a reset of the device clock the time continues.
+        gesture: the most probable label, or None while there is no answer; for the gate, that of its rule, if any.
         affect: ``positive``, ``neutral``, ``negative`` or ``none`` (None while there is no answer).
         confidence: smoothed probability of the gesture, 0 to 1, or None.
-        source: who decided; ``cnn``, the network, or ``gate``, the threshold rules, between two steps.
-        state: ``warming`` until the span has been seen since the start or a restart; then ``tracking``; ``no signal``
-            when no frame came; ``sensor fault`` when sensors are at fault.
+        source: what decided: ``cnn``, the network, or, between two steps, ``gate``, the threshold rules.
+        state: ``warming`` from the start or a restart until enough samples for the network were read; then
+            ``tracking``; ``no signal`` when frames are missing; ``sensor fault`` when sensors are at fault.
         probabilities: smoothed probabilities in class order, or None.
         answer: ``sure`` (of one gesture), ``affect`` (of an affect only), ``unsure``, ``unknown`` (not a known
             gesture) or ``idle``; None while there is no answer.
-        events: what happened to events at this moment, in order; mostly nothing.
+        events: changes of events at this time, in order; usually none.
     """
 
     t_s: float
@@ -84,7 +84,7 @@ class Decision:
     events: tuple[GestureEvent, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the line that ``plushsense live`` prints."""
+        """Return plain values for the line that ``plushsense live`` prints."""
         confidence = None if self.confidence is None else round(self.confidence, _DECIMALS)
         return {
             "t_s": round(self.t_s, _DECIMALS),
@@ -99,11 +99,11 @@ class Decision:
 
 
 class StreamReader:
-    """Reads the frames of one toy and decides.
+    """Reads the frames of one toy and returns decisions.
 
-    Decisions come every ``step`` even samples; between them when the gate fires, when the signal was lost, and when
-    sensors fail. A gap beyond the layout's ``gap_ms`` or a reset of the device clock gives ``no signal`` with the first
-    frame after it, at the time of the last one before. In a sensor fault nothing is decided.
+    There is a decision every ``step`` samples, and also when the gate fires, the signal was lost or sensors fail. The
+    first frame after a gap beyond the layout's ``gap_ms`` or a reset of the device clock gives ``no signal``, at the
+    time of the last frame before. During a sensor fault there are no decisions.
 
     The arguments are those of `ToyMachine`.
     """
@@ -118,7 +118,7 @@ class StreamReader:
 
     @property
     def restarts(self) -> int:
-        """Number of gaps and clock resets after which everything began again."""
+        """Number of gaps and clock resets after which the computation was restarted."""
         return self._machine.frames.clock.restarts
 
     @property
@@ -142,25 +142,25 @@ class StreamReader:
         return self._machine.frames.time_us / 1e6
 
     def reset(self) -> None:
-        """Begin a new stream at time 0, with every count at 0."""
+        """Begin a new stream at time 0 and set all counts to 0."""
         self._machine.reset()
         self._silent = False
 
     def silence(self) -> Decision:
-        """End the open event: no frame came for a while.
+        """End the open event, because no frame has arrived for a while.
 
-        The next frame goes on, or restarts after a gap.
+        The stream continues with the next frame, or restarts after a gap.
         """
         self._silent = True
         return self._decision(self._machine.silence())
 
     def push(self, frame: Frame) -> list[Decision]:
-        """Read one frame; return the decisions, mostly none or one, that it completes."""
+        """Process one frame and return the decisions that it completes, usually none or one."""
         silent, self._silent = self._silent, False
         decisions = [
             self._decision(moment)
             for moment in self._machine.push(frame.device_ms, frame.values)
-            if not (silent and moment.cause == "no signal")  # it was reported by `silence`
+            if not (silent and moment.cause == "no signal")  # `silence` has reported it already
         ]
         if silent and not decisions and self._machine.frames.health.fault:
             decisions.append(Decision(self.time_s, None, None, None, "cnn", "sensor fault", None))
@@ -192,7 +192,7 @@ class StreamReader:
 
 
 def events_of(updates: Iterable[Update], gestures: GestureSet) -> tuple[GestureEvent, ...]:
-    """Return updates with times in microseconds as events with labels and seconds."""
+    """Convert updates, with times in microseconds, to events with labels and seconds."""
     return tuple(
         GestureEvent(
             KINDS[u.kind],
@@ -208,14 +208,14 @@ def events_of(updates: Iterable[Update], gestures: GestureSet) -> tuple[GestureE
 
 
 class StreamClassifier(StreamReader):
-    """Classifies the frames of one toy by the float network of a bundle.
+    """Classifies the frames of one toy with the float network of a bundle.
 
-    Works with every padding; ``mirror`` and ``causal`` compute the whole window anew at each step. Confidence,
-    probabilities and events come from its logits rounded to steps of 1/256, and are smoothed as in the toy.
+    Works with every padding; ``mirror`` and ``causal`` compute the whole window again at each step. Its logits are
+    rounded to steps of 1/256; smoothing and decisions are then the same as in the toy.
 
     Args:
         bundle: the model.
-        decide: how decisions are made; the bundle's own settings when left out.
+        decide: decision settings; by default those of the bundle.
     """
 
     def __init__(self, bundle: Bundle, decide: DecideSpec | None = None) -> None:
@@ -227,7 +227,7 @@ class StreamClassifier(StreamReader):
 
 
 class IntegerClassifier(StreamReader):
-    """Classifies the frames of one toy by a deployed model, as the toy does, to the bit.
+    """Classifies the frames of one toy with a deployed model, with exactly the results of the toy.
 
     ``confidence`` of a decision is a multiple of 2^-15, its ``probabilities`` of 2^-27; ``t_s`` in microseconds,
     counted from the first frame of the stream, is the time of the toy's answer.
@@ -239,7 +239,7 @@ class IntegerClassifier(StreamReader):
 
 
 class BothEngines(IntegerClassifier):
-    """The deployed model and its float original on the same frames: decides as the first, counts where they differ."""
+    """Classifies like the deployed model, and counts differences from its float original on the same frames."""
 
     def __init__(self, model: IntegerModel, original: StreamReader) -> None:
         super().__init__(model)
@@ -248,22 +248,22 @@ class BothEngines(IntegerClassifier):
         self._clear_counts()
 
     def silence(self) -> Decision:
-        """End the open event, as `StreamReader.silence` does; return the deployed model's decision."""
+        """End the open event like `StreamReader.silence`; return the deployed model's decision."""
         self.original.silence()
         return super().silence()
 
     def reset(self) -> None:
-        """Begin a new stream, with every count at 0."""
+        """Begin a new stream and set all counts to 0."""
         super().reset()
         self.original.reset()
         self._clear_counts()
 
     def _clear_counts(self) -> None:
         self._compared = self._gesture = self._affect = 0
-        self._far = 0.0
+        self._largest = 0.0
 
     def push(self, frame: Frame) -> list[Decision]:
-        """Read one frame; return the deployed model's decisions that it completes."""
+        """Process one frame; return the deployed model's decisions that it completes."""
         decisions = super().push(frame)
         answered = [d for d in decisions if d.probabilities is not None]
         others = [d for d in self.original.push(frame) if d.probabilities is not None]
@@ -273,30 +273,30 @@ class BothEngines(IntegerClassifier):
             self._compared += 1
             self._gesture += one.gesture == other.gesture
             self._affect += one.affect == other.affect
-            apart = max(abs(a - b) for a, b in zip(one.probabilities, other.probabilities, strict=True))
-            self._far = max(self._far, apart)
+            difference = max(abs(a - b) for a, b in zip(one.probabilities, other.probabilities, strict=True))
+            self._largest = max(self._largest, difference)
         return decisions
 
     def agreement(self) -> dict[str, Any]:
-        """Return how often both engines gave the same answer, of the ``decisions`` with an answer.
+        """Return how often both networks gave the same answer.
 
-        ``gesture`` and ``affect`` are shares, ``largest_difference`` that of any smoothed probability; None where there
-        was no answer, and for affect where no gesture has one.
+        ``decisions`` counts those with an answer; ``gesture`` and ``affect`` are the shares of equal ones;
+        ``largest_difference`` is that of smoothed probabilities. None without answers, or without affects.
         """
         n = self._compared
         return {
             "decisions": n,
             "gesture": self._gesture / n if n else None,
             "affect": self._affect / n if n and self._has_affects else None,
-            "largest_difference": self._far if n else None,
+            "largest_difference": self._largest if n else None,
         }
 
 
 def check_layout(sent: Layout, read: Layout) -> None:
-    """Refuse a device whose frames are not those that a model reads.
+    """Raise ConfigError if a model cannot read the frames that a device sends.
 
-    What a frame holds is compared (channels, units, integer steps, valid ranges), not the line format: older
-    firmware of the same toy will do. The model's own rate, gap and inputs hold.
+    The channels are compared, with their units, integer steps and valid ranges, but not the line format, so that older
+    firmware of the same toy is accepted. Rate, gap and inputs are those of the model.
 
     Raises:
         ConfigError: naming both layouts and the first channel that differs.

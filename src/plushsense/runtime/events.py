@@ -1,32 +1,32 @@
 """Events from logits: one event for each gesture, with a beginning and an end, in integers only.
 
-This module defines the events of a toy; ``deploy/c/plushsense.c`` repeats it. A step is one answer of the network.
-Every count is in steps, every share in steps of 2^-15, every logit in steps of 1/256. Times are those of the caller
-(milliseconds in the toy) and are only passed on.
+This module is the specification that ``deploy/c/plushsense.c`` implements. A step is one answer of the network. Counts
+are in steps, shares (probabilities) in steps of 2^-15, logits in steps of 1/256. Times are in the caller's unit
+(milliseconds in the toy).
 
-A step, in this order:
+In each step, in this order:
 
-1. The probabilities are smoothed (`fixed.smooth`), and so is the highest logit: how *known* the touch looks (the
-   maximum logit score of open-set recognition).
-2. The step's `Answer`: ``unknown`` when that is below ``known``; else ``idle`` when the best class is idle; else the
-   conformal set, every class of at least ``sure``: one class is ``sure``, several of one affect (not ``none``) are
-   ``affect``, anything else is ``unsure``.
-3. The candidate: the best class's gesture when it reaches ``enter``, else an affect whose classes together reach
-   ``enter_affect``; none while idle or unknown.
-4. No event is open: one begins when the candidate was the same for ``least`` steps in a row (the same affect; without
-   one, the same gesture), and not within ``rest`` steps of the last event, the refractory time. It begins with its
-   affect, and with the gesture when that was the candidate for ``least`` steps too.
-5. An event is open: it gets its gesture once, when one of its affect was the candidate for ``least`` steps. Another
+1. The probabilities and the highest logit are smoothed (`fixed.smooth`). The latter is the *known* score: the maximum
+   logit score of open-set recognition.
+2. The step's `Answer` is ``unknown`` when this score is below ``known``; else ``idle`` when the best class is idle;
+   else the conformal set, every class of at least ``sure``: one class is ``sure``, several of one affect (not ``none``)
+   are ``affect``, anything else is ``unsure``.
+3. The candidate is the gesture of the best class if it reaches ``enter``, else an affect whose classes together reach
+   ``enter_affect``; there is none if the answer is idle or unknown.
+4. If no event is open, one begins when the candidate was the same for ``least`` steps in a row (the same affect;
+   without one, the same gesture), and not within ``rest`` steps of the last event, the refractory time. It begins with
+   its affect, and with the gesture when that was the candidate for ``least`` steps too.
+5. If an event is open, it gets its gesture once, when one of its affect was the candidate for ``least`` steps. Another
    gesture or affect that was the candidate for ``switch`` steps in a row, after at least ``hold`` steps, ends it and
    begins the next. It ends after ``end`` steps in a row in which its gesture (without one: its affect's classes
    together) was below ``leave`` (``leave_affect``), or the best class was an idle one and reached ``enter``; never
    before its minimum duration of ``hold`` steps.
 
 The gate fires between steps (`EventMachine.gate`): its event begins at once and cannot be ended or replaced for
-``wait`` steps, in which the network may name it. A gate that fires during an event of its own affect, or one that the
-gate began, prolongs that event: ``wait`` begins anew. While the network is warming there are blind steps, without
-evidence for an event (`EventMachine.blind_step`). A suspect step (`plushsense.runtime.health`) neither counts nor
-breaks a row, and begins, names and ends nothing.
+``wait`` steps, during which the network may name it. If the gate fires during an event of the same affect, or one that
+it began, it prolongs that event: ``wait`` restarts. While the network is warming, steps have no answer and are no
+evidence for an event (`EventMachine.blind_step`). A suspect step (`plushsense.runtime.health`) does not begin, name or
+end an event, and neither adds to nor interrupts a row of steps.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class EventSettings:
 
     enter: int = 0
     leave: int = 0
-    enter_affect: int = ONE + 1  # more than there is: never by affect alone
+    enter_affect: int = ONE + 1  # above the maximum: never by affect alone
     leave_affect: int = 0
     sure: int = ONE // 2
     known: int = -LOGIT_LIMIT
@@ -96,9 +96,9 @@ class Update:
     """Change of an event.
 
     ``number`` counts events from 1; ``affect`` a code of `AFFECT_CODES`; ``gesture`` a class index or `NO_GESTURE`;
-    ``source`` `CNN` or `GATE`, who began it; ``since`` the time of the step in which it first was the candidate (an
-    end: in which it was first missed), ``now`` the time of the change. Where one event takes another's place, and when
-    the signal is lost, both are ``now``.
+    ``source`` what began it, `CNN` or `GATE`; ``since`` the time of the step in which it was first the candidate (for
+    an end: first below its threshold), ``now`` the time of the change. If one event replaces another, or the signal is
+    lost, ``since`` is ``now``.
     """
 
     kind: int
@@ -112,7 +112,7 @@ class Update:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """Answer of one step.
+    """Answer of the network at one step.
 
     ``best`` class, its smoothed ``share`` (2^-15), ``kind`` an index into `ANSWERS`, and ``known``, the smoothed
     highest logit in steps of 1/256.
@@ -125,8 +125,8 @@ class Answer:
 
 
 class EventMachine:
-    """Follows one stream. ``mean`` holds the smoothed probabilities (K,) in steps of 2^-27, and after them the smoothed
-    highest logit in steps of 2^-20; None before the first step.
+    """Decides the events of one stream. ``mean`` holds the smoothed probabilities (K,) in steps of 2^-27, then the
+    smoothed highest logit in steps of 2^-20; None before the first step.
     """
 
     def __init__(self, plan: EventSettings, smoothing: int, gestures: GestureSet) -> None:
@@ -136,7 +136,7 @@ class EventMachine:
         self.reset()
 
     def reset(self) -> None:
-        """Begin a new stream, with no event counted."""
+        """Begin a new stream and set the number of events to 0."""
         self.number = 0
         self._clear()
 
@@ -157,17 +157,15 @@ class EventMachine:
         self._resting = rest
 
     def lost(self, now: int) -> list[Update]:
-        """End the open event, after a gap, a clock reset or a fault, and forget all but the count of
-        events.
-        """
+        """End the open event after a gap, a clock reset or a fault, and reset all but the number of events."""
         updates = [self._end(now, now)] if self.open else []
         self._clear()
         return updates
 
     def gate(self, affect: int, gesture: int, now: int) -> list[Update]:
-        """Take in a firing of the gate, with its rule's affect and gesture (or `NO_GESTURE`).
+        """Process a firing of the gate, with the affect and gesture (or `NO_GESTURE`) of its rule.
 
-        Return what happened to events.
+        Returns the changes of events.
         """
         updates: list[Update] = []
         if self.open and (self.affect == affect or self.source == GATE):
@@ -181,13 +179,13 @@ class EventMachine:
         return updates
 
     def step(self, logits: Ints, now: int, suspect: bool = False) -> tuple[Answer, list[Update]]:
-        """Take in one step's logits (K,); return the answer, and what happened to events."""
+        """Process the logits (K,) of a step; return the answer and the changes of events."""
         highest = int(logits.max())
         both = np.append(softmax(logits), highest)
         self.mean = smooth(self.mean, both, self.smoothing)
         rows = (self.mean >> SMOOTH_EXTRA_BITS).tolist()
         shares, known = rows[:-1], rows[-1]
-        # By all bits, as the toy does: the first of equal ones.
+        # Compare all bits, like the toy; of equal ones take the first.
         best = int(self.mean[:-1].argmax())
         answer = Answer(best, shares[best], self._kind(shares, best, known), known)
         return answer, self.follow(shares, best, *self._candidate_of(shares, answer), now, suspect)
@@ -195,7 +193,7 @@ class EventMachine:
     def follow(
         self, shares: list[int], best: int, gesture: int, affect: int, now: int, suspect: bool = False
     ) -> list[Update]:
-        """Follow one step of known shares, best class and candidate; return what happened to events."""
+        """Process a step with given shares, best class and candidate; return the changes of events."""
         if suspect:
             gesture, affect = NO_GESTURE, 0
         else:
@@ -205,13 +203,13 @@ class EventMachine:
         return self._open_step(shares, best, gesture, affect, now, suspect)
 
     def skip(self, steps: int, now: int) -> None:
-        """Pass over ``steps`` steps without a candidate while no event is open; they can only end a refractory time."""
+        """Skip ``steps`` steps without a candidate while no event is open; only the refractory time is updated."""
         if steps:
             self._count(NO_GESTURE, 0, now)
             self._resting = max(0, self._resting - steps)
 
     def blind_step(self, now: int) -> list[Update]:
-        """Take in one step without an answer, while the network is warming: the event of the gate ends in its time."""
+        """Process a step without an answer, while the network is warming; it can end an event of the gate."""
         if not self.open:
             return []
         self._lasted += 1
@@ -221,7 +219,7 @@ class EventMachine:
         return self._miss(now)
 
     def _miss(self, now: int) -> list[Update]:
-        """Count a step without evidence for the event, and end it after enough of them."""
+        """Count a step without evidence for the open event, and end the event after enough of them."""
         if self._away == 0:
             self._away_since = now
         self._away += 1
@@ -244,7 +242,7 @@ class EventMachine:
         return UNSURE
 
     def _affect_shares(self, shares: list[int]) -> list[int]:
-        """Return the share of each affect's classes together, by its code; idle classes are left out."""
+        """Return the summed share of the classes of each affect, by affect code, without idle classes."""
         totals = [0, 0, 0, 0]
         for share, affect, idle in zip(shares, self._affects, self._idle, strict=True):
             if not idle:
@@ -262,7 +260,7 @@ class EventMachine:
         return NO_GESTURE, most if totals[most] >= self.plan.enter_affect else 0
 
     def _count(self, gesture: int, affect: int, now: int) -> None:
-        """Count the steps in a row that have the same candidate."""
+        """Count successive steps with the same candidate."""
         candidate = affect if affect else 4 + gesture if gesture != NO_GESTURE else -1
         if candidate != self._candidate:
             self._candidate, self._candidate_steps, self._candidate_since = candidate, 0, now
@@ -300,15 +298,15 @@ class EventMachine:
             return []
         another = (affect and affect != self.affect) or (gesture not in (NO_GESTURE, self.gesture))
         if another and self.gesture == NO_GESTURE and affect == self.affect:
-            another = False  # it has no gesture yet: this one may become its own
+            another = False  # the event has no gesture yet and may get this one
         row = self._gesture_steps if gesture != NO_GESTURE and affect == self.affect else self._candidate_steps
         if another and row >= plan.switch and self._lasted >= plan.hold:
             ended = self._end(now, now)
             return [ended, self._begin(affect, self._named(gesture), CNN, now, now)]
-        mine = shares[self.gesture] if self.gesture != NO_GESTURE else self._affect_shares(shares)[self.affect]
-        stays = mine >= (plan.leave if self.gesture != NO_GESTURE else plan.leave_affect)
+        share = shares[self.gesture] if self.gesture != NO_GESTURE else self._affect_shares(shares)[self.affect]
+        stays = share >= (plan.leave if self.gesture != NO_GESTURE else plan.leave_affect)
         if self.gesture == NO_GESTURE and self.affect == 0:
-            stays = False  # begun by the gate, and nothing to recognise it by
+            stays = False  # begun by the gate without affect: no share to compare
         if self._idle[best] and shares[best] >= plan.enter:
             stays = False
         if stays:

@@ -1,7 +1,7 @@
-"""The arithmetic of a deployed model: fixed point, in integers of 32 bits, the same here and in the toy's C.
+"""Fixed-point arithmetic of a deployed model in 32-bit integers, with the same results here and in the toy's C.
 
-Every rule is stated once, here; ``deploy/c/plushsense.c`` repeats it. ``>>`` is a floor division by a power of two
-also of negative numbers, so that nothing depends on a language's rounding of quotients.
+This module is the specification that ``deploy/c/plushsense.c`` implements. ``>>`` is a floor division by a power of
+two, also for negative numbers, so that no result depends on how a language rounds quotients.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from plushsense.core.errors import BundleError
 Ints = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
 
-LOGIT_LIMIT = 1 << 14  # logits are held within ±64 in steps of 1/256
+LOGIT_LIMIT = 1 << 14  # logits are clamped to ±64, in steps of 1/256
 PROBABILITY_BITS = 15
 SMOOTH_EXTRA_BITS = 12
 _MULTIPLIER_BITS = 15
@@ -39,18 +39,18 @@ _COARSE, _FINE = exponentials()
 
 
 class _Table:
-    """Columns of integers, one a row; the ranges are what 32 bits can hold at every step."""
+    """Base of tables of equally long integer columns, each within ``RANGES``, so that nothing exceeds 32 bits."""
 
     RANGES: dict[str, tuple[int, int]]
 
     def __post_init__(self) -> None:
         rows: int | None = None
         for name, (low, high) in self.RANGES.items():
-            given = np.asarray(getattr(self, name))
-            values = given.astype(np.int64) if given.dtype.kind in "iu" or not given.size else None
+            raw = np.asarray(getattr(self, name))
+            values = raw.astype(np.int64) if raw.dtype.kind in "iu" or not raw.size else None
             if values is None or values.ndim != 1 or (values.size and not low <= values.min() <= values.max() <= high):
                 raise BundleError(
-                    f"A fixed-point scale has {name} {given.tolist()}; accepted are whole numbers from {low} to {high}."
+                    f"A fixed-point scale has {name} {raw.tolist()}; accepted are whole numbers from {low} to {high}."
                 )
             rows = len(values) if rows is None else rows
             if len(values) != rows:
@@ -63,10 +63,10 @@ class _Table:
 
 @dataclass(frozen=True, eq=False)
 class InputScale(_Table):
-    """Raw inputs to 8 bits, a channel each.
+    """Scale from raw inputs to 8 bits, with a row for each channel.
 
-    ``d = x - offset`` held within ± (2^(15 + before) - 1); ``((d >> before) * multiplier + bias) >> after`` held
-    within 0 and 255. The rounding half is in ``bias``.
+    ``d = x - offset``, clamped to ± (2^(15 + before) - 1); then ``((d >> before) * multiplier + bias) >> after``,
+    clamped to 0…255. ``bias`` includes the half for rounding.
     """
 
     offset: Ints
@@ -84,16 +84,16 @@ class InputScale(_Table):
     }
 
     def apply(self, x: ArrayLike) -> Bytes:
-        """Return raw inputs (..., C) as the network reads them, (..., C) uint8."""
+        """Scale raw inputs (..., C) to the network's inputs (..., C) uint8."""
         limit = (1 << (15 + self.before)) - 1
         d = np.clip(np.asarray(x, dtype=np.int64) - self.offset, -limit, limit)
-        read: Bytes = np.clip(((d >> self.before) * self.multiplier + self.bias) >> self.after, 0, 255).astype(np.uint8)
-        return read
+        out: Bytes = np.clip(((d >> self.before) * self.multiplier + self.bias) >> self.after, 0, 255).astype(np.uint8)
+        return out
 
 
 @dataclass(frozen=True, eq=False)
 class _SumScale(_Table):
-    """Scale of sums of 32 bits, a row for each filter or class."""
+    """Scale of 32-bit sums, with a row for each filter or class."""
 
     before: Ints
     multiplier: Ints
@@ -106,10 +106,10 @@ class _SumScale(_Table):
 
 
 class Requantize(_SumScale):
-    """ReLU and sums to 8 bits, a filter each.
+    """ReLU, and scale from sums to 8-bit activations, with a row for each filter.
 
-    A sum up to 0 gives 0; else ``t = sum >> before``, at most 65535; ``(t * multiplier + half) >> after``, at most
-    255, where half is ``2^after >> 1``.
+    A sum of 0 or less gives 0; else ``t = sum >> before``, at most 65535; then ``(t * multiplier + half) >> after``, at
+    most 255, where half is ``2^after >> 1``.
     """
 
     def apply(self, sums: Ints) -> Bytes:
@@ -119,9 +119,9 @@ class Requantize(_SumScale):
 
 
 class LogitScale(_SumScale):
-    """Sums of the dense layer to logits in steps of 1/256, a class each.
+    """Scale from sums of the dense layer to logits in steps of 1/256, with a row for each class.
 
-    ``t = sum >> before`` held within -32768 and 32767; ``(t * multiplier + half) >> after`` held within ±16384.
+    ``t = sum >> before``, clamped to 16 bits; then ``(t * multiplier + half) >> after``, clamped to ±16384.
     """
 
     def apply(self, sums: Ints) -> Ints:
@@ -131,10 +131,10 @@ class LogitScale(_SumScale):
 
 
 def split_ratio(ratio: float, highest: float, most_after: int = 30, most_before: int = 30) -> tuple[int, int, int]:
-    """Return (before, multiplier, after) that multiply by ``ratio``; arguments reach up to ``highest``.
+    """Return the (before, multiplier, after) that multiply numbers up to ``highest`` by ``ratio``.
 
-    ``before`` shifts ``highest`` under 2^15, so that only bits of no weight are lost; the multiplier has 15 bits. A
-    ratio beyond what they can hold gives the largest multiplier: with it every whole number saturates.
+    ``before`` shifts ``highest`` below 2^15, so that only insignificant bits are lost; the multiplier has 15 bits. A
+    ratio that is too large gives the largest multiplier, with which every whole number saturates.
     """
     if not (ratio > 0 and np.isfinite(ratio) and highest >= 0 and np.isfinite(highest)):
         return 0, 0, 0
@@ -150,12 +150,12 @@ def split_ratio(ratio: float, highest: float, most_after: int = 30, most_before:
 
 
 def integer_logits(logits: NDArray[Any]) -> Ints:
-    """Return float logits (..., K) rounded to steps of 1/256 and held within the limit, as a toy holds them."""
+    """Round float logits (..., K) to steps of 1/256 and clamp them to the limit, like the toy."""
     return np.clip(np.rint(np.asarray(logits, dtype=np.float64) * 256), -LOGIT_LIMIT, LOGIT_LIMIT).astype(np.int64)
 
 
 def softmax(logits: Ints) -> Ints:
-    """Return probabilities (K,) in steps of 2^-15 from logits (K,) in steps of 1/256.
+    """Compute probabilities (K,) in steps of 2^-15 from logits (K,) in steps of 1/256.
 
     ``d = max - logit``; from 4096 on the probability is 0; else ``e = (coarse[d >> 6] * fine[d & 63]) >> 16``. The
     probability is ``((e << 15) + (sum >> 1)) / sum``, rounded down.
@@ -168,15 +168,15 @@ def softmax(logits: Ints) -> Ints:
 
 
 def smoothing_weight(seconds: float, step_s: float) -> int:
-    """Return the weight of a new step in an exponential mean with this time constant, in steps of 2^-15; at least 1."""
+    """Return the weight (at least 1, in steps of 2^-15) of a new step in an exponential mean over ``seconds``."""
     full = 1 << PROBABILITY_BITS
     return full if seconds == 0 else max(1, round(-float(np.expm1(-step_s / seconds)) * full))
 
 
 def smooth(mean: Ints | None, probabilities: Ints, weight: int) -> Ints:
-    """Return the exponential mean (K,) in steps of 2^-27 after a step of probabilities (K,); the first starts it.
+    """Update an exponential mean (K,) in steps of 2^-27 by new probabilities (K,); ``mean`` is None at the first step.
 
-    ``d = (probability << 12) - mean``; the mean grows by ``(d * weight + 2^14) >> 15``.
+    ``d = (probability << 12) - mean``; the mean increases by ``(d * weight + 2^14) >> 15``.
     """
     now = probabilities << SMOOTH_EXTRA_BITS
     return now if mean is None else mean + (((now - mean) * weight + (1 << 14)) >> 15)

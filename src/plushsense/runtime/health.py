@@ -1,15 +1,15 @@
 """Sensor health, in integers only: suspect frames and sensor faults.
 
-This module defines it; ``deploy/c/plushsense.c`` repeats it. It sees every frame before the clock does.
+This module is the specification that ``deploy/c/plushsense.c`` implements. It checks frames before resampling.
 
-- A channel is *wrong* in a frame when its value is out of its valid range, or when it repeats exactly a value beyond
-  ``low`` to ``high``, the range that touches reached in the recordings: a sensor at its end stop.
-- The toy is *still* while every channel repeats the frame before. Real sensors are noisy; one that hangs is not.
-- A frame is *suspect* while a channel is wrong, or the toy was still for ``still_ms`` / 2. Nothing begins on it.
-- A *fault* begins when in every frame for ``fault_ms`` some channel was wrong (not always the same one), or the toy was
-  still for ``still_ms``. Then frames are not read, until for ``recover_ms`` none was suspect; after that everything
-  begins again.
-- After a gap or a reset of the clock all times are counted anew (`Health.clear`), also within a fault.
+- A channel is *wrong* in a frame if its value is outside its valid range, or if it is the same as in the frame before
+  and outside ``low`` to ``high``, the range of values in the recordings: a saturated sensor.
+- The toy is *still* while all channels repeat the frame before. Working sensors are noisy; ones that hang are not.
+- A frame is *suspect* if a channel is wrong, or the toy was still for ``still_ms`` / 2. No event begins at it.
+- A *fault* begins when for ``fault_ms`` every frame had a wrong channel (not always the same one), or the toy was still
+  for ``still_ms``. Frames are then ignored until none was suspect for ``recover_ms``; after that the stream begins
+  anew.
+- After a gap or a reset of the clock, all these times are counted from 0 (`Health.clear`), also during a fault.
 """
 
 from __future__ import annotations
@@ -26,9 +26,10 @@ _INT32 = -(1 << 31), (1 << 31) - 1
 
 @dataclass(frozen=True)
 class HealthSettings:
-    """The settings of `Health`; ``low`` and ``high`` (C,) of each measured channel, empty: not known, so that a value
-    may stay wherever it is valid. ``fault_ms`` or ``still_ms`` of 0 switches its rule off; with a ``recover_ms`` of 0
-    the first good frame ends a fault.
+    """Settings of `Health`.
+
+    ``low`` and ``high`` (C,) are for the measured channels; empty: unknown, so that only valid ranges are checked. A
+    ``fault_ms`` or ``still_ms`` of 0 disables its rule; with a ``recover_ms`` of 0 the first good frame ends a fault.
 
     Raises:
         BundleError: for a value out of its range.
@@ -52,7 +53,7 @@ class HealthSettings:
 
 
 class Health:
-    """Follows one stream of frames."""
+    """Checks the sensor health of one stream of frames."""
 
     def __init__(self, plan: HealthSettings, layout: Layout) -> None:
         self.plan = plan
@@ -66,28 +67,28 @@ class Health:
         self.reset()
 
     def reset(self) -> None:
-        """Begin a new stream, with no fault counted."""
+        """Begin a new stream and set the number of faults to 0."""
         self.faults = 0
         self.fault = False
         self.clear()
 
     def clear(self) -> None:
-        """Forget the past, as after a gap; a fault goes on until it has recovered."""
+        """Discard earlier frames, as after a gap; a fault continues until it has recovered."""
         self.suspect = False
         self._last: list[int] | None = None
-        self._wrong: int | None = None  # since when, in every frame
+        self._wrong: int | None = None  # ms at the first of the wrong frames in sequence
         self._still: int | None = None
         self._good: int | None = None
 
     def push(self, ms: int, values: Sequence[int]) -> str:
-        """Read one frame at a time ``ms`` that does not run backwards (`clear` first).
+        """Check one frame; ``ms`` must not be earlier than in the frame before, unless `clear` was called.
 
-        Returns ``"fault"`` when a fault begins with it, ``"recovered"`` when one ends, else ``""``.
+        Returns ``"fault"`` if a fault begins with this frame, ``"recovered"`` if one ends, else ``""``.
         """
         plan, last = self.plan, self._last
         wrong = False
         for i, (value, (low, high)) in enumerate(zip(values, self._inside, strict=True)):
-            # Mostly this one comparison is all there is to do.
+            # For most values only the first comparison is evaluated.
             if not low <= value <= high and (
                 not self._valid[i][0] <= value <= self._valid[i][1] or (last is not None and value == last[i])
             ):
@@ -97,14 +98,14 @@ class Health:
             self._wrong = None
         elif self._wrong is None:
             self._wrong = ms
-        broken = self._wrong is not None and plan.fault_ms > 0 and ms - self._wrong >= plan.fault_ms
+        wrong_too_long = self._wrong is not None and plan.fault_ms > 0 and ms - self._wrong >= plan.fault_ms
         now = list(values)
         still = last is not None and plan.still_ms > 0 and now == last
         if not still:
             self._still = ms
-        quiet = ms - (self._still if self._still is not None else ms)
+        still_for = ms - (self._still if self._still is not None else ms)
         self._last = now
-        self.suspect = wrong or (still and 2 * quiet >= plan.still_ms)
+        self.suspect = wrong or (still and 2 * still_for >= plan.still_ms)
         if self.fault:
             if self.suspect:
                 self._good = None
@@ -114,7 +115,7 @@ class Health:
                 return ""
             self.fault, self._good = False, None
             return "recovered"
-        if broken or (still and quiet >= plan.still_ms):
+        if wrong_too_long or (still and still_for >= plan.still_ms):
             self.faults += 1
             self.fault, self._good = True, None
             return "fault"

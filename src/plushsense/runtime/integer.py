@@ -1,8 +1,8 @@
 """Integer network: 8-bit weights and activations, 32-bit sums, fixed-point scales.
 
-This module defines the exact answers of a deployed model; the C in the toy gives the same bits. Only ``stream``
-networks are here: batch normalisation is folded into the layer that follows it. Sums are computed in float64, which
-holds every whole number that can occur, so that they are exact and fast.
+This module is the specification of a deployed network; the C in the toy gives the same results bit for bit. Only
+``stream`` networks are supported; batch normalisation is folded into the following layer. Sums are computed in float64,
+which is fast and represents all possible sums exactly.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ _SUM_LIMIT = (1 << 31) - 1
 
 
 def deployable(arch: Arch) -> bool:
-    """Return whether a network can be deployed in integers; `plushsense.deploy.quantize` says why another cannot."""
+    """Return whether a network can be deployed; `plushsense.deploy.quantize.refuse_undeployable` gives the reasons."""
     return arch.padding == "stream" and arch.norm == "batch"
 
 
 @dataclass(frozen=True, eq=False)
 class IntegerLayer:
-    """Integer layer: ``weights`` (F, C, K) int8, ``bias`` (F,) int32, and how its sums become 8-bit activations."""
+    """Integer layer: ``weights`` (F, C, K) int8, ``bias`` (F,) int32, ``scale`` from sums to 8-bit activations."""
 
     weights: NDArray[np.int8]
     bias: Ints
@@ -37,18 +37,18 @@ class IntegerLayer:
 
     @cached_property
     def matrix(self) -> Floats:
-        """(K · C, F), taps outermost."""
+        """The weights as (K · C, F), taps outermost."""
         f, c, k = self.weights.shape
         return self.weights.transpose(2, 1, 0).reshape(k * c, f).astype(np.float64)
 
     def apply(self, taps: Floats) -> Floats:
-        """Return activations (n, F), integers in float64, of taps (n, K · C), taps outermost."""
+        """Compute activations (n, F), integers as float64, from inputs (n, K · C), taps outermost."""
         return self.scale.apply((taps @ self.matrix).astype(np.int64) + self.bias).astype(np.float64)
 
 
 @dataclass(frozen=True, eq=False)
 class IntegerDense:
-    """The last layer: ``weights`` (K, F) int8 on sums over ``pool`` positions, ``bias`` (K,) int32, logits' scale."""
+    """The last layer, on sums over time: ``weights`` (K, F) int8, ``bias`` (K,) int32, ``scale`` of sums to logits."""
 
     weights: NDArray[np.int8]
     bias: Ints
@@ -56,11 +56,11 @@ class IntegerDense:
 
     @cached_property
     def matrix(self) -> Floats:
-        """(F, K)."""
+        """The weights as (F, K)."""
         return self.weights.T.astype(np.float64)
 
     def apply(self, pooled: Floats) -> Ints:
-        """Return logits (N, K) in steps of 1/256 of sums over time (N, F)."""
+        """Compute logits (N, K) in steps of 1/256 from sums over time (N, F)."""
         return self.scale.apply((pooled @ self.matrix).astype(np.int64) + self.bias)
 
 
@@ -69,7 +69,7 @@ class IntegerNetwork:
     """A network in integers.
 
     Raises:
-        BundleError: when the parts are not those of ``arch``, or a sum could leave 32 bits.
+        BundleError: if the layers do not fit ``arch``, or a sum could exceed 32 bits.
     """
 
     arch: Arch
@@ -112,9 +112,9 @@ class IntegerNetwork:
             )
 
     def forward(self, x: ArrayLike) -> Ints:
-        """Return logits (N, K) in steps of 1/256 of raw integer windows (N, C, T).
+        """Compute logits (N, K) in steps of 1/256 of raw integer windows (N, C, T).
 
-        The last ``arch.span`` samples are read.
+        Only the last ``arch.span`` samples are used.
 
         Raises:
             BadInput: for windows of another shape, shorter than the span, or not of whole numbers.
@@ -134,22 +134,20 @@ class IntegerNetwork:
         return np.empty((0, self.arch.classes), dtype=np.int64)
 
     def activations(self, x: ArrayLike) -> list[Bytes]:
-        """Return the inputs of each layer and the output of the last, [(N, T', C')] uint8, of windows (N, C, T),
-        to inspect.
-        """
-        seen = [self.inputs.apply(_whole(x).transpose(0, 2, 1))]
+        """Return the inputs of each layer and the output of the last, [(N, T', C')] uint8, of windows (N, C, T)."""
+        outputs = [self.inputs.apply(_whole(x).transpose(0, 2, 1))]
         for layer, part in zip(self.arch.layers, self.layers, strict=True):
-            taps = taps_of(seen[-1].astype(np.float64), layer)
-            seen.append(np.stack([part.apply(each.reshape(len(each), -1)) for each in taps]).astype(np.uint8))
-        return seen
+            taps = taps_of(outputs[-1].astype(np.float64), layer)
+            outputs.append(np.stack([part.apply(each.reshape(len(each), -1)) for each in taps]).astype(np.uint8))
+        return outputs
 
     def stepper(self) -> IntegerStepper:
-        """Return a reader of one stream, in the state ``warming``."""
+        """Create a stepper for one stream."""
         return IntegerStepper(self)
 
 
 def _whole(x: ArrayLike) -> NDArray[Any]:
-    """Raw values: a network in integers does not read scaled ones."""
+    """Return raw values as an array; raise BadInput if they are not integers, as scaled ones are not."""
     values = np.asarray(x)
     if values.size and values.dtype.kind not in "iu":
         raise BadInput(
@@ -159,7 +157,7 @@ def _whole(x: ArrayLike) -> NDArray[Any]:
 
 
 class IntegerStepper(Stepper):
-    """Reads raw integer samples as they come; logits are in steps of 1/256."""
+    """Computes the network sample by sample from raw integers; logits are in steps of 1/256."""
 
     def __init__(self, network: IntegerNetwork) -> None:
         self.network = network
@@ -178,5 +176,5 @@ class IntegerStepper(Stepper):
             if not len(taps):
                 return self.network._none()
             z = part.apply(taps)
-        # The pool gives means; a whole number times pool / pool is that number again, once rounded.
+        # The pool returns means: multiply by its length and round to get the exact sums.
         return self.network.dense.apply(np.rint(self._pool.feed(z) * self.arch.pooled))

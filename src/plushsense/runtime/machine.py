@@ -1,14 +1,14 @@
-"""Computation of a toy, from frames to events: the one definition, which every reader of frames drives.
+"""The computation of a toy, from frames to events. All readers of frames use this module.
 
-1. `FrameReader` makes even samples of frames: a gap or a reset of the device clock breaks the stream; then sensor
-   health, the clock rule, and the inputs of the network.
-2. `SampleReader` reads the samples: the gate with each of them; the network, the decision and the events every
-   ``step`` samples, counted so that the first answer falls on the sample that fills the span. A break ends the event
-   that is going on, and everything begins again.
-3. `ToyMachine` is both: frames in, moments out.
+1. `FrameReader` resamples frames to evenly spaced samples: it detects gaps and resets of the device clock, which break
+   the stream, checks sensor health, applies the clock rule, and computes the inputs of the network.
+2. `SampleReader` passes each sample to the gate, and every ``step`` samples computes the network, the decision and the
+   events. The steps are aligned so that the first answer is at the sample that completes the span. A break ends the
+   open event and restarts everything.
+3. `ToyMachine` combines both: it reads frames and yields moments.
 
 Only a float network computes in floats; its logits are rounded to steps of 1/256, and all else is in integers.
-``deploy/c/plushsense.c`` repeats this order.
+``deploy/c/plushsense.c`` computes the same in the same order.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class LogitStream(Protocol):
         """The architecture of the network."""
 
     def reset(self) -> None:
-        """Forget the past."""
+        """Discard all earlier samples."""
 
     def push(self, samples: InputRows) -> Ints:
         """Read raw integer inputs (n, I); return the logits (m, K), in steps of 1/256, of the decisions now due."""
@@ -59,7 +59,7 @@ class FloatLogits:
         self._stepper = bundle.network().stepper()
 
     def reset(self) -> None:
-        """Forget the past."""
+        """Discard all earlier samples."""
         self._stepper.reset()
 
     def push(self, samples: InputRows) -> Ints:
@@ -68,7 +68,7 @@ class FloatLogits:
 
 
 class Sample(NamedTuple):
-    """The inputs (I,) of the network at an even sample; ``suspect`` as `Health` has it at the newest frame."""
+    """The inputs (I,) of the network at one resampled time; ``suspect`` is that of `Health` at the newest frame."""
 
     time_us: int
     inputs: list[int]
@@ -76,23 +76,23 @@ class Sample(NamedTuple):
 
 
 class Break(NamedTuple):
-    """The end of a piece of the stream: everything that remembers the past begins again."""
+    """A break in the stream, after which the computation is restarted."""
 
     time_us: int
     reason: BreakReason
 
 
 class FrameReader:
-    """Makes the even samples of one stream of frames.
+    """Resamples one stream of frames and computes the inputs of the network.
 
-    Times are in microseconds since the first frame. A gap counts in full; a device clock that was set back goes on one
+    Times are in microseconds since the first frame and include gaps; if the device clock is reset, they continue one
     sample after the last frame. While sensors are at fault there are no samples.
 
     Attributes:
-        zero_us: device time at which the time of the stream is 0; it changes when the device clock is reset.
+        zero_us: device time at which the stream's time is 0; it changes if the device clock is reset.
         time_us: time of the newest frame.
         clock: counts restarts and invalid values.
-        health: says whether sensors are at fault, and counts faults.
+        health: detects and counts sensor faults.
     """
 
     def __init__(self, layout: Layout, health: HealthSettings) -> None:
@@ -102,19 +102,19 @@ class FrameReader:
         self.reset()
 
     def reset(self) -> None:
-        """Begin a new stream at time 0, with every count at 0."""
+        """Begin a new stream at time 0 and set all counts to 0."""
         self.clock = SampleClock(self.layout)
         self.health.reset()
         self._begun = False
         self.zero_us = self.time_us = 0
 
     def count_from(self, other: FrameReader) -> None:
-        """Go on with the counts of another reader."""
+        """Continue with the counts of another reader."""
         self.health.faults = other.health.faults
         self.clock.restarts, self.clock.invalid = other.clock.restarts, other.clock.invalid
 
     def push(self, device_ms: int, values: Sequence[int]) -> Iterator[Sample | Break]:
-        """Read one frame; yield what it brings about. Counts and ``zero_us`` are those of the item just yielded."""
+        """Process one frame; yield samples and breaks. When one is yielded, counts and ``zero_us`` are valid for it."""
         clock, health = self.clock, self.health
         device_us = int(device_ms) * 1000
         if not self._begun:
@@ -144,16 +144,16 @@ class FrameReader:
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """Result of the machine at one moment, with the numbers behind it.
+    """Result of the machine at one time, with the numbers that led to it.
 
     Attributes:
         cause: ``step``, a step of the network; ``gate``, the gate fired and changed an event; or the reason of a break.
-        time_us: its time, in microseconds since the first frame of the stream.
+        time_us: in microseconds since the first frame of the stream.
         updates: changes of events, in order.
         rule: rule of the gate that fired.
-        answer: what the network says; None in any moment but a step, and while warming.
-        logits: (K,) logits of the step in steps of 1/256; None where there is no answer.
-        smoothed: (K,) smoothed probabilities in steps of 2^-27, from which gesture and events are decided.
+        answer: result of the network; None while warming, and if ``cause`` is not ``step``.
+        logits: (K,) logits in steps of 1/256; None if there is no answer.
+        smoothed: (K,) smoothed probabilities in steps of 2^-27, which decide gesture and events.
     """
 
     cause: Literal["step", "gate", "no signal", "sensor fault"]
@@ -166,9 +166,9 @@ class Moment:
 
 
 class SampleReader:
-    """Reads the even samples of one stream: gate, network, decision, events.
+    """Computes gate, network, decision and events on the samples of one stream.
 
-    ``samples`` counts them since the start or the last break.
+    ``samples`` is their number since the start or the last break.
     """
 
     def __init__(self, network: LogitStream, gestures: GestureSet, rules: Rules, smoothing: int) -> None:
@@ -180,23 +180,23 @@ class SampleReader:
         self.reset()
 
     def reset(self) -> None:
-        """Begin a new stream, with no event counted."""
+        """Begin a new stream and set the number of events to 0."""
         self._events.reset()
         self._restart()
 
     def count_from(self, other: SampleReader) -> None:
-        """Go on with the numbers of another reader's events."""
+        """Continue with the event numbers of another reader."""
         self._events.number = other._events.number
 
     def _restart(self) -> None:
         self._network.reset()
         self._gate.reset()
         self.samples = 0
-        self._block: list[list[int]] = []  # inputs since the last step: one call of the network for all of them
+        self._block: list[list[int]] = []  # inputs since the last step, for one call of the network
 
     @property
     def warming(self) -> bool:
-        """Whether fewer samples than the span have come since the start or the last break."""
+        """Whether there were fewer samples than the span since the start or the last break."""
         return self.samples < self._span
 
     @property
@@ -205,7 +205,7 @@ class SampleReader:
         return self._events.open
 
     def read(self, items: Iterable[Sample | Break]) -> Iterator[Moment]:
-        """Read samples and breaks; yield the moments that they bring about."""
+        """Process samples and breaks; yield the resulting moments."""
         for item in items:
             if isinstance(item, Sample):
                 yield from self._sample(*item)
@@ -214,7 +214,7 @@ class SampleReader:
                 self._restart()
 
     def lose(self, time_us: int, reason: BreakReason) -> Moment:
-        """End the open event: the signal is lost."""
+        """End the open event, because the signal is lost."""
         return Moment(reason, time_us, self._events.lost(time_us))
 
     def _sample(self, time_us: int, inputs: list[int], suspect: bool) -> list[Moment]:
@@ -242,12 +242,12 @@ class SampleReader:
 
 
 class ToyMachine:
-    """Computes what a toy computes: frames in, moments out.
+    """Computes the same as a toy, from frames to moments.
 
     Args:
-        network: reads the inputs; float or integer.
-        layout: of the frames.
-        gestures: in class order.
+        network: float or integer network.
+        layout: layout of the frames.
+        gestures: gestures in class order.
         rules: settings of health, gate and events.
         smoothing: weight of a new step, in steps of 2^-15 (`plushsense.runtime.fixed.smoothing_weight`).
     """
@@ -259,19 +259,19 @@ class ToyMachine:
         self.samples = SampleReader(network, gestures, rules, smoothing)
 
     def reset(self) -> None:
-        """Begin a new stream at time 0, with every count at 0."""
+        """Begin a new stream at time 0 and set all counts to 0."""
         self.frames.reset()
         self.samples.reset()
 
     def push(self, device_ms: int, values: Sequence[int]) -> Iterator[Moment]:
-        """Read one frame; yield its moments. Counts of `frames` and `samples` are those of the moment just yielded."""
+        """Process one frame; yield its moments. When one is yielded, the counts of the readers are valid for it."""
         return self.samples.read(self.frames.push(device_ms, values))
 
     def continue_from(self, other: ToyMachine) -> Moment:
-        """Take the place of another machine on the same stream, as ``plush_swap`` does: counts go on, nothing else.
+        """Replace another machine on the same stream, like ``plush_swap``: take over its counts, but no other state.
 
         Returns:
-            The end of the event that is open in ``other``.
+            The moment that ends the open event of ``other``.
         """
         ended = other.silence()
         self.samples.count_from(other.samples)
@@ -279,8 +279,8 @@ class ToyMachine:
         return ended
 
     def silence(self) -> Moment:
-        """End the open event: no frame came for a while.
+        """End the open event, because no frame has arrived for a while.
 
-        The next frame goes on, or restarts after a gap.
+        The stream continues with the next frame, or restarts after a gap.
         """
         return self.samples.lose(self.frames.time_us, "no signal")

@@ -1,7 +1,7 @@
-"""Augmentations: changes of training windows that could have been recorded with the toy held or worn otherwise.
+"""Augmentations: change training windows as if the toy had been held or worn differently.
 
-A setting names them in a list, each with its strength: ``augment = ["random-rotation:45"]``. It replaces the list
-of the preset.
+The setting ``augment`` is a list of names, each with a strength: ``augment = ["random-rotation:45"]``. It replaces the
+list of the preset.
 """
 
 from __future__ import annotations
@@ -25,9 +25,10 @@ Transform = Callable[["Tensor", "torch.Generator"], "Tensor"]
 
 @dataclass(frozen=True)
 class Channels:
-    """The channels of the windows, as augmentations need to know them.
+    """What augmentations need to know about the channels.
 
-    ``vectors``: the channels of each three-axis sensor (accelerometer, gyroscope). ``scaler``: from raw to scaled.
+    ``vectors``: indices of the channels of each three-axis sensor (accelerometer, gyroscope). ``scaler``: scaling of
+    the windows.
     """
 
     vectors: tuple[tuple[int, ...], ...]
@@ -38,8 +39,8 @@ class Channels:
         """Return offset and scale (n, 1) of some channels: scaled = (raw - offset) * scale."""
         import torch
 
-        at = list(channels)
-        offset, scale = self.scaler.offset[at], self.scaler.scale[at]
+        index = list(channels)
+        offset, scale = self.scaler.offset[index], self.scaler.scale[index]
         return (
             torch.tensor(offset, dtype=torch.float32, device=self.device)[:, None],
             torch.tensor(scale, dtype=torch.float32, device=self.device)[:, None],
@@ -49,12 +50,12 @@ class Channels:
 def random_rotation(degrees: float, channels: Channels) -> Transform | None:
     """Rotate the vectors of every window by a random angle about a random axis.
 
-    People hold the toy as they like: on the makeability recordings the mean direction of gravity at rest differs by
-    up to 90° between people. All vectors of a window rotate alike, as they sit in one toy. Magnitudes do not change,
-    so a layout that gives a network only magnitudes is left as it is.
+    People hold the toy differently: in the makeability recordings the mean direction of gravity at rest differs by up
+    to 90° between people. All vectors of a window are rotated alike, as the sensors are in one toy. Magnitudes do not
+    change; None if the layout has only magnitudes as inputs.
 
     Args:
-        degrees: standard deviation of the angle, which is normal.
+        degrees: standard deviation of the angle, which is normally distributed.
     """
     import torch
 
@@ -74,10 +75,10 @@ def random_rotation(degrees: float, channels: Channels) -> Transform | None:
 
 
 class Augmentation(NamedTuple):
-    """An augmentation: ``make`` prepares it for the windows, or returns None where it would change nothing.
+    """An augmentation: ``make`` returns the transform for a strength, or None if it would change nothing.
 
-    ``make`` is called with a strength above 0 and up to ``strongest``. ``unit`` is the unit of the strength in
-    messages; "" for a number without one, such as a probability.
+    The strength is above 0 and at most ``strongest``. ``unit`` is its unit in messages; "" for a number without one,
+    such as a probability.
     """
 
     make: Callable[[float, Channels], Transform | None]
@@ -85,7 +86,7 @@ class Augmentation(NamedTuple):
     unit: str = ""
 
 
-# An augmentation is a function and a line here.
+# To add an augmentation, write a function like `random_rotation` and list it here.
 AUGMENTATIONS: dict[str, Augmentation] = {
     "random-rotation": Augmentation(random_rotation, 180.0, "degrees"),
 }
@@ -111,17 +112,17 @@ def parse_augmentation(text: str) -> tuple[str, float]:
 
 
 def augmentations(names: Sequence[str], channels: Channels) -> Transform | None:
-    """Return the augmentations of a list as one, applied in their order; None where nothing would change."""
-    made = []
+    """Combine augmentations into one transform, applied in order; None if it would change nothing."""
+    transforms = []
     for name, strength in map(parse_augmentation, names):
         transform = AUGMENTATIONS[name].make(strength, channels) if strength > 0.0 else None
         if transform is not None:
-            made.append(transform)
-    if not made:
+            transforms.append(transform)
+    if not transforms:
         return None
 
     def apply(x: Tensor, random: torch.Generator) -> Tensor:
-        for transform in made:
+        for transform in transforms:
             x = transform(x, random)
         return x
 

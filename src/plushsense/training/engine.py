@@ -1,9 +1,9 @@
-"""Training engines: a network that `fit` can step and evaluate.
+"""Training engines, with which `fit` trains and evaluates a network.
 
-Network and device alone decide which of the two is used.
+Network and device determine which engine is used.
 
-`Fast` (``training/fast``) runs on the CPU, for batch normalisation with ``mirror`` or ``stream`` padding; `Plain` uses
-PyTorch's layers and gradients, for everything else: layer normalisation, ``causal`` padding, a GPU.
+`Fast` (``training/fast``) is for batch normalisation with ``mirror`` or ``stream`` padding on the CPU. `Plain` uses
+PyTorch's layers and gradients for everything else: layer normalisation, ``causal`` padding, or a GPU.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class FitState:
     best: dict[str, NDArray[np.float32]] = field(default_factory=dict)
 
     def to_arrays(self) -> dict[str, Any]:
-        """Return the state as arrays and plain values by name, as a journal takes them."""
+        """Return the state as arrays and plain values by name, for a journal."""
         arrays: dict[str, Any] = {"epoch": self.epoch, "steps": self.steps, "history": self.history}
         for prefix, weights in ((_WEIGHT, self.weights), (_BEST, self.best)):
             arrays |= {prefix + name: values for name, values in weights.items()}
@@ -61,7 +61,7 @@ class FitState:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Any]) -> FitState:
-        """Return the state from `to_arrays`; other names are ignored."""
+        """Build the state from the result of `to_arrays`; other names are ignored."""
 
         def several(prefix: str) -> list[NDArray[np.float32]]:
             return [arrays[f"{prefix}{i}"] for i in range(sum(name.startswith(prefix) for name in arrays))]
@@ -88,7 +88,7 @@ class FitState:
 
 
 # Windows at a time without gradients.
-_READ = 512
+_EVAL_BATCH = 512
 
 
 class Windows:
@@ -104,12 +104,12 @@ class Windows:
 
 
 def is_fast(arch: Arch, device: torch.device) -> bool:
-    """Tell whether `Fast` trains a network on a device."""
+    """Return whether `Fast` is used for a network on a device."""
     return device.type == "cpu" and can_train(arch)
 
 
 def step_bytes(arch: Arch, spec: TrainSpec) -> int | None:
-    """Return the memory of a training step beside the data, in bytes; None for `Plain`, where it is unknown.
+    """Return the memory of a training step without the data, in bytes; None for `Plain`, where it is unknown.
 
     ``spec.device`` is not "auto" (see `plushsense.training.fit.resolve_device`).
     """
@@ -130,7 +130,7 @@ class Plain:
     def step(
         self, x: Windows, batch: Tensor, y: Tensor, augment: Transform | None, random: torch.Generator
     ) -> tuple[Tensor, Tensor]:
-        """Return mean loss and logits (n, K) of the windows ``batch`` with truth ``y``, and compute the gradients."""
+        """Compute the gradients for the windows ``batch`` with classes ``y``; return mean loss and logits (n, K)."""
         self._net.train()
         windows = x.whole[batch]
         logits = self._net(windows if augment is None else augment(windows, random))
@@ -140,14 +140,14 @@ class Plain:
         return loss.detach(), logits.detach()
 
     def logits(self, x: Windows) -> Tensor:
-        """Return the logits (N, K) in evaluation mode."""
+        """Compute the logits (N, K) in evaluation mode."""
         self._net.eval()
         with torch.no_grad():
-            parts = [self._net(x.whole[at]) for at in slices(len(x), _READ)]
+            parts = [self._net(x.whole[at]) for at in slices(len(x), _EVAL_BATCH)]
         return torch.cat(parts) if parts else torch.zeros(0, self._net.arch.classes)
 
     def export_weights(self) -> dict[str, NDArray[np.float32]]:
-        """Return a copy of the weights, as ``models/reference`` takes them."""
+        """Return a copy of the weights in the format of ``models/reference``."""
         return self._net.export_weights()
 
     def close(self) -> None:
@@ -201,18 +201,18 @@ Engine = Plain | Fast
 
 
 def engine(arch: Arch, net: Net, device: torch.device, batch: int, threads: int) -> Engine:
-    """Return the engine for a network; the weights are taken from ``net``.
+    """Create the engine for a network, with the weights of ``net``.
 
     Args:
-        batch: windows in a batch, at most.
-        threads: on the CPU.
+        batch: maximum number of windows in a batch.
+        threads: number of threads on the CPU.
     """
     return Fast(net, batch, threads) if is_fast(arch, device) else Plain(net, device)
 
 
 @contextmanager
 def torch_threads(threads: int) -> Iterator[None]:
-    """Set the number of PyTorch's threads, and restore it at the end of the block."""
+    """Set the number of PyTorch threads within the block."""
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
@@ -222,5 +222,5 @@ def torch_threads(threads: int) -> Iterator[None]:
 
 
 def slices(n: int, size: int) -> Iterator[slice]:
-    """Yield the slices of ``n`` items, ``size`` at a time."""
+    """Yield slices of at most ``size`` items that cover ``n`` items."""
     return (slice(start, start + size) for start in range(0, n, size))

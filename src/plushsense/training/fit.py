@@ -1,4 +1,4 @@
-"""Training of one network: from windows to weights, scaling and history."""
+"""Train one network: from windows to weights, scaling and history."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ import torch  # isort: skip - after models.net, which says how to install it
 from torch import Tensor
 from torch.nn import functional as F
 
-# Called with (epoch, epochs at most, the epoch's row of the history).
+# Called with (epoch, maximum epochs, row of the history).
 Progress = Callable[[int, int, dict[str, Any]], None]
 
 
@@ -33,12 +33,12 @@ class FittedNetwork:
     """A trained network.
 
     Attributes:
-        weights: by name, as `plushsense.models.reference.Network` takes them.
+        weights: arrays by name, for `plushsense.models.reference.Network`.
         history: a row for each epoch: epoch (from 1), train_loss and train_accuracy (means over the batches, measured
             while training), validation_loss and validation_accuracy (None without validation), learning_rate.
         best_epoch: the epoch of ``weights``.
-        kept: weights after the epochs of ``keep``.
-        state: state to resume the training from; None with early stopping.
+        kept: weights after each epoch in ``keep``.
+        state: state to continue the training from; None with early stopping.
     """
 
     weights: dict[str, NDArray[np.float32]]
@@ -65,11 +65,11 @@ def fit(
 
     Args:
         train: windows to train on.
-        validation: windows that decide when to stop; None or none: all epochs are trained.
-        keep: epochs after which a copy of the weights is stored. With a constant learning rate, these are the weights
+        validation: windows that decide when to stop; None or empty: train all epochs.
+        keep: epochs after which a copy of the weights is stored. With a constant learning rate, these equal the weights
             of trainings with fewer epochs.
-        start: state to resume from, with the same windows and settings but more epochs; the result equals that of an
-            uninterrupted training bit for bit.
+        start: state to continue from, with the same windows and settings but more epochs; the result is bit for bit
+            that of an uninterrupted training.
         save: called with such a state every ``save_every_s`` seconds, also with early stopping.
 
     Raises:
@@ -83,21 +83,21 @@ def fit(
     device = _device(spec.device)
     scaler = Scaler.fit(train.x)
     x, y = _tensors(train, scaler, arch, device)
-    held_out = None if validation is None or not len(validation) else _tensors(validation, scaler, arch, device)
-    stops = held_out is not None and spec.patience is not None
+    val_data = None if validation is None or not len(validation) else _tensors(validation, scaler, arch, device)
+    stops = val_data is not None and spec.patience is not None
     if start is not None and stops and not start.best:
         raise TrainingError(
             "A training with early stopping cannot go on from a state that holds no best weights: leave patience out."
         )
-    # The fast engine has its own threads, each with one of PyTorch's.
+    # The fast engine starts its own threads, in each of which PyTorch uses one.
     threads = 1 if is_fast(arch, device) else spec.threads
     repeatable = torch.backends.cudnn.flags(enabled=True, deterministic=True)
     with torch.random.fork_rng(devices=[]), repeatable, torch_threads(threads):
         torch.manual_seed(spec.seed)
-        fresh = Net(arch)
+        initial = Net(arch)
         if start is not None:
-            fresh.import_weights(start.weights)
-        net = engine(arch, fresh, device, min(spec.batch, len(train)), spec.threads)
+            initial.import_weights(start.weights)
+        net = engine(arch, initial, device, min(spec.batch, len(train)), spec.threads)
         order = torch.Generator().manual_seed(spec.seed)
         augment = augmentations(spec.augment, Channels(train.vectors, scaler, device))
         adam = torch.optim.Adam(net.parameters, lr=spec.learning_rate, fused=True)
@@ -117,7 +117,7 @@ def fit(
                     group["lr"] = spec.learning_rate_at(epoch)
                 row["train_loss"], row["train_accuracy"] = _train(net, adam, x, y, spec, order, augment)
                 row["validation_loss"], row["validation_accuracy"] = (
-                    (None, None) if held_out is None else _measure(net, *held_out)
+                    (None, None) if val_data is None else _measure(net, *val_data)
                 )
                 row["learning_rate"] = spec.learning_rate_at(epoch)
                 _refuse_not_finite(row, spec)
@@ -185,7 +185,7 @@ def _restore(adam: torch.optim.Adam, net: Engine, start: FitState) -> None:
 def predict(
     arch: Arch, weights: dict[str, NDArray[np.float32]], scaler: Scaler, windows: WindowSet, device: str = "auto"
 ) -> NDArray[np.float32]:
-    """Return the probabilities (N, K) of the classes for each window."""
+    """Compute the class probabilities (N, K) of windows."""
     _check(windows, arch, "read", some=False)
     place = _device(device)
     net = Net(arch)
@@ -206,25 +206,25 @@ def _train(
     augment: Transform | None,
 ) -> tuple[float, float]:
     """Train one epoch; return mean loss and accuracy over its batches."""
-    # Summed on the device: reading a number from a GPU would wait for it in every batch.
-    sums, seen = torch.zeros(2, device=y.device), 0
+    # Sum on the device: reading a number from a GPU in every batch would make the CPU wait.
+    sums, n_windows = torch.zeros(2, device=y.device), 0
     shuffled = torch.randperm(len(x), generator=order).to(y.device)
     for at in slices(len(x), spec.batch):
         batch = shuffled[at]
-        # A few left over would give noisy batch statistics; they are used in another epoch.
-        if seen and len(batch) < min(8, spec.batch):
+        # The batch statistics of a few remaining windows would be noisy; they are used in other epochs.
+        if n_windows and len(batch) < min(8, spec.batch):
             continue
         truth = y[batch]
         loss, logits = net.step(x, batch, truth, augment, order)
         adam.step()
         sums[0] += loss * len(batch)
         sums[1] += (logits.argmax(dim=1) == truth).sum()
-        seen += len(batch)
-    return float(sums[0]) / seen, float(sums[1]) / seen
+        n_windows += len(batch)
+    return float(sums[0]) / n_windows, float(sums[1]) / n_windows
 
 
 def _measure(net: Engine, x: Windows, y: Tensor) -> tuple[float, float]:
-    """Return mean loss and accuracy without training."""
+    """Compute mean loss and accuracy without training."""
     logits = net.logits(x)
     return float(F.cross_entropy(logits, y)), float((logits.argmax(dim=1) == y).float().mean())
 
@@ -261,10 +261,10 @@ def _refuse_not_finite(row: dict[str, Any], spec: TrainSpec) -> None:
 
 
 def resolve_device(spec: TrainSpec) -> TrainSpec:
-    """Return the settings with "auto" replaced by the device that it means here, as a job's id needs it.
+    """Replace the device "auto" by the one that it means on this machine, for the id of a job.
 
     Raises:
-        TrainingError: when the device is not there.
+        TrainingError: if the device does not exist.
     """
     return replace(spec, device=_device(spec.device).type)
 

@@ -1,10 +1,10 @@
 """Quantization-aware fine-tuning: adapt weights to their rounding to 8 bits.
 
-The forward pass computes what ``runtime/integer`` computes: weights in steps of their filter's largest, activations in
-255 steps of a fixed range, biases as in ``deploy/quantize``. Only the fixed-point scales are left out, which change an
-activation by less than a hundredth of a step unless it lies on a rounding boundary. Gradients pass straight through
-rounding. Batch normalisation is frozen. The float network is the teacher: its outputs are learned, not the labels, so
-that a few epochs on the training windows do not overfit.
+The forward pass computes what ``runtime/integer`` computes: weights in steps of 1/127 of the largest in their filter,
+activations in 255 steps of a fixed range, biases as in ``deploy/quantize``. Only the fixed-point scales are left out,
+which change an activation by less than a hundredth of a step unless it lies on a rounding boundary. Gradients pass
+straight through rounding. Batch normalisation is frozen. The targets are the outputs of the float network, not the
+labels, so that a few epochs on the training windows do not overfit.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 Weights = dict[str, NDArray[np.float32]]
-_READ = 256
-_SLOWER = 5
+_READ = 256  # windows at a time, without gradients
+_SLOWER = 5  # divisor of the last learning rate of the training
 
 
 @dataclass(frozen=True)
@@ -55,14 +55,14 @@ def fine_tune(
     epochs: int,
     progress: Callable[[int, int, dict[str, Any]], None] | None = None,
 ) -> FineTuned:
-    """Fine-tune trained weights for the ranges of ``calibration``, which stay those of the deployed network.
+    """Fine-tune trained weights for rounding with the value ranges of ``calibration``, which do not change.
 
-    Batch, seed and threads are those of ``spec``, the rate falls linearly from a fifth of the last of its schedule to
-    0. Windows are not augmented: rotated ones exceed the ranges and would be clipped. It runs on the CPU. The same
-    seed gives the same weights.
+    Batch size, seed and threads are those of ``spec``; the learning rate falls linearly to 0 from a fifth of the last
+    one in its schedule. Windows are not augmented: rotated ones exceed the ranges and would be clipped. Runs on the
+    CPU. The same seed gives the same weights.
 
     Raises:
-        TrainingError: for a network that cannot be deployed, no calibration, or fewer epochs than 1.
+        TrainingError: for a network that cannot be deployed, without calibration, or for less than 1 epoch.
     """
     if not deployable(arch) or not calibration:
         raise TrainingError(
@@ -102,9 +102,9 @@ def fine_tune(
 
 
 class Rounded:
-    """A network that computes as it will when deployed, with straight-through gradients.
+    """A network that rounds like the deployed one, with straight-through gradients.
 
-    ``parameters`` are convolutions, gains, shifts and the dense layer; ``mean`` and ``var`` stay.
+    ``parameters`` are convolutions, gains, shifts and the dense layer; ``mean`` and ``var`` are constant.
     """
 
     def __init__(self, arch: Arch, weights: Mapping[str, NDArray[Any]], calibration: Mapping[str, Any]) -> None:
@@ -118,18 +118,18 @@ class Rounded:
 
     def __call__(self, x: Tensor) -> Tensor:
         """Return the logits (N, K) of scaled windows (N, C, span)."""
-        of, arch = self._tensors, self.arch
+        tensors, arch = self._tensors, self.arch
         unit = (self._high - self._low).clamp_min(1e-6) / 255
         start, mean = self._low, self._means[0]
         codes = _whole((x - start[:, None]) / unit[:, None])
         for i, (layer, top) in enumerate(zip(arch.layers, self._tops, strict=True)):
-            w, b = _rounded(of[f"conv{i}.weight"], of[f"conv{i}.bias"], unit, start, mean)
+            w, b = _rounded(tensors[f"conv{i}.weight"], tensors[f"conv{i}.bias"], unit, start, mean)
             sums = F.conv1d(codes, w, b, dilation=layer.dilation)
             codes = _whole(sums / (top / 255)[:, None])
-            gain = of[f"norm{i}.gain"] / torch.sqrt(of[f"norm{i}.var"] + NORM_EPSILON)
-            unit, start = gain * top / 255, of[f"norm{i}.shift"] - of[f"norm{i}.mean"] * gain
+            gain = tensors[f"norm{i}.gain"] / torch.sqrt(tensors[f"norm{i}.var"] + NORM_EPSILON)
+            unit, start = gain * top / 255, tensors[f"norm{i}.shift"] - tensors[f"norm{i}.mean"] * gain
             mean = gain * self._means[i + 1] + start
-        w, b = _rounded(of["dense.weight"], of["dense.bias"], unit, start, mean)
+        w, b = _rounded(tensors["dense.weight"], tensors["dense.bias"], unit, start, mean)
         return F.linear(codes.mean(dim=2), w, b)
 
     def logits(self, x: Tensor) -> Tensor:
@@ -148,7 +148,7 @@ def _straight(x: Tensor, rounded: Tensor) -> Tensor:
 
 
 def _whole(x: Tensor) -> Tensor:
-    """Round to the 8-bit range; values outside it have no gradient."""
+    """Round to whole numbers and clamp to 0…255; clamped values have no gradient."""
     clamped = x.clamp(0.0, 255.0)
     return _straight(clamped, torch.floor(clamped + 0.5))
 
@@ -156,15 +156,17 @@ def _whole(x: Tensor) -> Tensor:
 def _rounded(w: Tensor, b: Tensor, unit: Tensor, start: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
     """Return rounded weights (F, C, …) and biases for inputs in steps ``unit`` (C,) from ``start``.
 
-    Weights are rounded as in ``deploy/quantize``; the biases compensate the effect of rounding on the mean.
+    Weights are rounded as in ``deploy/quantize``; the biases compensate the mean error of the rounding.
     """
-    each = (1, -1, *[1] * (w.ndim - 2))
-    scaled = w * unit.reshape(each)
+    per_channel = (1, -1, *[1] * (w.ndim - 2))
+    scaled = w * unit.reshape(per_channel)
     step = (scaled.detach().abs().flatten(1).amax(dim=1) / 127).clamp_min(1e-30).reshape(-1, *[1] * (w.ndim - 1))
     rounded = _straight(scaled, torch.round(scaled / step) * step)
-    read = torch.where(unit == 0, torch.zeros_like(unit), (mean - start) / torch.where(unit == 0, 1.0, unit))
-    lost = (
-        (scaled - rounded).flatten(2).sum(dim=2) @ read.detach() if w.ndim > 2 else (scaled - rounded) @ read.detach()
+    mean_codes = torch.where(unit == 0, torch.zeros_like(unit), (mean - start) / torch.where(unit == 0, 1.0, unit))
+    mean_error = (
+        (scaled - rounded).flatten(2).sum(dim=2) @ mean_codes.detach()
+        if w.ndim > 2
+        else (scaled - rounded) @ mean_codes.detach()
     )
-    through = w.flatten(2).sum(dim=2) @ start if w.ndim > 2 else w @ start
-    return rounded, b + through + lost
+    offset = w.flatten(2).sum(dim=2) @ start if w.ndim > 2 else w @ start
+    return rounded, b + offset + mean_error

@@ -1,7 +1,7 @@
-"""Recurrent networks for comparison: LSTM and BiLSTM, trained with the schedule and seed of our own networks.
+"""Recurrent networks for comparison: LSTM and BiLSTM, trained with the same schedule and seed as our networks.
 
-The paper tried both (section 3.3) and gives no sizes. Here: one layer of 32 units, about as many parameters as the
-default network; a dense layer reads the last state (of both directions in a BiLSTM).
+The paper tried both (section 3.3) without giving sizes. We use one layer of 32 units, with about as many parameters as
+the default network, and a dense layer on the last state (in a BiLSTM, of both directions).
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ import torch  # isort: skip - after training.engine, which says how to install i
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-# Part of every training's id: raise it when the same settings train differently.
+# Part of every training's id: increase it when the same settings give another result.
 RECURRENT_VERSION = 1
 UNITS = 32
-# Windows at a time without gradients; batches smaller than _FEW after the first are skipped.
+# Windows at a time without gradients; smallest batch to train on, except the first.
 _READ, _FEW = 512, 8
 
 
@@ -48,7 +48,7 @@ class Recurrent(nn.Module):
 
 @dataclass(frozen=True)
 class RecurrentReader:
-    """A trained recurrent network; ``size_bytes`` is that of its float32 weights as safetensors."""
+    """A trained recurrent network; ``size_bytes`` is the size of its float32 weights as safetensors."""
 
     net: Recurrent
     scaler: Scaler
@@ -60,7 +60,7 @@ class RecurrentReader:
         return len(save({name: tensor.detach().cpu().numpy() for name, tensor in self.net.state_dict().items()}))
 
     def __call__(self, windows: WindowSet, /) -> NDArray[np.float32]:
-        """Return the probabilities (N, K) of the classes."""
+        """Compute the class probabilities (N, K) of windows."""
         device = self.net.dense.weight.device
         x = torch.from_numpy(self.scaler.apply(windows.x[:, :, -self.samples :])).to(device)
         with torch.no_grad():
@@ -75,10 +75,10 @@ def fit_recurrent(
 ) -> RecurrentReader:
     """Train on the last ``samples`` of each window, for all epochs of ``spec``; the same seed gives the same weights.
 
-    Adam, its learning rates, batches, augmentation and seed are those of ``spec``; ``patience`` is not used.
+    Learning rates, batch size, augmentations and seed are those of ``spec``; ``patience`` is not used.
 
     Raises:
-        TrainingError: without windows, or when the loss is no longer a number.
+        TrainingError: without windows, or if the loss becomes NaN or infinite.
     """
     if not len(train):
         raise TrainingError("There are no windows to train on: check the data set, the gestures and the split.")
@@ -120,7 +120,7 @@ def _epoch(
         loss = F.cross_entropy(net(windows), y[batch])
         adam.zero_grad(set_to_none=True)
         torch.autograd.backward(loss)
-        # Gradients of an LSTM can explode: one window in a long run would ruin the weights.
+        # Gradients of an LSTM can explode; without clipping, a single window could ruin the weights.
         nn.utils.clip_grad_norm_(net.parameters(), 1.0)
         adam.step()
         total += loss.detach()

@@ -11,7 +11,7 @@ from plushsense.training.augment import parse_augmentation
 DEVICES = ("auto", "cpu", "cuda")
 STOP_ON = ("loss", "accuracy")
 
-# Part of every training's id: raise it when the same settings train differently.
+# Part of every training's id: increase it when the same settings give another result.
 TRAINING_VERSION = 2
 
 _ROTATION = "random-rotation"
@@ -26,13 +26,13 @@ def _at_least(name: str, value: object, low: int) -> None:
 class TrainSpec:
     """Settings of a training run: Adam with a stepwise falling learning rate, and when to stop.
 
-    The learning rate is halved every ``halve_every`` epochs (None: constant). Training ends with the best weights
-    after ``patience`` epochs without a better validation loss (``stop_on`` "accuracy": a better accuracy); None:
-    all epochs, and the last weights.
+    The learning rate is halved every ``halve_every`` epochs (None: constant). Training stops
+    after ``patience`` epochs without a better validation loss (``stop_on`` "accuracy": a better accuracy) and returns
+    the best weights; None: it runs all epochs and returns the last weights.
     ``augment`` names the augmentations of the training windows (see `training.augment`).
-    ``device`` "auto" takes CUDA where it is available. ``threads`` on the CPU: those of ``training/fast`` share the
-    chunks of 64 windows of a batch, so that a batch of 64 keeps one busy; PyTorch's own gain little on networks as
-    small as these, and on a busy machine a second one made an epoch 25 times slower. Run folds side by side.
+    ``device`` "auto" is CUDA if it is available. ``threads`` is for the CPU. More than one rarely helps: a batch is
+    divided among them in chunks of 64 windows, and PyTorch's own threads gain little on networks as small as these (on
+    a busy machine a second one made an epoch 25 times slower). Train folds in parallel instead.
     """
 
     epochs: int = 150
@@ -82,29 +82,29 @@ class TrainSpec:
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON.
 
-        A list of at most a random rotation is written as ``turn_deg``, as earlier versions did: the identities of
-        their trainings and evaluations stay valid.
+        ``augment`` with at most a random rotation is written as ``turn_deg``, as in earlier versions, so that the ids
+        of their trainings and evaluations stay the same.
         """
-        given = [parse_augmentation(text) for text in self.augment]
+        parsed = [parse_augmentation(text) for text in self.augment]
         values: dict[str, Any] = {}
         for key, value in asdict(self).items():
             if key != "augment":
                 values[key] = value
-            elif [name for name, _ in given] in ([], [_ROTATION]):
-                values["turn_deg"] = given[0][1] if given else 0.0
+            elif [name for name, _ in parsed] in ([], [_ROTATION]):
+                values["turn_deg"] = parsed[0][1] if parsed else 0.0
             else:
                 values[key] = list(value)
         return values
 
     def key(self) -> dict[str, Any]:
-        """Return everything that the outcome depends on: all settings, and the version of the code."""
+        """Return everything that the result depends on: all settings, and the version of the code."""
         return {"version": TRAINING_VERSION} | self.to_dict()
 
 
-# "search": paper, section 3.6.1; "loso": paper, section 4.4; "paper" is the same schedule, for the paper's own form
-# of the network and of windows (see PADDING and CONTEXT). "people" is ours: with as few validation people as these
-# data sets have, their loss is a poor judge of when to stop, so it runs to the end of a faster falling rate, and it
-# turns vectors. Makeability, 5 folds by person, real context, one seed: 0.55 with early stopping, 0.63 without.
+# "search": paper, section 3.6.1; "loso": paper, section 4.4; "paper" is the same schedule, with the network and windows
+# of the paper (see PADDING and CONTEXT). "people" is our own: with so few validation people, their loss does not tell
+# when to stop, so it runs all epochs with a faster falling learning rate; and it rotates vectors. Accuracy on
+# makeability, 5 folds by person, real context, one seed: 0.55 with early stopping, 0.63 without.
 PRESETS: dict[str, TrainSpec] = {
     "search": TrainSpec(epochs=250, learning_rate=0.001, halve_every=None, patience=None),
     "loso": TrainSpec(),
@@ -112,10 +112,10 @@ PRESETS: dict[str, TrainSpec] = {
     "paper": TrainSpec(),
 }
 
-# The padding of the network that a preset trains unless another is set.
+# Default padding of the network for each preset.
 PADDING: dict[str, str] = {"search": "stream", "loso": "stream", "people": "stream", "paper": "mirror"}
 
-# The context of the windows that a preset trains on and is scored on unless another is set.
+# Default context of the windows to train on and to score for each preset.
 CONTEXT: dict[str, str] = {"search": "loop", "loso": "stream", "people": "stream", "paper": "loop"}
 
 

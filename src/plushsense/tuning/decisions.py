@@ -1,8 +1,8 @@
 """Fit decision settings on people to whom the network's weights were not fitted.
 
-All settings between the network and the events are fitted here, on training people only: event settings by a search
-over traces (`plushsense.tuning.events`), the conformal threshold and the threshold for known gestures on the same
-people's recordings, and the limits of the sensors (`fit_health`).
+This covers all settings between network and events, on training people only: event settings by a search over traces
+(`plushsense.tuning.events`), the conformal threshold and the threshold for known gestures on recordings of the same
+people, and the limits of the sensors (`fit_health`).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from plushsense.windows.clock import row_times_us
 from plushsense.windows.cut import cut_windows, whole_gestures
 
 _MARGIN = 0.1  # of the range of the data
-_SAFETY = 2  # the time limits of a fault are at least so many times what the data hold
+_SAFETY = 2  # the time limits of a fault are at least this many times the longest duration in the data
 _STILL_MS = 500
 _STILL_MOST_MS = 10_000
 _INT32 = -(1 << 31), (1 << 31) - 1
@@ -41,7 +41,7 @@ IntsLimits = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class HealthFit:
-    """Fitted ``plan`` with limits from ``seconds`` of data; ``widened`` names channels with an end stop."""
+    """Fitted ``plan`` and the amount of data; ``widened`` names channels whose limits had to be moved outwards."""
 
     plan: HealthSettings
     frames: int
@@ -51,7 +51,7 @@ class HealthFit:
 
 
 def frames_of(dataset: Dataset, subjects: Iterable[str]) -> Iterator[Frames]:
-    """Yield the streams of some people, and the recordings of those who have none."""
+    """Yield the frames of the streams of some people, or of the recordings of those without a stream."""
     people = set(subjects)
     streams = [s for s in dataset.streams if s.subject in people]
     with_stream = {s.subject for s in streams}
@@ -66,13 +66,13 @@ def fit_health(dataset: Dataset, subjects: Iterable[str], plan: HealthSettings |
     """Fit limits with which the sensors of ``subjects`` are never at fault.
 
     A channel's limits are the lowest and the highest valid value in the data, moved outwards by a tenth of the range
-    between them. If that is beyond what the sensor can send, people reach its end stop, and the limit is one step
-    inside their extreme value: touch stays there for a frame or two, a broken sensor permanently. If values beyond the
-    limits were repeated for half of ``fault_ms``, the limits are moved to include them. ``still_ms`` is twice the
-    longest time in which every channel repeated, at least 500 ms; above 10 s the rule is switched off.
+    between them. If such a limit is not within the valid range, touch can saturate the sensor; the limit is then one
+    step inside the extreme value, because touch saturates it only for a few frames and a broken sensor permanently. If
+    values beyond the limits were repeated for half of ``fault_ms``, the limits are moved to include them. ``still_ms``
+    is twice the longest time in which all channels repeated, at least 500 ms; above 10 s the rule is disabled.
 
     Args:
-        plan: times to keep (``fault_ms``, ``recover_ms``); by default the defaults.
+        plan: settings from which ``fault_ms`` and ``recover_ms`` are taken.
     """
     plan = plan or HealthSettings()
     layout = dataset.layout
@@ -84,17 +84,17 @@ def fit_health(dataset: Dataset, subjects: Iterable[str], plan: HealthSettings |
     valid = valid.astype(np.int64)
     low, high = (edge.copy() for edge in valid)
     for c in range(values.shape[1]):
-        mine = values[:, c]
-        mine = mine[(mine >= valid[0, c]) & (mine <= valid[1, c])]
-        if len(mine):
-            first, last = int(mine.min()), int(mine.max())
+        channel = values[:, c]
+        channel = channel[(channel >= valid[0, c]) & (channel <= valid[1, c])]
+        if len(channel):
+            first, last = int(channel.min()), int(channel.max())
             margin = int(np.ceil(_MARGIN * (last - first)))
             inside = 1 if last - first > 1 else 0
             low[c] = first - margin if first - margin > valid[0, c] else first + inside
             high[c] = last + margin if last + margin < valid[1, c] else last - inside
     usual = low.copy(), high.copy()
     for frames in parts:
-        for rows, wrong in _held(frames, usual, valid, plan.fault_ms / _SAFETY, layout.gap_ms):
+        for rows, wrong in _long_wrong(frames, usual, valid, plan.fault_ms / _SAFETY, layout.gap_ms):
             low = np.minimum(low, np.where(wrong, rows, low).min(axis=0))
             high = np.maximum(high, np.where(wrong, rows, high).max(axis=0))
     moved = (low != usual[0]) | (high != usual[1])
@@ -113,13 +113,13 @@ def fit_health(dataset: Dataset, subjects: Iterable[str], plan: HealthSettings |
 
 
 def _runs(at: Bools) -> list[tuple[int, int]]:
-    """Return (first, last) of every run of true values."""
+    """Return the indices (first, last) of each run of true values."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], at, [False]]).astype(np.int8)))
     return [(int(a), int(b) - 1) for a, b in edges.reshape(-1, 2)]
 
 
 def _repeats(values: NDArray[np.int64], ms: NDArray[np.int64], gap_ms: int) -> Bools:
-    """Return which frames (T,) repeat the one before in every channel of ``values``; none over a gap or a reset."""
+    """Return which frames (T,) repeat the one before in all channels; False after a gap or a clock reset."""
     out = np.zeros(len(values), dtype=bool)
     step = np.diff(ms)
     out[1:] = (values[1:] == values[:-1]).all(axis=1) & (step >= 0) & (step <= gap_ms)
@@ -127,11 +127,11 @@ def _repeats(values: NDArray[np.int64], ms: NDArray[np.int64], gap_ms: int) -> B
 
 
 def _longest(ms: NDArray[np.int64], repeats: Bools) -> int:
-    """Return the longest duration of a run of repeats, counted from the frame that they repeat."""
+    """Return the longest duration of a run of repeats, from the frame that is repeated."""
     return max((int(ms[b] - ms[a - 1]) for a, b in _runs(repeats)), default=0)
 
 
-def _held(
+def _long_wrong(
     frames: Frames, usual: tuple[IntsLimits, IntsLimits], valid: IntsLimits, longest_ms: float, gap_ms: int
 ) -> Iterator[tuple[IntsLimits, NDArray[np.bool_]]]:
     """Yield stretches of at least ``longest_ms`` in which some channel is wrong throughout.
@@ -152,15 +152,16 @@ def _held(
 
 COVERAGE = 0.9
 KNOWN_SHARE = 0.95
-# The search uses at most so much of the streams, which takes about 15 s.
+# The search uses at most this much of the streams, for which it takes about 15 s.
 MOST_SEARCHED_S = 3600.0
 
 
 @dataclass(frozen=True, eq=False)
 class LabelledSteps:
-    """Steps (or windows) of known truth, (n,) each.
+    """Steps (or windows) with known classes, (n,) each.
 
-    ``shares`` (n, K) in steps of 2^-15, ``highest`` logit in steps of 1/256, both smoothed; ``truth`` the class.
+    ``shares`` (n, K): probabilities in steps of 2^-15; ``highest``: highest logit in steps of 1/256 (both smoothed);
+    ``truth``: class index.
     """
 
     shares: Ints
@@ -171,7 +172,7 @@ class LabelledSteps:
 
     @property
     def of_truth(self) -> Ints:
-        """Shares (n,) of the true class."""
+        """Probabilities (n,) of the true class."""
         return self.shares[np.arange(len(self.truth)), self.truth]
 
     def take(self, at: NDArray[np.bool_]) -> LabelledSteps:
@@ -195,18 +196,19 @@ def fit_decisions(
 
     - Events: the settings of least cost in the streams of ``subjects`` (`events.tune`).
     - ``sure``: the split-conformal threshold at which the set of classes holds the true one in ``coverage`` of the
-      labelled steps (least ambiguous sets: Sadinle, Lei and Wasserman 2019), people and their recordings counting
-      alike; the finite-sample correction counts recordings, as steps of one recording are not independent.
+      labelled steps (least ambiguous sets: Sadinle, Lei and Wasserman 2019), with equal
+      weights of people and of their recordings; the finite-sample correction counts recordings, because the steps of
+      one recording are not independent.
     - ``known``: the smoothed highest logit that ``known_share`` of the same steps reach.
-    - Gate: thresholds at a rate of false alarms on all that is not energetic (`gate.fit_gate`), on everybody's streams.
-    - Health: limits with which no sensor of the training people is at fault.
+    - Gate: thresholds for a rate of false alarms on the streams of all people (`gate.fit_gate`).
+    - Health: limits with which no sensor of these people is at fault.
 
-    A labelled step is in the second half of its recording: before, the network mostly sees something else.
+    Labelled steps are in the second half of a recording, as in the first half the network still reads earlier samples.
 
     Args:
         subjects: training people to whom the weights were not fitted.
-        training: people to whom they were fitted, for the gate and the limits of the sensors.
-        spec: start of the search; ``keep`` names its settings that stay.
+        training: people to whom they were fitted, who are used for gate and health only.
+        spec: start of the search; ``keep`` names the settings not to change.
 
     Raises:
         ConfigError: for a coverage or a share out of range.
@@ -281,7 +283,7 @@ def _answers(
         "on": "steps in the second half of a recording" if steps else "windows, not smoothed",
         "coverage": coverage,
         "recordings": len(np.unique(labelled.recording)),
-        # Coverage of each person with the threshold of the others: what to expect of a new person.
+        # Coverage of each person with the threshold fitted to the others, as for a new person.
         "coverage_left_out": _round(float(np.mean(by_person))) if by_person else None,
         "coverage_left_out_worst": _round(min(by_person)) if by_person else None,
         # Largest share of new people for which n people can give a guarantee: n / (n + 1).
@@ -298,9 +300,9 @@ def marked_streams(
     spec: DecideSpec,
     gestures: GestureSet | None = None,
 ) -> list[MarkedStream]:
-    """Return the streams of some people as the network reads them, with their marked recordings.
+    """Compute the traces of the streams of some people, with their marked recordings.
 
-    Streams without a marked recording are left out. Above an hour in all, people get equal shares of an hour.
+    Streams without a marked recording are left out. Of more than an hour, an equal part is used for each person.
 
     Args:
         gestures: the set to which the indices of the truths refer; by default the network's own.
@@ -340,7 +342,7 @@ def truths_of(
 
 
 def labelled_steps(bundle: Bundle, streams: Sequence[MarkedStream], spec: DecideSpec) -> LabelledSteps:
-    """Return the steps in the second half of each recording of a known gesture, smoothed as in ``spec``."""
+    """Return the steps in the second half of each recording of a known gesture, smoothed according to ``spec``."""
     weight = smoothing_weight(spec.smoothing_s, bundle.arch.step * bundle.layout.period_us / 1e6)
     shares = [np.zeros((0, len(bundle.gestures)), dtype=np.int64)]
     highest = [_ints(())]
@@ -356,10 +358,10 @@ def labelled_steps(bundle: Bundle, streams: Sequence[MarkedStream], spec: Decide
                 continue
             number += 1
             for part, at in zip(parts, times, strict=True):
-                mine = (at >= (t.start_us + t.stop_us) // 2) & (at <= t.stop_us)
-                shares.append(part.shares[mine])
-                highest.append(part.highest[mine])
-                n = int(mine.sum())
+                selected = (at >= (t.start_us + t.stop_us) // 2) & (at <= t.stop_us)
+                shares.append(part.shares[selected])
+                highest.append(part.highest[selected])
+                n = int(selected.sum())
                 truth += [t.gesture] * n
                 person += [h.person] * n
                 recording += [number] * n
@@ -369,14 +371,14 @@ def labelled_steps(bundle: Bundle, streams: Sequence[MarkedStream], spec: Decide
 
 
 def labelled_windows(bundle: Bundle, dataset: Dataset, subjects: Iterable[str]) -> LabelledSteps:
-    """Return the windows of some people's recordings, for data without streams."""
+    """Compute the network on windows of some people's recordings, for data without streams."""
     people = set(subjects)
-    mine = [r for r in dataset.recordings if r.subject in people]
+    recordings = [r for r in dataset.recordings if r.subject in people]
     spec = whole_gestures(bundle.windowing)
     span_s = bundle.arch.span / bundle.layout.rate_hz
     spec = replace(spec, span_s=span_s if span_s > spec.window_s else 0.0)
     try:
-        windows = cut_windows(Dataset(dataset.path, dataset.head, mine, dataset.streams), spec, bundle.gestures)
+        windows = cut_windows(Dataset(dataset.path, dataset.head, recordings, dataset.streams), spec, bundle.gestures)
     except DatasetError:
         empty = np.zeros((0, len(bundle.gestures)), dtype=np.int64)
         return LabelledSteps(empty, _ints(()), _ints(()), np.zeros(0, dtype=np.str_), _ints(()))
@@ -390,20 +392,20 @@ def _ints(values: Sequence[int]) -> Ints:
 
 
 def weights_of(labelled: LabelledSteps) -> NDArray[np.float64]:
-    """Return weights (n,) that sum to 1: people count alike, and the recordings of a person."""
+    """Return weights (n,) that sum to 1, equal for all people and for all recordings of a person."""
     weight = np.zeros(len(labelled.truth))
     people = np.unique(labelled.person)
     for person in people:
-        mine = labelled.person == person
-        recordings = np.unique(labelled.recording[mine])
+        selected = labelled.person == person
+        recordings = np.unique(labelled.recording[selected])
         for recording in recordings:
-            at = mine & (labelled.recording == recording)
+            at = selected & (labelled.recording == recording)
             weight[at] = 1.0 / (len(people) * len(recordings) * at.sum())
     return weight
 
 
-def _lower(scores: Ints, labelled: LabelledSteps, share: float) -> int:
-    """Return the largest threshold that ``share`` of the weight reaches, corrected for the number of recordings."""
+def _threshold(scores: Ints, labelled: LabelledSteps, share: float) -> int:
+    """Return the largest threshold that ``share`` of the scores reach, weighted and with finite-sample correction."""
     n = len(np.unique(labelled.recording))
     under = max(0.0, ((1.0 - share) * (n + 1) - 1.0) / n)
     order = np.argsort(scores, kind="stable")
@@ -413,31 +415,31 @@ def _lower(scores: Ints, labelled: LabelledSteps, share: float) -> int:
 
 
 def sure_threshold(labelled: LabelledSteps, coverage: float) -> float:
-    """Return the conformal threshold on smoothed probabilities at a coverage, in whole steps of 2^-15."""
-    return _lower(labelled.of_truth, labelled, coverage) / ONE
+    """Return the conformal threshold of smoothed probabilities for a coverage, a multiple of 2^-15."""
+    return _threshold(labelled.of_truth, labelled, coverage) / ONE
 
 
 def known_threshold(labelled: LabelledSteps, share: float) -> float | None:
-    """Return the smoothed highest logit that a share of the labelled steps reach; None without any."""
-    return _lower(labelled.highest, labelled, share) / 256 if len(labelled.truth) else None
+    """Return the smoothed highest logit that a share of the labelled steps reach; None without steps."""
+    return _threshold(labelled.highest, labelled, share) / 256 if len(labelled.truth) else None
 
 
 def left_out_coverage(labelled: LabelledSteps, coverage: float) -> list[float]:
-    """Return for each person the share of steps whose set holds the truth with the threshold of the others.
+    """Return each person's coverage with the threshold fitted to the others.
 
-    Recordings count alike. Empty for one person.
+    Recordings have equal weights. Empty for fewer than two people.
     """
     people = np.unique(labelled.person)
     if len(people) < 2:
         return []
     out = []
     for person in people:
-        mine = labelled.take(labelled.person == person)
+        own_steps = labelled.take(labelled.person == person)
         threshold = sure_threshold(labelled.take(labelled.person != person), coverage)
-        out.append(covered(mine, threshold))
+        out.append(covered(own_steps, threshold))
     return out
 
 
 def covered(labelled: LabelledSteps, threshold: float) -> float:
-    """Return the share of steps whose set holds the truth; people and recordings count alike."""
+    """Return the share of steps whose set contains the true class; people and recordings have equal weights."""
     return float((weights_of(labelled) * (labelled.of_truth >= threshold * ONE)).sum())

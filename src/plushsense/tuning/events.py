@@ -1,7 +1,7 @@
-"""Search of event settings over traces, by the cost of wrong, late and missing events.
+"""Search for event settings with the lowest cost of wrong, late and missing events.
 
-The network reads a stream once (`plushsense.runtime.trace`); the event machine of the toy then replays the events of
-the stream for every setting.
+The network is computed once for each stream (`plushsense.runtime.trace`); the toy's event machine then replays its
+outputs with each candidate setting.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ OTHER = -1
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """Marked stretch of a stream: a class index, or `OTHER` for a gesture that the network does not know."""
+    """A marked part of a stream, with a class index, or `OTHER` for a gesture that the network does not know."""
 
     start_us: int
     stop_us: int
@@ -32,7 +32,7 @@ class Truth:
 
 @dataclass(frozen=True, eq=False)
 class MarkedStream:
-    """Stream of one person as the network reads it, with its marked stretches."""
+    """The trace of a stream of one person, with its marked parts."""
 
     person: str
     trace: Trace
@@ -41,13 +41,13 @@ class MarkedStream:
 
 @dataclass(frozen=True)
 class EventCosts:
-    """Costs of errors, in missed gestures.
+    """Costs of errors, in units of a missed gesture.
 
-    A gesture costs as much as its best event: ``missed`` without one; ``late_s`` for every second until it was named,
-    at most 3; ``unnamed`` if only its affect was reported; if it was taken for another gesture, ``family`` for one of
-    its family, ``same`` for one of its affect, ``other`` where it has no affect, ``affect`` for one of another affect.
-    Every further event costs ``again`` and half its error. An event during rest costs ``idle``, and one in an unmarked
-    stretch ``unmarked``: people may have practised there.
+    A gesture costs ``missed`` if it has no event, else as much as its best event: ``late_s`` for each second until it
+    is named, at most 3 s; ``unnamed`` if only its affect is reported; for a wrong gesture, ``family`` if it is of the
+    same family, ``same`` if it has the same affect, ``other`` if neither has one, ``affect`` if the affect differs.
+    Every further event costs ``again`` and half its error. An event during rest costs ``idle``, one in an unmarked part
+    ``unmarked``, which is less because people may have practised there.
     """
 
     missed: float = 1.0
@@ -66,7 +66,7 @@ class EventCosts:
 
 @dataclass(slots=True)
 class TimedEvent:
-    """Reported event; ``named_us`` is when its gesture was named."""
+    """A reported event; ``named_us`` is the time at which its gesture was named."""
 
     begun_us: int
     affect: int
@@ -76,7 +76,7 @@ class TimedEvent:
 
 
 def timed_events(updates: Sequence[Update]) -> list[TimedEvent]:
-    """Return whole events from their updates."""
+    """Combine updates into whole events."""
     out: list[TimedEvent] = []
     for u in updates:
         if u.kind == BEGUN:
@@ -91,48 +91,48 @@ def timed_events(updates: Sequence[Update]) -> list[TimedEvent]:
 def event_costs(
     stream: MarkedStream, events: Sequence[TimedEvent], gestures: GestureSet, prices: EventCosts
 ) -> NDArray[np.float64]:
-    """Return the cost (n,) of each of the n gestures of a stream, in order of time.
+    """Return the cost (n,) of answer_costs of the n gestures of a stream, in order of time.
 
-    An event where there was no gesture counts with the nearest gesture.
+    The cost of an event without a gesture is added to that of the nearest gesture.
     """
     idle = [g.idle for g in gestures.gestures]
-    mine = [t for t in stream.truths if t.gesture != OTHER and not idle[t.gesture]]
-    silent = [t for t in stream.truths if t.gesture != OTHER and idle[t.gesture]]
+    active = [t for t in stream.truths if t.gesture != OTHER and not idle[t.gesture]]
+    resting = [t for t in stream.truths if t.gesture != OTHER and idle[t.gesture]]
     others = [t for t in stream.truths if t.gesture == OTHER]
-    if not mine:
+    if not active:
         return np.zeros(0)
-    starts = np.array([t.start_us for t in mine])
-    answers: list[list[TimedEvent]] = [[] for _ in mine]
-    total = np.zeros(len(mine))
+    starts = np.array([t.start_us for t in active])
+    answers: list[list[TimedEvent]] = [[] for _ in active]
+    total = np.zeros(len(active))
     for event in events:
-        at = _place(event, mine, prices)
+        at = _place(event, active, prices)
         if at is not None:
             answers[at].append(event)
             continue
         nearest = int(np.abs(starts - event.begun_us).argmin())
-        if _within(event, silent, prices.early_us, 0):
+        if _within(event, resting, prices.early_us, 0):
             total[nearest] += prices.idle
         elif not _within(event, others, prices.early_us, prices.grace_us):
             total[nearest] += prices.unmarked
-    for at, (truth, reported) in enumerate(zip(mine, answers, strict=True)):
-        # A correct event that began before and continues needs no other one.
-        going_on = [
+    for at, (truth, reported) in enumerate(zip(active, answers, strict=True)):
+        # A correct event may have begun earlier, if it lasts for at least half of the gesture.
+        continuing = [
             e
             for e in events
             if e.gesture == truth.gesture
             and e.begun_us < truth.start_us - prices.early_us
             and 2 * (min(e.ended_us, truth.stop_us) - truth.start_us) >= truth.stop_us - truth.start_us
         ]
-        each = [_price(e, truth, gestures, prices) for e in reported]
-        if going_on:
-            each.insert(0, (True, 0.0))
-        if not each:
+        answer_costs = [_price(e, truth, gestures, prices) for e in reported]
+        if continuing:
+            answer_costs.insert(0, (True, 0.0))
+        if not answer_costs:
             total[at] += prices.missed
             continue
-        first = min(range(len(each)), key=lambda i: each[i][1])
-        total[at] += each[first][1]
+        first = min(range(len(answer_costs)), key=lambda i: answer_costs[i][1])
+        total[at] += answer_costs[first][1]
         total[at] += sum(
-            prices.again + (0.0 if right else cost / 2) for i, (right, cost) in enumerate(each) if i != first
+            prices.again + (0.0 if right else cost / 2) for i, (right, cost) in enumerate(answer_costs) if i != first
         )
     return total
 
@@ -142,7 +142,7 @@ def _within(event: TimedEvent, truths: Sequence[Truth], early_us: int, grace_us:
 
 
 def _place(event: TimedEvent, truths: Sequence[Truth], prices: EventCosts) -> int | None:
-    """Return the gesture that an event belongs to: among those at its beginning the same gesture, else the latest."""
+    """Return the index of the gesture that an event belongs to: the same gesture, if possible, else the latest one."""
     around = [
         i for i, t in enumerate(truths) if t.start_us - prices.early_us <= event.begun_us <= t.stop_us + prices.grace_us
     ]
@@ -152,7 +152,7 @@ def _place(event: TimedEvent, truths: Sequence[Truth], prices: EventCosts) -> in
 
 
 def _price(event: TimedEvent, truth: Truth, gestures: GestureSet, prices: EventCosts) -> tuple[bool, float]:
-    """Return whether an event was right, and its cost as the answer to a gesture."""
+    """Return whether an event is correct for a gesture, and its cost."""
     real = gestures.gestures[truth.gesture]
     late = prices.late_s * min(max(event.named_us - truth.start_us, 0) / 1e6, 3.0)
     if event.gesture == truth.gesture:
@@ -168,7 +168,7 @@ def _price(event: TimedEvent, truth: Truth, gestures: GestureSet, prices: EventC
     return False, (prices.other if real.affect == "none" else prices.same) + late
 
 
-# Values to try, in this order, twice. Settings with the largest effect come first.
+# Values to try, in this order and twice; settings with the largest effect come first.
 TRIED: dict[str, tuple[float, ...]] = {
     "enter": (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9),
     "least_s": (0.05, 0.1, 0.2, 0.3, 0.5),
@@ -184,12 +184,12 @@ TRIED_AFFECT: dict[str, tuple[float, ...]] = {
     "leave_affect": (0.2, 0.4, 0.6),
 }
 TRIED_GATE: dict[str, tuple[float, ...]] = {"wait_s": (0.5, 1.0, 1.5, 2.5)}
-_BLOCK = 10  # consecutive gestures whose mean cost is one sample of the standard error
+_BLOCK = 10  # consecutive gestures, whose mean is one sample for the standard error
 
 
 @dataclass(frozen=True)
 class TunedEvents:
-    """``spec`` with its cost per gesture, that of the initial settings, and the number of settings ``tried``."""
+    """The result of `tune`: costs are per gesture, ``tried`` is the number of settings tried, ``moved`` (old, new)."""
 
     spec: DecideSpec
     cost: float
@@ -205,36 +205,36 @@ def tune(
     prices: EventCosts | None = None,
     keep: Collection[str] = (),
 ) -> TunedEvents:
-    """Return the event settings with the least cost per gesture, people counting alike.
+    """Search for the event settings with the lowest cost per gesture, averaged over people.
 
-    One setting after the other is moved to its best value, twice over all, and only if the gain is more than its
-    standard error over blocks of 10 gestures and at least half of the people gain.
+    Each setting in turn is changed to its best value, in two passes, if the gain is larger than its standard error over
+    blocks of 10 gestures and at least half of the people do not lose by it.
 
     Args:
-        spec: start of the search; gate, health, ``known`` and ``sure`` are kept.
-        keep: settings that are not tried.
+        spec: start of the search; gate, health, ``known`` and ``sure`` are not changed.
+        keep: settings not to change.
     """
     prices = prices or EventCosts()
     listeners = [(h, TraceReplayer(h.trace)) for h in streams]
     gate = bool(spec.gate.rules)
-    knobs = TRIED | (TRIED_AFFECT if gestures.has_affect else {}) | (TRIED_GATE if gate else {})
-    knobs = {name: values for name, values in knobs.items() if name not in keep}
-    known: dict[tuple[Any, ...], list[NDArray[np.float64]]] = {}
+    settings = TRIED | (TRIED_AFFECT if gestures.has_affect else {}) | (TRIED_GATE if gate else {})
+    settings = {name: values for name, values in settings.items() if name not in keep}
+    costs: dict[tuple[Any, ...], list[NDArray[np.float64]]] = {}
 
     def cost(candidate: DecideSpec) -> list[NDArray[np.float64]]:
-        key = tuple(getattr(candidate, name) for name in knobs)
-        if key not in known:
-            known[key] = [
+        key = tuple(getattr(candidate, name) for name in settings)
+        if key not in costs:
+            costs[key] = [
                 event_costs(h, timed_events(listener.updates(candidate)), gestures, prices) for h, listener in listeners
             ]
-        return known[key]
+        return costs[key]
 
     people = [h.person for h in streams]
     now = before = cost(spec)
     moved: dict[str, tuple[float, float]] = {}
     for _ in range(2):
         changed = False
-        for name, values in knobs.items():
+        for name, values in settings.items():
             best, best_gain = None, 0.0
             for value in values:
                 if value == getattr(spec, name) or (name == "leave" and value > spec.enter):
@@ -251,7 +251,7 @@ def tune(
                 spec, now, changed = best, cost(best), True
         if not changed:
             break
-    return TunedEvents(spec, _mean(now, people), _mean(before, people), len(known), moved)
+    return TunedEvents(spec, _mean(now, people), _mean(before, people), len(costs), moved)
 
 
 def _mean(each: Sequence[NDArray[np.float64]], people: Sequence[str]) -> float:

@@ -1,4 +1,4 @@
-"""The material to fit a gate on, and the choice of its rules: two terms with thresholds, by recall and false alarms."""
+"""Collect the samples that a gate is fitted on, and choose rules of one or two terms by recall and false alarms."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from plushsense.windows.cut import recordings_in_time
 from plushsense.windows.features import network_inputs
 
 BETWEEN, CALM, LEFT_OUT = -1, -2, -3
-"""Kinds of samples: between recordings; in a recording of a gesture that is not energetic; unknown."""
+"""Kinds of samples: between recordings; in a recording of a gesture that is not energetic; of unknown content."""
 
 GUARD_S = 0.7
-"""Time before and after an energetic recording that is unknown: the gesture may begin early and end late."""
+"""Margin around an energetic recording that is left out: the gesture may begin early and end late."""
 
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """Even samples without a break.
+    """Evenly spaced samples of one person without a break.
 
-    ``x`` (T, I) raw inputs; ``what`` (T,) an index into `Material.trials`, or `BETWEEN`, `CALM` or `LEFT_OUT`; ``calm``
-    (T,) the recording of a calm sample (an index into `Material.calm`), else -1.
+    ``x`` (T, I): raw inputs. ``what`` (T,): index of the energetic recording in `Material.trials`, or `BETWEEN`, `CALM`
+    or `LEFT_OUT`. ``calm`` (T,): index of the recording of a calm sample in `Material.calm`, else -1.
     """
 
     subject: str
@@ -37,7 +37,7 @@ class Stretch:
 
 @dataclass(frozen=True)
 class Material:
-    """Stretches of some people; ``trials`` are their energetic recordings, ``calm`` the others, as (id, gesture)."""
+    """Stretches of some people; ``trials`` are their energetic recordings, ``calm`` their others, as (id, gesture)."""
 
     stretches: tuple[Stretch, ...]
     trials: tuple[tuple[str, str], ...]
@@ -45,15 +45,15 @@ class Material:
     rate_hz: float
 
     def hours(self, what: int) -> float:
-        """Return the total duration of one kind of samples, in hours."""
+        """Return the total duration of samples of one kind, in hours."""
         return sum(int((s.what == what).sum()) for s in self.stretches) / self.rate_hz / 3600
 
 
 def material_of(dataset: Dataset, gestures: GestureSet, subjects: Collection[str]) -> Material:
-    """Return the streams of ``subjects``, and their recordings that lie in no stream.
+    """Read the streams of ``subjects``, and their recordings that lie in no stream.
 
-    ``gestures`` define what is energetic. Free choice, other labels, excluded recordings and those that were not
-    stopped in time are left out, as their content is unknown.
+    ``gestures`` define what is energetic. Recordings of free choice or of other labels, excluded ones and those that
+    were not stopped in time are marked `LEFT_OUT`, as their content is unknown.
     """
     layout = dataset.layout
     people = set(subjects)
@@ -63,7 +63,7 @@ def material_of(dataset: Dataset, gestures: GestureSet, subjects: Collection[str
     calm: list[tuple[str, str]] = []
     stretches: list[Stretch] = []
 
-    def kind(r: RecordingInfo) -> int:
+    def register(r: RecordingInfo) -> int:
         gesture = gestures.find(r.gesture)
         if r.id not in in_time or gesture is None or gesture.free_choice:
             return LEFT_OUT
@@ -75,11 +75,11 @@ def material_of(dataset: Dataset, gestures: GestureSet, subjects: Collection[str
 
     def add(subject: str, segments: list[Segment], rows: list[tuple[int, int, RecordingInfo]], rest: int) -> None:
         guard = layout.samples(GUARD_S)
-        kinds = [(first, last, kind(r)) for first, last, r in rows]
-        at_calm, numbers = len(calm) - sum(k == CALM for _, _, k in kinds), []
+        kinds = [(first, last, register(r)) for first, last, r in rows]
+        calm_index, numbers = len(calm) - sum(k == CALM for _, _, k in kinds), []
         for _, _, k in kinds:
-            numbers.append(at_calm if k == CALM else -1)
-            at_calm += k == CALM
+            numbers.append(calm_index if k == CALM else -1)
+            calm_index += k == CALM
         for segment in segments:
             what = np.full(len(segment), rest)
             which = np.full(len(segment), -1)
@@ -110,27 +110,27 @@ def material_of(dataset: Dataset, gestures: GestureSet, subjects: Collection[str
 Ints32 = NDArray[np.int32]
 Whole = NDArray[np.int64]
 
-_SHARES = (0.5, 1, 2, 4, 7, 10, 15, 20, 30, 40, 50, 65, 80)
-"""Percentiles of the trials' heights to try as thresholds of the first term."""
-_COMMON = 0.05
-"""Largest share of the calm samples in which a first term may hold."""
+_PERCENTILES = (0.5, 1, 2, 4, 7, 10, 15, 20, 30, 40, 50, 65, 80)
+"""Percentiles of the trials' highest values to try as thresholds of the first term."""
+_MAX_CALM_SHARE = 0.05
+"""Largest share of the calm samples at which a first term may be true."""
 _SHORTLIST = 60
-_NEARBY = (0.85, 1.0, 1.18)
-"""As people differ, a rule's recall is the mean with its thresholds multiplied by each of these."""
-_CARELESS = 2
-"""At the lowest of them a rule may have so many times the allowed false alarms, and one more."""
-_PER_SECOND = 0.1
-"""Value of an answer that comes a second sooner, as a share of the trials."""
+_FACTORS = (0.85, 1.0, 1.18)
+"""Factors on the thresholds over which a rule's recall is averaged, because people differ."""
+_MAX_ALARM_FACTOR = 2
+"""With the lowest of these factors, a rule may cause this many times the allowed false alarms, and one more."""
+_WORTH_PER_SECOND = 0.1
+"""Share of the trials that a delay shorter by one second is worth."""
 
 
 @dataclass(frozen=True, eq=False)
 class Heights:
-    """Sizes of candidates as a term counts them: a row for each sample, a column for each candidate.
+    """Values that terms compare with their thresholds: a row for each sample, a column for each of S candidate terms.
 
-    ``calm`` (n, S) of samples that are not energetic, in ``chunks`` (n,) of at most one alarm; ``rough`` (m, S) of the
-    ``trials`` (m,), ``delays`` (m,) samples after the beginning of the trial. Both are sorted by chunk and trial.
-    ``least`` (S,) is the lowest threshold of a first term; calm samples below all of them are dropped. ``apart``
-    (S, S): which two candidates may be the terms of one rule.
+    ``calm`` (n, S): samples without an energetic gesture, in ``chunks`` (n,), each of which counts as one false alarm
+    at most. ``rough`` (m, S): samples of the ``trials`` (m,), ``delays`` (m,) samples after the trial's beginning. Both
+    are sorted, by chunk and by trial. ``least`` (S,): lowest threshold allowed for a first term; calm samples below all
+    of them are dropped. ``apart`` (S, S): whether two candidates may be combined in a rule.
     """
 
     calm: Ints32
@@ -145,10 +145,10 @@ class Heights:
     def of(
         cls, calm: Ints32, chunks: Whole, rough: Ints32, trials: Whole, delays: Whole, apart: NDArray[np.bool_]
     ) -> Heights:
-        """Return the heights of all energetic samples and of the calm ones in which a rule could fire."""
+        """Set ``least``, and drop the calm samples at which no rule can fire."""
         least = np.ones(rough.shape[1], dtype=np.int64)
         if len(calm):
-            rank = min(len(calm) - 1, int(len(calm) * (1.0 - _COMMON)))
+            rank = min(len(calm) - 1, int(len(calm) * (1.0 - _MAX_CALM_SHARE)))
             for column in range(len(least)):
                 least[column] = max(1, np.partition(calm[:, column], rank)[rank] + 1)
         if len(trials):
@@ -157,7 +157,7 @@ class Heights:
         return cls(calm[loud], chunks[loud], rough, trials, delays, least, apart)
 
     def without(self, rule: FoundRule) -> Heights:
-        """Return the heights without the chunks and trials in which a rule fires already."""
+        """Return a copy without the chunks and trials in which a rule fires already."""
         calm = ~np.isin(self.chunks, self.chunks[rule.holds(self.calm)])
         rough = ~np.isin(self.trials, self.trials[rule.holds(self.rough)])
         left = self.rough[rough], self.trials[rough], self.delays[rough]
@@ -166,9 +166,10 @@ class Heights:
 
 @dataclass(frozen=True)
 class FoundRule:
-    """A rule of one or two ``terms`` (column, threshold), with its results on the trials it was chosen on.
+    """A rule of one or two ``terms`` (column, threshold), with its results on the samples it was chosen on.
 
-    ``hits``; ``near``, their mean with thresholds a little higher and lower; ``alarms``; median ``delay`` in samples.
+    ``hits``: trials detected; ``near``: their mean number with thresholds a little higher and lower; ``alarms``: chunks
+    with a false alarm; ``delay``: median in samples.
     """
 
     terms: tuple[tuple[int, int], ...]
@@ -178,61 +179,61 @@ class FoundRule:
     delay: float = 0.0
 
     def holds(self, heights: Ints32) -> NDArray[np.bool_]:
-        """Return where the rule holds, (n,)."""
+        """Return whether the rule is true at each row of ``heights``, (n,)."""
         every: NDArray[np.bool_] = np.ones(len(heights), dtype=np.bool_)
         for column, threshold in self.terms:
             every &= heights[:, column] >= threshold
         return every
 
     def times(self, factor: float) -> FoundRule:
-        """Return the rule with other thresholds."""
+        """Return the rule with its thresholds multiplied by ``factor``, without results."""
         return FoundRule(tuple((column, max(1, round(factor * threshold))) for column, threshold in self.terms))
 
     def alarms_in(self, heights: Heights) -> int:
-        """Return the number of chunks in which it is wrong."""
+        """Return the number of chunks in which the rule causes a false alarm."""
         return len(np.unique(heights.chunks[self.holds(heights.calm)]))
 
 
 def best_rule(heights: Heights, alarms: int, rate_hz: float) -> FoundRule | None:
-    """Return the rule that detects most trials, and soonest, with false alarms in at most ``alarms`` chunks.
+    """Return the rule that detects the most trials, and soonest; None if there is no such rule.
 
-    Thresholds lie in the middle (in decibels) between the lowest that keeps that limit and the highest without a loss
-    of trials.
+    False alarms are allowed in ``alarms`` chunks. A threshold is the geometric mean of the lowest one within that limit
+    and the highest one that loses no trials.
     """
     n_trials = len(np.unique(heights.trials))
     if n_trials == 0:
         return None
     tops, _ = _highest(heights.rough, heights.trials)
-    tried: list[tuple[int, int, int, int]] = []
+    candidates: list[tuple[int, int, int, int]] = []
     for first in range(heights.rough.shape[1]):
-        for threshold in np.unique(np.percentile(tops[:, first], _SHARES).astype(np.int64)):
+        for threshold in np.unique(np.percentile(tops[:, first], _PERCENTILES).astype(np.int64)):
             if threshold < heights.least[first]:
                 continue
-            loud = heights.calm[:, first] >= threshold
-            needed = _needed(heights.calm[loud], heights.chunks[loud], alarms)
-            strong = heights.rough[:, first] >= threshold
-            reached, _ = _highest(heights.rough[strong], heights.trials[strong])
+            calm_rows = heights.calm[:, first] >= threshold
+            needed = _needed(heights.calm[calm_rows], heights.chunks[calm_rows], alarms)
+            trial_rows = heights.rough[:, first] >= threshold
+            reached, _ = _highest(heights.rough[trial_rows], heights.trials[trial_rows])
             hits = (reached >= needed).sum(axis=0)
-            tried += [(int(hits[s]), first, int(threshold), int(s)) for s in np.flatnonzero(heights.apart[first])]
-    tried.sort(key=lambda r: -r[0])
+            candidates += [(int(hits[s]), first, int(threshold), int(s)) for s in np.flatnonzero(heights.apart[first])]
+    candidates.sort(key=lambda r: -r[0])
     best: tuple[float, FoundRule] | None = None
-    seen: set[tuple[int, int]] = set()
-    for _, first, threshold, second in tried:
-        if (first, second) in seen:
+    pairs: set[tuple[int, int]] = set()
+    for _, first, threshold, second in candidates:
+        if (first, second) in pairs:
             continue
-        seen.add((first, second))
-        if len(seen) > _SHORTLIST:
+        pairs.add((first, second))
+        if len(pairs) > _SHORTLIST:
             break
         rule = _settle(heights, first, threshold, second, alarms)
         if rule is not None:
-            worth = rule.near / n_trials - _PER_SECOND * rule.delay / rate_hz
+            worth = rule.near / n_trials - _WORTH_PER_SECOND * rule.delay / rate_hz
             if best is None or worth > best[0]:
                 best = worth, rule
     return best[1] if best else None
 
 
 def _settle(heights: Heights, first: int, threshold: int, second: int, alarms: int) -> FoundRule | None:
-    """Move both thresholds to the middle of their accepted range, one after the other, twice."""
+    """Move each threshold in turn to the geometric mean of its range; None if the rule is not acceptable."""
     terms = {first: threshold, second: 1} if first != second else {first: threshold}
     for column in (second, first, second):
         calm, rough = (
@@ -249,13 +250,13 @@ def _settle(heights: Heights, first: int, threshold: int, second: int, alarms: i
         middle = round((needed * float(np.percentile(passing, 1))) ** 0.5)
         terms[column] = max(needed, min(int(passing.min()), middle))
     rule = FoundRule(tuple(terms.items()))
-    right = rule.holds(heights.rough)
-    trials, at = np.unique(heights.trials[right], return_index=True)
-    careless = rule.times(_NEARBY[0]).alarms_in(heights)
-    if not len(trials) or careless > _CARELESS * alarms + 1:
+    detected = rule.holds(heights.rough)
+    trials, at = np.unique(heights.trials[detected], return_index=True)
+    most_alarms = rule.times(_FACTORS[0]).alarms_in(heights)
+    if not len(trials) or most_alarms > _MAX_ALARM_FACTOR * alarms + 1:
         return None
-    near = [len(np.unique(heights.trials[rule.times(f).holds(heights.rough)])) for f in _NEARBY]
-    delay = float(np.median(heights.delays[right][at]))
+    near = [len(np.unique(heights.trials[rule.times(f).holds(heights.rough)])) for f in _FACTORS]
+    delay = float(np.median(heights.delays[detected][at]))
     return FoundRule(rule.terms, len(trials), float(np.mean(near)), rule.alarms_in(heights), delay)
 
 
@@ -268,7 +269,7 @@ def _highest(heights: Ints32, groups: Whole) -> tuple[Ints32, Whole]:
 
 
 def _needed(calm: Ints32, chunks: Whole, alarms: int) -> Whole:
-    """Return the lowest threshold of each column that is reached in at most ``alarms`` chunks; at least 1."""
+    """Return the lowest threshold of each column that at most ``alarms`` chunks reach; at least 1."""
     tops, _ = _highest(calm, chunks)
     if len(tops) <= alarms:
         return np.ones(calm.shape[1], dtype=np.int64)

@@ -5,11 +5,11 @@ a positive or a negative answer, none to neutral gestures, immediately to an abr
 about 3 s to broad strokes, hardly ever to fine scratches, sensitive to humidity and hand size. This is the simplest
 program that fits this description, not the authors':
 
-- *negative*: the acceleration, or the touch of all electrodes together, changes within 50 ms by so many counts.
-- *positive*: an electrode, smoothed over 0.3 s, goes up or down by so many counts, ``swings`` times in ``window_s``.
+- *negative*: the acceleration changes by ``shock`` counts in 50 ms, or the sum of electrodes by ``touch_shock``.
+- *positive*: an electrode, smoothed over 0.3 s, rises or falls by ``swing`` counts, ``swings`` times in ``window_s``.
 
-The thresholds do not adapt to humidity, hand or person. They are tuned on training people as if by hand
-(`fit_rule_baseline`): as sensitive as possible without answers to other gestures.
+The thresholds do not adapt to humidity, hand or person. `fit_rule_baseline` sets them as one would by hand, on training
+people: as sensitive as possible with almost no answers to other gestures.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ from plushsense.windows.cut import recordings_in_time
 from plushsense.windows.features import network_inputs
 
 _LAG_S = 0.05
-_SLOW_S = 0.3
-# Share of other gestures that may be answered.
-_WRONG = 0.02
+_SMOOTHING_S = 0.3
+# Largest share of the recordings of other gestures that a rule may answer.
+_MAX_WRONG = 0.02
 _NEGATIVE, _POSITIVE = AFFECT_CODES["negative"], AFFECT_CODES["positive"]
 
 
@@ -48,9 +48,9 @@ class BaselineSettings:
     """Settings of the rule baseline, in raw counts and seconds; a count of 0 switches its rule off.
 
     Attributes:
-        shock: change of the acceleration within 50 ms for a blow; touch_shock: the same of all electrodes.
-        swing: how far an electrode must go up or down; swings: how often within window_s.
-        negative_s, positive_s: time after the rule last held at which an event ends.
+        shock: change of the acceleration within 50 ms that is a blow; touch_shock: the same for the sum of electrodes.
+        swing: how far an electrode must rise or fall; swings: how often within window_s.
+        negative_s, positive_s: how long an event lasts after its rule was last met.
     """
 
     shock: int = 0
@@ -67,29 +67,29 @@ class BaselineSettings:
 
 
 class _Swings:
-    """Counts the swings of one electrode: how often it turned after going at least ``size`` one way."""
+    """Counts the swings of one electrode: rises and falls in turn, of at least ``size`` counts each."""
 
     def __init__(self, size: int, weight: float) -> None:
         self._size, self._weight = size, weight
-        self._slow: float | None = None
+        self._smoothed: float | None = None
         self._low = self._high = 0.0
-        self._way = 0
+        self._direction = 0
         self.times: list[int] = []
 
     def push(self, value: int, now: int, window: int) -> int:
         """Return the number of swings within the last ``window`` samples, including this one."""
-        slow = self._slow
-        slow = float(value) if slow is None else slow + self._weight * (value - slow)
-        if self._slow is None:
-            self._low = self._high = slow
-        self._slow = slow
-        self._low, self._high = min(self._low, slow), max(self._high, slow)
+        smoothed = self._smoothed
+        smoothed = float(value) if smoothed is None else smoothed + self._weight * (value - smoothed)
+        if self._smoothed is None:
+            self._low = self._high = smoothed
+        self._smoothed = smoothed
+        self._low, self._high = min(self._low, smoothed), max(self._high, smoothed)
         # A swing counts once it has gone far enough; the next one must go the other way.
-        if self._way <= 0 and slow - self._low >= self._size:
-            self._way, self._high = 1, slow
+        if self._direction <= 0 and smoothed - self._low >= self._size:
+            self._direction, self._high = 1, smoothed
             self.times.append(now)
-        elif self._way >= 0 and self._high - slow >= self._size:
-            self._way, self._low = -1, slow
+        elif self._direction >= 0 and self._high - smoothed >= self._size:
+            self._direction, self._low = -1, smoothed
             self.times.append(now)
         while self.times and now - self.times[0] > window:
             del self.times[0]
@@ -97,7 +97,7 @@ class _Swings:
 
 
 class _Rules:
-    """The rules on even samples of inputs."""
+    """Applies the rules to evenly sampled inputs."""
 
     def __init__(self, layout: Layout, plan: BaselineSettings) -> None:
         touch, shock = sensors_of(layout)
@@ -105,24 +105,24 @@ class _Rules:
         self._touch, self._shock = touch, shock
         self._lag = layout.samples(_LAG_S)
         self._window = layout.samples(plan.window_s)
-        self._last = {
+        self._timeout = {
             _NEGATIVE: layout.samples(plan.negative_s),
             _POSITIVE: layout.samples(plan.positive_s),
         }
-        self._weight = -math.expm1(-1.0 / (_SLOW_S * layout.rate_hz))
+        self._weight = -math.expm1(-1.0 / (_SMOOTHING_S * layout.rate_hz))
         self.number = 0
         self.forget()
 
     def forget(self) -> None:
-        """Forget the past, after a break of the stream."""
+        """Discard earlier samples, after a break of the stream."""
         self._past: list[list[int]] = []
         self._swings = [_Swings(self.plan.swing, self._weight) for _ in self._touch]
         self._sample = 0
         self.affect = 0
-        self._held = 0
+        self._met_at = 0
 
     def _affect_of(self, row: list[int]) -> int:
-        """Return the affect whose rule holds now, 0 for none."""
+        """Return the affect whose rule is met at this sample, 0 for none."""
         plan, past = self.plan, self._past
         self._sample += 1
         past.append(row)
@@ -143,16 +143,16 @@ class _Rules:
         return affect
 
     def push(self, row: list[int], now: int) -> list[Update]:
-        """Read one sample and return its updates. A blow replaces a caress; a caress waits until a blow has ended."""
+        """Process one sample and return the event updates. A negative event ends a positive one, but not vice versa."""
         affect = self._affect_of(row)
         updates: list[Update] = []
         if affect and affect == self.affect:
-            self._held = self._sample
-        elif self.affect and (affect == _NEGATIVE or self._sample - self._held > self._last[self.affect]):
+            self._met_at = self._sample
+        elif self.affect and (affect == _NEGATIVE or self._sample - self._met_at > self._timeout[self.affect]):
             updates.append(self.end(now))
         if affect and not self.affect:
             self.number += 1
-            self.affect, self._held = affect, self._sample
+            self.affect, self._met_at = affect, self._sample
             updates.append(Update(BEGUN, self.number, affect, NO_GESTURE, GATE, now, now))
         return updates
 
@@ -175,7 +175,7 @@ def sensors_of(layout: Layout) -> tuple[tuple[int, ...], tuple[int, ...]]:
 
 
 class BaselineReader:
-    """Reads the frames of one toy by the rule baseline: events with an affect, no gesture and source ``gate``."""
+    """Applies the rule baseline to the frames of one toy; its events have an affect, no gesture and source ``gate``."""
 
     def __init__(self, layout: Layout, plan: BaselineSettings) -> None:
         self.layout, self.plan = layout, plan
@@ -187,7 +187,7 @@ class BaselineReader:
         self._rules = _Rules(self.layout, self.plan)
 
     def push(self, frame: Frame) -> list[GestureEvent]:
-        """Read one frame; return what happened to events, times in seconds since the stream's first frame."""
+        """Process one frame; return changes of events, with times in seconds since the stream's first frame."""
         updates: list[Update] = []
         for item in self._frames.push(frame.device_ms, frame.values):
             if isinstance(item, Sample):
@@ -199,7 +199,7 @@ class BaselineReader:
         return [_to_event(update) for update in updates]
 
     def silence(self) -> list[GestureEvent]:
-        """End the current event, as no frames arrive."""
+        """End the current event when frames have stopped arriving."""
         return [_to_event(self._rules.end(self._frames.time_us))] if self._rules.affect else []
 
 
@@ -209,7 +209,7 @@ def _to_event(update: Update) -> GestureEvent:
 
 
 def baseline_events(frames: Frames, layout: Layout, plan: BaselineSettings) -> list[GestureEvent]:
-    """Return the events of a whole stream; an event that continues at its end is ended there."""
+    """Return the events of a whole stream; an event that is open at the end of the stream ends there."""
     reader = BaselineReader(layout, plan)
     host = frames.host_ms if frames.host_ms is not None else frames.device_ms
     events: list[GestureEvent] = []
@@ -223,14 +223,14 @@ def fit_rule_baseline(
     gestures: GestureSet,
     subjects: Collection[str],
 ) -> tuple[BaselineSettings, dict[str, Any]]:
-    """Tune the rules on people's recordings, as if by hand.
+    """Tune the thresholds on the recordings of ``subjects``.
 
-    The shocks are the lowest counts at which at most 2 % of the recordings that are not negative would be answered as a
-    blow (half of it by each rule); the swing is the lowest of a few at which at most 2 % of the neutral and of the
-    negative recordings, each, would be answered as a caress. Strokes and scratches are not used.
+    ``shock`` and ``touch_shock`` are the lowest counts at which at most 2 % of the positive and neutral recordings
+    would cause a negative event (1 % by each rule). ``swing`` is the lowest of a few values at which at most 2 % of the
+    neutral and at most 2 % of the negative recordings would cause a positive event.
 
     Returns:
-        The plan, and a report of what it was tuned on.
+        The settings, and a report on the recordings used and the errors that remain.
 
     Raises:
         ConfigError: for gestures without affects.
@@ -243,8 +243,8 @@ def fit_rule_baseline(
     layout, people = dataset.layout, set(subjects)
     touch, shock = sensors_of(layout)
     lag = layout.samples(_LAG_S)
-    calm: list[tuple[int, int]] = []
-    silent: dict[str, list[NDArray[np.int64]]] = {"neutral": [], "negative": []}
+    peaks: list[tuple[int, int]] = []
+    unanswered: dict[str, list[NDArray[np.int64]]] = {"neutral": [], "negative": []}
     used = recordings_in_time([r for r in dataset.used if r.subject in people and gestures.find(r.gesture)])
     for recording in used:
         affect = gestures.get(recording.gesture).affect
@@ -254,24 +254,28 @@ def fit_rule_baseline(
             if affect in ("positive", "neutral") and len(change):
                 shaken = int(np.abs(change[:, list(shock)]).sum(axis=1).max()) if shock else 0
                 pressed = int(np.abs(change[:, list(touch)].sum(axis=1)).max()) if touch else 0
-                calm.append((shaken, pressed))
-            if affect in silent:
-                silent[affect].append(x)
-    if not calm:
+                peaks.append((shaken, pressed))
+            if affect in unanswered:
+                unanswered[affect].append(x)
+    if not peaks:
         raise ConfigError("None of these people recorded a gesture that is not negative: include other people.")
-    high = np.ceil(np.quantile(np.array(calm), 1.0 - _WRONG / 2, axis=0)).astype(int) + 1
-    plan = BaselineSettings(int(high[0]) if shock else 0, int(high[1]) if touch else 0)
+    thresholds = np.ceil(np.quantile(np.array(peaks), 1.0 - _MAX_WRONG / 2, axis=0)).astype(int) + 1
+    plan = BaselineSettings(int(thresholds[0]) if shock else 0, int(thresholds[1]) if touch else 0)
     shares: dict[str, float] = {}
     for swing in _SWINGS if touch else ():
-        tried = BaselineSettings(plan.shock, plan.touch_shock, swing)
-        shares = {a: float(np.mean([_caressed(x, layout, tried) for x in xs])) for a, xs in silent.items() if xs}
-        if max(shares.values(), default=0.0) <= _WRONG:
-            plan = tried
+        candidate = BaselineSettings(plan.shock, plan.touch_shock, swing)
+        shares = {
+            a: float(np.mean([_is_answered_positive(x, layout, candidate) for x in xs]))
+            for a, xs in unanswered.items()
+            if xs
+        }
+        if max(shares.values(), default=0.0) <= _MAX_WRONG:
+            plan = candidate
             break
     report = {
         "people": len(people),
         "recordings": len(used),
-        "wrong_allowed": _WRONG,
+        "wrong_allowed": _MAX_WRONG,
         "answered_as_a_caress": {a: round(s, 4) for a, s in shares.items()},
         **plan.to_dict(),
     }
@@ -281,6 +285,6 @@ def fit_rule_baseline(
 _SWINGS = tuple(round(100 * 1.25**n) for n in range(18))
 
 
-def _caressed(x: NDArray[np.int64], layout: Layout, plan: BaselineSettings) -> bool:
+def _is_answered_positive(x: NDArray[np.int64], layout: Layout, plan: BaselineSettings) -> bool:
     rules = _Rules(layout, plan)
     return any(u.affect == _POSITIVE for at, row in enumerate(x.tolist()) for u in rules.push(row, at))

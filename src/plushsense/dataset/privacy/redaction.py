@@ -1,6 +1,6 @@
-"""Redact texts: names, codes, dates, logins and addresses in session files, marks, people and the head.
+"""Redact the texts of a data set: session files, marks, the people's table and ``dataset.toml``.
 
-Codes and names are replaced, dates shifted, logins become roles, and addresses of toys and computers are dropped.
+Names and codes are replaced, dates shifted, logins become roles, and addresses of toys and computers are removed.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ NO_ADDRESS = "[address]"
 
 
 def is_searchable(word: str) -> bool:
-    """Return whether a word is long enough to be searched in a text: ``P1`` is, ``7`` and ``a`` are not."""
+    """Return whether a word is long enough to search for it in texts: ``P1`` is, ``7`` and ``a`` are not."""
     key = normalize_code(word)
     return len(key) >= (5 if key.isdigit() else 2)
 
@@ -47,15 +47,15 @@ def is_searchable(word: str) -> bool:
 def _pattern(word: str) -> str:
     pieces = _PIECES.findall(unicodedata.normalize("NFC", word))
     if any(len(p) == 1 and p.isalpha() for p in pieces):
-        # A single letter is easily part of something else: "it's 1 o'clock" is not S1.
+        # A single letter can be part of another word: "it's 1 o'clock" does not contain S1.
         return "(?<!['’])" + r"[\s_-]?".join(map(re.escape, pieces))
     return r"[\s_.'-]*".join(map(re.escape, pieces))
 
 
 class NamePatterns:
-    """Words to search for and their replacements: whole words, in any case, with ``_``, ``-`` or blanks inside.
+    """Replaces whole words in texts, in any letter case and with any ``_``, ``-`` or spaces between their parts.
 
-    Words that are too short for that (`is_searchable`) are in ``too_short``.
+    ``too_short`` lists the words that are not searched for (`is_searchable`).
     """
 
     def __init__(self, instead: Mapping[str, str]) -> None:
@@ -66,21 +66,21 @@ class NamePatterns:
         self._any = re.compile(f"{_BEFORE}(?:{alternatives}){_AFTER}", re.IGNORECASE) if words else None
 
     def replace(self, text: str) -> tuple[str, list[str]]:
-        """Return the text with the words replaced, and the replacements in order."""
+        """Replace the words in a text; return the new text and the replacements in order."""
         if self._any is None:
             return text, []
-        put: list[str] = []
+        replacements: list[str] = []
 
         def one(match: re.Match[str]) -> str:
-            put.append(self._instead.get(normalize_code(match.group()), "[name]"))
-            return put[-1]
+            replacements.append(self._instead.get(normalize_code(match.group()), "[name]"))
+            return replacements[-1]
 
-        plain = unicodedata.normalize("NFC", text)
-        changed = self._any.sub(one, plain)
-        return (changed, put) if put else (text, put)
+        normalized = unicodedata.normalize("NFC", text)
+        changed = self._any.sub(one, normalized)
+        return (changed, replacements) if replacements else (text, replacements)
 
     def find_in(self, text: str) -> list[str]:
-        """Return the words as they occur in a text."""
+        """Return all occurrences of the words in a text, as they are written there."""
         if self._any is None:
             return []
         return [m.group() for m in self._any.finditer(unicodedata.normalize("NFC", text))]
@@ -93,21 +93,21 @@ def without_addresses(text: str) -> str:
 
 ON_FILE = "on file"
 ORIGIN = "origin.json"
-"""File of the importer with the name and hash of the file that it converted."""
+"""File in which the importer stores the name and hash of the original of a converted file."""
 _MENDED = "mended"
 LOGINS = frozenset({"who", "by", "user", "author", "leader", "operator", "recorded_by"})
 _SUBJECT, _CONSENT = "subject", "consent"
 _PLACES = frozenset({"device", "port", "address", "url", "mac", "hostname", "computer", "serial_number"})
 PROSE = frozenset({"why", "text", "note", "notes", "comment", "comments", "said", "description"})
 _SECONDS = ("_s", "timestamp", "epoch")
-# Programs sign marks with their own name, which identifies nobody.
+# Marks can be signed by programs, whose names identify nobody.
 _PROGRAMS = re.compile(r"plushsense.*|recorder", re.IGNORECASE | re.DOTALL)
 _FILE = re.compile(r"^(?P<label>.+)_(?P<epoch>\d{1,18})_(?P<rows>\d{1,12}(?:\.\w+)?(?:#.*)?)$", re.DOTALL)
 
 
 @dataclass
 class ReviewNotes:
-    """Notes for a person to review: file (its new path), line (0: the whole file) and a sentence."""
+    """Notes for manual review: file (new path), line (0: the whole file) and message."""
 
     found: list[dict[str, Any]] = field(default_factory=list)
     prose: int = 0
@@ -127,7 +127,7 @@ class ReviewNotes:
 
 @dataclass(frozen=True)
 class Redactor:
-    """Rewrites texts of one person (or nobody). ``roles`` gives a login's role by its folded form."""
+    """Redacts the texts of one person (or nobody). ``roles`` maps case-folded logins to roles."""
 
     names: NamePatterns
     roles: dict[str, str]
@@ -137,24 +137,24 @@ class Redactor:
     drop_notes: bool = False
 
     def text(self, text: str, where: tuple[str, int] | None = None) -> str:
-        """Replace names, addresses and dates in a text; a replaced name is noted for ``where``."""
-        new, put = self.names.replace(shifted_text(without_addresses(text), self.shift_ms))
-        if put and where is not None:
-            for word, times in Counter(put).items():
+        """Replace names, addresses and dates in a text; add a note for ``where`` if a name was replaced."""
+        new, replacements = self.names.replace(shifted_text(without_addresses(text), self.shift_ms))
+        if replacements and where is not None:
+            for word, times in Counter(replacements).items():
                 self.findings.add(
                     where[0], f"a name or code in the text was replaced by '{word}' ({times}×): read it", where[1]
                 )
         return new
 
     def name(self, name: str) -> str:
-        """Shift the time in a file's name, or in the last part of an id; its label stays."""
+        """Shift the time in a file name or in the last part of an id, without redacting the label."""
         match = _FILE.match(name)
         if match is None:
             return self.text(name)
         return f"{match['label']}_{shifted_number(int(match['epoch']), self.shift_ms)}_{match['rows']}"
 
     def role(self, login: str) -> str:
-        """Return ``person-1`` in place of a login; the name of a program stays."""
+        """Return a role such as ``person-1`` for a login; names of programs are returned unchanged."""
         if not login or _PROGRAMS.fullmatch(login):
             return login
         return self.roles.setdefault(login.casefold(), f"person-{len(self.roles) + 1}")
@@ -162,7 +162,7 @@ class Redactor:
     def value(self, value: Any, key: str = "", where: tuple[str, int] = ("", 0)) -> Any:
         """Redact a value of JSON or TOML recursively."""
         if isinstance(value, dict):
-            # The text cut off a torn line can be a fragment of a date.
+            # The text of a mended line is a fragment, in which dates cannot be recognised.
             torn = value.get("what") == _MENDED
             remaining = {k: v for k, v in value.items() if not (torn and k == "text")}
             return {self.text(str(k)): self.value(v, str(k), where) for k, v in remaining.items()}
@@ -198,7 +198,7 @@ class Redactor:
 
 
 def logins_in(value: Any, key: str = "") -> Iterator[str]:
-    """Yield every login in a value of JSON."""
+    """Yield every login in a JSON value."""
     if isinstance(value, dict):
         for k, v in value.items():
             yield from logins_in(v, str(k).casefold())
@@ -210,13 +210,13 @@ def logins_in(value: Any, key: str = "") -> Iterator[str]:
 
 
 def subject_in(value: Any) -> str:
-    """Return the person in a session's head; "" if there is none."""
+    """Return the person's code in the head of a session; "" if there is none."""
     subject = value.get(_SUBJECT) if isinstance(value, dict) else None
     return subject if isinstance(subject, str) else ""
 
 
 def read_lines(path: Path) -> Iterator[tuple[int, Any]]:
-    """Yield the values of a JSON file (one, line 1) or JSON-lines file with their lines; None for invalid JSON."""
+    """Yield (line number, value) of a JSON-lines file, or (1, value) of a JSON file; None for invalid JSON."""
     data = path.read_bytes()
     pieces = data.split(b"\n") if path.suffix.lower() == ".jsonl" else [data]
     for number, piece in enumerate(pieces, 1):
@@ -229,9 +229,9 @@ def read_lines(path: Path) -> Iterator[tuple[int, Any]]:
 
 
 def redact_json(path: Path, new: str, words: Redactor) -> str | None:
-    """Return a session file's redacted text; None if nothing of it can be read.
+    """Return the redacted text of a session file; None if it cannot be read.
 
-    A line that is not JSON was torn by a crash; it is left out and reported.
+    Lines that are not JSON (because of a crash, for example) are left out and reported.
     """
     lines = path.suffix.lower() == ".jsonl"
     out = []
@@ -247,9 +247,9 @@ def redact_json(path: Path, new: str, words: Redactor) -> str | None:
 def redact_marks(
     path: Path, words_of: Callable[[str], Redactor | None], renamed: Callable[[str], str], findings: ReviewNotes
 ) -> str:
-    """Return the marks with new ids, sorted by new id, since the old order would tell who is who.
+    """Return the redacted marks, sorted by new id, because the old order could reveal identities.
 
-    ``words_of`` returns the redactor for a mark's recording, None if its person is unknown; ``renamed`` its new id.
+    For a recording's id, ``words_of`` returns the redactor, or None if its person is unknown; ``renamed`` the new id.
     """
     out: list[tuple[str, str]] = []
     for number, table in read_lines(path):
@@ -266,7 +266,7 @@ def redact_marks(
 
 
 def redact_people(people: Iterable[PersonInfo], words_of: Callable[[str], Redactor], file: str) -> Iterator[PersonInfo]:
-    """Yield the people's table with codes; a consent reference becomes "on file", since it leads to a signed name."""
+    """Yield people with their new codes; consent references become "on file", as they lead to signed names."""
     for person in people:
         words = words_of(person.subject)
         redact = partial(words.text, where=(file, 0))
@@ -276,14 +276,14 @@ def redact_people(people: Iterable[PersonInfo], words_of: Callable[[str], Redact
 
 
 def redact_head(folder: Path, words: Redactor) -> str:
-    """Return the redacted ``dataset.toml``; layout and gesture set stay as they are."""
+    """Return the redacted ``dataset.toml``; layout and gesture set are not changed."""
     table = read_toml(folder / HEAD, "data set", DatasetError)
     unchanged = ("layout", "gesture_set", "format")
     return tomli_w.dumps({k: v if k in unchanged else _redact_texts(v, words) for k, v in table.items()})
 
 
 def _redact_texts(value: Any, words: Redactor) -> Any:
-    """Redact a value of the head; its authors stay, so that only people's codes and dates change."""
+    """Redact all texts in a value of ``dataset.toml``; names of authors are kept."""
     if isinstance(value, dict):
         return {key: _redact_texts(v, words) for key, v in value.items()}
     if isinstance(value, list):

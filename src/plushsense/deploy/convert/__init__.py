@@ -1,7 +1,7 @@
-"""Optional converters of the network to formats of other runtimes, and what they share.
+"""Optional converters of the network to formats of other runtimes, and code that they share.
 
-They compute a whole window for each decision; the C of the export computes each sample once. The caller provides the
-clock, the derived channels, the validity rule and the smoothing.
+A converted network computes a whole window for each decision, unlike the exported C, which computes each sample once.
+The caller must resample, compute derived channels, replace invalid values and smooth the probabilities.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ Windows = NDArray[np.int64]
 RAW = "raw"
 LOGITS = "logits"
 PROBABILITIES = "probabilities"
-LIMIT = LOGIT_LIMIT / 256  # of logits in the network in whole numbers
-# Logits in float32 against the reference in float64, relative to the largest logit; above it nothing is written.
+LIMIT = LOGIT_LIMIT / 256  # of the logits of the integer network
+# Largest difference of float32 logits from the float64 reference, relative to the largest logit.
 TOLERANCE = 1e-4
 NOT_EXACT = (
     "Compared with the network in whole numbers, which the C in the toy equals bit for bit; this file only comes "
@@ -42,9 +42,9 @@ NOT_EXACT = (
 class Converted:
     """A file for another runtime.
 
-    ``largest_difference`` is between its logits and those of the network it came from (`Network.forward`, or
-    `IntegerNetwork.forward` / 256 for the int8 formats) on the windows tried; None where the runtime that could tell
-    is not installed. ``notes`` are sentences for the person who uses the file.
+    ``largest_difference`` of its logits from those of the original network (`Network.forward`, or
+    `IntegerNetwork.forward` / 256 for the int8 formats) on test windows; None if the format's runtime is not installed.
+    ``notes`` are sentences for users of the file.
     """
 
     path: Path
@@ -90,16 +90,16 @@ def check_format(name: str) -> None:
 
 
 def convert(bundle: Bundle, path: str | Path, format_name: str, *, windows: NDArray[Any] | None = None) -> Converted:
-    """Write ``bundle`` to ``path`` in a format of `CONVERTERS`, tried in that format's runtime before it is written.
+    """Convert ``bundle`` to a format of `CONVERTERS`, test the result in that format's runtime, and write it.
 
     Args:
-        windows: raw integer windows (N, C, T) to try it on, beside made-up ones.
+        windows: raw integer windows (N, C, T) to test with, in addition to generated ones.
 
     Raises:
         ConfigError: for an unknown format.
-        MissingExtraError: with the install command, when the format's package is not there.
-        ArchError, BadInput: for a network that the format cannot hold.
-        BundleError: when the result does not give the network's answers; for int8, a bundle without calibration.
+        MissingExtraError: if the package for the format is not installed, with the command to install it.
+        ArchError, BadInput: for a network that the format does not support.
+        BundleError: if the logits differ from the network's; for int8, also for a bundle without calibration.
     """
     check_format(format_name)
     converter = pkgutil.resolve_name(f"{__name__}.{CONVERTERS[format_name].converter}")
@@ -115,9 +115,9 @@ def convert(bundle: Bundle, path: str | Path, format_name: str, *, windows: NDAr
 
 @dataclass(frozen=True)
 class ConversionJob:
-    """Input of a converter: the bundle and raw windows (N, C, T), of which the first ``given`` came from the caller.
+    """Input of a converter: the bundle, and raw windows (N, C, T) for calibration and comparison.
 
-    The windows serve to calibrate and to compare; the others are generated.
+    The first ``given`` windows are from the caller, the others are generated.
     """
 
     bundle: Bundle
@@ -126,17 +126,17 @@ class ConversionJob:
 
     @classmethod
     def of(cls, bundle: Bundle, windows: NDArray[Any] | None) -> ConversionJob:
-        """Return the job with generated windows after the given ones.
+        """Create the job, with generated windows after the given ones.
 
         Raises:
             BadInput: for windows of another shape.
         """
-        tried = made_up_windows(bundle)
+        all_windows = made_up_windows(bundle)
         if windows is not None:
             check_windows(bundle.arch, windows.shape)
             given = windows[:, :, windows.shape[2] - bundle.arch.span :].astype(np.int64)
-            tried = np.concatenate([given, tried])
-        return cls(bundle, tried, 0 if windows is None else len(windows))
+            all_windows = np.concatenate([given, all_windows])
+        return cls(bundle, all_windows, 0 if windows is None else len(windows))
 
     def thinned(self, most: int) -> ConversionJob:
         """Return the job with at most ``most`` of the given windows, evenly spaced, and all generated ones."""
@@ -145,7 +145,7 @@ class ConversionJob:
 
     @property
     def tried(self) -> str:
-        """Number of windows as text."""
+        """The numbers of windows as text."""
         made = len(self.windows) - self.given
         return f"{made} made-up windows" if not self.given else f"{self.given} given and {made} made-up windows"
 
@@ -169,9 +169,9 @@ def made_up_windows(bundle: Bundle, n: int = 24) -> Windows:
 
 
 def scaling(scaler: Scaler) -> tuple[Floats, Floats, Floats]:
-    """Return (whole, scale, rest), each (C,), with which ``(raw - whole) * scale + rest`` is the scaler in float32.
+    """Return (whole, scale, rest), each (C,), so that ``(raw - whole) * scale + rest`` scales the inputs in float32.
 
-    Subtracting a whole number first keeps the last digits of a large offset.
+    Subtracting a whole number first avoids a loss of precision for large offsets.
     """
     whole = np.rint(scaler.offset)
     rest = (whole - scaler.offset) * scaler.scale
@@ -181,7 +181,7 @@ def scaling(scaler: Scaler) -> tuple[Floats, Floats, Floats]:
 def input_codes(network: IntegerNetwork) -> tuple[Floats, Floats, Floats]:
     """Return (offset, gain, start), each (C,): ``(raw - offset) * gain + start``, rounded and clipped to 0…255.
 
-    This is the input of the first layer; it may differ from `InputScale` by 1 where that rounds the other way.
+    These are the inputs of the first layer; because of rounding they can differ by 1 from those of `InputScale`.
     """
     scale = network.inputs
     unit = np.ldexp(1.0, -scale.after)
@@ -190,12 +190,12 @@ def input_codes(network: IntegerNetwork) -> tuple[Floats, Floats, Floats]:
 
 
 def sum_scales(multiplier: NDArray[Any], before: NDArray[Any], after: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the factors of a layer's sums; at least 2^-32, because runtimes refuse 0."""
+    """Return the scales of a layer's sums as floats; at least 2^-32, because runtimes reject 0."""
     return np.asarray(np.maximum(multiplier * np.ldexp(1.0, -(before + after)), 2.0**-32))
 
 
 def describe(bundle: Bundle) -> dict[str, str]:
-    """Return the metadata to write into a file, as texts (`metadata_props` of ONNX, metadata of a .tflite)."""
+    """Return the metadata for a file as texts (``metadata_props`` of ONNX, metadata of .tflite)."""
     arch, layout = bundle.arch, bundle.layout
     provenance = bundle.provenance
     facts: dict[str, Any] = {
@@ -230,12 +230,12 @@ def compared(
     """Compare the logits (N, K) of a file with the expected ones and return the conversion.
 
     Args:
-        expected: logits that the file only approximates; None: those of the float network, from which a difference
-            beyond rounding is refused.
+        expected: logits that the file approximates; None: those of the float network, which it must match up to
+            rounding.
         note: a sentence about the file.
 
     Raises:
-        BundleError: when a float file does not give the network's answers.
+        BundleError: if the logits of a float file differ from the network's.
     """
     exact = expected is None
     reference = job.reference() if expected is None else expected

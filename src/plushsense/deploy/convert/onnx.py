@@ -1,7 +1,7 @@
-"""The network as ONNX, written node by node: in floats, and in integers with QuantizeLinear (QDQ).
+"""Convert a network to ONNX: in floats, or quantized with QuantizeLinear and DequantizeLinear (QDQ).
 
-Both read ``raw`` (N, C, span) float32, whole numbers as the toy measures them, and give ``logits`` and
-``probabilities`` (N, K). Operators of opset 18, IR version 9.
+The input ``raw`` (N, C, span) is float32 with whole numbers in raw sensor counts; the outputs are ``logits`` and
+``probabilities`` (N, K). Opset 18, IR version 9.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Shape = list[str | int]
 
 
 class OnnxGraph:
-    """Nodes in the order in which they are added; each has one output, whose name is the node's unless one is given."""
+    """Builds a graph node by node. A node has one output, after which it is named unless ``name`` is given."""
 
     def __init__(self, extra: str = "onnx") -> None:
         self.onnx = need("onnx", extra)
@@ -50,26 +50,26 @@ class OnnxGraph:
         self.constants.append(self.onnx.numpy_helper.from_array(np.ascontiguousarray(values), name))
         return name
 
-    def add(self, kind: str, out: str, *read: str, **settings: Any) -> str:
-        self.nodes.append(self.onnx.helper.make_node(kind, list(read), [out], **{"name": out, **settings}))
+    def add(self, kind: str, out: str, *inputs: str, **settings: Any) -> str:
+        self.nodes.append(self.onnx.helper.make_node(kind, list(inputs), [out], **{"name": out, **settings}))
         return out
 
     def columns(self, name: str, values: Floats) -> str:
-        """Add a constant with one value a channel, shaped for windows (N, C, T)."""
+        """Add a constant with one value per channel, as (C, 1) to broadcast over windows (N, C, T)."""
         return self.constant(name, values[:, None])
 
     def model(self, inputs: dict[str, Shape], outputs: dict[str, Shape], **settings: Any) -> Any:
-        """Return the checked graph as an ONNX model; inputs and outputs are names and shapes of float32 tensors."""
+        """Check the graph and return it as an ONNX model; inputs and outputs map names to shapes of float32 tensors."""
         helper, real = self.onnx.helper, self.onnx.TensorProto.FLOAT
-        ends = [[helper.make_tensor_value_info(n, real, s) for n, s in part.items()] for part in (inputs, outputs)]
-        graph = helper.make_graph(self.nodes, "plushsense", *ends, self.constants)
+        infos = [[helper.make_tensor_value_info(n, real, s) for n, s in part.items()] for part in (inputs, outputs)]
+        graph = helper.make_graph(self.nodes, "plushsense", *infos, self.constants)
         opset = [helper.make_opsetid("", OPSET)]
         model = helper.make_model(graph, ir_version=IR_VERSION, opset_imports=opset, **settings)
         self.onnx.checker.check_model(model, full_check=True)
         return model
 
     def to_bytes(self, bundle: Bundle) -> bytes:
-        """Return the graph from RAW to LOGITS and PROBABILITIES as the bytes of a file."""
+        """Serialise the graph with the input RAW and the outputs LOGITS and PROBABILITIES."""
         arch = bundle.arch
         inputs: dict[str, Shape] = {RAW: ["N", arch.channels, arch.span]}
         classes: Shape = ["N", arch.classes]
@@ -114,9 +114,9 @@ def _padding(g: OnnxGraph, i: int, arch: Arch, layer: ConvLayer, z: str) -> tupl
     if layer.reach < arch.window:
         pads = np.array([0, 0, layer.reach, 0, 0, 0], dtype=np.int64)
         return g.add("Pad", f"mirror{i}", z, g.constant(f"mirror{i}.pads", pads), mode="reflect"), [0, 0]
-    # More than one reflection, which Pad does not do.
-    places = reflected(arch.window, layer.reach).astype(np.int64)
-    return g.add("Gather", f"mirror{i}", z, g.constant(f"mirror{i}.places", places), axis=2), [0, 0]
+    # Pad reflects only once; longer padding needs several reflections.
+    indices = reflected(arch.window, layer.reach).astype(np.int64)
+    return g.add("Gather", f"mirror{i}", z, g.constant(f"mirror{i}.places", indices), axis=2), [0, 0]
 
 
 def _mean(g: OnnxGraph, z: str) -> str:
@@ -126,18 +126,18 @@ def _mean(g: OnnxGraph, z: str) -> str:
 def integer_model(bundle: Bundle, network: IntegerNetwork) -> bytes:
     """Return the integer network as ONNX with QuantizeLinear and DequantizeLinear.
 
-    Activations keep the codes of `IntegerNetwork` (uint8, scale 1): a filter's own scale stands with its int8
-    weights. Means over time and the dense layer are in floats, on weights that are int8.
+    Activations have the uint8 codes of `IntegerNetwork` with scale 1; the scale of each filter is applied to its int8
+    weights. The mean over time and the dense layer are computed in float32, the latter with int8 weights.
     """
     g, arch = OnnxGraph(), network.arch
     one = g.constant("code.scale", np.array(1, dtype=np.float32))
     zero = g.constant("code.zero", np.array(0, dtype=np.uint8))
 
-    def codes(z: str, name: str) -> str:
+    def quantized(z: str, name: str) -> str:
         z = g.add("QuantizeLinear", f"{name}.codes", z, one, zero)
         return g.add("DequantizeLinear", f"{name}.read", z, one, zero)
 
-    def parted(name: str, whole: NDArray[Any], scales: NDArray[np.float64]) -> str:
+    def dequantized(name: str, whole: NDArray[Any], scales: NDArray[np.float64]) -> str:
         scale = g.constant(f"{name}.scale", scales.astype(np.float32))
         none = g.constant(f"{name}.zero", np.zeros(len(scales), dtype=whole.dtype))
         return g.add("DequantizeLinear", f"{name}.real", g.constant(name, whole), scale, none, axis=0)
@@ -145,18 +145,18 @@ def integer_model(bundle: Bundle, network: IntegerNetwork) -> bytes:
     offset, gain, start = input_codes(network)
     z = g.add("Sub", "shifted", RAW, g.columns("input.offset", offset))
     z = g.add("Mul", "sized", z, g.columns("input.gain", gain))
-    z = codes(g.add("Add", "scaled", z, g.columns("input.start", start)), "input")
-    for i, (layer, part) in enumerate(zip(arch.layers, network.layers, strict=True)):
-        sizes = sum_scales(part.scale.multiplier, part.scale.before, part.scale.after)
-        w = parted(f"conv{i}.weight", part.weights, sizes)
-        b = parted(f"conv{i}.bias", part.bias.astype(np.int32), sizes)
+    z = quantized(g.add("Add", "scaled", z, g.columns("input.start", start)), "input")
+    for i, (layer, integer_layer) in enumerate(zip(arch.layers, network.layers, strict=True)):
+        scales = sum_scales(integer_layer.scale.multiplier, integer_layer.scale.before, integer_layer.scale.after)
+        w = dequantized(f"conv{i}.weight", integer_layer.weights, scales)
+        b = dequantized(f"conv{i}.bias", integer_layer.bias.astype(np.int32), scales)
         z = g.add("Conv", f"conv{i}", z, w, b, dilations=[layer.dilation], kernel_shape=[layer.kernel])
-        z = codes(g.add("Relu", f"relu{i}", z), f"layer{i}")
+        z = quantized(g.add("Relu", f"relu{i}", z), f"layer{i}")
     z = _mean(g, z)
     dense = network.dense
-    sizes = sum_scales(dense.scale.multiplier, dense.scale.before, dense.scale.after) / 256
-    w = parted("dense.weight", dense.weights, sizes * arch.pooled)
-    z = g.add("Gemm", "dense", z, w, g.constant("dense.bias", (dense.bias * sizes).astype(np.float32)), transB=1)
+    scales = sum_scales(dense.scale.multiplier, dense.scale.before, dense.scale.after) / 256
+    w = dequantized("dense.weight", dense.weights, scales * arch.pooled)
+    z = g.add("Gemm", "dense", z, w, g.constant("dense.bias", (dense.bias * scales).astype(np.float32)), transB=1)
     low = g.constant("logits.low", np.array(-LIMIT, dtype=np.float32))
     high = g.constant("logits.high", np.array(LIMIT, dtype=np.float32))
     g.add("Clip", LOGITS, z, low, high)
@@ -165,14 +165,14 @@ def integer_model(bundle: Bundle, network: IntegerNetwork) -> bytes:
 
 
 def answers(model: bytes, windows: NDArray[Any]) -> NDArray[np.float32] | None:
-    """Return the logits (N, K) of raw windows in onnxruntime; None where it is not installed."""
+    """Run a model in onnxruntime on raw windows and return the logits (N, K); None if it is not installed."""
     if importlib.util.find_spec("onnxruntime") is None:
         return None
     ort = need("onnxruntime", "onnx")
     settings = ort.SessionOptions()
     settings.intra_op_num_threads = 1
     settings.log_severity_level = 3
-    # Processors without VNNI add products of 8 bits in 16 bits, which overflows, unless precision is asked for.
+    # Otherwise sums of 8-bit products overflow in 16 bits on processors without VNNI.
     settings.add_session_config_entry("session.x64quantprecision", "1")
     session = ort.InferenceSession(model, settings, providers=["CPUExecutionProvider"])
     return np.asarray(session.run([LOGITS], {RAW: windows.astype(np.float32)})[0])
@@ -188,7 +188,7 @@ def to_onnx(job: ConversionJob) -> Conversion:
 
 
 def to_integer_onnx(job: ConversionJob) -> Conversion:
-    """Convert the integer network; close to the exported C, not equal in every bit."""
+    """Convert the integer network; its outputs are close to those of the exported C, but not bit-identical."""
     network = integer_network(job.bundle)
     model = integer_model(job.bundle, network)
     return _conversion(job, model, network.forward(job.windows) / 256, NOT_EXACT)

@@ -1,10 +1,10 @@
-"""The network as LiteRT (.tflite), written operator by operator: in floats, and with int8 convolutions.
+"""Convert a network to LiteRT (.tflite): in floats, or with int8 convolutions.
 
 Needs neither TensorFlow nor PyTorch.
 
-Both read ``raw`` (1, span, C) float32 — time before channels, as LiteRT has it — integers as the toy measures them, and
-give ``logits`` and ``probabilities`` (1, K). Only builtin operators that the LiteRT and TensorFlow Lite
-Micro interpreters have.
+The input ``raw`` (1, span, C) is float32 with whole numbers in raw sensor counts, time before channels as usual in
+LiteRT; the outputs are ``logits`` and ``probabilities`` (1, K). All operators are built into the interpreters of LiteRT
+and TensorFlow Lite Micro.
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ from plushsense.models.reference import affine
 from plushsense.runtime.integer import IntegerNetwork
 
 SCHEMA_VERSION = 3
-_ZERO = -128  # of int8 codes: 0 to 255 less 128
+_ZERO = -128  # zero point of int8 codes, which are those of 0 to 255 minus 128
 
 
 class _TfliteGraph:
-    """Tensors and operators in the order in which they are added."""
+    """Builds a graph; tensors and operators are stored in the order in which they are added."""
 
     def __init__(self) -> None:
         self.schema = need("ai_edge_litert.schema_py_generated", "tflite")
         self.flatbuffers = need("flatbuffers", "tflite")
         self.tensors: list[Any] = []
-        self.buffers: list[Any] = [self.schema.BufferT()]  # the first is the empty one of what is computed
+        self.buffers: list[Any] = [self.schema.BufferT()]  # the first is empty, for computed tensors
         self.operators: list[Any] = []
         self.codes: dict[tuple[str, int], int] = {}
 
@@ -59,7 +59,7 @@ class _TfliteGraph:
         return len(self.tensors) - 1
 
     def value(self, name: str, *shape: int, dtype: str = "float32") -> int:
-        """Add a computed tensor; int8 means codes of scale 1."""
+        """Add a computed tensor; an int8 one has codes with scale 1."""
         at = self._put(name, shape, dtype, 0)
         if dtype == "int8":
             self._quantized(at, np.ones(1), _ZERO)
@@ -82,10 +82,10 @@ class _TfliteGraph:
         q.quantizedDimension = 0
         self.tensors[at].quantization = q
 
-    def add(self, kind: str, out: int, *read: int, options: str = "", version: int = 1, **settings: Any) -> int:
+    def add(self, kind: str, out: int, *inputs: int, options: str = "", version: int = 1, **settings: Any) -> int:
         op = self.schema.OperatorT()
         op.opcodeIndex = self.codes.setdefault((kind, version), len(self.codes))
-        op.inputs, op.outputs = list(read), [out]
+        op.inputs, op.outputs = list(inputs), [out]
         if options:
             op.builtinOptionsType = getattr(self.schema.BuiltinOptions, options)
             op.builtinOptions = getattr(self.schema, f"{options}T")()
@@ -95,12 +95,12 @@ class _TfliteGraph:
         return out
 
     def per_channel(self, kind: str, name: str, z: int, values: Floats, *shape: int) -> int:
-        """Add ADD, SUB or MUL with one value a channel."""
+        """Add an operator ADD, SUB or MUL with one value per channel."""
         options = f"{kind.title()}Options"
         return self.add(kind, self.value(name, *shape), z, self.constant(f"{name}.by", values), options=options)
 
     def model(self, bundle: Bundle, raw: int, logits: int, probabilities: int) -> bytes:
-        """Return the graph as the bytes of a .tflite file."""
+        """Serialise the graph as a .tflite file."""
         schema = self.schema
         graph = schema.SubGraphT()
         graph.name, graph.tensors, graph.operators = "main", self.tensors, self.operators
@@ -173,12 +173,12 @@ class _TfliteGraph:
 def float_model(bundle: Bundle) -> bytes:
     """Return the float network as .tflite."""
     g, arch = _TfliteGraph(), bundle.arch
-    seen = (1, arch.span, arch.channels)
-    raw = z = g.value(RAW, *seen)
+    shape_in = (1, arch.span, arch.channels)
+    raw = z = g.value(RAW, *shape_in)
     whole, scale, rest = scaling(bundle.scaler)
-    z = g.per_channel("SUB", "shifted", z, whole, *seen)
-    z = g.per_channel("MUL", "sized", z, scale, *seen)
-    z = g.raised(g.per_channel("ADD", "scaled", z, rest, *seen), "image", arch)
+    z = g.per_channel("SUB", "shifted", z, whole, *shape_in)
+    z = g.per_channel("MUL", "sized", z, scale, *shape_in)
+    z = g.raised(g.per_channel("ADD", "scaled", z, rest, *shape_in), "image", arch)
     for i, (layer, positions) in enumerate(zip(arch.layers, arch.positions, strict=True)):
         z = _padded(g, i, arch, layer, z)
         w = g.constant(f"conv{i}.weight", bundle.weights[f"conv{i}.weight"].transpose(0, 2, 1)[:, None])
@@ -197,9 +197,9 @@ def _padded(g: _TfliteGraph, i: int, arch: Arch, layer: ConvLayer, z: int) -> in
         return z
     out = g.value(f"padded{i}", 1, 1, arch.window + layer.reach, arch.inputs[i])
     if arch.padding == "mirror" and layer.reach >= arch.window:
-        # More than one reflection, which MIRROR_PAD does not do.
-        places = g.constant(f"padded{i}.places", reflected(arch.window, layer.reach).astype(np.int32))
-        return g.add("GATHER", out, z, places, options="GatherOptions", axis=2)
+        # MIRROR_PAD reflects only once; longer padding needs several reflections.
+        indices = g.constant(f"padded{i}.places", reflected(arch.window, layer.reach).astype(np.int32))
+        return g.add("GATHER", out, z, indices, options="GatherOptions", axis=2)
     pads = g.constant(f"padded{i}.pads", np.array([[0, 0], [0, 0], [layer.reach, 0], [0, 0]], dtype=np.int32))
     if arch.padding == "causal":
         return g.add("PAD", out, z, pads, options="PadOptions")
@@ -224,29 +224,29 @@ def _normed(g: _TfliteGraph, i: int, bundle: Bundle, z: int, shape: tuple[int, .
 def integer_model(bundle: Bundle, network: IntegerNetwork) -> bytes:
     """Return the network with int8 convolutions as .tflite.
 
-    Activations are the codes of `IntegerNetwork` less 128; a filter's own scale stands with its weights. The scaling
-    before and the mean and the dense layer after are in floats.
+    Activations have the codes of `IntegerNetwork` minus 128 with scale 1; the scale of each filter is applied to its
+    weights. The scaling of inputs, the mean over time and the dense layer are computed in float32.
     """
     g, arch = _TfliteGraph(), network.arch
-    seen = (1, arch.span, arch.channels)
-    raw = z = g.value(RAW, *seen)
+    shape_in = (1, arch.span, arch.channels)
+    raw = z = g.value(RAW, *shape_in)
     offset, gain, start = input_codes(network)
-    z = g.per_channel("SUB", "shifted", z, offset, *seen)
-    z = g.per_channel("MUL", "sized", z, gain, *seen)
-    z = g.per_channel("ADD", "scaled", z, start, *seen)
-    z = g.add("QUANTIZE", g.value("codes", *seen, dtype="int8"), z)
+    z = g.per_channel("SUB", "shifted", z, offset, *shape_in)
+    z = g.per_channel("MUL", "sized", z, gain, *shape_in)
+    z = g.per_channel("ADD", "scaled", z, start, *shape_in)
+    z = g.add("QUANTIZE", g.value("codes", *shape_in, dtype="int8"), z)
     z = g.raised(z, "image", arch, "int8")
     for i, (layer, part, positions) in enumerate(zip(arch.layers, network.layers, arch.positions, strict=True)):
-        sizes = sum_scales(part.scale.multiplier, part.scale.before, part.scale.after)
-        w = g.constant(f"conv{i}.weight", part.weights.transpose(0, 2, 1)[:, None], sizes)
-        b = g.constant(f"conv{i}.bias", part.bias.astype(np.int32), sizes)
+        scales = sum_scales(part.scale.multiplier, part.scale.before, part.scale.after)
+        w = g.constant(f"conv{i}.weight", part.weights.transpose(0, 2, 1)[:, None], scales)
+        b = g.constant(f"conv{i}.bias", part.bias.astype(np.int32), scales)
         z = g.conv(z, g.value(f"layer{i}", 1, 1, positions, layer.filters, dtype="int8"), w, b, layer, 3)
     z = g.add("DEQUANTIZE", g.value("real", 1, 1, arch.pooled, arch.filters[-1]), z, version=2)
     z = g.mean("pooled", z, (1, 2), 1, arch.filters[-1], keep=False)
     dense = network.dense
-    sizes = sum_scales(dense.scale.multiplier, dense.scale.before, dense.scale.after) / 256
-    w = g.constant("dense.weight", (dense.weights * (sizes * arch.pooled)[:, None]).astype(np.float32))
-    b = g.constant("dense.bias", (dense.bias * sizes).astype(np.float32))
+    scales = sum_scales(dense.scale.multiplier, dense.scale.before, dense.scale.after) / 256
+    w = g.constant("dense.weight", (dense.weights * (scales * arch.pooled)[:, None]).astype(np.float32))
+    b = g.constant("dense.bias", (dense.bias * scales).astype(np.float32))
     z = g.add("FULLY_CONNECTED", g.value("dense", 1, arch.classes), z, w, b, options="FullyConnectedOptions")
     for kind, limit in (("MINIMUM", LIMIT), ("MAXIMUM", -LIMIT)):
         name = LOGITS if limit < 0 else "lowered"
@@ -256,7 +256,7 @@ def integer_model(bundle: Bundle, network: IntegerNetwork) -> bytes:
 
 
 def answers(model: bytes, windows: NDArray[Any]) -> NDArray[np.float32]:
-    """Return the logits (N, K) of raw windows (N, C, T) in the LiteRT interpreter."""
+    """Run a model in the LiteRT interpreter on raw windows (N, C, T) and return the logits (N, K)."""
     litert = need("ai_edge_litert.interpreter", "tflite")
     run = litert.Interpreter(model_content=model, num_threads=1).get_signature_runner("serving_default")
     rows = windows.astype(np.float32).transpose(0, 2, 1)
@@ -271,7 +271,7 @@ def to_tflite(job: ConversionJob) -> Conversion:
 
 
 def to_integer_tflite(job: ConversionJob) -> Conversion:
-    """Convert the network with int8 convolutions; close to the exported C, not equal in every bit."""
+    """Convert the network with int8 convolutions; its outputs are close to those of the C, not bit-identical."""
     network = integer_network(job.bundle)
     model = integer_model(job.bundle, network)
     return compared(job, model, answers(model, job.windows), "LiteRT", network.forward(job.windows) / 256)

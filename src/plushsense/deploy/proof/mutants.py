@@ -1,4 +1,4 @@
-"""Mutants: deliberate errors, applied one at a time, each of which `plushsense verify` has to detect.
+"""Mutants: copies of the model or the C with one deliberate error each, which `plushsense verify` must detect.
 
 A mutant changes a number in the model's bytes (a weight, a shift, a range; with a new checksum), or replaces a text in
 ``plushsense.c`` (an index, a rounding, a clamp). The texts are in ``mutants.toml``.
@@ -21,12 +21,12 @@ from plushsense.runtime.fixed import PROBABILITY_BITS
 from plushsense.runtime.image import GROUP, HEAD_BYTES, image_head
 
 Kind = Literal["weight", "shift", "index", "rounding", "clamp", "rule", "constant", "event", "gate", "health"]
-RULES: tuple[Kind, ...] = ("event", "gate", "health")  # what the test scenarios are for
+RULES: tuple[Kind, ...] = ("event", "gate", "health")  # kinds that the test scenarios are made to detect
 
 
 @dataclass(frozen=True)
 class SourceMutant:
-    """A replacement of text in plushsense.c; ``name`` says what breaks, ``when`` which models can show it."""
+    """A replacement of text in plushsense.c; ``name`` describes the error, ``when`` the models it affects."""
 
     kind: Kind
     name: str
@@ -51,7 +51,7 @@ _MOST_SHIFT = 30
 
 @dataclass(frozen=True)
 class Mutant:
-    """A program with one planted fault: the changed bytes of the model, or the changed C; the other is None."""
+    """A program with one error: either in the model, ``image``, or in the C, ``source``; the other is None."""
 
     kind: Kind
     name: str
@@ -60,7 +60,7 @@ class Mutant:
 
 
 def mutants_of(image: bytes, source: str) -> list[Mutant]:
-    """Return the mutants of the image and of ``plushsense.c`` that this model can show.
+    """Return the mutants of the image and of ``plushsense.c`` that change results of this model.
 
     Raises:
         BadInput: when a text to replace does not occur in the C exactly once.
@@ -88,27 +88,27 @@ def mutants_of(image: bytes, source: str) -> list[Mutant]:
         "dilated": any(layer.dilation > 1 for layer in at.layers),
         "magnitude": at.magnitudes,
         "ranged": bool(ranged),
-        # With a step of one sample there is no phase.
+        # With a step of one sample, every sample has an answer.
         "stepped": at.step > 1,
         # Without smoothing nothing is rounded.
         "smoothed": at.smoothing < 1 << PROBABILITY_BITS,
-        # With fine time units ties are rare.
+        # With smaller time units, ties are rare.
         "ties": at.units_per_ms <= 10,
     }
-    for each in source_mutants():
-        if source.count(each.find) != 1:
+    for mutant in source_mutants():
+        if source.count(mutant.find) != 1:
             raise BadInput(
-                f"The mutant '{each.name}' cannot be applied: its text ({each.find.strip()!r}) occurs "
-                f"{source.count(each.find)} times in plushsense.c, and not once; export the model again with this "
+                f"The mutant '{mutant.name}' cannot be applied: its text ({mutant.find.strip()!r}) occurs "
+                f"{source.count(mutant.find)} times in plushsense.c, and not once; export the model again with this "
                 "PlushSense, or undo your changes to that file."
             )
-        if shows[each.when]:
-            mutants.append(Mutant(each.kind, each.name, source=source.replace(each.find, each.replace)))
+        if shows[mutant.when]:
+            mutants.append(Mutant(mutant.kind, mutant.name, source=source.replace(mutant.find, mutant.replace)))
     return mutants
 
 
 def _in_image(kind: Kind, name: str, image: bytes, at: int, form: str, most: int | None = None, by: int = 1) -> Mutant:
-    """Return the image with the number at an offset one greater (smaller at its maximum) and a valid checksum."""
+    """Increase the number at offset ``at`` by ``by`` (decrease it at its maximum) and renew the checksum."""
     most = most if most is not None else (1 << (8 * struct.calcsize(form) - form.islower())) - 1
     (value,) = struct.unpack_from("<" + form, image, at)
     changed = bytearray(image)
@@ -119,7 +119,7 @@ def _in_image(kind: Kind, name: str, image: bytes, at: int, form: str, most: int
 
 @dataclass(frozen=True, eq=False)
 class _LayerOffsets:
-    """Offsets of a layer's scales and weights in the image; ``index`` (F, C, K) has those of the ``weights``."""
+    """Scales and weights of a layer in an image. ``index`` (F, C, K): offsets of the weights; ``after``: next layer."""
 
     dilation: int
     scales_at: int
@@ -128,15 +128,15 @@ class _LayerOffsets:
     after: list[_LayerOffsets]
 
     def largest_weight(self) -> tuple[int, int]:
-        """Return the offset of the most influential weight, and its filter: a dead filter would hide any mutant."""
-        f = np.abs(self.after[0].weights).sum(axis=(0, 2)) if self.after else np.abs(self.weights).sum(axis=(1, 2))
-        filter_ = int(f[: len(self.weights)].argmax())
-        own = int(np.abs(self.weights[filter_]).argmax())
-        return int(self.index[filter_].flat[own]), filter_
+        """Return offset and filter of the largest weight in the filter that the next layer weights most."""
+        sums = np.abs(self.after[0].weights).sum(axis=(0, 2)) if self.after else np.abs(self.weights).sum(axis=(1, 2))
+        filter_ = int(sums[: len(self.weights)].argmax())
+        largest = int(np.abs(self.weights[filter_]).argmax())
+        return int(self.index[filter_].flat[largest]), filter_
 
 
 class _ImageOffsets:
-    """Offsets in an image, whose format is that of `plushsense.runtime.image`."""
+    """Offsets and settings in an image; `plushsense.runtime.image` defines the format."""
 
     def __init__(self, image: bytes) -> None:
         count, channels, inputs, classes, self.step = struct.unpack_from("<BBBBH", image, HEAD_BYTES)

@@ -1,9 +1,9 @@
-"""Test scenarios: variants of an exported model whose decision rules fire often, to test the rules in the C.
+"""Test scenarios: variants of an exported model whose decision rules often apply, to test the rules in the C.
 
-On generated frames the rules of a trained model rarely fire, so that an error in their C would not be detected. A
-scenario keeps the layers and the input scale of the model. It shifts and scales the logits so that every class is the
-best one at some time, changes which classes are idle and their affects, and chooses the thresholds of health, gate and
-events from quantiles of the generated frames.
+On generated frames the rules of a trained model rarely apply, so that an error in their C would not be detected. A
+scenario keeps the layers and the input scale of the model. It shifts and scales the logits so that each class is
+sometimes the best one, changes affects and idle classes, and chooses the thresholds of health, gate and events from
+quantiles of the generated frames.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from plushsense.windows.clock import resample
 from plushsense.windows.features import Scaler, network_inputs
 
 _SPREAD = 450  # of a logit over the frames, in steps of 1/256
-_INSIDE = 8  # of a valid range, at each end: room for a sensor to be stuck there
+_INSIDE = 8  # margin at each end of a valid range, in which a sensor can be stuck
 _AFFECTS: tuple[tuple[str, bool], ...] = (
     ("positive", False),
     ("neutral", True),
@@ -57,7 +57,7 @@ class _ScenarioSettings:
     Attributes:
         gate: whether the model has a gate.
         often: whether the gate fires often.
-        near: whether events end below the share at which they begin; otherwise they end far below it, so that most are
+        near: whether events end just below the probability at which they begin; else far below it, so that most are
             replaced by other events.
         end, hold: lowest and highest value of these event settings, in steps.
         smoothing: weight of a new step, in steps of 2^-15.
@@ -96,7 +96,7 @@ class Scenario:
 
 
 def scenarios_of(model: IntegerModel, scaler: Scaler, repeat: int = 0) -> list[Scenario]:
-    """Return one scenario of each `SCENARIO_SETTINGS` for a model; deterministic, different for each ``repeat``."""
+    """Generate a scenario for each of `SCENARIO_SETTINGS`; deterministic, different for each ``repeat``."""
     return [
         _scenario(replace(model, rules=Rules(), gestures=_gestures(model, settings)), scaler, settings, seed)
         for seed, settings in enumerate(SCENARIO_SETTINGS, 1 + repeat * len(SCENARIO_SETTINGS))
@@ -104,7 +104,7 @@ def scenarios_of(model: IntegerModel, scaler: Scaler, repeat: int = 0) -> list[S
 
 
 def all_outcomes() -> set[str]:
-    """Return the outcomes that scenarios should cover; a network with few classes may not reach all."""
+    """Return the outcomes that scenarios should cover; with few classes some cannot occur."""
     events = {f"{what} by {source}" for what in KINDS.values() for source in SOURCES}
     ends = {"lost in silence", "lost in a gap", "lost in a fault", "replaced", "replaced by the gate"}
     health = {"fault", "recovery", "suspect only"}
@@ -112,7 +112,7 @@ def all_outcomes() -> set[str]:
 
 
 def covered(scenario: Scenario) -> set[str]:
-    """Return those of `all_outcomes` that a scenario covers."""
+    """Return the subset of `all_outcomes` that a scenario covers."""
     rows, outcomes = scenario.rows.astype(np.int64), set()
     answered = column(rows, "answer")[column(rows, "state") == TRACKING]
     outcomes |= {ANSWERS[k] for k in set(answered.tolist())}
@@ -175,7 +175,7 @@ def _logits(rows: NDArray[np.int32]) -> NDArray[np.float64]:
 
 
 def _gestures(model: IntegerModel, settings: _ScenarioSettings) -> GestureSet:
-    # Where events replace each other, mostly by one of the same affect.
+    # With ``near``, varied affects; else mostly the same, so that most events are replaced by one of the same affect.
     more = (0, 2, 4, 0, 2, 1) if settings.near else (0, 0, 0, 2, 0, 1)
     affects = [_AFFECTS[k if k < 5 else more[k % 6]] for k in range(len(model.gestures))]
     gestures = tuple(
@@ -185,9 +185,9 @@ def _gestures(model: IntegerModel, settings: _ScenarioSettings) -> GestureSet:
 
 
 class _NormalizedModel:
-    """A model with a new last layer, whose logits (n, K) all have mean 0 and the same spread.
+    """A model with a new last layer, so that the logits (n, K) of all classes have mean 0 and the same spread.
 
-    ``shares`` (n,) are those of the best class, ``known`` (n,) the highest logits.
+    ``shares`` (n,) are the probabilities of the best class, ``known`` (n,) its logits.
     """
 
     def __init__(self, model: IntegerModel, logits: NDArray[np.float64]) -> None:
@@ -237,7 +237,7 @@ def _events(level: _NormalizedModel, settings: _ScenarioSettings, rng: np.random
 
 
 def _health(model: IntegerModel, scaler: Scaler, rng: np.random.Generator) -> HealthSettings:
-    """Return limits about six spreads from the mean, inside the valid range, so that its ends lie beyond them."""
+    """Return limits about six spreads from the mean, which do not include the ends of the valid range."""
     layout = model.layout
     mean, spread = measured(layout, scaler)
     inside = np.minimum(_INSIDE, (layout.valid_max_int - layout.valid_min_int) // 2)
@@ -250,7 +250,7 @@ def _health(model: IntegerModel, scaler: Scaler, rng: np.random.Generator) -> He
 def _troubled(
     model: IntegerModel, scaler: Scaler, health: HealthSettings, rng: np.random.Generator
 ) -> tuple[Ints, tuple[int, ...]]:
-    """Generate frames with impacts and failing sensors, also during warm-up, and the silences."""
+    """Generate frames with impacts and failing sensors, also during warm-up; return them and the silences."""
     layout, span = model.layout, model.network.arch.span
     generator, silences = FrameGenerator(layout, scaler, rng), []
     part = span + 400
@@ -277,7 +277,7 @@ def _troubled(
 def _calm(
     model: IntegerModel, scaler: Scaler, health: HealthSettings, rng: np.random.Generator
 ) -> tuple[Ints, tuple[int, ...]]:
-    """Generate frames with long touches, some suspect frames, and the silences."""
+    """Generate frames with long touches and some suspect frames; return them and the silences."""
     generator, silences = FrameGenerator(model.layout, scaler, rng), []
     generator.touches(model.network.arch.span)
     for n in range(24):
@@ -287,7 +287,7 @@ def _calm(
 
 
 def _gate(model: IntegerModel, frames: Ints, often: bool, rng: np.random.Generator) -> GateSettings:
-    """Return signals of every kind with thresholds that the frames exceed sometimes, or ``often``."""
+    """Return a gate with signals of every kind and thresholds that the frames exceed sometimes, or ``often``."""
     arch, layout = model.network.arch, model.layout
     segments = [network_inputs(s.data, layout) for s in resample(Frames(frames[:, 1:], frames[:, 0]), layout) if len(s)]
     rows = max(segments, key=len)

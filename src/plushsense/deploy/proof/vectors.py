@@ -1,4 +1,4 @@
-"""Expected answers of a toy: golden vectors of an export folder, recordings, generated frames."""
+"""Test vectors for an export: frames from golden vectors, recordings or a generator, and the expected answers."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ _PAUSE_MS = 1000
 
 
 def frames_of(dataset: Dataset, layout: Layout, *, subjects: Sequence[str] = (), rows: int) -> Ints:
-    """Read frames (n, 1 + C) from a data set, at least ``rows`` where the data set has that many.
+    """Read frames (n, 1 + C) from a data set: at least ``rows``, or all if it has fewer.
 
-    Of each person, the session streams are read, or else the recordings. Each begins after a pause that makes a toy
-    restart, and keeps its own gaps and resets. The same number of rows is taken from the beginning of each, where it
-    is long enough. Stamps wrap at 2^32 as a toy's do; values are clipped to 32 bits.
+    The session streams of each person are read, or the recordings if there are none. Each begins after a pause that
+    makes a toy restart, and keeps its own gaps and resets. The same number of rows is taken from the beginning of each,
+    if it is long enough. Time stamps wrap at 2^32 as in a toy; values are clipped to 32 bits.
 
     Raises:
-        ConfigError: for another layout than the model's, or a person who is not there.
+        ConfigError: for another layout than the model's, or an unknown person.
     """
     if dataset.layout.channels != layout.channels:
         raise ConfigError(
@@ -53,7 +53,7 @@ def frames_of(dataset: Dataset, layout: Layout, *, subjects: Sequence[str] = (),
     pieces = list(_pieces(dataset, subjects or known))
     lengths = np.array([len(p) for p in pieces], dtype=np.int64)
     takes = np.zeros_like(lengths)
-    # The shortest first: the others make up for what they lack.
+    # Shortest first, so that longer pieces supply the rows that shorter ones lack.
     for left, at in zip(range(len(pieces), 0, -1), np.argsort(lengths, kind="stable"), strict=True):
         takes[at] = min(lengths[at], max(0, -(-(rows - int(takes.sum())) // left)))
     parts: list[Ints] = []
@@ -78,15 +78,15 @@ def _pieces(dataset: Dataset, subjects: Sequence[str]) -> Iterator[Frames]:
 
 
 Ints = NDArray[np.int64]
-# Fits into every emulator beside the program.
+# Fits into the memory of every emulated chip, next to the program.
 MOST_FRAME_BYTES = 8 << 20
 
 
 @dataclass(frozen=True, eq=False)
 class Vectors:
-    """Frames (n, 1 + C) and the expected rows (m, 12 + 2 K); the clock makes ``samples`` even samples of the frames.
+    """Frames (n, 1 + C) and the expected rows (m, 12 + 2 K); ``samples`` is the length of the resampled frames.
 
-    ``model``: the model of the case, if not the export's own; ``silences``: frames before a silence.
+    ``model``: model to run, if not that of the export; ``silences``: number of frames before each silence.
     """
 
     name: str
@@ -98,16 +98,16 @@ class Vectors:
 
     @property
     def decisions(self) -> int:
-        """Number of answers outside the warm-up."""
+        """Number of answers after the warm-up."""
         return int((column(self.answers, "state") == TRACKING).sum())
 
     @property
     def memory_bytes(self) -> int:
-        """Memory of a toy for ``model``; 0 for the export's own model."""
+        """Bytes of memory that ``model`` needs; 0 for the model of the export."""
         return memory_bytes(self.model) if self.model else 0
 
     def to_bytes(self) -> bytes:
-        """Serialise the case for the harness: model (empty: the export's own), silences, frames, each with a count."""
+        """Serialise for the test program: model (empty: that of the export), silences and frames, each with a count."""
         image = self.model.to_bytes() if self.model else b""
         counts = [struct.pack("<I", n) for n in (len(image), len(self.silences), len(self.frames))]
         frames = (self.frames & 0xFFFFFFFF).astype("<u4").tobytes()
@@ -126,6 +126,7 @@ class Counts:
 
 
 def counted(streams: Sequence[Vectors]) -> tuple[Counts, ...]:
+    """Return the total counts of the vectors of each name."""
     return tuple(
         Counts(name, sum(len(v.frames) for v in own), sum(v.samples for v in own), sum(len(v.answers) for v in own))
         for name in dict.fromkeys(v.name for v in streams)
@@ -136,10 +137,10 @@ def counted(streams: Sequence[Vectors]) -> tuple[Counts, ...]:
 class Export:
     """Export folder, opened for verification.
 
-    ``changed`` names the library and model files that are not what this version writes for the bundle in the folder.
+    ``changed`` names the library and model files that differ from what this version writes for the bundle.
 
     Raises:
-        BadInput: when it is none, lacks a file, or holds golden vectors that are not those of its model.
+        BadInput: if it is no export, lacks a file, or its golden vectors do not fit its model.
     """
 
     def __init__(self, folder: str | Path) -> None:
@@ -164,11 +165,11 @@ class Export:
         # The golden vectors of a model edited by hand may differ: the runs report that.
         self.is_own = IMAGE not in self.changed
         if self.is_own:
-            seen = compare(answers_of(self.model, frames), answers.astype("<i4").tobytes(), self.labels)
-            if seen.first:
+            comparison = compare(answers_of(self.model, frames), answers.astype("<i4").tobytes(), self.labels)
+            if comparison.first:
                 raise BadInput(
                     f"The golden vectors in '{self.folder / GOLDEN}' are not those of {BUNDLE}: they are damaged, or "
-                    f"of another model ({seen.first}); export the model again."
+                    f"of another model ({comparison.first}); export the model again."
                 )
 
     def _require_file(self, name: str) -> Path:
@@ -178,7 +179,7 @@ class Export:
         return path
 
     def require_unchanged(self) -> None:
-        """BadInput when a library or model file is not what this version writes: compiled, it could do anything."""
+        """Raise BadInput if a C or model file was changed, as running changed code is not safe."""
         if self.changed:
             one = len(self.changed) == 1
             raise BadInput(
@@ -188,10 +189,10 @@ class Export:
             )
 
     def code(self, room: Path) -> Path:
-        """Return the folder to compile from.
+        """Return the folder to compile from: the new folder ``room``, or the export itself if files in it were changed.
 
-        Files that are this version's own are written anew into ``room``, so that no other file of the export (a
-        ``string.h``, a precompiled header) reaches the compiler; changed files are compiled where they are.
+        Unchanged files are written to ``room``, so that the compiler finds no other file of the export, such as a
+        ``string.h`` or a precompiled header.
         """
         if self.changed:
             return self.folder
@@ -205,16 +206,16 @@ class Export:
         return self.model.gestures.labels
 
     def samples_of(self, frames: Ints) -> int:
-        """Return the number of even samples that the clock makes of frames."""
+        """Return the number of samples that frames are resampled to."""
         return sum(map(len, resample(Frames(frames[:, 1:], frames[:, 0]), self.model.layout)))
 
     def answered(self, name: str, frames: Ints) -> Vectors:
-        """Pair frames with the expected answers; refuses as `require_own`."""
+        """Compute the expected answers to frames; raise BadInput like `require_own`."""
         self.require_own()
         return Vectors(name, frames, answers_of(self.model, frames), self.samples_of(frames))
 
     def require_own(self) -> None:
-        """Raise BadInput when plush_model.bin is not what this PlushSense makes of the bundle beside it."""
+        """Raise BadInput if plush_model.bin differs from what this version makes of the bundle."""
         if not self.is_own:
             raise BadInput(
                 f"{IMAGE} in '{self.folder}' is not what this PlushSense makes of {BUNDLE} beside it, so that only the "
@@ -222,9 +223,9 @@ class Export:
             )
 
     def scenarios(self, repeat: int = 0) -> list[Vectors]:
-        """Return the test scenarios of the export's network, different for each ``repeat``.
+        """Return the test scenarios for the export's network, different for each ``repeat``.
 
-        None for a model that is not that of the bundle beside it.
+        Empty if plush_model.bin differs from what this version makes of the bundle.
         """
         if not self.is_own:
             return []
@@ -236,26 +237,26 @@ class Export:
         return self._scenarios[repeat]
 
     def made_up(self, samples: int) -> list[Vectors]:
-        """Generate more frames like the golden ones, until they make this many samples."""
-        seed, have = 2, 0
+        """Generate further frames like the golden ones, for at least ``samples`` samples."""
+        seed, n_samples = 2, 0
         pieces: list[Ints] = []
-        while have < samples:
+        while n_samples < samples:
             span, health = self.model.network.arch.span, self.model.rules.health
             pieces.append(golden_frames(self.model.layout, self.bundle.scaler, span, seed, health=health))
-            have += self.samples_of(pieces[-1])
+            n_samples += self.samples_of(pieces[-1])
             seed += 1
         return [self.answered("made up", p) for p in in_parts(np.concatenate(pieces))] if pieces else []
 
     def recorded(self, dataset: Dataset, subjects: Sequence[str], samples: int) -> list[Vectors]:
-        """Read recordings until they make this many samples or there are no more; refuses as `frames_of`."""
+        """Read recordings for at least ``samples`` samples, or all; raise ConfigError like `frames_of`."""
         layout = self.model.layout
         rows = samples
         while True:
             frames = frames_of(dataset, layout, subjects=subjects, rows=rows)
-            have = self.samples_of(frames)
-            if have >= samples or len(frames) < rows:
+            n_samples = self.samples_of(frames)
+            if n_samples >= samples or len(frames) < rows:
                 break
-            rows += max(samples - have, rows // 4)
+            rows += max(samples - n_samples, rows // 4)
         if not len(frames):
             raise ConfigError(f"The data set '{dataset.head.name}' holds nothing to stream: give another one.")
         name = "simulated recordings" if dataset.head.simulated else "recordings"
@@ -264,7 +265,7 @@ class Export:
 
 @dataclass(frozen=True)
 class RowComparison:
-    """Result of comparing rows with the expected ones."""
+    """Result of `compare`; ``first`` describes the first difference as part of a sentence."""
 
     vectors: int
     mismatches: int
@@ -273,31 +274,31 @@ class RowComparison:
 
 
 def compare(expected: NDArray[np.int32], got: bytes, labels: Sequence[str]) -> RowComparison:
-    """Compare the output of a toy with the expected rows (m, 12 + 2 K); ``first`` is half a sentence."""
+    """Compare the output of the test program with the expected rows (m, 12 + 2 K)."""
     width = expected.shape[1]
-    whole = len(got) // (4 * width)
-    rows = np.frombuffer(got[: whole * 4 * width], dtype="<i4").reshape(whole, width).astype(np.int64)
-    words = got[whole * 4 * width :].decode("utf-8", "replace").strip()
-    both = min(len(expected), whole)
-    off = np.abs(rows[:both] - expected[:both])
-    wrong = np.flatnonzero(off.any(axis=1))
-    mismatches = len(wrong) + max(len(expected), whole) - both
+    n_rows = len(got) // (4 * width)
+    rows = np.frombuffer(got[: n_rows * 4 * width], dtype="<i4").reshape(n_rows, width).astype(np.int64)
+    message = got[n_rows * 4 * width :].decode("utf-8", "replace").strip()
+    both = min(len(expected), n_rows)
+    differences = np.abs(rows[:both] - expected[:both])
+    wrong = np.flatnonzero(differences.any(axis=1))
+    mismatches = len(wrong) + max(len(expected), n_rows) - both
     first = None
     if len(wrong):
         at = int(wrong[0])
-        field = int(np.flatnonzero(off[at])[0])
+        field = int(np.flatnonzero(differences[at])[0])
         first = (
             f"row {at} ({_row(expected[at])}): {_column(field, int(expected[at, 0]), labels)} should be "
             f"{int(expected[at, field])} and is {int(rows[at, field])}"
         )
-    elif whole < len(expected):
-        first = f"row {whole} ({_row(expected[whole])}) is missing"
-    elif whole > len(expected):
+    elif n_rows < len(expected):
+        first = f"row {n_rows} ({_row(expected[n_rows])}) is missing"
+    elif n_rows > len(expected):
         first = f"row {both} ({_row(rows[both])}) is one too many"
-    if words:
-        first = f"{words.rstrip('.')}" if first is None else f"{words.rstrip('.')}; {first}"
+    if message:
+        first = f"{message.rstrip('.')}" if first is None else f"{message.rstrip('.')}; {first}"
         mismatches = max(mismatches, 1)
-    return RowComparison(len(expected), mismatches, int(off.max()) if off.size else 0, first)
+    return RowComparison(len(expected), mismatches, int(differences.max()) if differences.size else 0, first)
 
 
 def _row(row: NDArray[Any]) -> str:

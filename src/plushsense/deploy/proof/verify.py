@@ -1,9 +1,8 @@
-"""Verification that the C in an export folder gives exactly the answers of the integer model in Python.
+"""Verify that the C in an export folder gives exactly the results of the integer model in Python.
 
-The library and model files in the folder must be those that this version writes, or nothing is compiled. With ``trust``
-changed files are compiled as they are. Golden vectors and test scenarios (`plushsense.deploy.proof.scenarios`) always
-run; recordings, or more generated frames, on demand. Every number of every answer, event and change of health is
-compared.
+The C and model files in the folder must be those that this version writes, unless ``trust`` is given. Golden vectors
+and test scenarios (`plushsense.deploy.proof.scenarios`) are always run; recordings or further generated frames are
+optional. Every number of every answer, change of an event and change of sensor health is compared.
 """
 
 from __future__ import annotations
@@ -28,8 +27,8 @@ from plushsense.deploy.proof.vectors import Counts, Export, RowComparison, Vecto
 from plushsense.deploy.targets import C_FOLDER, TARGETS, build, missing_tools, require, target_named
 
 Progress = Callable[[int, int], None]
-Stream = tuple[Vectors, ...]  # what one program runs, one after the other
-Cases = tuple[Stream, Path]  # a stream, and the file that holds it for the harness
+Stream = tuple[Vectors, ...]  # run by one program, one after the other
+Cases = tuple[Stream, Path]  # a stream, and the file with it for the harness
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror")
 SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-g")
 HARNESS = C_FOLDER / "harness.c"
@@ -41,7 +40,7 @@ _ENCODING = "latin-1"  # reads any bytes
 class Setting:
     """A compiler with its options: one row of the report.
 
-    ``image``: the model is read from plush_model.bin and not compiled in; ``cpp``: the caller is C++, the library C.
+    ``image``: the model is read from plush_model.bin instead of compiled in; ``cpp``: the C library is called from C++.
     """
 
     target: str
@@ -57,18 +56,18 @@ class Setting:
 
     @property
     def options(self) -> str:
-        """Flags as text, without the warnings, which are the same everywhere."""
+        """Flags as text, without those for warnings, which all settings have."""
         also = [("sanitizers", SANITIZERS[0] in self.flags), ("called from C++", self.cpp), (IMAGE, self.image)]
         return " ".join([self.optimise, *(word for word, is_so in also if is_so)])
 
 
 def settings_of(target: str) -> list[Setting]:
-    """Return the settings with which a target's programs are compiled."""
+    """Return the compiler settings to verify on a target."""
     if target != "host":
         return [Setting(target, optimise=o) for o in ("-O2", "-Os")]
     settings = [Setting(target, cc, o) for cc in ("gcc", "clang") for o in ("-O0", "-O2", "-O3")]
     settings += [Setting(target, cc, "-O1", (*STRICT, *SANITIZERS)) for cc in ("gcc", "clang")]
-    # -std=c99 is not for C++; exceptions would need its library.
+    # C++ has no -std=c99, and exceptions would need its library.
     settings.append(Setting(target, "gcc", "-O2", (*STRICT[1:], "-fno-exceptions"), cpp=True))
     settings.append(Setting(target, "gcc", "-O2", image=True))
     return settings
@@ -76,7 +75,7 @@ def settings_of(target: str) -> list[Setting]:
 
 @dataclass(frozen=True)
 class SettingResult:
-    """Result of one setting: ``vectors`` counts answers, ``first`` describes the first that differs."""
+    """Result of one setting: ``vectors`` counts rows, ``first`` describes the first one that differs."""
 
     target: str
     compiler: str
@@ -104,9 +103,9 @@ class MutantResult:
 
     @property
     def silent(self) -> bool:
-        """Whether a mutant of the rules stayed undetected because no test scenario of this network reaches its line.
+        """Whether this is an undetected mutant of the rules, which no test scenario of this network reaches.
 
-        With two classes only, for example; it is no defect of the C.
+        This can happen with two classes, for example; it is no error in the C.
         """
         return not self.caught and self.kind in RULES
 
@@ -118,11 +117,11 @@ class MutantResult:
 
 @dataclass(frozen=True)
 class VerificationReport:
-    """Result of a verification; ``passed`` when nothing differs and every mutant that the model can show was caught.
+    """Result of a verification; ``passed`` if nothing differs and all mutants that affect the model were caught.
 
-    ``decisions`` counts the answers outside the warm-up: without any, nothing is proven. ``changed`` names the files
-    with C or the model's bytes that are not what this PlushSense writes for the bundle beside them: then it is only
-    known that they agree with the vectors, and ``own`` is False.
+    ``decisions`` counts the answers after the warm-up, of which there must be some. ``changed`` names the C and model
+    files that differ from what this version writes for the bundle. Then ``own`` is False, and ``passed`` means only
+    that the files agree with the vectors.
     """
 
     title: str
@@ -135,7 +134,7 @@ class VerificationReport:
 
     @property
     def own(self) -> bool:
-        """Whether what was compiled is what this PlushSense writes for the bundle."""
+        """Whether the compiled files are those that this version writes for the bundle."""
         return not self.changed
 
     @property
@@ -181,20 +180,20 @@ def verify(
     jobs: int | None = None,
     progress: Progress | None = None,
 ) -> VerificationReport:
-    """Compile the C of the export folder for each target, run it, and compare every answer.
+    """Compile the C of the export folder for caught target, run it, and compare all_vectors answer.
 
     Args:
         export: the folder.
-        targets: names of `TARGETS`; empty: all for which the tools are here.
-        vectors: what to run besides the golden vectors.
-        mutants: selects the mutants to apply, one at a time; each must be detected on every target. None: none. For a
-            mutant of the rules that the scenarios do not show, more are generated, up to `MORE_SCENARIOS` times.
+        targets: names of `TARGETS`; empty: all whose tools are installed.
+        vectors: further vectors to run.
+        mutants: selects the mutants to apply, one at a time; each must be detected on every target. None: no mutants.
+            For undetected mutants of the rules, new scenarios are generated, up to `MORE_SCENARIOS` times.
         only: which settings of a target to run.
-        trust: also compile and run library and model files that are not what this version writes.
-        jobs: programs at a time; None: one a core.
+        trust: also compile and run C and model files that differ from what this version writes.
+        jobs: number of programs at a time; None: one per core.
 
     Raises:
-        BadInput: when such a file is not what this version writes, and ``trust`` is not given.
+        BadInput: if such files differ and ``trust`` is false.
         ConfigError: for an unknown target; ToolError: for a named one whose tools are missing.
     """
     if not trust:
@@ -223,19 +222,19 @@ def verify(
     ):
         runner = _Runner(export, Path(work))
         cases = [runner.write_cases(stream) for stream in streams]
-        for found in pool.map(runner.run, settings, repeat(cases)):
-            runs.append(found)
+        for result in pool.map(runner.run, settings, repeat(cases)):
+            runs.append(result)
             report()
-        # In C that is wrong already every mutant would count as caught.
+        # If the C differs already, every mutant would count as caught.
         if any(r.mismatches for r in runs):
             selected = []
         first_of = {target: next(s for s in settings if s.target == target) for target in chosen}
         pairs = [(mutant, first_of[target]) for mutant in selected for target in chosen]
         mutant_cases = cases[: 1 + bool(scenarios)]
-        for each in pool.map(runner.run_mutant, *zip(*pairs, strict=True), repeat(mutant_cases)) if pairs else ():
-            results.append(each)
+        for outcome in pool.map(runner.run_mutant, *zip(*pairs, strict=True), repeat(mutant_cases)) if pairs else ():
+            results.append(outcome)
             report()
-        # A mutant that needs a rare sequence of steps may show in other scenarios.
+        # Other scenarios may contain the rare sequences of steps that a mutant affects.
         for again in range(1, 1 + MORE_SCENARIOS):
             missed = [n for n, result in enumerate(results) if result.silent]
             if not missed:
@@ -246,18 +245,18 @@ def verify(
                 runs += unchanged
                 break
             repeated = pool.map(lambda n: runner.run_mutant(*pairs[n], more), missed)  # noqa: B023
-            for at, each in zip(missed, repeated, strict=True):
-                results[at] = each
-    every = [v for stream in streams for v in stream]
+            for at, outcome in zip(missed, repeated, strict=True):
+                results[at] = outcome
+    all_vectors = [v for stream in streams for v in stream]
     # Scenarios have models of their own.
-    decisions = sum(v.decisions for v in every if v.model is None)
+    decisions = sum(v.decisions for v in all_vectors if v.model is None)
     return VerificationReport(
-        export.title, export.changed, decisions, counted(every), tuple(runs), tuple(not_run), tuple(results)
+        export.title, export.changed, decisions, counted(all_vectors), tuple(runs), tuple(not_run), tuple(results)
     )
 
 
 def _choose(targets: Sequence[str], only: Callable[[Setting], bool]) -> tuple[list[Setting], list[tuple[str, str]]]:
-    """Return the settings that can run here, and the others with the reason."""
+    """Return the settings that can run on this computer, and (name, reason) of the others."""
     runnable: list[Setting] = []
     not_run: list[tuple[str, str]] = []
     for name in dict.fromkeys(targets or TARGETS):
@@ -280,7 +279,7 @@ def _choose(targets: Sequence[str], only: Callable[[Setting], bool]) -> tuple[li
 
 
 def _lacks(setting: Setting) -> str:
-    """Return why a setting cannot run here; empty when it can."""
+    """Return why a setting cannot run on this computer; "" if it can."""
     missing = missing_tools(setting.target, cc=setting.cc)
     if setting.cpp and shutil.which("g++") is None:
         missing.append("g++")
@@ -290,7 +289,7 @@ def _lacks(setting: Setting) -> str:
 
 
 def _no_sanitizers(setting: Setting) -> str:
-    """Return why the sanitizers do not work here (missing libraries, system policy); empty when they do."""
+    """Return why sanitizers do not work on this computer (missing libraries, system policy); "" if they do."""
     with tempfile.TemporaryDirectory(prefix="plushsense-verify-") as work:
         source = Path(work) / "nothing.c"
         source.write_text("int main(void)\n{\n    return 0;\n}\n")
@@ -320,7 +319,7 @@ class _Runner:
         return Path(tempfile.mkdtemp(dir=self.work))
 
     def run(self, setting: Setting, streams: Iterable[Cases]) -> SettingResult:
-        """Compile with one setting and compare the answers to each stream."""
+        """Compile with one setting, run each stream and compare the results."""
         began, out = time.monotonic(), self._new_folder()
         compared = []
         for cases in streams:
@@ -342,9 +341,9 @@ class _Runner:
         )
 
     def run_mutant(self, mutant: Mutant, setting: Setting, streams: Sequence[Cases]) -> MutantResult:
-        """Build a copy with one mutant and compare its answers to the golden vectors and the test scenarios.
+        """Build a copy with one mutant and compare its results for the golden vectors and the test scenarios.
 
-        Scenarios have models of their own and cannot show a mutant of the export's model.
+        Scenarios have their own models, so that only golden vectors can detect a mutant of the export's model.
         """
         out = self._new_folder()
         copy = out / "export"
@@ -359,7 +358,7 @@ class _Runner:
         optimise = "-O0" if setting.target == "host" else "-O2"
         plain = replace(setting, optimise=optimise, flags=("-std=c99",), image=mutant.image is not None)
         streams = streams[: 1 if mutant.image is not None else None]
-        # Mutants of the rules show in the scenarios first.
+        # Scenarios are most likely to detect mutants of the rules.
         for cases in reversed(streams) if mutant.kind in RULES else streams:
             result = self._attempt(copy, plain, cases, out)
             if result.mismatches:
@@ -384,8 +383,8 @@ class _Runner:
             **({"PLUSH_HARNESS_IMAGE": 1} if setting.image else {}),
             **({"PLUSH_HARNESS_BOTH": 1} if both else {}),
         }
-        # A copy, because the compiler would find PlushSense's own plushsense.h beside the original first. Definitions
-        # stand in it, so that the other sources are compiled once for all streams.
+        # Compile a copy, because next to the original the compiler would find PlushSense's own plushsense.h. The
+        # definitions are in the copy, so that the other sources are compiled only once for all streams.
         harness = out / ("harness.cpp" if setting.cpp else "harness.c")
         lines = [f"#define {name} {value}" for name, value in defines.items()]
         harness.write_text("\n".join([*lines, "#line 1", HARNESS.read_text(encoding="utf-8")]), encoding="utf-8")

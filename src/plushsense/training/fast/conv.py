@@ -1,7 +1,7 @@
-"""Three methods of convolving a chunk of windows, forward and backward, in reused memory, by several threads.
+"""Three methods of convolution, forward and backward, on chunks of windows in several threads and reused memory.
 
-Rows are (T, N, C). Weights are (taps, channels read, filters). A method prepares its weights once in
-a step; then each chunk is passed forward and backward, and the gradients of the weights are summed over the chunks.
+Rows are (T, N, C), weights (taps, input channels, filters). In each training step the weights are prepared once; then
+each chunk is passed forward and backward, and the gradients of the weights are summed over the chunks.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from plushsense.training.fast.transform import matrices
 
 
 class BufferPool:
-    """Buffers by name, reused: allocating megabytes anew costs more than the computation in them."""
+    """Reusable buffers by name: allocating megabytes takes longer than the computation in them."""
 
     def __init__(self) -> None:
         self._held: dict[object, Tensor] = {}
 
     def take(self, name: object, *shape: int) -> Tensor:
-        """Return a tensor of ``shape`` that still holds what the last user of ``name`` left in it."""
+        """Return the buffer ``name`` as a tensor of ``shape``, with the values that were last written to it."""
         size = 1
         for n in shape:
             size *= n
@@ -47,7 +47,7 @@ def _alone() -> None:
 
 
 class ThreadPool:
-    """Threads that call a function for each chunk as (chunk, lane, thread)."""
+    """Threads that call a function with (chunk, lane, thread) for each chunk."""
 
     def __init__(self, threads: int) -> None:
         self.threads = min(threads, LANES)
@@ -71,25 +71,25 @@ class ThreadPool:
 
 
 class Way(ABC):
-    """A method of computing a layer. ``spectrum`` is memory that the forward pass leaves for the backward pass."""
+    """A method of computing a layer; ``spectrum`` is what the forward pass stores for the backward pass."""
 
     def __init__(self, plan: LayerPlan) -> None:
         self.plan = plan
 
     def weights(self, w: Tensor, space: BufferPool, name: object) -> Tensor:
-        """Return the weights (taps, C, F) in the form that this method uses."""
+        """Transform the weights (taps, C, F) into the form that this method uses."""
         return w
 
     def spectrum_shape(self, windows: int) -> tuple[int, ...]:
-        """Return the shape of the memory that the forward pass leaves."""
+        """Return the shape of the spectrum of a chunk of ``windows`` windows."""
         return (0,)
 
     def spectrum(self, x: Tensor, scratch: BufferPool, out: Tensor) -> None:  # noqa: B027
-        """Compute that memory again where it was not kept."""
+        """Compute the spectrum of ``x`` into ``out``, if it was not kept."""
 
     @abstractmethod
     def forward(self, x: Tensor, w: Tensor, bias: Tensor, out: Tensor, scratch: BufferPool, spectrum: Tensor) -> None:
-        """Compute ``out`` (writes, N, F) from ``x`` (needs or more, N, C)."""
+        """Compute ``out`` (writes, N, F) from ``x`` (at least needs, N, C)."""
 
     @abstractmethod
     def backward(
@@ -105,12 +105,12 @@ class Way(ABC):
     ) -> Tensor:
         """Compute the gradients from ``dz`` (writes, N, F), which is zero beyond ``after``.
 
-        The gradient of the weights is added to ``total`` (in the form of `weights`; ``fresh``: overwrites it), that of
-        the input rows is written to ``dx`` (needs, N, C); returns that of the bias (F,).
+        The gradient of the weights, in the form of `weights`, is added to ``total`` (``fresh``: replaces it); that of
+        the input rows is written to ``dx`` (needs, N, C); that of the bias (F,) is returned.
         """
 
     def gradient(self, total: Tensor) -> Tensor:
-        """Return the gradient of the weights (taps, C, F) from ``total``."""
+        """Transform ``total`` back into the gradient of the weights (taps, C, F)."""
         return total
 
 
@@ -262,6 +262,6 @@ class Spectral(Way):
 
 
 def way(plan: LayerPlan) -> Way:
-    """Return the method that a plan chose."""
+    """Create the method that ``plan`` names."""
     ways: dict[str, type[Way]] = {"pointwise": Pointwise, "direct": Direct, "spectral": Spectral}
     return ways[plan.way](plan)

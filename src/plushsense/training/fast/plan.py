@@ -1,7 +1,7 @@
-"""The method by which each layer is computed: a function of its shape alone, the same on every machine.
+"""Choose the convolution method of each layer from its shape alone, so that every machine makes the same choice.
 
-Activations are (T, N, C), time first. Dilation is then a view: row q · d + p is row q of phase p, and the phases are
-an extra window dimension.
+Activations are (T, N, C), time first. A dilated layer then needs no copy: row q · d + p is row q of phase p, and the
+phases are a further batch dimension.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ _NARROW = 16
 
 @dataclass(frozen=True)
 class LayerPlan:
-    """Plan of a layer: ``front`` mirrored rows, ``before`` input rows, ``after`` output rows.
+    """Method and sizes of a layer: ``before`` input rows after ``front`` mirrored ones, ``after`` output rows.
 
-    ``needs`` input rows are read (zeros beyond the input) and ``writes`` rows written (undefined beyond ``after``).
+    It reads ``needs`` rows (zeros beyond the input) and writes ``writes`` rows (undefined beyond ``after``).
     """
 
     way: Way
@@ -45,28 +45,28 @@ class LayerPlan:
 
     @property
     def _steps(self) -> int:
-        """Output positions of one phase."""
+        """Number of output positions of one phase."""
         return -(-self.after // self.dilation)
 
     @property
     def rows(self) -> int:
-        """Rows of the last stage of a spectral layer."""
+        """Number of rows of the last stage of a spectral layer."""
         assert self.lengths is not None
         return -(-self._steps // self.lengths.short)
 
     @property
     def needs(self) -> int:
-        """Input rows read."""
+        """Number of input rows read."""
         return self.front + self.before if self.lengths is None else self.lengths.samples * self.dilation
 
     @property
     def writes(self) -> int:
-        """Output rows written."""
+        """Number of output rows written."""
         return self.after if self.lengths is None else self.rows * self.lengths.short * self.dilation
 
     @property
     def spectra_floats(self) -> int:
-        """Numbers in the transform of one window's input."""
+        """Size of the transform of one window's input, in floats."""
         return 0 if self.lengths is None else self.lengths.planes * self.dilation * self.reads
 
     @property
@@ -79,7 +79,7 @@ class LayerPlan:
 
 @dataclass(frozen=True)
 class NetPlan:
-    """The layers, and whether each keeps its spectra between the passes."""
+    """Plans of all layers, and whether each keeps its spectra from the forward to the backward pass."""
 
     layers: tuple[LayerPlan, ...]
     keeps: tuple[bool, ...]
@@ -87,7 +87,7 @@ class NetPlan:
 
     @property
     def buffers(self) -> tuple[int, ...]:
-        """Rows of each layer's input buffer, and of the last layer's output."""
+        """Number of rows of each layer's input buffer, and of the last layer's output."""
         rows, written = [], self.layers[0].before
         for layer in self.layers:
             rows.append(max(layer.needs, layer.front + written))
@@ -96,7 +96,7 @@ class NetPlan:
 
     @property
     def bytes(self) -> int:
-        """Memory of a training step beside the data: activations, their gradients, spectra, scratch of one thread."""
+        """Memory of a training step without the data: activations, gradients, spectra and the scratch of one thread."""
         windows, chunk = self.batch, min(self.batch, CHUNK)
         widths = (*(layer.reads for layer in self.layers), self.layers[-1].filters)
         kept = sum(r * w for r, w in zip(self.buffers, widths, strict=True)) * windows

@@ -1,4 +1,4 @@
-"""A correlation as three real matrices and one product: y = A ((G w) · (D x)), all computed as matrix products.
+"""Compute a correlation by matrix products with three real matrices: y = A ((G w) · (D x)).
 
 D x is the discrete Fourier transform of ``x`` at the L/2 frequencies k + ½ (the odd roots of z^L = −1: none of them is
 real, so that no product is wasted), in two stages (L = short · long, Cooley and Tukey 1965), each complex number as the
@@ -33,17 +33,17 @@ class Lengths:
 
     @property
     def samples(self) -> int:
-        """L."""
+        """The length L of the transform."""
         return self.short * self.long
 
     @property
     def pairs(self) -> int:
-        """Frequencies of the first stage: half of ``long``, the others are their conjugates."""
+        """Number of frequencies of the first stage: half of ``long``, as the others are their conjugates."""
         return self.long // 2
 
     @property
     def planes(self) -> int:
-        """Real products for each pair of channels: 3 L / 2."""
+        """Number of real products for each pair of channels: 3 L / 2."""
         return PLANES * self.samples // 2
 
     @property
@@ -54,7 +54,7 @@ class Lengths:
 
 @cache
 def lengths_for(samples: int) -> Lengths:
-    """Return the cheapest transform that holds ``samples``; the same on every machine."""
+    """Return the cheapest transform of at least ``samples`` samples; the same on every machine."""
     candidates = []
     for short in _SHORT:
         long = -(-samples // short)
