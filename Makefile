@@ -40,10 +40,10 @@ demo: $(VENV)/.train
 	$(BIN)/plushsense demo --out $(DEMO_OUT) $(DEMO_FLAGS)
 
 test: $(VENV)/.dev
-	$(BIN)/python -m pytest -n auto $(PYTEST_FLAGS)
+	$(BIN)/python -m pytest -n auto --dist worksteal $(PYTEST_FLAGS)
 
 test-quick: $(VENV)/.dev
-	$(BIN)/python -m pytest -n auto -m "not slow" $(PYTEST_FLAGS)
+	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow" $(PYTEST_FLAGS)
 
 check: $(VENV)/.dev
 	$(BIN)/ruff check .
