@@ -1,1 +1,1 @@
-"""Errors, layouts, gesture sets, recorder files, atomic files and strict loading of TOML, used by all packages."""
+"""Errors, layouts, gesture sets, recorder files, atomic writing and strict TOML loading, used by all packages."""

@@ -14,22 +14,22 @@ from pathlib import Path
 from plushsense.core.errors import BadInput
 
 PART = ".part"
-"""Suffix of unfinished files; those of a killed program can be deleted."""
+"""Suffix of files being written; files with it that a killed program left behind can be deleted."""
 _UNFINISHED = "-unfinished-"
 
 
 def unfinished(dest: Path) -> str:
-    """Return the prefix of the names of work folders for ``dest``, which are beside it."""
+    """Return the name prefix of the work folders for ``dest``, which lie beside it."""
     return f".{dest.resolve().name}{_UNFINISHED}"
 
 
 def is_unfinished(name: str) -> bool:
-    """Return whether a file name is that of a work folder."""
+    """Return whether ``name`` is the name of a work folder."""
     return name.startswith(".") and _UNFINISHED in name
 
 
 def write_file(path: Path, content: str | bytes, *, private: bool = False) -> None:
-    """Write a file in one step (see `replacing_file`); text as UTF-8 with unchanged line ends."""
+    """Write a file atomically (see `replacing_file`); text is encoded as UTF-8, with line ends unchanged."""
     with replacing_file(path, private=private) as part:
         part.write_bytes(content.encode("utf-8") if isinstance(content, str) else content)
 
@@ -38,14 +38,14 @@ def write_file(path: Path, content: str | bytes, *, private: bool = False) -> No
 def replacing_file(path: Path, *, private: bool = False) -> Iterator[Path]:
     """Yield a path beside ``path`` to write to; it replaces ``path`` when the block ends without an exception.
 
-    Readers see the old file or the new one, also after a power failure and with several writers at once. After an
-    exception ``path`` is unchanged and nothing is left beside it.
+    Readers see either the old file or the new one, even after a power failure or with several writers at once. After
+    an exception ``path`` is unchanged and nothing is left beside it.
 
     Args:
-        private: only the owner can read the file (mode 600, where the system has modes).
+        private: make the file readable by its owner only (mode 600, where the system has file modes).
 
     Raises:
-        OSError: when the file cannot be written; on Windows also while another program reads ``path``.
+        OSError: when the file cannot be written; on Windows also while another program has ``path`` open.
     """
     part = path.with_name(f".{path.name}.{secrets.token_hex(4)}{PART}")
     try:
@@ -64,15 +64,15 @@ def replacing_file(path: Path, *, private: bool = False) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def syncing_folder(folder: Path) -> Iterator[Callable[[], None]]:
-    """Yield a function that flushes the names in a folder to the disk, which Windows does by itself.
+    """Yield a function that flushes a folder's entries to the disk; on Windows it does nothing.
 
-    The folder is opened at the start, so that no error occurs after a file has been renamed.
+    The folder is opened first, so that opening cannot fail after a file has been renamed.
     """
     if os.name != "posix":
         yield lambda: None
         return
     descriptor = None
-    # A folder without read permission cannot be flushed.
+    # A folder without read permission cannot be opened, so it is not flushed.
     with contextlib.suppress(PermissionError):
         descriptor = os.open(folder, os.O_RDONLY)
 
@@ -97,11 +97,11 @@ def syncing_folder(folder: Path) -> Iterator[Callable[[], None]]:
 def new_folder(dest: Path, error: type[BadInput], last: str = "") -> Iterator[Path]:
     """Yield a work folder beside ``dest`` that becomes ``dest`` when the block ends, and is deleted after an exception.
 
-    The name of the work folder is new each time. An empty ``dest`` (also ``.``, or a link to an empty folder) is filled
-    rather than replaced, the file ``last`` at the end.
+    Each work folder has a unique name. If ``dest`` is an existing empty folder (such as ``.``, or a link to one), the
+    files are moved into it, with the file ``last`` moved last.
 
     Raises:
-        error: when ``dest`` is not empty, or cannot be written.
+        error: when ``dest`` exists and is not an empty folder, or cannot be written.
     """
     scratch: Path | None = None
     try:

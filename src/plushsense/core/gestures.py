@@ -1,4 +1,4 @@
-"""Gestures, their affect and family, and gesture sets, which fix the class order."""
+"""Gestures with their affect and family, and gesture sets, whose order is the class order of a model."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ NOBODY = "none"
 
 
 def plain_label(label: str) -> str:
-    """Normalise a label for comparison: lower case, with ``_`` and runs of spaces as one space."""
+    """Normalise a label for comparison: fold case, and turn ``_`` and runs of white space into one space."""
     return " ".join(label.replace("_", " ").split()).casefold()
 
 
 @dataclass(frozen=True)
 class Gesture:
-    """A gesture.
+    """A gesture that people make on the toy; a class of a model.
 
     Attributes:
-        affect: one of `AFFECTS`; "none" where unknown.
-        family: a name for similar gestures; default: the label.
-        free_choice: each person chose what to do.
-        nobody: recorded without a person (the toy at rest).
-        idle: never starts an event.
-        energetic: so abrupt that threshold rules may detect it before the network does.
+        affect: one of `AFFECTS`; "none" if unknown.
+        family: name of a group of similar gestures; defaults to the label.
+        free_choice: whether each person chose what to do.
+        nobody: whether it is recorded without a person (the toy at rest).
+        idle: whether it means that nothing happens; it never starts an event.
+        energetic: whether it is so abrupt that the threshold rules of the gate can detect it before the network does.
     """
 
     label: str
@@ -55,9 +55,10 @@ class Gesture:
 
 @dataclass(frozen=True)
 class GestureSet:
-    """An ordered set of gestures; the order is the class index.
+    """An ordered set of gestures; the position of a gesture is its class index.
 
-    A TOML file has the keys ``name`` and ``gestures``, a list of tables with the keys of `Gesture`.
+    In a TOML file it has the keys ``name`` and ``gestures``, a list of tables with the attributes of `Gesture` as keys.
+    ``inferred`` marks a set that was made from the labels of recordings (`infer`).
     """
 
     name: str
@@ -94,12 +95,12 @@ class GestureSet:
         return tuple(g.family for g in self.gestures)
 
     def find(self, label: str) -> Gesture | None:
-        """Return the gesture of a label, ignoring case and ``_`` against space; None when it is not in the set."""
+        """Return the gesture with this label, with case ignored and ``_`` equal to a space; None if not in the set."""
         plain = plain_label(label)
         return next((g for g in self.gestures if plain_label(g.label) == plain), None)
 
     def get(self, label: str) -> Gesture:
-        """Return the gesture of a label; raise GestureError with the nearest label when it is not in the set."""
+        """Return the gesture with this label; raise GestureError with the nearest label if it is not in the set."""
         found = self.find(label)
         if found is None:
             raise GestureError(
@@ -113,7 +114,7 @@ class GestureSet:
         return self.gestures.index(self.get(label))
 
     def subset(self, labels: Iterable[str]) -> GestureSet:
-        """Return the set of the gestures of ``labels``, in this set's order."""
+        """Return a set with only the gestures in ``labels``, in the order of this set."""
         chosen = {self.get(label) for label in labels}
         return GestureSet(self.name, tuple(g for g in self.gestures if g in chosen), self.inferred)
 
@@ -123,19 +124,19 @@ class GestureSet:
 
     @classmethod
     def from_dict(cls, table: dict[str, Any], where: str = "gesture set") -> GestureSet:
-        """Return the gesture set that plain values describe (a TOML file, a bundle).
+        """Create a gesture set from plain values, as in a TOML file or a bundle; ``where`` names it in messages.
 
         Raises:
-            GestureError: for an unknown or missing key, or a value that does not fit.
+            GestureError: for an unknown or missing key, or a value of the wrong type or out of range.
         """
         return load_table(table, cls, where, GestureError)
 
     @classmethod
     def infer(cls, labels: Iterable[str], name: str = "inferred") -> GestureSet:
-        """Return a gesture set for the labels of recordings, in alphabetical order, with unknown affects.
+        """Create a gesture set from the labels of recordings, in alphabetical order, with unknown affects.
 
-        Labels that differ only in case, or in ``_`` and space, are one gesture in its first spelling. ``Custom`` is the
-        GestureRecorder's label for a gesture of free choice.
+        Labels that differ only in case, or in ``_`` and spaces, become one gesture with the first spelling. ``Custom``
+        is the GestureRecorder's label for a gesture of free choice.
         """
         spellings: dict[str, str] = {}
         for label in labels:
@@ -150,6 +151,6 @@ def gesture_set_names() -> tuple[str, ...]:
 
 
 def load_gestures(name_or_path: str | Path) -> GestureSet:
-    """Load a built-in gesture set by name, or one of the user's own by the path of its TOML file."""
+    """Load a built-in gesture set by its name, or any other by the path of its TOML file."""
     table, source = read_named(name_or_path, "gestures", "gesture set", GestureError)
     return GestureSet.from_dict(table, f"gesture set '{source}'")

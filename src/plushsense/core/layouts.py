@@ -1,4 +1,4 @@
-"""Sensor layouts: the channels of a toy and their order on the wire, in files and in a network's input."""
+"""Sensor layouts: the channels of a toy and their order on the wire, in files and in the input of a network."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ _INT32 = (-2147483648.0, 2147483647.0)
 
 
 def magnitude_limit(n: int) -> int:
-    """Return the largest component of n whose magnitude, with its fraction bits, stays below 2³¹: 2²⁷ / √n."""
+    """Return the largest size, 2²⁷ / √n, of ``n`` components whose magnitude with fraction bits stays below 2³¹."""
     return math.isqrt((2 ** (62 - 2 * MAGNITUDE_FRACTION_BITS) - 1) // n)
 
 
 @dataclass(frozen=True)
 class Channel:
-    """A measured quantity.
+    """A quantity that the toy measures and sends as a raw value.
 
-    A raw value is sent by the toy. ``physical = (raw - offset) * scale`` in ``unit``; all later computations use the
-    integer ``round(raw / step)``. Raw values outside ``[valid_min, valid_max]`` are invalid.
+    The physical value, in ``unit``, is ``(raw - offset) * scale``; all computations use the integer
+    ``round(raw / step)``. Raw values outside ``[valid_min, valid_max]`` are invalid.
     """
 
     name: str
@@ -46,7 +46,7 @@ class Channel:
     def __post_init__(self) -> None:
         if self.step <= 0:
             raise LayoutError(f"Channel '{self.name}': step is {self.step}; it must be above 0.")
-        # The default range is that of the integers.
+        # By default, every 32-bit number of steps is valid.
         if self.valid_min == _INT32[0]:
             object.__setattr__(self, "valid_min", _INT32[0] * self.step)
         if self.valid_max == _INT32[1]:
@@ -61,7 +61,7 @@ class Channel:
 
 @dataclass(frozen=True)
 class Derived:
-    """A channel computed from others; ``magnitude`` is √(Σ v²) in integers with 4 fraction bits."""
+    """A channel computed from the channels ``of``; the kind ``magnitude`` is √(Σ v²), an integer with 4 fraction bits."""
 
     name: str
     kind: str
@@ -70,7 +70,7 @@ class Derived:
 
 @dataclass(frozen=True)
 class CsvFormat:
-    """The layout's CSV format in the authors' recorder: column keys in file order, header texts, separator."""
+    """CSV format of the authors' recorder for a layout: column keys in file order, header texts and separator."""
 
     columns: tuple[str, ...]
     header: tuple[str, ...]
@@ -82,11 +82,13 @@ class Layout:
     """The channels of a toy, their order on the wire and in files, and the inputs of a network.
 
     The attributes are the keys of a TOML file. It may omit ``title`` (default: the name), ``derived`` (none),
-    ``inputs`` (all channels), ``vectors`` (none), ``gap_ms`` (100), and ``csv`` or keys of it (``host_ms``,
-    ``device_ms`` and the channels, separated by commas).
+    ``inputs`` (all channels), ``vectors`` (none), ``gap_ms`` (100), and ``csv`` or any of its keys (default:
+    ``host_ms``, ``device_ms`` and the channels, separated by commas).
 
     Attributes:
-        wire: names of channels, ``device_ms`` (the device clock) and ``delay_ms`` (since the frame before).
+        wire: fields of a frame in order: channel names, ``device_ms`` (the toy's clock) and ``delay_ms`` (time since
+            the previous frame).
+        gap_ms: longest time between two frames that is interpolated; a longer gap starts a new segment.
         vectors: triples of channels that are the axes of one vector, such as an accelerometer.
     """
 
@@ -159,7 +161,7 @@ class Layout:
 
     @property
     def is_labelled(self) -> bool:
-        """Return whether every row of a file has a label, so that recordings are sections of streams."""
+        """Whether every row of a file has a label, so that recordings are sections of streams."""
         return "label" in self.csv.columns
 
     @property
@@ -169,7 +171,7 @@ class Layout:
 
     @property
     def n_inputs(self) -> int:
-        """Number of a network's input channels, F."""
+        """Number of input channels of a network, F."""
         return len(self.inputs)
 
     @property
@@ -179,16 +181,16 @@ class Layout:
 
     @property
     def valid_min_int(self) -> NDArray[np.int64]:
-        """Smallest valid integer of each channel, (C,)."""
+        """Smallest valid value of each channel in integer steps, (C,)."""
         return np.array([max(_INT32[0], np.ceil(c.valid_min / c.step)) for c in self.channels], dtype=np.int64)
 
     @property
     def valid_max_int(self) -> NDArray[np.int64]:
-        """Largest valid integer of each channel, (C,)."""
+        """Largest valid value of each channel in integer steps, (C,)."""
         return np.array([min(_INT32[1], np.floor(c.valid_max / c.step)) for c in self.channels], dtype=np.int64)
 
     def index(self, name: str) -> int:
-        """Return the index of a channel; raise LayoutError with the nearest known name for an unknown one."""
+        """Return the index of a channel; for an unknown name raise LayoutError with the nearest known one."""
         if name not in self.names:
             raise LayoutError(
                 f"Layout '{self.name}' has no channel '{name}'; it has {', '.join(self.names)}."
@@ -197,7 +199,7 @@ class Layout:
         return self.names.index(name)
 
     def samples(self, seconds: float) -> int:
-        """Return the number of samples in a duration, at least one."""
+        """Return the number of samples in ``seconds``, at least one."""
         return max(1, round(seconds * self.rate_hz))
 
     def to_dict(self) -> dict[str, Any]:
@@ -206,13 +208,13 @@ class Layout:
 
     @classmethod
     def from_dict(cls, table: dict[str, Any], where: str = "layout") -> Layout:
-        """Return the layout that plain values describe (a TOML file, a bundle).
+        """Create a layout from plain values, as in a TOML file or a bundle; ``where`` names it in messages.
 
         Raises:
-            LayoutError: for an unknown or missing key, or a value that does not fit.
+            LayoutError: for an unknown or missing key, or a value of the wrong type or out of range.
         """
         given = table.get("channels")
-        # `load_table` reports errors in the channels.
+        # Wrong types are skipped here, since `load_table` reports them.
         names = [c.get("name") for c in given if isinstance(c, dict)] if isinstance(given, list | tuple) else []
         csv = table.get("csv", {})
         if isinstance(csv, dict):
@@ -228,7 +230,7 @@ def layout_names() -> tuple[str, ...]:
 
 
 def load_layout(name_or_path: str | Path) -> Layout:
-    """Load a built-in layout by name, or one of the user's own by the path of its TOML file.
+    """Load a built-in layout by its name, or any other by the path of its TOML file.
 
     Raises:
         LayoutError: for an unknown name or an unusable file.

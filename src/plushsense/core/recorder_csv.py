@@ -1,7 +1,7 @@
 """Read and write the CSV files of the authors' recorder: single recordings and session streams.
 
-Recordings are ``<label>_<epoch ms>_<rows>.csv`` with a header line; after the authors' trimming step the header is
-gone and the separator is ``;``. A stream (``fulldatastream.csv``) has the same columns and no header.
+Recordings are named ``<label>_<epoch ms>_<rows>.csv`` and have a header line; the authors' trimming step removes the
+header and changes the separator to ``;``. A stream (``fulldatastream.csv``) has the same columns and no header.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ _BLOCK = 1000
 
 
 def separator_of(line: bytes) -> str | None:
-    """Return the separator of a line: ``;`` or ``,``, else None for white space."""
+    """Return the separator of a line, ``;`` or ``,``; None means white space."""
     return ";" if b";" in line else "," if b"," in line else None
 
 
 def _cells(line: bytes, separator: str | None, width: int) -> list[bytes]:
-    """Split a line into fields, ignoring extra separators at its end; a line that is too long has none."""
+    """Split a line into fields, ignoring extra separators at its end; return [] for a line that is too long."""
     if len(line) > LONGEST_LINE:
         return []
     if separator is None:
@@ -48,7 +48,7 @@ def _cells(line: bytes, separator: str | None, width: int) -> list[bytes]:
 def _parse_slowly(
     lines: list[bytes], separator: str | None, width: int, label_at: int | None
 ) -> tuple[list[list[float]], list[str], int]:
-    """Parse lines that NumPy refuses; return rows, labels and the number of malformed lines."""
+    """Parse lines one by one, after NumPy has failed; return rows, labels and the number of malformed lines."""
     rows, labels, malformed = [], [], 0
     for line in lines:
         if not line.strip():
@@ -58,7 +58,7 @@ def _parse_slowly(
             if len(cells) != width:
                 raise ValueError
             text = cells.pop(label_at).decode("utf-8", "replace") if label_at is not None else ""
-            # float() accepts 1_000.
+            # float() would accept 1_000.
             row = [float(c) if b"_" not in c else np.nan for c in cells]
             if not all(abs(v) < LIMIT for v in row) or len(text) > LONGEST_LABEL:
                 raise ValueError
@@ -71,7 +71,7 @@ def _parse_slowly(
 
 
 def _parse_fast(data: bytes, separator: str | None, skip: int, width: int) -> NDArray[Any] | None:
-    """Parse numbers (T, width) as int64 or float64; return None when any line does not fit."""
+    """Parse numbers (T, width) as int64 or float64; return None if any line is malformed."""
     begin = data.find(b"\n") + 1 if skip else 0
     # Integers are parsed faster, but some versions of NumPy truncate fractions silently.
     whole = not any(data.find(sign, begin) >= 0 for sign in (b".", b"e", b"E"))
@@ -82,14 +82,14 @@ def _parse_fast(data: bytes, separator: str | None, skip: int, width: int) -> ND
             )
         except ValueError:
             continue
-        # NaN compares as false; abs() of the smallest int64 overflows.
+        # Two comparisons refuse NaN too; abs() would overflow for the smallest int64.
         fits = table.shape[1] == width and bool(np.all((table > -LIMIT) & (table < LIMIT)))
         return table if fits else None
     return None
 
 
 def _parse_in_blocks(lines: list[bytes], separator: str | None, width: int) -> tuple[list[NDArray[Any]], int]:
-    """Parse lines in blocks, so that a malformed line only slows down its block; count malformed lines."""
+    """Parse lines in blocks, so that a malformed line slows down only its block; return blocks and malformed lines."""
     blocks, malformed = [], 0
     for at in range(0, len(lines), _BLOCK):
         block = lines[at : at + _BLOCK]
@@ -107,7 +107,11 @@ def _parse_in_blocks(lines: list[bytes], separator: str | None, width: int) -> t
 def parse_table(
     data: bytes, keys: list[str], skip: int, path: Path
 ) -> tuple[NDArray[Any], NDArray[np.str_] | None, int]:
-    """Return all numeric columns (T, columns), the labels or None, and the number of malformed lines."""
+    """Parse a file with the columns ``keys`` after ``skip`` header lines.
+
+    Returns:
+        all numeric columns (T, columns), the labels or None, and the number of malformed lines.
+    """
     label_at = keys.index("label") if "label" in keys else None
     row = _FULL_LINE.search(data, data.find(b"\n") + 1 if skip else 0)
     separator = separator_of(row[0]) if row else None
@@ -138,10 +142,10 @@ def parse_table(
 
 
 STREAM_NAME = "fulldatastream.csv"
-# Marks a folder of simulated recordings, so that scores on them are marked too.
+# A file of this name marks a folder of simulated recordings, so that scores on them can be marked too.
 SIMULATION_MARK = "SIMULATION.txt"
 _NAME = re.compile(r"^(?P<label>.+)_(?P<epoch>\d{1,18})_(?P<rows>\d{1,12})\.csv$", re.IGNORECASE)
-# Layouts have at least 1 frame a second: larger values are not delays.
+# Layouts have at least 1 frame per second, so a larger median cannot be a delay.
 _SLOWEST_MS = 2000
 _PAUSE_MS = 60_000
 
@@ -151,9 +155,9 @@ class Frames:
     """Rows of one recording or stream.
 
     Attributes:
-        values: (T, C) integer steps in layout order.
-        device_ms, host_ms: (T,) clocks; ``host_ms`` is None where the file has no such column.
-        labels: (T,) labels, where every row has one.
+        values: (T, C) values in integer steps, in layout order.
+        device_ms, host_ms: (T,) clocks of toy and computer; ``host_ms`` is None if the file has no such column.
+        labels: (T,) label of each row; None if the file has no such column.
     """
 
     values: NDArray[np.int64]
@@ -165,7 +169,7 @@ class Frames:
         return len(self.device_ms)
 
     def slice(self, start: int, stop: int) -> Frames:
-        """Return rows ``start`` to ``stop`` without copying them."""
+        """Return rows ``start`` to ``stop`` (exclusive) as a view."""
         part = slice(start, stop)
         return Frames(
             self.values[part],
@@ -190,8 +194,9 @@ class ReadResult:
 
     Attributes:
         malformed: number of lines that were left out.
-        integrated: ``device_ms`` is the sum of delays, and begins at 0 in every file.
-        cut: the last line had no end and was left out; it counts as malformed.
+        had_header: whether the file began with a header line.
+        integrated: whether ``device_ms`` is a sum of delays, which starts at 0 in every file.
+        cut: whether the last line had no line end and was left out; it counts as malformed.
     """
 
     frames: Frames
@@ -203,7 +208,7 @@ class ReadResult:
 
 
 def parse_name(filename: str) -> RecordingName | None:
-    """Parse the file name of a recording; return None for another name."""
+    """Parse the file name of a recording; return None for any other name."""
     match = _NAME.match(Path(filename).name)
     if match is None:
         return None
@@ -211,7 +216,7 @@ def parse_name(filename: str) -> RecordingName | None:
 
 
 def recording_filename(label: str, epoch_ms: int, rows: int) -> str:
-    """Return the file name of a recording, with ``_`` for characters that file systems refuse."""
+    """Return the file name of a recording, with ``_`` in place of characters that file systems refuse."""
     safe = re.sub(r'[\\/:*?"<>|()\x00-\x1f]', "_", label).strip(" .") or "_"
     return f"{safe}_{epoch_ms}_{rows}.csv"
 
@@ -234,7 +239,7 @@ def column_keys(first: bytes, layout: Layout, path: Path) -> tuple[list[str], bo
     separator = separator_of(first)
     cells = [c.strip() for c in (first.split(separator.encode()) if separator else first.split())]
     columns = list(layout.csv.columns)
-    # An empty last field is an extra separator, or a missing label.
+    # An empty last field comes from an extra separator, unless it is an empty label.
     while cells and not cells[-1] and not (columns[-1] == "label" and len(cells) == len(columns)):
         cells.pop()
     header = bool(cells) and not any(_is_number(c) for c in cells)
@@ -256,10 +261,10 @@ def column_keys(first: bytes, layout: Layout, path: Path) -> tuple[list[str], bo
 
 
 def _looks_like_delay(column: NDArray[np.int64], host_ms: NDArray[np.int64] | None) -> bool:
-    """Return whether the clock column contains delays, as in recordings of the 14-integer firmware.
+    """Return whether the clock column contains delays between frames, as in recordings of the 14-integer firmware.
 
-    Delays are small, decrease as often as they increase (a clock decreases only at a reset), and add up to the time on
-    the host, not counting pauses, since a stream may have been continued on another day.
+    Delays are small, decrease about as often as they increase (a clock decreases only at a reset), and add up to the
+    time on the host. Pauses are not counted, since a stream may be continued on another day.
     """
     if len(column) < 3 or column.min() < 0 or np.median(column) > _SLOWEST_MS:
         return False
@@ -275,7 +280,7 @@ def _looks_like_delay(column: NDArray[np.int64], host_ms: NDArray[np.int64] | No
 
 
 def read_bytes(path: Path) -> bytes:
-    """Read a file; raise FileFormatError if the system refuses."""
+    """Read a file; raise FileFormatError if that fails."""
     try:
         return path.read_bytes()
     except OSError as cause:
@@ -310,7 +315,7 @@ def _read(path: Path, layout: Layout, data: bytes | None, *, whole_lines: bool =
         warnings.append(f"{malformed} malformed line{'s' if malformed > 1 else ''} left out")
 
     def as_whole(numbers: NDArray[Any]) -> NDArray[np.int64]:
-        # Values beyond the integers are clipped; they are outside every valid range in any case.
+        # Clipped values are invalid in any case: LIMIT is outside every valid range.
         if numbers.dtype != np.int64:
             numbers = np.clip(np.round(numbers), -LIMIT, LIMIT)
         return np.ascontiguousarray(numbers, dtype=np.int64)
@@ -343,23 +348,23 @@ def _read(path: Path, layout: Layout, data: bytes | None, *, whole_lines: bool =
 
 
 def read_recording(path: str | os.PathLike[str], layout: Layout, data: bytes | None = None) -> ReadResult:
-    """Read one recording, separated by ``,`` or ``;``, with or without header, with any line ends.
+    """Read one recording, separated by ``,``, ``;`` or white space, with or without header, with any line ends.
 
     Malformed lines are left out and counted. Delays in the clock column (14-integer firmware) are detected and summed.
 
     Args:
-        data: the content of the file, if it has been read.
+        data: the content of the file, if it has already been read.
 
     Raises:
-        FileFormatError: for a file that is empty, not text, or has another number of columns than the layout.
+        FileFormatError: for a file that is empty, not text, or does not have the columns of the layout.
     """
     return _read(Path(path), layout, data)
 
 
 def read_stream(path: str | os.PathLike[str], layout: Layout, data: bytes | None = None) -> ReadResult:
-    """Read a session's stream as `read_recording` does, but leave out a last line without an end.
+    """Read a session's stream like `read_recording`, but leave out a last line that has no line end.
 
-    Such a line may have the right number of fields and lack digits of the last one.
+    Such a line may have the right number of fields, but the last field may lack digits.
     """
     return _read(Path(path), layout, data, whole_lines=True)
 
@@ -387,18 +392,18 @@ def _columns(frames: Frames, layout: Layout) -> Iterator[list[str]]:
 
 
 def format_rows(frames: Frames, layout: Layout) -> str:
-    """Format rows as the recorder writes them, without header, each ended by a newline."""
+    """Format rows as the recorder writes them, without the header; each row ends with a newline."""
     join = layout.csv.separator.join
     return "".join(join(cells) + "\n" for cells in zip(*_columns(frames, layout), strict=True))
 
 
 def format_header(layout: Layout) -> str:
-    """Return the recorder's header line."""
+    """Return the header line that the recorder writes."""
     return layout.csv.separator.join(layout.csv.header) + "\n"
 
 
 def write_recording(path: str | os.PathLike[str], frames: Frames, layout: Layout) -> None:
-    """Write one recording with its header atomically; raise FileFormatError if the file exists."""
+    """Write one recording with its header, atomically; raise FileFormatError if the file exists."""
     target = Path(path)
     if target.exists():
         raise FileFormatError(f"'{target}' is already there: a recording is never overwritten.")

@@ -1,4 +1,4 @@
-"""Fill Jinja templates that are stored beside the code which uses them; base installs have jinja2."""
+"""Fill Jinja templates that are stored beside the code that uses them."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import Any
 
 
 def fill_text(package: str, template: str, **values: Any) -> str:
-    """Fill the template of a text document; values are inserted unchanged.
+    """Fill the template of a text document with ``values``, unchanged.
 
-    Filters: ``cell`` (of a Markdown table), ``c_comment`` (see `c_comment`), ``json``.
+    Templates can use the filters ``cell`` (escape for a Markdown table), ``c_comment`` (see `c_comment`) and ``json``.
 
     Args:
         package: the package whose folder contains ``template`` and the templates that it includes.
@@ -21,7 +21,7 @@ def fill_text(package: str, template: str, **values: Any) -> str:
 
 
 def fill_html(package: str, template: str, **values: Any) -> str:
-    """Fill the template of an HTML page as `fill_text` does; values are escaped."""
+    """Fill the template of an HTML page like `fill_text`, with values escaped."""
     page: str = _environment(package, html=True).get_template(template).render(**values)
     return page
 
@@ -46,6 +46,6 @@ def _environment(package: str, html: bool = False) -> Any:
 
 
 def c_comment(text: str) -> str:
-    """Make a text safe for a C comment: without its delimiters, backslashes and unprintable characters."""
+    """Make a text safe for a C comment: replace comment delimiters, backslashes and unprintable characters."""
     plain = "".join(c if c.isprintable() else " " for c in text)
     return plain.replace("\\", "/").replace("*/", "* /").replace("/*", "/ *")

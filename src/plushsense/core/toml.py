@@ -1,6 +1,6 @@
-"""Read TOML files strictly: unknown keys, and values that do not have the type of a dataclass's field, are refused.
+"""Read TOML files strictly: refuse unknown keys, and values whose type is not that of the dataclass field.
 
-`cattrs` converts the values; this module sets the rules (nothing is converted except whole numbers to numbers) and
+`cattrs` creates the dataclasses; this module sets the rules (the only conversion is from whole number to float) and
 formats the error messages.
 """
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 Steps = tuple[str | int, ...]
-"""The path from a table to a value in it: keys and indices."""
+"""Path from a table to a value in it: keys and indices."""
 
 
 def builtin_names(folder: str) -> tuple[str, ...]:
@@ -35,7 +35,7 @@ def builtin_names(folder: str) -> tuple[str, ...]:
 
 
 def read_named(name_or_path: str | Path, folder: str, what: str, error: type[BadInput]) -> tuple[dict[str, Any], str]:
-    """Return the table of a built-in name or of a TOML file by path, and the name to quote in messages.
+    """Read a built-in TOML file by its name, or any other by its path; return its table and its name for messages.
 
     Raises:
         error: for an unknown name, a missing file, or a file that is not TOML.
@@ -55,7 +55,7 @@ def read_named(name_or_path: str | Path, folder: str, what: str, error: type[Bad
 
 
 def read_toml(path: Path, what: str, error: type[BadInput]) -> dict[str, Any]:
-    """Read the TOML file at ``path``; ``what`` names its purpose in messages."""
+    """Read the TOML file at ``path``; ``what`` names its content in messages. Raise ``error`` if that fails."""
     try:
         return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
@@ -67,14 +67,15 @@ def read_toml(path: Path, what: str, error: type[BadInput]) -> dict[str, Any]:
 
 
 def load_table(table: object, kind: type[T], where: str, error: type[BadInput]) -> T:
-    """Return the instance of the dataclass ``kind`` that a table describes.
+    """Create an instance of the dataclass ``kind`` from a table.
 
     Args:
-        table: keys are the fields of ``kind``; tables in it become the dataclasses of their fields, lists tuples.
-        where: the place in messages, such as "layout 'plush-15'".
+        table: its keys are the fields of ``kind``; inner tables become dataclasses and lists become tuples, as the
+            fields are declared.
+        where: name of the table in messages, such as "layout 'plush-15'".
 
     Raises:
-        error: for the first key that is unknown or missing, or the first value that does not fit, with its path.
+        error: for the first unknown or missing key or unfit value; the message has its path.
     """
     try:
         made: T = _converter().structure(table, kind)
@@ -85,9 +86,9 @@ def load_table(table: object, kind: type[T], where: str, error: type[BadInput]) 
 
 
 def check_table(table: Mapping[str, Any], kind: type[Any], where: str) -> tuple[dict[str, Any], list[str]]:
-    """Return the values of a table that fit the fields of the dataclass ``kind``, and a message for each that does not.
+    """Check a table that sets some fields of the dataclass ``kind``; return its valid values and the error messages.
 
-    Keys may be missing, for settings that override others. The fitting items of a list are kept.
+    Keys may be missing, since the values override other settings. Of a list, the valid items are kept.
     """
     known = get_type_hints(kind)
     values: dict[str, Any] = {}
@@ -109,13 +110,13 @@ def check_table(table: Mapping[str, Any], kind: type[Any], where: str) -> tuple[
 
 
 def unknown_key(key: str, known: Iterable[str], where: str) -> str:
-    """Return the message for an unknown key, with the nearest known one."""
+    """Return the error message for an unknown key, with the nearest known one."""
     known = tuple(known)
     return f"Unknown key '{key}' in {where}: accepted are {', '.join(known)}.{nearest(key, known)}"
 
 
 def refuse_unknown(table: Mapping[str, Any], known: Iterable[str], where: str, error: type[BadInput]) -> None:
-    """Raise ``error`` for the first key of a table that is not among the known ones."""
+    """Raise ``error`` for the first key of a table that is not in ``known``."""
     known = tuple(known)
     for key in table:
         if key not in known:
@@ -129,7 +130,7 @@ _MANY = {int: "whole numbers", float: "numbers", str: "texts", bool: "true and f
 
 
 def _describe(kind: Any, many: bool = False) -> str:
-    """Return a type in words, such as "a list of whole numbers"."""
+    """Describe a type in words, such as "a list of whole numbers"; ``many`` asks for the plural."""
     origin = get_origin(kind)
     if origin in _UNIONS:
         return " or ".join(filter(None, (_describe(one, many) for one in get_args(kind))))
@@ -168,7 +169,7 @@ def _value(table: object, steps: Steps) -> Any:
 
 
 def _leaves(cause: Exception, steps: Steps, expected: Any) -> Iterator[tuple[Steps, Exception, Any]]:
-    """Yield every error in an exception of cattrs: its path, the exception, and the expected type."""
+    """Yield every single error in an exception of cattrs: its path, the exception and the expected type."""
     from cattrs.errors import ClassValidationError, IterableValidationError
 
     if isinstance(cause, ClassValidationError):
@@ -186,7 +187,7 @@ def _leaves(cause: Exception, steps: Steps, expected: Any) -> Iterator[tuple[Ste
 
 @functools.cache
 def _converter() -> Converter:  # noqa: C901
-    """Return a converter that coerces nothing. cattrs is imported only when needed, because that takes long."""
+    """Return a converter that coerces nothing. cattrs is imported here because importing it is slow."""
     from cattrs import Converter
     from cattrs.gen import make_dict_structure_fn
 
@@ -233,7 +234,7 @@ def _converter() -> Converter:  # noqa: C901
                     return structure(value, one)
                 except Exception as cause:  # noqa: BLE001
                     failed = cause
-            # With several options, the intended one is unknown.
+            # Of several options, it is unknown which one was meant.
             raise failed if len(options) == 1 else TypeError(kind)
 
         return structure_union

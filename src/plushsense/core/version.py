@@ -1,3 +1,3 @@
-"""State the version of PlushSense that writes a file."""
+"""The version of PlushSense, which is written into files."""
 
 __version__ = "0.1.0"

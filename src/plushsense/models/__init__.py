@@ -1,1 +1,1 @@
-"""Networks: the symbol that names one, its meaning in NumPy, its trainable form, the file that carries it."""
+"""Networks: architecture, reference implementation in NumPy, trainable network in PyTorch, and the bundle file."""

@@ -1,7 +1,7 @@
-"""A trained model in one file (``*.plush``): weights, and everything needed to feed it and to judge it.
+"""Bundles: a trained model in one file (``*.plush``), with all that is needed to run it and to assess it.
 
-The file is safetensors; its one metadata entry ``plushsense`` holds JSON: format, version, the SHA-256 of
-content and tensors, and the content. Never pickle. The same bundle gives the same bytes.
+The file has the safetensors format, never pickle. Its only metadata entry, ``plushsense``, is JSON with the format, the
+version, the content, and the SHA-256 of content and tensors. Equal bundles give equal bytes.
 """
 
 from __future__ import annotations
@@ -36,16 +36,21 @@ _AGAIN = "copy it again from where it came, or train again"
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Bundle:
-    """A network and its world. The order of ``gestures`` is the class index.
+    """A trained network with its layout, scaling, gestures and settings. The order of ``gestures`` is the class index.
 
-    ``windowing``, ``decision`` and ``provenance`` are plain values for JSON: how the windows were cut, how
-    live decisions are smoothed, where the weights come from (data set hash, subjects, code version, split,
-    scores). ``calibration`` says what 8 bits have to hold in a deployed network (``deploy/quantize``): ranges of the
-    training windows, nobody's samples. It may be empty, and is in bundles of before. ``personal`` says to whom the
-    dense layer was adapted, and what it was before (`plushsense.live.adaptation`); empty: to nobody.
+    The dictionaries are plain values for JSON.
+
+    Attributes:
+        windowing: settings with which the windows were cut.
+        decision: settings of live decisions (`plushsense.runtime.decisions.DecideSpec`).
+        provenance: origin of the weights: data set hash, subjects, code version, split, scores.
+        calibration: value ranges of the training windows, from which a deployed network gets its 8-bit scales
+            (``deploy/quantize``), without any sample of a person; empty in old bundles.
+        personal: the person to whom the dense layer was adapted, and the layer before (`plushsense.live.adaptation`);
+            empty if it was not adapted.
 
     Raises:
-        BundleError: when the parts do not fit each other.
+        BundleError: if the parts do not fit together.
     """
 
     arch: Arch
@@ -81,18 +86,18 @@ class Bundle:
 
     @property
     def adapted_to(self) -> str | None:
-        """Code of the person to whom it was adapted, "somebody" where it is unknown; None: not adapted."""
+        """Code of the person to whom the bundle is adapted, "somebody" if unknown; None if it is not adapted."""
         return str(self.personal.get("subject", "somebody")) if self.personal else None
 
     def network(self) -> Network:
-        """Return the network in NumPy."""
+        """Return the NumPy network with these weights."""
         return Network(self.arch, self.weights)
 
     def save(self, path: str | Path) -> Path:
-        """Write the bundle; the file appears whole or not at all. Missing folders are made.
+        """Write the bundle atomically, creating missing folders; return the path.
 
         Raises:
-            BundleError: when the place cannot be written.
+            BundleError: if the file cannot be written.
         """
         path = Path(path)
         data = self.to_bytes()
@@ -108,7 +113,7 @@ class Bundle:
         """Read a bundle.
 
         Raises:
-            BundleError: when the file is missing, cut, changed, of another version, or no bundle.
+            BundleError: if the file is missing, incomplete, altered, of another version, or not a bundle.
         """
         path = Path(path)
         try:
@@ -125,10 +130,10 @@ class Bundle:
 
     @classmethod
     def from_bytes(cls, data: bytes, path: str | Path = "in memory") -> Bundle:
-        """Return the bundle that ``to_bytes`` wrote; ``path`` names it in errors.
+        """Read a bundle from the bytes of its file; ``path`` names it in messages.
 
         Raises:
-            BundleError: as for ``load``.
+            BundleError: as in `load`.
         """
         head = _header(data, path)
         version = head.get("version")
@@ -169,7 +174,7 @@ class Bundle:
         return bundle
 
     def _implied(self) -> dict[str, Any]:
-        """Return what follows from the parts, for readers in other languages."""
+        """Return values that follow from the parts, for programs in other languages."""
         return {
             "features": list(self.layout.inputs),
             "clock": {
@@ -183,7 +188,7 @@ class Bundle:
         }
 
     def to_bytes(self) -> bytes:
-        """Return the bytes of the file that ``save`` writes."""
+        """Return the bytes of the file that `save` writes."""
         content: dict[str, Any] = _plain(
             {
                 "arch": self.arch.to_dict(),
@@ -209,20 +214,20 @@ class Bundle:
 
 
 def known_people(provenance: Mapping[str, Any]) -> set[str]:
-    """Return the codes of the people that a bundle was trained on or chosen by, without nobody and the unknown."""
+    """Return the codes of the people in the training and validation data, without "nobody" and unknown people."""
     listed = [provenance.get(key) for key in ("subjects", "validation_subjects")]
     codes = {str(code) for each in listed if isinstance(each, list | tuple) for code in each}
     return codes - {NOBODY, UNKNOWN_SUBJECT}
 
 
 def _header(data: bytes, path: str | Path) -> dict[str, Any]:
-    """Return the JSON header of a bundle, after checking the length of the file."""
+    """Return the JSON metadata of a bundle, after checking that the file is complete."""
     other_file = f"'{path}' is not a PlushSense bundle: give a *.plush file made by plushsense train"
     length = int.from_bytes(data[:8], "little")
     if len(data) < 10 or data[8:9] != b"{":
         raise BundleError(f"{other_file}." if data else f"'{path}' is empty: {_AGAIN}.")
     if 8 + length > len(data):
-        # A file of another kind gives a length beyond any sense here.
+        # In a file of another format, these bytes give an absurdly large length.
         raise BundleError(f"{_damaged(path)} (it ends within its header)." if length < 1 << 26 else f"{other_file}.")
     try:
         outer = json.loads(data[8 : 8 + length])
@@ -250,7 +255,7 @@ def _canonical(content: Mapping[str, Any]) -> str:
 
 
 def _digest(content: str, weights: Mapping[str, NDArray[Any]]) -> str:
-    """SHA-256 over the content and every tensor with its name, type and shape."""
+    """Return the SHA-256 of the content and of every tensor with its name, type and shape."""
     total = hashlib.sha256(content.encode())
     for name in sorted(weights):
         values = np.ascontiguousarray(weights[name])
@@ -260,7 +265,7 @@ def _digest(content: str, weights: Mapping[str, NDArray[Any]]) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value ready for JSON: NumPy and paths made plain, keys text, numbers that are not finite null."""
+    """Convert a value for JSON: NumPy values and paths to plain ones, keys to text, numbers that are not finite to None."""
     if isinstance(value, Mapping):
         return {str(k): _plain(v) for k, v in value.items()}
     if isinstance(value, np.ndarray):

@@ -1,9 +1,10 @@
-"""Network of PyTorch layers, equal to `plushsense.models.reference` to 1e-5.
+"""Networks made of PyTorch layers, whose logits equal those of `plushsense.models.reference` to 1e-5.
 
-Training begins from its weights; what ``training/fast`` cannot do (see ``training/engine``) trains with its layers.
+Training starts from the weights of such a network. Architectures that ``training/fast`` does not support (see
+``training/engine``) are also trained with it.
 
-Inside, activations are (N, C, 1, T) with the channels last in memory: on a CPU a step of training then takes
-0.5 to 0.75 of the time that Conv1d on (N, C, T) needs, measured over kernels of 14 to 126 taps.
+Activations are (N, C, 1, T) with the channels last in memory: on a CPU, a training step then takes 0.5 to 0.75 of the
+time that it takes with Conv1d on (N, C, T), measured with kernels of 14 to 126 taps.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from torch.nn import functional as F
 
 
 def _mirrored(x: Tensor, left: int) -> Tensor:
-    """Extend ``x`` (N, C, 1, T) as `models.arch.reflected` does; flipping trains faster than an index."""
+    """Extend ``x`` (N, C, 1, T) as `models.arch.reflected` does; training is faster with flips than with an index."""
     while left:
         some = min(left, x.shape[3] - 1)
         x = torch.cat([x[..., 1 : some + 1].flip(3), x], dim=3)
@@ -37,7 +38,7 @@ def _mirrored(x: Tensor, left: int) -> Tensor:
 
 
 class _Block(nn.Module):
-    """Padding → Conv1d → ReLU → normalisation, on (N, C, 1, T)."""
+    """A layer on (N, C, 1, T): padding, convolution over time, ReLU and normalisation."""
 
     def __init__(self, arch: Arch, i: int) -> None:
         super().__init__()
@@ -64,9 +65,9 @@ class _Block(nn.Module):
 
 
 class Net(nn.Module):
-    """A trainable network: scaled windows (N, C, T) → logits (N, K).
+    """A trainable network that computes logits (N, K) from scaled windows (N, C, T).
 
-    Fresh weights come from PyTorch's global random state: seed it first.
+    The initial weights are drawn from PyTorch's global random state, so seed it first.
     """
 
     def __init__(self, arch: Arch) -> None:
@@ -76,7 +77,7 @@ class Net(nn.Module):
         self.dense = nn.Linear(arch.filters[-1], arch.classes)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return logits (N, K); of windows longer than the span the last ``arch.span`` samples are read."""
+        """Return logits (N, K); only the last ``arch.span`` samples of each window are used."""
         check_windows(self.arch, tuple(x.shape))
         z = x[:, :, x.shape[2] - self.arch.span :].unsqueeze(2).contiguous(memory_format=torch.channels_last)
         for block in self.blocks:
@@ -84,7 +85,7 @@ class Net(nn.Module):
         return cast(Tensor, self.dense(z.mean(dim=(2, 3))))
 
     def _tensors(self) -> dict[str, Tensor]:
-        """Return the tensors by their names in a weights dict; ``conv.weight`` is (F, C, 1, K) here."""
+        """Return the tensors by their names in a weights dict; here a ``conv{i}.weight`` is (F, C, 1, K)."""
         named: dict[str, Tensor] = {"dense.weight": self.dense.weight, "dense.bias": self.dense.bias}
         for i, module in enumerate(self.blocks):
             block = cast(_Block, module)
@@ -93,7 +94,7 @@ class Net(nn.Module):
         return {name: named[name] for name in self.arch.weight_shapes}
 
     def export_weights(self) -> dict[str, NDArray[np.float32]]:
-        """Return a copy of the weights as float32 arrays, as ``models.reference`` and the bundle take them."""
+        """Return a copy of the weights as float32 arrays, in the form of ``models.reference`` and of bundles."""
         shapes = self.arch.weight_shapes
         return {
             name: np.array(tensor.detach().cpu().numpy(), dtype=np.float32).reshape(shapes[name])
@@ -101,7 +102,7 @@ class Net(nn.Module):
         }
 
     def import_weights(self, weights: Mapping[str, NDArray[Any]]) -> None:
-        """Take over a weights dict; BundleError when it belongs to another network."""
+        """Load a weights dict; raise BundleError if it belongs to another architecture."""
         check_weights(self.arch, weights)
         with torch.no_grad():
             for name, tensor in self._tensors().items():

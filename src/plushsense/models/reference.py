@@ -1,7 +1,7 @@
-"""Reference of the networks in NumPy floats: logits of whole windows, and the same logits sample by sample.
+"""Reference implementation of the networks in NumPy, for whole windows and, with equal logits, sample by sample.
 
-Everything is computed in float64 from float32 weights, time-major inside. ``Network.forward`` reads windows;
-a ``Stepper`` reads a stream and keeps what the next decision still needs.
+All values are computed in float64 from float32 weights; internal arrays have time before channels.
+``Network.forward`` computes windows; a ``Stepper`` processes a stream and keeps only what later decisions need.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from plushsense.models.arch import NORM_EPSILON, Arch, ConvLayer, reflected
 
 Floats = NDArray[np.float64]
 
-CHUNK = 256  # samples that are worked on at once: their taps stay in the cache
+CHUNK = 256  # samples processed at once, few enough for their taps to stay in the cache
 
 
 class SampleRing:
-    """Ring buffer of the samples that a layer still reads.
+    """Buffer of the latest samples that a layer still needs.
 
     Rows move to the front only when the space behind them is used up.
     """
@@ -34,7 +34,7 @@ class SampleRing:
         self.end = 0
 
     def feed(self, x: Floats) -> Floats:
-        """Add rows (n, C); return the taps (m, kernel · C) of the positions that they complete."""
+        """Add rows (n, C); return the taps (m, kernel · C) of the m output positions that they complete."""
         reach = self.layer.reach
         if self.end + len(x) > len(self.rows):
             kept = min(reach, self.end)
@@ -52,20 +52,20 @@ class SampleRing:
 
 
 class Pool:
-    """The running mean of the last ``blocks`` · ``step`` rows, from one sum a step.
+    """The mean of the last ``blocks`` · ``step`` rows, updated every ``step`` rows.
 
-    Sums are only ever added up anew, never subtracted, so that nothing drifts.
+    It keeps one sum per step. Sums are never subtracted, so that rounding errors do not accumulate.
     """
 
     def __init__(self, step: int, blocks: int, features: int) -> None:
         self.step = step
         self.blocks = blocks
         self.done = np.empty((0, features))  # sums of whole steps, at most blocks − 1
-        self.open = np.zeros(features)  # sum of the step that is filling
+        self.open = np.zeros(features)  # sum of the current, incomplete step
         self.held = 0
 
     def feed(self, z: Floats) -> Floats:
-        """Add rows (n, F); return the mean (m, F) at each step that they complete, once all blocks are there."""
+        """Add rows (n, F); return the mean (m, F) at each step that they complete, once there are enough steps."""
         if self.held + len(z) < self.step:
             self.open = self.open + z.sum(axis=0)
             self.held += len(z)
@@ -92,13 +92,13 @@ _TAPS_BYTES = 2 << 20
 
 
 def softmax(logits: NDArray[np.floating[Any]]) -> Floats:
-    """Return probabilities from logits over the last axis."""
+    """Return the softmax of logits over the last axis."""
     shifted = np.exp(np.asarray(logits, dtype=np.float64) - np.max(logits, axis=-1, keepdims=True))
     return np.asarray(shifted / shifted.sum(axis=-1, keepdims=True))
 
 
 def check_weights(arch: Arch, weights: Mapping[str, NDArray[Any]]) -> None:
-    """Refuse weights that are not those of ``arch``: BundleError naming the first that does not fit."""
+    """Raise BundleError for the first weight that does not fit ``arch``, or has an impossible value."""
     shapes = arch.weight_shapes
     for name in weights:
         if name not in shapes:
@@ -116,8 +116,9 @@ def check_weights(arch: Arch, weights: Mapping[str, NDArray[Any]]) -> None:
 
 
 def affine(arch: Arch, i: int, weights: Weights) -> tuple[Floats, Floats]:
-    """Return gain and shift (F,) of the normalisation of layer ``i``; those of batch normalisation hold its mean and
-    variance.
+    """Return gain and shift (F,) of the normalisation of layer ``i``.
+
+    With batch normalisation, the running mean and variance are included in them.
     """
     gain, shift = (weights[f"norm{i}.{name}"].astype(np.float64) for name in ("gain", "shift"))
     if arch.norm == "batch":
@@ -128,7 +129,7 @@ def affine(arch: Arch, i: int, weights: Weights) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True)
 class _Block:
-    """Layer ready to compute: ``matrix`` (kernel · channels, filters), taps outermost."""
+    """Float64 parameters of a layer; ``matrix`` is (kernel · channels, filters), with the channels of a tap adjacent."""
 
     layer: ConvLayer
     matrix: Floats
@@ -162,7 +163,7 @@ class _Block:
 
 
 def taps_of(x: Floats, layer: ConvLayer) -> Floats:
-    """Return a view of the samples that each position of a layer reads: (N, T, C) → (N, T − reach, kernel, C)."""
+    """Return, as a view, the samples for each output position of a layer: (N, T, C) → (N, T − reach, kernel, C)."""
     x = np.ascontiguousarray(x)
     n, t, c = x.shape
     batch, row, item = x.strides
@@ -191,10 +192,10 @@ def _through(x: Floats, block: _Block, arch: Arch) -> Floats:
 
 
 class Network:
-    """An architecture with its weights, ready to answer.
+    """An architecture with its weights, ready to compute.
 
     Raises:
-        BundleError: when the weights are not those of the architecture.
+        BundleError: if the weights do not fit the architecture.
     """
 
     def __init__(self, arch: Arch, weights: Weights) -> None:
@@ -205,7 +206,7 @@ class Network:
         self._bias = weights["dense.bias"].astype(np.float64)
 
     def forward(self, x: NDArray[np.floating[Any]]) -> Floats:
-        """Return logits (N, K) of scaled windows (N, C, T); the last ``arch.span`` samples are read.
+        """Return logits (N, K) of scaled windows (N, C, T); only the last ``arch.span`` samples are used.
 
         Raises:
             BadInput: for windows of another shape, or shorter than the span.
@@ -213,10 +214,10 @@ class Network:
         return self.classify(self.features(x))
 
     def features(self, x: NDArray[np.floating[Any]]) -> Floats:
-        """Return the inputs of the dense layer, means over time (N, F), of scaled windows (N, C, T).
+        """Return the inputs of the dense layer, means over time (N, F), for scaled windows (N, C, T).
 
         Raises:
-            BadInput: as `forward`.
+            BadInput: as in `forward`.
         """
         check_windows(self.arch, x.shape)
         z: Floats = np.ascontiguousarray(x[:, :, x.shape[2] - self.arch.span :].transpose(0, 2, 1), dtype=np.float64)
@@ -225,9 +226,9 @@ class Network:
         return np.asarray(z.mean(axis=1))
 
     def rectified(self, x: NDArray[np.floating[Any]]) -> list[Floats]:
-        """Return the ReLU outputs of each layer before normalisation, [(N, T', F)], of scaled windows (N, C, T).
+        """Return the ReLU outputs (N, T', F) of each layer, before normalisation, for scaled windows (N, C, T).
 
-        ``stream`` only.
+        Only for networks with the padding ``stream`` and batch normalisation.
         """
         z: Floats = np.ascontiguousarray(x.transpose(0, 2, 1), dtype=np.float64)
         seen = []
@@ -246,12 +247,12 @@ class Network:
         return softmax(self.forward(x))
 
     def stepper(self) -> Stepper:
-        """Return a reader of one stream, in the state ``warming``."""
+        """Return a new `Stepper` for one stream."""
         return _Streaming(self) if self.arch.padding == "stream" else _Recomputing(self)
 
 
 def check_windows(arch: Arch, shape: tuple[int, ...]) -> None:
-    """Refuse windows that are not (N, ``arch.channels``, at least ``arch.span``)."""
+    """Raise BadInput unless ``shape`` is (N, ``arch.channels``, at least ``arch.span``)."""
     if len(shape) != 3 or shape[1] != arch.channels or shape[2] < arch.span:
         raise BadInput(
             f"Windows of the shape {tuple(shape)} do not fit {arch.symbol}: it reads (windows, "
@@ -260,9 +261,9 @@ def check_windows(arch: Arch, shape: tuple[int, ...]) -> None:
 
 
 class Stepper(ABC):
-    """Reads samples as they come; decides when the span has come, then every ``arch.step`` samples.
+    """Compute logits from a stream: after the first ``arch.span`` samples, then every ``arch.step`` samples.
 
-    ``seen`` counts the samples since the start or the last reset.
+    ``seen`` is the number of samples since the start or the last reset.
     """
 
     def __init__(self, arch: Arch) -> None:
@@ -270,15 +271,17 @@ class Stepper(ABC):
         self.reset()
 
     def step(self, sample: ArrayLike) -> NDArray[Any] | None:
-        """Read one sample (C,); return logits (K,) when a decision is due, else None."""
+        """Add one sample (C,); return logits (K,) if a decision is due, else None."""
         due = self.push(np.asarray(sample)[None])
         return due[0] if len(due) else None
 
     def push(self, samples: ArrayLike) -> NDArray[Any]:
-        """Read samples (n, C); return the logits (m, K) of the decisions now due, the same in pieces of any size.
+        """Add samples (n, C); return the logits (m, K) of the decisions that are due.
+
+        The logits do not depend on how the samples are divided among calls.
 
         Raises:
-            BadInput: for samples of another shape, or of values that the network does not read.
+            BadInput: for samples of another shape, or with values that the network does not accept.
         """
         block = self._values(samples)
         if block.ndim != 2 or block.shape[1] != self.arch.channels:
@@ -295,11 +298,11 @@ class Stepper(ABC):
 
     @property
     def state(self) -> Literal["warming", "ready"]:
-        """``warming`` until ``arch.span`` samples have come since the start or the last reset."""
+        """``warming`` until ``arch.span`` samples were added since the start or the last reset, then ``ready``."""
         return "ready" if self.seen >= self.arch.span else "warming"
 
     def reset(self) -> None:
-        """Forget the past: after a gap, a clock reset, a reconnection."""
+        """Drop all samples, as after a gap, a clock reset or a reconnection."""
         self.seen = 0
         self._clear()
 
@@ -308,15 +311,15 @@ class Stepper(ABC):
 
     @abstractmethod
     def _values(self, samples: ArrayLike) -> NDArray[Any]:
-        """Return the samples as an array that the network reads."""
+        """Return the samples as an array of the type that the network uses."""
 
     @abstractmethod
     def _advance(self, chunk: NDArray[Any]) -> NDArray[Any]:
-        """Read at most CHUNK samples; return logits (decisions, K)."""
+        """Add at most CHUNK samples; return logits (decisions, K)."""
 
 
 class _FloatStepper(Stepper):
-    """Reads scaled samples. A value that is not finite spoils the decisions that see it and none after."""
+    """A stepper for scaled samples. A value that is not finite affects only decisions whose span includes it."""
 
     def __init__(self, network: Network) -> None:
         self.network = network
@@ -327,7 +330,7 @@ class _FloatStepper(Stepper):
 
 
 class _Streaming(_FloatStepper):
-    """``stream``: every sample is computed once."""
+    """Stepper for the padding ``stream``, in which every layer output is computed once."""
 
     def _clear(self) -> None:
         self._rings, self._pool = stream_state(self.arch)
@@ -342,7 +345,7 @@ class _Streaming(_FloatStepper):
 
 
 class _Recomputing(_FloatStepper):
-    """``mirror`` and ``causal``: each decision computes the whole window again."""
+    """Stepper for the paddings ``mirror`` and ``causal``; each decision computes the whole window again."""
 
     def _clear(self) -> None:
         self._ring = SampleRing(ConvLayer(self.arch.window, 1, 1), self.arch.channels)
@@ -355,15 +358,15 @@ class _Recomputing(_FloatStepper):
 
 
 def stream_state(arch: Arch) -> tuple[list[SampleRing], Pool]:
-    """Return what a ``stream`` network remembers between samples: a ring before each layer, and the pooling."""
+    """Return the state of a ``stream`` network between samples: a buffer before each layer, and the pooling."""
     rings = [SampleRing(layer, read) for layer, read in zip(arch.layers, arch.inputs, strict=True)]
     return rings, Pool(arch.step, arch.pooled // arch.step, arch.filters[-1])
 
 
 def random_weights(arch: Arch, seed: int) -> dict[str, NDArray[np.float32]]:
-    """Return random weights with the statistics of trained ones (norms that fit, uneven gains, logits of a few units).
+    """Return random weights with statistics like trained ones, for tests and measurements.
 
-    For tests and for measuring.
+    Normalisation statistics fit the activations, gains are uneven and logits have a size of a few units.
     """
     rng = np.random.default_rng(seed)
     weights: dict[str, NDArray[np.float32]] = {}
