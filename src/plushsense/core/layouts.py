@@ -61,7 +61,7 @@ class Channel:
 
 @dataclass(frozen=True)
 class Derived:
-    """A channel computed from the channels ``of``; the kind ``magnitude`` is √(Σ v²), an integer with 4 fraction bits."""
+    """A channel computed from the channels ``of``; ``magnitude`` is √(Σ v²), an integer with 4 fraction bits."""
 
     name: str
     kind: str
@@ -86,8 +86,7 @@ class Layout:
     ``host_ms``, ``device_ms`` and the channels, separated by commas).
 
     Attributes:
-        wire: fields of a frame in order: channel names, ``device_ms`` (the toy's clock) and ``delay_ms`` (time since
-            the previous frame).
+        wire: names of channels, ``device_ms`` (the toy's clock) and ``delay_ms`` (time since the previous frame).
         gap_ms: longest time between two frames that is interpolated; a longer gap starts a new segment.
         vectors: triples of channels that are the axes of one vector, such as an accelerometer.
     """

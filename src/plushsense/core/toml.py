@@ -70,8 +70,7 @@ def load_table(table: object, kind: type[T], where: str, error: type[BadInput]) 
     """Create an instance of the dataclass ``kind`` from a table.
 
     Args:
-        table: its keys are the fields of ``kind``; inner tables become dataclasses and lists become tuples, as the
-            fields are declared.
+        table: its keys are the fields of ``kind``; inner tables become dataclasses, and lists become tuples.
         where: name of the table in messages, such as "layout 'plush-15'".
 
     Raises:

@@ -44,10 +44,8 @@ class Bundle:
         windowing: settings with which the windows were cut.
         decision: settings of live decisions (`plushsense.runtime.decisions.DecideSpec`).
         provenance: origin of the weights: data set hash, subjects, code version, split, scores.
-        calibration: value ranges of the training windows, from which a deployed network gets its 8-bit scales
-            (``deploy/quantize``), without any sample of a person; empty in old bundles.
-        personal: the person to whom the dense layer was adapted, and the layer before (`plushsense.live.adaptation`);
-            empty if it was not adapted.
+        calibration: value ranges in training windows, for 8-bit scales (``deploy/quantize``); no samples. May be empty.
+        personal: for whom the dense layer was adapted, and the layer before (`plushsense.live.adaptation`); or empty.
 
     Raises:
         BundleError: if the parts do not fit together.
@@ -265,7 +263,7 @@ def _digest(content: str, weights: Mapping[str, NDArray[Any]]) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Convert a value for JSON: NumPy values and paths to plain ones, keys to text, numbers that are not finite to None."""
+    """Convert a value for JSON: NumPy values and paths to plain ones, keys to text, NaN and infinity to None."""
     if isinstance(value, Mapping):
         return {str(k): _plain(v) for k, v in value.items()}
     if isinstance(value, np.ndarray):

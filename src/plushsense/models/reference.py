@@ -129,7 +129,7 @@ def affine(arch: Arch, i: int, weights: Weights) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True)
 class _Block:
-    """Float64 parameters of a layer; ``matrix`` is (kernel · channels, filters), with the channels of a tap adjacent."""
+    """Float64 parameters of a layer; ``matrix`` is (kernel · channels, filters), channels of a tap adjacent."""
 
     layer: ConvLayer
     matrix: Floats

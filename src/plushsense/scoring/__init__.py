@@ -1,1 +1,1 @@
-"""Splits and metrics: pure functions on indices and predictions."""
+"""Splits, metrics and event scores: pure functions of labels, people, predictions and intervals."""

@@ -1,7 +1,8 @@
-"""Splits of recordings (or, leaky, windows) into training, validation and test: functions on arrays.
+"""Split recordings, or windows, into training, validation and test sets.
 
-A unit is a recording, or a window in splits over windows. A split by subject keeps test, validation (which decides when
-training stops) and training people apart. Units of nobody (subject "none": the toy at rest) are spread over the folds.
+A unit is a recording, or a window in splits of windows. Those are leaky: overlapping windows of one recording can be in
+training and test. A split by subject keeps the people of test, validation (which decides when training stops) and
+training apart. Units of nobody (subject "none": the toy at rest) are spread over the folds.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ HOLDOUT_SHARE = 0.15
 class Fold:
     """One fold: three disjoint index arrays into the units, each in ascending order.
 
-    ``subjects`` are the test people (without nobody); unless people are kept apart, they are also trained on.
+    ``subjects`` are the people in the test set; only splits by subject exclude them from training.
     """
 
     name: str
@@ -38,9 +39,9 @@ class Fold:
 
 @dataclass(frozen=True)
 class Split:
-    """A split by its name: ``by-subject:5`` is kind "by-subject" with k = 5.
+    """A method of splitting: ``by-subject:5`` has the kind "by-subject" and ``k`` = 5 folds.
 
-    Without k, "windows" is the paper's hold-out split (``windows:holdout``).
+    The kind "windows" without ``k`` is the paper's hold-out split (``windows:holdout``).
     """
 
     kind: str
@@ -48,24 +49,24 @@ class Split:
 
     @property
     def text(self) -> str:
-        """The split as it is written on the command line."""
+        """Name of the split, as on the command line."""
         if self.kind == "windows" and self.k is None:
             return "windows:holdout"
         return self.kind if self.k is None else f"{self.kind}:{self.k}"
 
     @property
     def leaky(self) -> bool:
-        """Whether windows of one recording, which overlap, can be on both sides."""
+        """Whether overlapping windows of one recording can be in both training and test."""
         return self.kind == "windows"
 
     @property
     def unit(self) -> str:
-        """The unit that is split: "recording" or "window"."""
+        """Unit that is split: "recording" or "window"."""
         return "window" if self.leaky else "recording"
 
     @property
     def apart(self) -> bool:
-        """Whether no person is both tested and trained on."""
+        """Whether no person is in both training and test."""
         return self.kind in ("leave-one-subject-out", "by-subject")
 
 
@@ -73,7 +74,7 @@ EXAMPLES = ("leave-one-subject-out", "by-subject:5", "by-recording:5", "windows:
 
 
 def parse_split(text: str) -> Split:
-    """Return the split of a name.
+    """Parse the name of a split.
 
     Raises:
         ConfigError: for an unknown name, with the accepted forms and the nearest of them.
@@ -93,16 +94,16 @@ def parse_split(text: str) -> Split:
 
 
 def make_folds(split: Split, subject: NDArray[np.str_], label: Index, seed: int = 0) -> list[Fold]:
-    """Return the folds of ``split`` over units of these people and classes, both (n,); equal seeds give equal folds.
+    """Return the folds of ``split`` for units with these people and classes, both (n,). Deterministic for a ``seed``.
 
     Raises:
-        BadInput: when there are too few people or units for the split, or units of unknown people.
+        BadInput: if there are too few people or units for the split, or, when splitting by people, unknown ones.
     """
     if len(subject) != len(label):
         raise BadInput(f"A split needs one class for each unit: got {len(subject)} people and {len(label)} classes.")
     if split.kind == "leave-one-subject-out":
         people = _people(subject, split.kind, 3)
-        # In the order of their codes; 15 % of the others, at least one, validate.
+        # The folds are in the order of the codes; 15 % of the other people, at least one, are for validation.
         return _by_people(subject, [(person,) for person in people], people, seed)
     if split.kind == "by-subject":
         return by_subject(subject, split.k or 5, seed)
@@ -114,7 +115,7 @@ def make_folds(split: Split, subject: NDArray[np.str_], label: Index, seed: int 
 
 
 def by_subject(subject: NDArray[np.str_], k: int, seed: int = 0) -> list[Fold]:
-    """Divide the people into ``k`` groups and test each once; 15 % of the other people, at least one, validate."""
+    """Divide the people into ``k`` test groups; 15 % of the other people, at least one, are for validation."""
     people = _people(subject, f"by-subject:{k}", max(k, 3))
     dealt = np.random.default_rng([seed, 1]).permutation(people).tolist()
     groups = [tuple(sorted(dealt[i::k])) for i in range(k)]
@@ -124,19 +125,19 @@ def by_subject(subject: NDArray[np.str_], k: int, seed: int = 0) -> list[Fold]:
 
 
 def by_recording(subject: NDArray[np.str_], label: Index, k: int, seed: int = 0) -> list[Fold]:
-    """Divide the recordings into ``k`` groups, evenly over classes and people; 15 % of the others validate."""
+    """Divide the recordings into ``k`` test groups, balanced by class and person; validate on 15 % of the others."""
     _enough(len(label), max(k, 3), f"by-recording:{k}", "recordings")
     return _stratified(subject, label, k, seed, strata=subject)
 
 
 def windows(subject: NDArray[np.str_], label: Index, k: int, seed: int = 0) -> list[Fold]:
-    """Divide the windows into ``k`` groups, evenly over classes; 15 % of the others validate. Leaky."""
+    """Divide the windows into ``k`` test groups, balanced by class; validate on 15 % of the others. Leaky."""
     _enough(len(label), max(k, 3), f"windows:{k}", "windows")
     return _stratified(subject, label, k, seed, strata=np.full(len(label), ""))
 
 
 def holdout(subject: NDArray[np.str_], label: Index, seed: int = 0) -> list[Fold]:
-    """Return the paper's split, stratified by class: 70 % of the windows train, 15 % validate, 15 % test. Leaky."""
+    """Return the paper's split: 70 % of the windows for training, 15 % validation, 15 % test, by class. Leaky."""
     everything = np.arange(len(label), dtype=np.int64)
     _enough(len(label), 3, "windows:holdout", "windows")
     rng = np.random.default_rng([seed, 3])
@@ -149,11 +150,11 @@ def holdout(subject: NDArray[np.str_], label: Index, seed: int = 0) -> list[Fold
 def purge(
     stream: NDArray[np.str_], rows: Index, tested_stream: NDArray[np.str_], tested_rows: Index
 ) -> NDArray[np.bool_]:
-    """Return which windows (n,) may be trained on: those whose stream rows touch no tested recording.
+    """Return which windows (n,) may be used for training: those that overlap no test recording in their stream.
 
     Args:
-        stream, rows: stream id (n,) and rows (n, 2), the last exclusive, of each window; "" or −1: none.
-        tested_stream, tested_rows: the same of the recordings that are tested, (m,) and (m, 2).
+        stream, rows: stream id (n,) and row range (n, 2), with exclusive end, of each window; "" and −1 mean none.
+        tested_stream, tested_rows: the same for the test recordings, (m,) and (m, 2).
     """
     keep = np.ones(len(stream), dtype=np.bool_)
     for name in np.unique(tested_stream[tested_rows[:, 0] >= 0]):
@@ -207,7 +208,7 @@ def _by_people(subject: NDArray[np.str_], groups: list[tuple[str, ...]], people:
 
 
 def _stratified(subject: NDArray[np.str_], label: Index, k: int, seed: int, strata: NDArray[np.str_]) -> list[Fold]:
-    """Divide units into groups by class, then by ``strata``, then at random, so that each group has its share."""
+    """Divide units into ``k`` random test groups with equal shares of each class, and within it of each stratum."""
     rng = np.random.default_rng([seed, 5])
     order = np.lexsort((rng.random(len(label)), strata, label))
     group = np.empty(len(label), dtype=np.int64)
@@ -222,9 +223,9 @@ def _stratified(subject: NDArray[np.str_], label: Index, k: int, seed: int, stra
 
 
 def _stratified_share(units: Index, label: Index, share: float, rng: np.random.Generator) -> Index:
-    """Draw about ``share`` of ``units``, at least one, evenly over classes; ascending."""
+    """Draw about ``share`` of ``units``, at least one, balanced by class; return them in ascending order."""
     order = units[np.lexsort((rng.random(len(units)), label[units]))]
     count = max(1, round(share * len(units)))
-    # Evenly spaced in class order from a random offset, so that each class gives its share to within one.
+    # Evenly spaced in class order from a random offset, so that each class has its share, give or take one.
     places = (np.arange(count) + rng.random()) * len(units) / count
     return np.sort(order[places.astype(np.int64)])

@@ -1,1 +1,1 @@
-"""Clock rule, derived channels, scaling and cutting of windows."""
+"""From recordings to the input of a network: even resampling, derived channels, scaling and cutting of windows."""

@@ -1,20 +1,20 @@
-"""Cut windows anywhere in a session's stream, as a network reads it in use: with onsets, ends and idle time.
+"""Cut windows anywhere in a session's stream, as a network in use gets them: with onsets, ends and idle time.
 
-A *position* is a sample of the stream at which a network might have to answer; its window ends there. Positions lie
-every ``every_s`` along the streams of the data set. The label of a position is
+A *position* is a sample of a stream at which a window ends. Positions lie every ``every_s`` along the streams of the
+data set. The label of a position is
 
-- a gesture, from ``onset_s`` after the beginning of its recording (after trimming) to ``after_s`` after its end;
-- idle, where there is no recording, and no end of one within the last ``settle_s``, and in recordings of an idle
-  gesture;
-- nothing, so that it is left out: just after a beginning or an end, in recordings that are not used (excluded, of a
-  gesture that is not a class, not stopped in time), and where two recordings overlap.
+- a gesture, from ``onset_s`` after the start of its recording (after trimming) to ``after_s`` after its end;
+- idle, in recordings of an idle gesture, and outside recordings if none has ended within the last ``settle_s``;
+- none, elsewhere: just after a start or an end, in recordings that are not used (excluded, of a gesture that is not a
+  class, not stopped in time), and where two recordings overlap. Such positions are left out.
 
-People also practise between recordings, which is not idle time: of the unmarked positions of a stream, the
-``busy_share`` with the most movement in the last second is left out. Of the others, as many are taken, evenly, as make
-``idle_share`` of all windows.
+People also practise between recordings, which is not idle time. Therefore the share ``busy_share`` of a stream's
+positions outside recordings, those with the most movement in the last second, is left out too. Of the remaining idle
+positions, evenly spaced ones are taken, so that ``idle_share`` of all windows are idle.
 
-A recording that is in no stream (or has no position there) is cut as by `plushsense.windows.cut`, and marked. A session
-with such a recording gives no idle positions, since its stream may contain that gesture.
+A recording that is in no stream (or has no position there) is cut as in `plushsense.windows.cut`, and marked. If a
+recording of a session has no place in the stream, the session gives no idle positions outside recordings, since its
+stream may contain that gesture.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ NOTHING, FREE = -1, -2
 
 @dataclass(frozen=True)
 class AnywhereSpec:
-    """Settings of the positions of a stream to train on, in seconds and shares; see the docstring of the module."""
+    """Settings for choosing positions, in seconds and shares; the docstring of the module explains them."""
 
     every_s: float = 0.4
     onset_s: float = 0.3
@@ -71,7 +71,7 @@ class AnywhereSpec:
 
 
 def add_idle_gesture(gestures: GestureSet, dataset: Dataset) -> GestureSet:
-    """Return the gesture set with an idle class added, if it has none and the streams have unmarked rows."""
+    """Return the gesture set with an idle class added, if it has none and there are recordings within streams."""
     if any(g.idle for g in gestures.gestures) or dataset.layout.is_labelled:
         return gestures
     if not any(r.stream_row >= 0 for r in dataset.used):
@@ -92,7 +92,7 @@ def add_idle_gesture(gestures: GestureSet, dataset: Dataset) -> GestureSet:
 
 @dataclass(frozen=True, eq=False)
 class _Place:
-    """A position: the samples of ``segment`` (``x`` as a network reads them) up to ``at``."""
+    """A position: the first ``at`` samples of ``segment``; ``x`` (T, F) are the network inputs of the segment."""
 
     x: NDArray[np.int64]
     segment: Segment
@@ -114,15 +114,15 @@ def cut_anywhere(
     """Cut windows at positions along the streams of ``dataset``, for training.
 
     Args:
-        gestures: the classes (see `add_idle_gesture`). Without an idle one, only positions in recordings are taken.
-        progress: called with (streams done, streams in all).
+        gestures: the classes (see `add_idle_gesture`). Without an idle one, only positions in recordings are used.
+        progress: called with (streams done, total number of streams).
 
     Returns:
-        Windows whose ``context`` is "anywhere" ("loop" and "inside" for recordings without a stream). Idle windows
-        of a stream count as one recording of the stream's person; no window spans a break of the clock.
+        Windows with the ``context`` "anywhere" ("loop" or "inside" for recordings without a stream). The idle windows
+        of a stream form one recording of the stream's person; no window contains a gap or reset of the clock.
 
     Raises:
-        DatasetError: when there is no window.
+        DatasetError: if there is no window.
     """
     anywhere = anywhere or AnywhereSpec()
     layout = dataset.layout
@@ -137,7 +137,7 @@ def cut_anywhere(
         for recording, place in in_recordings:
             (resting if gestures.get(recording.gesture).idle else moving).append((recording, place))
         if idle is not None and (stream.subject, stream.session) not in adrift:
-            # One idle recording without rows, so that it excludes none.
+            # An idle recording without rows, so that it overlaps no other.
             name, file = f"{stream.id} (unmarked)", stream.file
             key = (name, stream.subject, stream.session, idle.label, file)
             nobody = RecordingInfo(*key, 0, 0, 0, 0, stream.id, 0, 0, 0, 0.0, False, (), "")
@@ -164,7 +164,7 @@ def cut_anywhere(
 
 
 def _evenly(places: Sequence[tuple[RecordingInfo, _Place]], most: int) -> list[tuple[RecordingInfo, _Place]]:
-    """Return at most ``most`` places, at even distances from the first to the last."""
+    """Return at most ``most`` of the places, evenly spaced."""
     if len(places) <= most:
         return list(places)
     return [places[at] for at in (np.arange(max(0, most)) * len(places) // max(1, most)).tolist()]
@@ -173,7 +173,7 @@ def _evenly(places: Sequence[tuple[RecordingInfo, _Place]], most: int) -> list[t
 def _positions(
     dataset: Dataset, stream: StreamInfo, used: Sequence[RecordingInfo], reach: int, spec: AnywhereSpec
 ) -> tuple[list[tuple[RecordingInfo, _Place]], list[_Place]]:
-    """Return the positions of a stream in recordings, with the recording, and the unmarked ones to use as idle."""
+    """Return the positions of a stream in recordings, with the recording, and those outside to use as idle."""
     mine = [r for r in used if r.stream == stream.id and r.stream_row >= 0]
     chosen = {r.id for r in mine}
     barred = [r for r in dataset.recordings if r.stream == stream.id and r.stream_row >= 0 and r.id not in chosen]
@@ -208,8 +208,8 @@ def position_labels(
     """Return the label of each position of a segment, (n + 1,): an index into ``used``, `FREE` or `NOTHING`.
 
     Args:
-        used: recordings of the stream whose gesture is a class; their rows after trimming count.
-        barred: the stream's other recordings, all their rows.
+        used: recordings of the stream whose gesture is a class; only their rows after trimming are labelled.
+        barred: the other recordings of the stream; all their rows become `NOTHING`.
     """
     labels = np.full(len(segment) + 1, FREE, dtype=np.int64)
     onset, after, settle = (round(s * rate_hz) for s in (spec.onset_s, spec.after_s, spec.settle_s))
@@ -223,7 +223,7 @@ def position_labels(
 
     spans = [(number, *samples(*rows(r))) for number, r in enumerate(used)]
     spans = [(number, begin, end) for number, begin, end in spans if end > begin]
-    # A position counts the samples read: at ``begin`` none of the recording, at ``end`` all of it.
+    # A position is a number of samples: the first ``begin`` are before the recording, the first ``end`` include it.
     for _, _, end in spans:
         labels[end + 1 : end + settle + 1] = NOTHING
     for number, _, end in spans:
@@ -245,7 +245,7 @@ def position_labels(
 
 
 def _moved(x: NDArray[np.int64], samples: int, usual: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the movement (T,) over the last ``samples``: spreads of the channels over ``usual`` (F,), averaged."""
+    """Return the movement (T,): standard deviation in the last ``samples``, relative to ``usual`` (F,), averaged."""
     values = x - x.mean(axis=0)
     sums = np.vstack([np.zeros(values.shape[1]), np.cumsum(values, axis=0)])
     squares = np.vstack([np.zeros(values.shape[1]), np.cumsum(values**2, axis=0)])

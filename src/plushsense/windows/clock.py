@@ -1,15 +1,15 @@
-"""The clock rule: device frames become even samples, the same for a batch, a live stream and the chip.
+"""The clock rule: resample frames of a device to evenly spaced ("even") samples.
 
-In integers throughout, so that every reader gets the same bits:
+A whole recording, a live stream and a toy's chip get identical samples, since all computations are in integers:
 
-1. A frame whose device clock runs backwards, or that comes more than ``layout.gap_ms`` after the one before, starts a
-   new segment: everything that remembers the past restarts.
-2. A value outside its channel's valid range is replaced by the channel's last valid value in the segment. Until every
-   channel has had one, frames of the segment are passed over.
-3. The first frame that is used sets the time of sample 0; sample k is due ``k * period_us`` later. Sample k is
+1. A frame starts a new segment if its device clock is earlier than that of the previous frame, or more than
+   ``layout.gap_ms`` later. All state of later computations is then reset.
+2. A value outside the valid range of its channel is replaced by the channel's last valid value in the segment. Frames
+   are skipped until every channel has had a valid value.
+3. The first frame that is not skipped sets the time of sample 0; sample k is due ``k * period_us`` later. It is
    computed when the first frame at or after its time arrives, by linear interpolation between the two frames around
    it, rounded half up: ``x0 + floor((2 (x1 - x0) (t - t0) + (t1 - t0)) / (2 (t1 - t0)))``. Of several frames with
-   one time, the first closes the interval before it and the last opens the one after.
+   equal times, the first ends the interval before them, and the last starts the interval after them.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from plushsense.core.recorder_csv import Frames
 
 
 def row_times_us(frames: Frames, period_us: int) -> NDArray[np.int64]:
-    """Return the time (T,) of every row in a live stream: from 0, and continuing where the clock was reset."""
+    """Return the time (T,) of every row since the first one; a clock reset counts as a step of ``period_us``."""
     step = np.diff(frames.device_ms.astype(np.int64), prepend=frames.device_ms[:1]) * 1000
     return np.cumsum(np.where(step < 0, period_us, step))
 
 
 @dataclass(frozen=True)
 class Segment:
-    """Even samples without a break.
+    """Evenly spaced samples without a break.
 
-    ``data`` (n, C) int64; ``start_us`` is the device time of sample 0; ``first_row`` to ``last_row`` (exclusive) are
-    the rows of the source; ``row_of`` (n,) the source row whose arrival completed each sample; ``invalid`` counts
-    values that were replaced.
+    ``data`` (n, C) are the samples; ``start_us`` is the device time of sample 0; ``first_row`` to ``last_row``
+    (exclusive) are the source rows used; ``row_of`` (n,) is the source row that completed each sample; ``invalid`` is
+    the number of values outside their valid range.
     """
 
     data: NDArray[np.int64]
@@ -53,7 +53,7 @@ class Segment:
 
 
 class SampleClock:
-    """The clock rule for a live stream: frames in, even samples out."""
+    """The clock rule for a live stream, one frame at a time."""
 
     def __init__(self, layout: Layout) -> None:
         self._low = [int(v) for v in layout.valid_min_int]
@@ -67,7 +67,7 @@ class SampleClock:
         self._forget()
 
     def forget(self) -> None:
-        """Begin a new segment with the next frame."""
+        """Start a new segment with the next frame."""
         self._seen_us = None
         self._forget()
 
@@ -83,14 +83,14 @@ class SampleClock:
         return None if self._made == 0 else self._start + (self._made - 1) * self._period
 
     def push(self, device_ms: int, values: Sequence[int]) -> list[NDArray[np.int64]]:
-        """Return the samples, each (C,) int64, that this frame completes.
+        """Add a frame; return the samples, each (C,) int64, that it completes.
 
-        ``restarted`` is then whether the frame began a new segment: reset any state before it reads these samples.
+        If ``restarted`` is then true, the frame started a new segment: reset later computations before these samples.
         """
         return [np.array(row, dtype=np.int64) for row in self.rows(device_ms, values)]
 
     def rows(self, device_ms: int, values: Sequence[int]) -> list[list[int]]:
-        """Return what `push` does, in plain integers: faster for a live stream."""
+        """Do the same as `push`, but return plain integers, which is faster for a live stream."""
         time = int(device_ms) * 1000
         seen, self._seen_us = self._seen_us, time
         self.restarted = seen is not None and (time < seen or time - seen > self._gap)
@@ -128,7 +128,7 @@ class SampleClock:
 
 
 def resample(frames: Frames, layout: Layout) -> list[Segment]:
-    """Return the segments that a `SampleClock` would make of a whole recording."""
+    """Resample a whole recording; the segments have the same samples as those of a `SampleClock`."""
     time = frames.device_ms.astype(np.int64) * 1000
     if len(time) == 0:
         return []
@@ -144,7 +144,7 @@ def resample(frames: Frames, layout: Layout) -> list[Segment]:
 
 
 def hold_valid(values: NDArray[np.int64], layout: Layout) -> tuple[NDArray[np.int64], int, int]:
-    """Apply rule 2 to the rows of one segment; return (values, first usable row, number of invalid values)."""
+    """Apply rule 2 to the rows of a segment; return (values, first row not skipped, number of invalid values)."""
     good = (values >= layout.valid_min_int) & (values <= layout.valid_max_int)
     if good.all():
         return values, 0, 0
@@ -162,7 +162,7 @@ def _segment(time: NDArray[np.int64], values: NDArray[np.int64], layout: Layout,
         return None
     time, valid_values = time[first:], valid_values[first:]
     period = layout.period_us
-    # Equal stamps: the first row closes an interval, the last one opens the next.
+    # Of rows with equal times, the first ends an interval and the last starts the next one.
     opens = np.flatnonzero(np.append(np.diff(time) > 0, True))
     closes = np.insert(opens[:-1] + 1, 0, 0)
     moments = time[closes]

@@ -1,15 +1,15 @@
-"""Cut recordings into windows: equal stretches of even samples with their recording, person and context.
+"""Cut recordings into windows of equal length, made of even samples.
 
-A recording of at least one window gives full windows every ``step_s`` from its start ("inside"). A shorter one gives
-one window, whose remaining samples depend on the ``context``:
+A recording that is at least one window long gives full windows every ``step_s`` from its start ("inside"). A shorter
+one gives a single window, whose remaining samples depend on the ``context``:
 
-- ``stream``: the rows of the session's stream before the recording. Where there is no stream, or too little of it, the
-  recording is looped, and the window is marked so.
-- ``loop``: the recording repeated from its start, as in the paper (never zero-padded).
+- ``stream``: they are the samples before the recording in the session's stream. If there is no stream, or it has too
+  few samples, the recording is looped, and the window is marked as such.
+- ``loop``: the recording is repeated from its start, as in the paper (never zero-padded).
 
-To train for continuous recognition there is a third context, ``anywhere`` (``windows/anywhere``).
+A third context, ``anywhere``, is for training continuous recognition (``windows/anywhere``).
 
-A recording many times longer than its gesture usually is was not stopped in time; it is left out and listed.
+A recording that is many times longer than usual for its gesture was not stopped in time; it is left out and listed.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ TRAIN_CONTEXTS = (*CONTEXTS, ANYWHERE)
 
 @dataclass(frozen=True)
 class WindowSpec:
-    """Settings of the cutting of windows, in seconds.
+    """Settings for cutting windows; durations in seconds.
 
-    ``span_s`` asks for more past than the window, for networks that need it. Recordings longer than
-    ``longest_factor`` times the median of their gesture are left out (0: none are).
+    ``span_s`` lengthens windows for networks that need more samples than ``window_s``. Recordings longer than
+    ``longest_factor`` times the median of their gesture are left out (0: never).
     """
 
     window_s: float = 2.5
@@ -62,7 +62,7 @@ class WindowSpec:
 
 
 def whole_gestures(windowing: Mapping[str, Any]) -> WindowSpec:
-    """Return the window settings of a bundle's ``windowing``; with the context "stream" if it is another one."""
+    """Return the window settings in a bundle's ``windowing``, for whole recordings: "anywhere" becomes "stream"."""
     values = {field.name: windowing[field.name] for field in fields(WindowSpec) if field.name in windowing}
     if values.get("context") not in CONTEXTS:
         values["context"] = "stream"
@@ -71,14 +71,14 @@ def whole_gestures(windowing: Mapping[str, Any]) -> WindowSpec:
 
 @dataclass(frozen=True)
 class WindowSet:
-    """N windows.
+    """N windows with their classes, recordings and people.
 
-    ``x`` (N, F, T) int32, even samples of the network's channels, not scaled; ``y`` (N,) class index; ``recording``
-    (N,) index into ``recording_ids``; ``subject`` (N,) the person's code, "none" for nobody; ``context`` (N,)
-    "stream" (real past), "inside" (wholly inside its recording) or "loop"; ``stream`` (N,) id of the stream in which
-    the recording lies, "" for none; ``window_rows`` and ``recording_rows`` (N, 2) raw rows of that stream that the
-    window and its recording cover (−1: none; a looped window covers none). ``vectors`` are triples of channels that
-    are the axes of one vector; ``left_out`` names recordings that gave no window, and why.
+    ``x`` (N, F, T): unscaled inputs of the network; ``y`` (N,): class index; ``recording`` (N,): index into
+    ``recording_ids``; ``subject`` (N,): code of the person, "none" if nobody; ``context`` (N,): "inside" (wholly in its
+    recording), "stream" (begins before it in the stream), "loop" or "anywhere"; ``stream`` (N,): id of the stream of
+    the recording, or ""; ``window_rows`` and ``recording_rows`` (N, 2): rows of that stream which the window and its
+    recording cover, −1 if unknown (always for looped windows). ``vectors``: triples of inputs that are the axes of one
+    vector; ``left_out``: recordings that gave no window, with the reason.
     """
 
     x: NDArray[np.int32]
@@ -102,7 +102,7 @@ class WindowSet:
         return len(self.y)
 
     def take(self, index: NDArray[np.int64]) -> WindowSet:
-        """Return the windows at ``index``; recordings keep their numbers."""
+        """Return the windows at ``index``; ``recording`` still refers to all ``recording_ids``."""
         per_window = ("x", "y", "recording", "subject", "context", "stream", "window_rows", "recording_rows")
         return replace(self, **{name: getattr(self, name)[index] for name in per_window})
 
@@ -117,7 +117,7 @@ class WindowSet:
 
 @dataclass
 class WindowCut:
-    """One window before it is assembled into a set."""
+    """One window (T, F), before `assemble` makes a set of windows."""
 
     x: NDArray[np.int64]
     context: str
@@ -141,9 +141,10 @@ def from_recording(segments: list[Segment], dataset: Dataset, window: int, step:
 def _from_stream(
     segments: list[Segment], first: int, last: int, window: int, reach: int, step: int, dataset: Dataset
 ) -> list[WindowCut]:
-    """Cut rows ``first`` to ``last`` of a stream with the samples before; return none where these are too few.
+    """Cut windows of ``reach`` samples that end in rows ``first`` to ``last`` of a stream.
 
-    If a gap or a clock reset divides the recording, the parts before it give full windows only.
+    A window that would begin before its segment is not cut; then no later one of that segment is. If a gap or a clock
+    reset divides the recording, parts before the last one give windows only if they are at least ``window`` long.
     """
     cuts: list[WindowCut] = []
     for segment in (s for s in segments if s.first_row < last and first < s.last_row):
@@ -171,11 +172,12 @@ def cut_windows(
     """Cut the used recordings of ``dataset`` into windows.
 
     Args:
-        gestures: the classes, in order, by default all of the data set; recordings of other gestures are left out.
-        progress: called with (recordings done, recordings in all).
+        gestures: the classes, in order; by default all of the data set. Recordings of other gestures are left out.
+        progress: called with (recordings done, total number of recordings).
 
     Raises:
-        DatasetError: when there is no window.
+        ConfigError: for the context ``anywhere``.
+        DatasetError: if there is no window.
     """
     spec = spec or WindowSpec()
     gestures = gestures or dataset.gestures
@@ -215,7 +217,7 @@ def cut_windows(
 
 
 def drop_long_recordings(recordings: list[RecordingInfo], spec: WindowSpec) -> tuple[list[RecordingInfo], list[str]]:
-    """Split recordings into those to cut and descriptions of those that were not stopped in time."""
+    """Return the recordings to cut, and a description of each recording that was not stopped in time."""
     usual = usual_rows((r.gesture, r.stop - r.start) for r in recordings)
     in_time, left_out = [], []
     for r in recordings:
@@ -228,7 +230,7 @@ def drop_long_recordings(recordings: list[RecordingInfo], spec: WindowSpec) -> t
 
 
 def recordings_in_time(recordings: list[RecordingInfo], spec: WindowSpec | None = None) -> list[RecordingInfo]:
-    """Return the recordings that were stopped in time, by the rule of `WindowSpec.longest_factor`."""
+    """Return the recordings that were stopped in time, according to `WindowSpec.longest_factor`."""
     return drop_long_recordings(recordings, spec or WindowSpec())[0]
 
 
@@ -269,10 +271,10 @@ def assemble(cuts: list[tuple[RecordingInfo, WindowCut]], gestures: GestureSet, 
 
 
 def shared_gestures(dataset: Dataset, share: float = 0.9) -> tuple[GestureSet, dict[str, str]]:
-    """Return the gestures for models of all people, and the reason why each other gesture is left out.
+    """Return the gestures for a model of all people, and for each other gesture the reason why it is left out.
 
-    These are gestures that at least ``share`` of the people made and that are not free choice, and those that are
-    recorded without a person.
+    Included are gestures that at least ``share`` of the people made, and those that are recorded without a person;
+    never gestures of free choice.
     """
     people = dataset.subjects
     shared, left_out = [], {}

@@ -1,6 +1,7 @@
-"""Compute the inputs of a network: derived channels in integers, scaling to floats, and statistics of windows.
+"""Compute the inputs of a network: derived channels and scaling; also statistics of windows.
 
-The order is fixed: raw integers → even samples → derived channels, all in integers → per-channel offset and scale.
+Raw values are first resampled to even samples (`plushsense.windows.clock`), then derived channels are computed, all in
+integers; last, each channel is scaled to floats.
 """
 
 from __future__ import annotations
@@ -18,27 +19,27 @@ from plushsense.core.layouts import MAGNITUDE_FRACTION_BITS, Layout, magnitude_l
 
 
 def magnitude(parts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return floor of 16 · √(Σ v²), the magnitude with 4 fraction bits, exact in integers.
+    """Return ⌊16 · √(Σ v²)⌋ over the last axis: the magnitude as an exact integer with 4 fraction bits.
 
     Args:
-        parts: (..., n) integers; the sum of squares is held in 64 bits, the result in 32.
+        parts: (..., n) integers, such that the sum of squares fits 64 bits and the result 32 bits.
 
     Raises:
-        BadInput: for a component beyond `magnitude_limit`.
+        BadInput: if a component is larger than `magnitude_limit`.
     """
     limit = magnitude_limit(parts.shape[-1])
     if parts.size and int(np.abs(parts).max()) > limit:
         raise BadInput(f"A magnitude of values beyond ±{limit} does not fit 32 bits: narrow the channels' valid range.")
     total = (parts * parts).sum(axis=-1) << (2 * MAGNITUDE_FRACTION_BITS)
     root = np.floor(np.sqrt(total.astype(np.float64))).astype(np.int64)
-    # The float root of a 64-bit number may be off by one either way.
+    # The float root of a 64-bit number may be off by one in either direction.
     root -= root * root > total
     root += (root + 1) * (root + 1) <= total
     return np.asarray(root, dtype=np.int64)
 
 
 def network_inputs(values: NDArray[np.int64], layout: Layout) -> NDArray[np.int64]:
-    """Return the network's channels (T, F) from measured ones (T, C), in integers."""
+    """Return the unscaled inputs of a network (T, F) from the measured channels (T, C), in integers."""
     derived = {d.name: d for d in layout.derived}
     columns = []
     for name in layout.inputs:
@@ -50,7 +51,7 @@ def network_inputs(values: NDArray[np.int64], layout: Layout) -> NDArray[np.int6
 
 
 class SampleInputs:
-    """Computes `network_inputs` of one sample at a time, in plain integers: faster for a live stream."""
+    """The computation of `network_inputs` for single samples, in plain integers, which is faster for a live stream."""
 
     def __init__(self, layout: Layout) -> None:
         derived = {d.name: tuple(layout.index(part) for part in d.of) for d in layout.derived}
@@ -68,14 +69,14 @@ class SampleInputs:
 
 @dataclass(frozen=True)
 class Scaler:
-    """``(value - offset) * scale`` a channel; both (F,) float64."""
+    """Scaling of each channel, ``(value - offset) * scale``; both are (F,) float64."""
 
     offset: NDArray[np.float64]
     scale: NDArray[np.float64]
 
     @classmethod
     def fit(cls, x: NDArray[np.integer[Any]]) -> Scaler:
-        """Fit the z-score to windows (N, F, T) of training people; a constant channel is only shifted."""
+        """Fit a scaler to zero mean and unit variance in training windows (N, F, T); a constant channel gets scale 1."""
         mean = np.asarray(np.mean(x, axis=(0, 2), dtype=np.float64))
         spread = np.empty_like(mean)
         for channel in range(x.shape[1]):
@@ -83,12 +84,12 @@ class Scaler:
         return cls(mean, np.where(spread > 0, 1.0 / np.where(spread > 0, spread, 1.0), 1.0))
 
     def apply(self, x: NDArray[np.integer[Any]]) -> NDArray[np.float32]:
-        """Return windows (N, F, T) scaled, as a network reads them."""
+        """Scale windows (N, F, T) for the network."""
         scaled = (x - self.offset[:, None]) * self.scale[:, None]
         return scaled.astype(np.float32)
 
     def apply_sample(self, sample: Sequence[int] | NDArray[np.int64]) -> NDArray[np.float32]:
-        """Return samples (..., F) scaled, as a network reads them."""
+        """Scale samples (..., F) for the network."""
         scaled = (np.asarray(sample, dtype=np.float64) - self.offset) * self.scale
         return scaled.astype(np.float32)
 
@@ -98,7 +99,7 @@ class Scaler:
 
     @classmethod
     def from_dict(cls, table: dict[str, list[float]]) -> Scaler:
-        """Return a scaler from plain values."""
+        """Create a scaler from plain values."""
         return cls(np.array(table["offset"], dtype=np.float64), np.array(table["scale"], dtype=np.float64))
 
 
@@ -107,9 +108,9 @@ NAMES = ("mean", "sd", "min", "max", "rms", "energy", *(f"power {low:g}-{high:g}
 
 
 def statistics(x: NDArray[np.integer[Any]] | NDArray[np.floating[Any]], rate_hz: float) -> NDArray[np.float64]:
-    """Return the statistics (N, 8 C) of windows (N, C, T) at even samples.
+    """Return the statistics ``NAMES`` (N, 8 C) of windows (N, C, T) of even samples.
 
-    All channels' means first, then all their sd …
+    The first C columns are the means of all channels, the next C the standard deviations, and so on.
 
     Raises:
         BadInput: for windows without samples.
@@ -121,7 +122,7 @@ def statistics(x: NDArray[np.integer[Any]] | NDArray[np.floating[Any]], rate_hz:
     mean = values.mean(axis=2)
     power = np.abs(np.fft.rfft(values - mean[:, :, None], axis=2)) ** 2 * (2.0 / samples**2)
     if samples % 2 == 0:
-        # Half the sampling rate has no twin at negative frequencies.
+        # The bin at half the sampling rate has no counterpart at negative frequencies.
         power[:, :, -1] *= 0.5
     frequency = np.fft.rfftfreq(samples, 1.0 / rate_hz)
     bands = [power[:, :, (frequency >= low) & (frequency < high)].sum(axis=2) for low, high in BANDS_HZ]
