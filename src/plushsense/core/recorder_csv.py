@@ -107,7 +107,7 @@ def _parse_in_blocks(lines: list[bytes], separator: str | None, width: int) -> t
 def parse_table(
     data: bytes, keys: list[str], skip: int, path: Path
 ) -> tuple[NDArray[Any], NDArray[np.str_] | None, int]:
-    """Parse rows with the columns ``keys``; return numbers (T, columns), labels or None, and number of malformed lines."""
+    """Parse rows with the columns ``keys``; return numbers (T, columns), labels or None, and malformed lines."""
     label_at = keys.index("label") if "label" in keys else None
     row = _FULL_LINE.search(data, data.find(b"\n") + 1 if skip else 0)
     separator = separator_of(row[0]) if row else None

@@ -1,4 +1,4 @@
-"""Settings of decisions: in seconds and shares in a bundle, in steps and integers in a toy."""
+"""Settings of decisions: in seconds and probabilities for a bundle, in steps and integers for a toy."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from plushsense.runtime.health import HealthSettings
 
 @dataclass(frozen=True)
 class Rules:
-    """Settings of a deployed toy beside its network; the defaults report the best class of every step."""
+    """Settings of a deployed toy apart from its network; the defaults report the best class of every step."""
 
     events: EventSettings = field(default_factory=EventSettings)
     gate: GateSettings = field(default_factory=GateSettings)
@@ -29,23 +29,23 @@ _SECONDS = ("smoothing_s", "least_s", "switch_s", "end_s", "hold_s", "rest_s", "
 
 @dataclass(frozen=True)
 class DecideSpec:
-    """Settings of decisions; `plushsense.runtime.events` states what each does.
+    """Settings of decisions; `plushsense.runtime.events` describes their effects. Durations are in seconds.
 
     Attributes:
-        smoothing_s: time constant of an exponential mean of the probabilities, in seconds: a change has reached 63 %
-            after it. 0 switches it off.
-        enter, leave: smoothed probability at which a gesture may begin, and below which it is over.
-        enter_affect, leave_affect: the same for all gestures of an affect together; above 1 no affect begins alone.
-        sure: a class of at least this probability is in the conformal set of a step.
-        known: highest logit, smoothed, below which a touch is not a known gesture; None: every touch is.
-        least_s: for how long a gesture or affect must be the candidate before its event begins (minimum duration).
-        switch_s: for how long another one, before it takes an event's place.
-        end_s: for how long it must be missed before its event is over.
-        hold_s: an event lasts at least so long; rest_s: refractory time, none begins sooner after another.
-        wait_s: for how long the gate's event waits for the network to name it.
-        gate: the gate's signals and rules; none: there is no gate.
-        health: when sensors are suspect or at fault.
-        fitted: what the settings were fitted on, for people to read.
+        smoothing_s: time constant of the exponential mean of the probabilities, after which the mean has followed 63 %
+            of a change; 0 means no smoothing.
+        enter, leave: smoothed probability from which a gesture may begin, and below which it may end.
+        enter_affect, leave_affect: the same for the sum over an affect; above 1, no event begins with only an affect.
+        sure: smoothed probability from which a class is in the conformal set of a step.
+        known: smoothed highest logit below which a touch is no known gesture; None: every touch is one.
+        least_s: how long a gesture or affect must be the candidate before its event begins (minimum duration).
+        switch_s: how long another candidate must last before it replaces the gesture of the event.
+        end_s: how long the gesture or affect must be below its threshold before the event ends.
+        hold_s, rest_s: minimum duration of an event, and minimum time after it until the next begins (refractory time).
+        wait_s: how long an event of the gate waits for the network to name a gesture.
+        gate: signals and rules of the gate; without rules there is no gate.
+        health: settings for detecting suspect and faulty sensors.
+        fitted: description of the data on which the settings were fitted, for people to read.
     """
 
     smoothing_s: float = 0.3
@@ -79,7 +79,7 @@ class DecideSpec:
             raise ConfigError(f"known is {self.known!r}; accepted are logits from {-limit:g} to {limit:g}, or none.")
 
     def rules(self, step_s: float) -> Rules:
-        """Return the settings in steps of ``step_s`` seconds and in integers."""
+        """Convert the settings to integers, and durations to steps of ``step_s`` seconds."""
         shares = {name: min(round(getattr(self, name) * ONE), ONE + 1) for name in _SHARES}
 
         def steps(seconds: float, least: int = 0) -> int:
@@ -106,16 +106,16 @@ class DecideSpec:
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> DecideSpec:
-        """Return settings from plain values (a bundle, a configuration file); what is left out keeps its default.
+        """Create settings from plain values, as in a bundle or a configuration file; missing keys get defaults.
 
         Raises:
-            ConfigError: for an unknown key, or a value that does not fit.
+            ConfigError: for an unknown key, or a value of the wrong type or out of range.
         """
         return load_table(table, cls, "decision settings", ConfigError)
 
 
 def argmax_spec(smoothing_s: float = 0.0) -> DecideSpec:
-    """Return settings that report every step's best class: the baseline that events are compared with."""
+    """Return settings that report the best class of every step: a baseline to compare events with."""
     return DecideSpec(
         smoothing_s, 0.0, 0.0, 2.0, 0.0, least_s=0.0, switch_s=0.0, end_s=0.0, hold_s=0.0, rest_s=0.0, wait_s=0.0
     )

@@ -2,14 +2,14 @@
 
 The counts are those of the event analysis of Ward, Lukowicz and Gellersen, *Performance metrics for activity
 recognition*, ACM TIST 2(1), 2011, article 6. Labels are gestures, families or affects; one of these levels is scored at
-a time. A *truth* is a true gesture, an interval with a label.
+a time. A *truth* is the labelled interval of a gesture that was really made.
 
 *Overlap.* An event lasts from the time at which its label was reported to its end. It belongs to a truth if it begins
-before the truth and ends in it or later, or if it begins in the truth or at most ``late_s`` after its end, because a
-reaction to a hit of 0.2 s cannot be faster. It does not belong to a truth if the next truth of the same label has begun
-before the event.
+before the truth and ends in it or later, or if it begins in the truth or less than ``late_s`` after its end, because an
+event cannot be reported within a hit of 0.2 s. It does not belong to a truth that has ended if the next truth of the
+same label has begun before the event.
 
-The categories of truths and events of one label that belong together:
+Categories of truths and events of one label, by which of them belong together:
 
 ========================  =============================================================================================
 of a truth                of an event
@@ -23,9 +23,10 @@ correct: none of these    correct: none of these
 ========================  =============================================================================================
 
 Each truth and each event is in one category. ``hits`` are truths with an event, ``matched`` are events with a truth. An
-event with a wrong label is an insertion, and its truth a deletion if no other event was right. An insertion that
-overlaps a truth of another label is ``confused``, any other ``outside``. An event without a label (a gate reports only
-an affect, when gestures are scored) that overlaps a truth is ``unnamed``, neither right nor wrong.
+event with a wrong label is an insertion, and its truth is a deletion if it has no event of its own label. An insertion
+that belongs to the time of a truth with another label is ``confused``, any other is ``outside``. An event without a
+label (as when gestures are scored and the gate reported only an affect) is ``unnamed`` if it belongs to the time of a
+truth; it is then neither right nor wrong.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ LATE_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """A labelled interval: a truth, or an event from the time of its report; ``label`` may be "" for an event."""
+    """A labelled interval: a truth, or an event, which starts when it is reported. The label of an event may be ""."""
 
     start_s: float
     stop_s: float
@@ -52,10 +53,10 @@ class Interval:
 
 @dataclass
 class Tally:
-    """Counts of the categories of one label, or the sums over several labels.
+    """Counts of the categories for one label, or sums over several labels; the module describes the categories.
 
-    ``latencies`` are the seconds from the onset to the first right event of each hit. ``early`` are hits whose event
-    was reported before the onset; their latency is 0.
+    ``latencies`` are the seconds from the onset of each hit to the report of its first event. ``early`` is the number
+    of hits whose event was reported before the onset; their latency is 0.
     """
 
     truths: int = 0
@@ -82,34 +83,34 @@ class Tally:
 
     @property
     def outside(self) -> int:
-        """Insertions where there is no truth of any label."""
+        """Number of insertions that belong to the time of no truth."""
         return self.insertions - self.confused
 
     @property
     def recall(self) -> float | None:
-        """Hits divided by truths; None without truths."""
+        """Share of the truths that are hits; None without truths."""
         return self.hits / self.truths if self.truths else None
 
     @property
     def precision(self) -> float | None:
-        """Matched events divided by named events; None without any."""
+        """Share of the events, without unnamed ones, that are matched; None without such events."""
         named = self.events - self.unnamed
         return self.matched / named if named else None
 
     @property
     def f1(self) -> float | None:
-        """Harmonic mean of recall and precision: 0 without named events, None without truths and events."""
+        """Harmonic mean of recall and precision; 0 if one of them is undefined, None without truths and events."""
         if not self.truths and not self.events:
             return None
         recall, precision = self.recall or 0.0, self.precision or 0.0
         return 2 * recall * precision / (recall + precision) if recall + precision else 0.0
 
     def latency_s(self) -> dict[str, float | None]:
-        """Return median and 90th percentile of the time from onset to the first right event."""
+        """Return the median and 90th percentile of ``latencies``."""
         return latency_summary(self.latencies)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return counts and the scores that follow from them, ready for JSON; not every latency."""
+        """Return counts and scores as plain values, ready for JSON; of the latencies only a summary."""
         table = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "latencies"}
         return table | {
             "outside": self.outside,
@@ -122,7 +123,7 @@ class Tally:
         }
 
     def kept(self) -> dict[str, Any]:
-        """Return all fields as plain values, from which ``Tally(**values)`` restores the tally."""
+        """Return all fields as plain values; ``Tally(**values)`` restores the tally."""
         return {f.name: getattr(self, f.name) for f in fields(self)}
 
 
@@ -130,14 +131,14 @@ Tallies = dict[str, Tally]
 
 
 def latency_summary(latencies: Sequence[float]) -> dict[str, float | None]:
-    """Return ``{median, p90}`` in seconds; None without latencies."""
+    """Return ``{median, p90}`` in seconds; both are None without latencies."""
     if not latencies:
         return {"median": None, "p90": None}
     return {"median": float(np.median(latencies)), "p90": float(np.percentile(latencies, 90))}
 
 
 def pooled(tallies: Iterable[Tally]) -> Tally:
-    """Add several tallies up."""
+    """Return the sum of several tallies."""
     total = Tally()
     for tally in tallies:
         total.add(tally)
@@ -145,7 +146,7 @@ def pooled(tallies: Iterable[Tally]) -> Tally:
 
 
 def overlaps(truths: Sequence[Interval], events: Sequence[Interval], late_s: float = LATE_S) -> NDArray[np.bool_]:
-    """Return (T, E) whether each event belongs to the time of each truth, whatever their labels."""
+    """Return whether each event belongs to the time of each truth, (T, E), whatever their labels."""
     if not truths or not events:
         return np.zeros((len(truths), len(events)), dtype=np.bool_)
     start = np.array([t.start_s for t in truths])[:, None]
@@ -156,7 +157,7 @@ def overlaps(truths: Sequence[Interval], events: Sequence[Interval], late_s: flo
 
 
 def _until(truths: Sequence[Interval], late_s: float) -> NDArray[np.float64]:
-    """Return (T,) the time up to which an event of each truth may begin."""
+    """Return the time (T,) before which an event must begin to belong to each truth."""
     until = np.array([t.stop_s + late_s for t in truths])
     following: dict[str, float] = {}
     for at in sorted(range(len(truths)), key=lambda i: truths[i].start_s, reverse=True):
@@ -168,17 +169,17 @@ def _until(truths: Sequence[Interval], late_s: float) -> NDArray[np.float64]:
 
 
 def tally(truths: Sequence[Interval], events: Sequence[Interval], late_s: float = LATE_S) -> Tallies:
-    """Count one stream by label; `pooled` adds the labels up.
+    """Count the categories of each label in one stream; `pooled` adds the labels up.
 
     Args:
-        truths, events: in any order; a truth has a label, an event may have none.
+        truths, events: in any order; the label of an event may be "".
     """
     over = overlaps(truths, events, late_s)
     of_truth = np.array([t.label for t in truths], dtype=np.str_)
     of_event = np.array([e.label for e in events], dtype=np.str_)
     same = over & (of_truth[:, None] == of_event[None, :]) & (of_event != UNNAMED)[None, :]
     per_truth, per_event = same.sum(axis=1), same.sum(axis=0)
-    # A truth is merged when one of its events has another truth too; an event fragments when its truth has another.
+    # A truth is merged if one of its events has another truth; an event is fragmenting if its truth has another event.
     merged: list[bool] = (same & (per_event > 1)[None, :]).any(axis=1).tolist()
     fragmenting: list[bool] = (same & (per_truth > 1)[:, None]).any(axis=0).tolist()
     anything = [bool(n) for n in over.sum(axis=0)]
@@ -221,7 +222,7 @@ def tally(truths: Sequence[Interval], events: Sequence[Interval], late_s: float 
 def outside_insertions(
     truths: Sequence[Interval], events: Sequence[Interval], late_s: float = LATE_S
 ) -> list[Interval]:
-    """Return the insertions where there is no truth of any label."""
+    """Return the events that belong to the time of no truth."""
     anything = overlaps(truths, events, late_s).sum(axis=0) > 0
     return [event for event, any_truth in zip(events, anything, strict=True) if not any_truth]
 
@@ -230,13 +231,14 @@ def outside_insertions(
 class ErrorCosts:
     """Costs of the kinds of errors.
 
-    They are not measured: a family minds a hug taken for a blow more than one scratch taken for
-    another, and a toy that reacts for no reason more than one that misses something.
+    The values are judgements, not measurements: that a hug taken for a blow is worse for a family than one scratch
+    taken for another, and that a toy which reacts for no reason is worse than one that misses something.
 
-    Every event is charged by the truth it fits best: nothing for the first event of the right gesture; ``again`` for
-    every further one; ``family`` for another gesture of the family (also when it only says the right affect);
-    ``confused`` for another family of the same affect, or where no affect is known; ``affect`` for another affect;
-    ``outside`` where there is no truth. Every truth without any event costs ``missed``.
+    The cost of an event is the lowest over the truths to whose time it belongs: 0 for the first event of the right
+    gesture; ``again`` for each further one; ``family`` for another gesture of the same family, or if only the affect
+    was reported and is right; ``confused`` for another family of the same affect, or if an affect is unknown;
+    ``affect`` for another affect. It is ``outside`` if there is no such truth. A truth without any event costs
+    ``missed``.
     """
 
     again: float = 0.5
@@ -256,12 +258,12 @@ def cost(
     weights: ErrorCosts | None = None,
     late_s: float = LATE_S,
 ) -> float:
-    """Return the cost of one stream's errors, 0 for none.
+    """Return the total cost of the errors in one stream.
 
     Args:
-        truths, events: with gestures as labels; an event may have none.
-        affects: the affect of each event (E,), "none" where it has none.
-        families, affect_of: of each gesture; affect "none" is unknown.
+        truths, events: with gestures as labels; the label of an event may be "".
+        affects: affect of each event (E,); "none" if unknown.
+        families, affect_of: family and affect of each gesture; the affect "none" means unknown.
     """
     weights = weights or ErrorCosts()
     over = overlaps(truths, events, late_s)
@@ -294,7 +296,7 @@ def cost(
 
 
 def uncovered_s(spans: Sequence[tuple[float, float]], covered: Iterable[tuple[float, float]]) -> float:
-    """Return how much of ``spans`` (start, stop; they do not overlap) no span of ``covered`` covers, in seconds."""
+    """Return the duration of ``spans`` (start, stop; without overlap) outside all spans of ``covered``, in seconds."""
     union: list[list[float]] = []
     for start, stop in sorted(covered):
         if union and start <= union[-1][1]:
@@ -307,7 +309,7 @@ def uncovered_s(spans: Sequence[tuple[float, float]], covered: Iterable[tuple[fl
 
 
 def front(points: Sequence[tuple[float, float]]) -> list[int]:
-    """Return the indices of the points (recall, false events) on the Pareto front, by rising recall."""
+    """Return the indices of the points (recall, false events) on the Pareto front, in order of recall."""
     best: list[int] = []
     least = float("inf")
     for at in sorted(range(len(points)), key=lambda i: (-points[i][0], points[i][1], i)):
@@ -318,7 +320,7 @@ def front(points: Sequence[tuple[float, float]]) -> list[int]:
 
 
 def at_recall(points: Sequence[tuple[float, float]], recall: float) -> float | None:
-    """Interpolate false events at a recall on the `front` of ``points``; None beyond its ends."""
+    """Return the false events at ``recall``, interpolated on the `front` of ``points``; None beyond its ends."""
     chosen = [points[i] for i in front(points)]
     if not chosen or not chosen[0][0] <= recall <= chosen[-1][0]:
         return None

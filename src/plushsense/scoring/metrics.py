@@ -1,6 +1,6 @@
-"""Scores from truth and prediction: confusion, accuracy, macro-F1, votes, risk and coverage, Pareto front.
+"""Scores of predictions: confusion matrix, accuracy, macro-F1, votes, risk-coverage curve, Pareto front.
 
-A confusion matrix (K, K) has the truth in rows and the prediction in columns.
+Confusion matrices (K, K) have the true class in rows and the predicted class in columns.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ Floats = NDArray[np.float64]
 
 
 def confidences(logits: ArrayLike, smoothed: ArrayLike, highest: ArrayLike, sure: float) -> dict[str, Floats]:
-    """Return several confidences of n answers, (n,) each.
+    """Compute several confidence measures of n answers, (n,) each, by name; higher is more confident.
 
     Args:
-        logits: (n, K) of the step itself.
-        smoothed: (n, K) smoothed probabilities; ``highest`` (n,) the smoothed highest logit.
-        sure: the conformal threshold on smoothed probabilities; an empty set is the lowest confidence.
+        logits: (n, K) logits, not smoothed.
+        smoothed: (n, K) smoothed probabilities; ``highest`` (n,) are the smoothed highest logits.
+        sure: threshold on smoothed probabilities for the conformal set, whose size is a measure; empty is lowest.
     """
     z = np.asarray(logits, dtype=np.float64)
     p, top = np.asarray(smoothed, dtype=np.float64), np.asarray(highest, dtype=np.float64)
@@ -45,9 +45,9 @@ def confidences(logits: ArrayLike, smoothed: ArrayLike, highest: ArrayLike, sure
 
 @dataclass(frozen=True)
 class RiskCoverage:
-    """Risk-coverage curve: of the most confident answers, their share ``coverage`` (n,) and error rate ``risk`` (n,).
+    """Risk-coverage curve: error rate ``risk`` (n,) of the share ``coverage`` (n,) of the most confident answers.
 
-    ``area`` lies under the curve (AURC), ``oracle`` is the area of a perfect confidence, ``random`` that of chance.
+    ``area`` is the area under the curve (AURC), ``oracle`` that of a perfect confidence, ``random`` that of a random one.
     """
 
     coverage: Floats
@@ -58,17 +58,17 @@ class RiskCoverage:
 
     @property
     def gain(self) -> float:
-        """Share of the oracle's gain over chance that the confidence reaches; NaN where the oracle gains nothing."""
+        """Gain over a random confidence, as a share of the oracle's gain; NaN if the oracle gains nothing."""
         return (self.random - self.area) / (self.random - self.oracle) if self.random > self.oracle else float("nan")
 
     def coverage_at(self, risk: float) -> float:
-        """Return the largest coverage with at most this risk; 0 where there is none."""
+        """Return the largest coverage with at most this risk; 0 if there is none."""
         fits = np.flatnonzero(self.risk <= risk + 1e-12)
         return float(self.coverage[fits[-1]]) if len(fits) else 0.0
 
 
 def risk_coverage(confidence: ArrayLike, right: ArrayLike) -> RiskCoverage:
-    """Compute the risk-coverage curve of n answers from their confidence and whether each is ``right``.
+    """Compute the risk-coverage curve of n answers from their ``confidence`` and whether each is ``right``.
 
     The area is the mean of the risk over the coverages 1/n to 1 (Geifman, Uziel and El-Yaniv 2019).
     """
@@ -82,7 +82,7 @@ def risk_coverage(confidence: ArrayLike, right: ArrayLike) -> RiskCoverage:
 
 
 def _wrong(sure: Floats, good: NDArray[np.bool_]) -> Floats:
-    """Return (n,) the expected number of errors among the k most confident answers, over all orders of ties."""
+    """Return the expected number of errors (n,) in the 1 to n most confident answers, over all orders of ties."""
     order = np.argsort(-sure, kind="stable")
     ranked, wrong = sure[order], (~good[order]).astype(np.float64)
     starts = np.flatnonzero(np.concatenate([[True], ranked[1:] != ranked[:-1]]))
@@ -92,7 +92,10 @@ def _wrong(sure: Floats, good: NDArray[np.bool_]) -> Floats:
 
 
 def auroc(known: ArrayLike, unknown: ArrayLike) -> float:
-    """Return the probability that a known item scores higher than an unknown one, ties half; NaN without either."""
+    """Return the area under the ROC curve: the probability that a score in ``known`` is above one in ``unknown``.
+
+    Ties count half. NaN if either is empty.
+    """
     a, b = np.asarray(known, dtype=np.float64), np.sort(np.asarray(unknown, dtype=np.float64))
     if not len(a) or not len(b):
         return float("nan")
@@ -107,10 +110,10 @@ BOOTSTRAP_SEED = 20_260
 
 
 def confusion(truth: NDArray[np.int64], predicted: NDArray[np.int64], classes: int) -> Counts:
-    """Count (classes, classes) how often each truth (n,) was predicted as each class.
+    """Return the confusion matrix (classes, classes) of true and predicted class indices, both (n,).
 
     Raises:
-        BadInput: for a class index out of range.
+        BadInput: if a class index is out of range.
     """
     for name, index in (("truth", truth), ("prediction", predicted)):
         if len(index) and (int(index.min()) < 0 or int(index.max()) >= classes):
@@ -120,14 +123,14 @@ def confusion(truth: NDArray[np.int64], predicted: NDArray[np.int64], classes: i
 
 
 def accuracy(counts: Counts) -> float:
-    """Return the share of correct predictions; NaN without any."""
+    """Return the share of correct predictions; NaN if there are no predictions."""
     total = int(counts.sum())
     return float(np.trace(counts) / total) if total else float("nan")
 
 
 @dataclass(frozen=True)
 class ClassScores:
-    """Precision, recall and F1 of each class, (K,) each; 0 where they are undefined."""
+    """Precision, recall, F1 and number of items (``support``) of each class, (K,) each; undefined scores are 0."""
 
     precision: NDArray[np.float64]
     recall: NDArray[np.float64]
@@ -136,7 +139,7 @@ class ClassScores:
 
 
 def class_scores(counts: Counts) -> ClassScores:
-    """Return precision, recall and F1 by class."""
+    """Compute the scores of each class from a confusion matrix."""
     right = np.diag(counts).astype(np.float64)
     support, read = counts.sum(axis=1), counts.sum(axis=0)
     return ClassScores(
@@ -148,7 +151,7 @@ def class_scores(counts: Counts) -> ClassScores:
 
 
 def class_rows(counts: Counts, labels: Sequence[str]) -> list[dict[str, Any]]:
-    """Return label, precision, recall, F1 and support of each class as plain values."""
+    """Return label and scores of each class as plain values, ready for JSON."""
     scores = class_scores(counts)
     return [
         {
@@ -163,15 +166,15 @@ def class_rows(counts: Counts, labels: Sequence[str]) -> list[dict[str, Any]]:
 
 
 def macro_recall(counts: Counts) -> float:
-    """Return the mean recall of the classes that are present in the truth; NaN without any."""
+    """Return the mean recall of the classes that occur in the truth; NaN if there are none."""
     return _mean(class_scores(counts).recall[counts.sum(axis=1) > 0])
 
 
 def macro_f1(counts: Counts, all_classes: bool = False) -> float:
-    """Return the mean F1 of the classes that are present in the truth; NaN without any.
+    """Return the mean F1 of the classes that occur in the truth; NaN if there are none.
 
     Args:
-        all_classes: average every class, as the paper does over its 18; one that is absent counts as 0.
+        all_classes: average over all classes, like the paper over its 18; a class that never occurs counts as 0.
     """
     scores = class_scores(counts)
     if not all_classes:
@@ -180,10 +183,10 @@ def macro_f1(counts: Counts, all_classes: bool = False) -> float:
 
 
 class Metric(NamedTuple):
-    """A score computed from a confusion matrix (K, K), and how tables name and print it.
+    """A score computed from a confusion matrix (K, K), with its name and format in tables.
 
-    ``percent``: sweep tables print it in percent. ``column``: narrow tables (people, trials) have a column of it;
-    without, only the full table of an evaluation has it.
+    ``percent``: whether sweep tables print it in percent. ``column``: whether narrow tables (of people, of trials) have
+    it as a column; otherwise only the full table of an evaluation has it.
     """
 
     function: Callable[[Counts], float]
@@ -194,11 +197,11 @@ class Metric(NamedTuple):
 
     @property
     def title(self) -> str:
-        """The name as the head of a column."""
+        """Name as a column heading."""
         return self.name[0].upper() + self.name[1:]
 
 
-# A metric is a function and a line here: evaluations, reports, sweep tables and the command line read this table.
+# To add a metric, add a line here: evaluations, reports, sweep tables and the command line use this table.
 METRICS: dict[str, Metric] = {
     "accuracy": Metric(accuracy, "accuracy", percent=True),
     "macro_recall": Metric(macro_recall, "macro recall", column=False),
@@ -207,20 +210,20 @@ METRICS: dict[str, Metric] = {
 
 
 def column_metrics() -> dict[str, Metric]:
-    """Return the metrics that narrow tables have a column of, by key."""
+    """Return the metrics that are columns of narrow tables, by key."""
     return {key: metric for key, metric in METRICS.items() if metric.column}
 
 
 def scores_of(counts: Counts) -> dict[str, float]:
-    """Return every metric of a confusion matrix, by key; NaN where it is undefined."""
+    """Compute all metrics of a confusion matrix, by key; undefined ones are NaN."""
     return {key: metric.function(counts) for key, metric in METRICS.items()}
 
 
 def grouped(counts: Counts, groups: Sequence[str]) -> tuple[tuple[str, ...], Counts]:
-    """Sum a confusion by groups of classes (affects, families).
+    """Sum a confusion matrix over groups of classes, such as affects or families.
 
     Returns:
-        the names of the groups in order of appearance, and counts (G, G).
+        the names of the groups in order of appearance, and their confusion matrix (G, G).
 
     Args:
         groups: the group of each class, (K,).
@@ -233,13 +236,14 @@ def grouped(counts: Counts, groups: Sequence[str]) -> tuple[tuple[str, ...], Cou
 def vote(
     probabilities: NDArray[np.floating[Any]], recording: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the class of each recording: that of the highest mean probability over its windows.
+    """Choose the class of each recording by the highest mean probability over its windows.
 
     Args:
-        probabilities: (N, K); recording: (N,) any integer for each recording.
+        probabilities: (N, K) class probabilities of each window.
+        recording: (N,) number of the recording of each window.
 
     Returns:
-        the recordings in ascending order (R,), and the class of each (R,).
+        the numbers of the recordings in ascending order (R,), and the class of each (R,).
     """
     ids, place = np.unique(recording, return_inverse=True)
     total = np.zeros((len(ids), probabilities.shape[1]), dtype=np.float64)
@@ -249,10 +253,10 @@ def vote(
 
 
 def summary(values: Sequence[float] | NDArray[np.float64]) -> dict[str, Any]:
-    """Return ``{mean, sd, ci95}`` of one value for each person (or fold).
+    """Return ``{mean, sd, ci95}`` of values, one for each person (or fold).
 
-    ``sd`` divides by n − 1. ``ci95`` is the percentile bootstrap of the mean: 10 000 resamples with a fixed seed.
-    Values that are not numbers are left out; what cannot be computed is None.
+    ``sd`` divides by n − 1. ``ci95`` is a percentile bootstrap of the mean with 10 000 resamples and a fixed seed.
+    Values that are not finite are left out; figures that cannot be computed are None.
     """
     table = np.asarray(values, dtype=np.float64)
     table = table[np.isfinite(table)]
@@ -275,9 +279,9 @@ def _mean(values: NDArray[np.float64]) -> float:
 
 
 def pareto_front(rows: Sequence[tuple[float, ...]]) -> list[bool]:
-    """Return for each row (score, cost, cost, …) whether it is on the Pareto front.
+    """Return whether each row (score, cost, cost, …) is on the Pareto front: high score, low costs.
 
-    A row is on it if no other is at least as good in every value and better in one. Equal rows are both on it.
+    A row is on it if no other row is at least as good in every value and better in one; so equal rows are both on it.
     """
 
     def beats(a: tuple[float, ...], b: tuple[float, ...]) -> bool:
@@ -288,5 +292,5 @@ def pareto_front(rows: Sequence[tuple[float, ...]]) -> list[bool]:
 
 
 def accuracy_complexity_ratio(accuracy: float | None, parameters: int) -> float | None:
-    """Return ACR = accuracy / log10(parameters) (paper, 3.6.3); None without an accuracy or for 1 parameter."""
+    """Return ACR = accuracy / log10(parameters) (paper, 3.6.3); None without accuracy or below 2 parameters."""
     return None if accuracy is None or parameters <= 1 else accuracy / math.log10(parameters)

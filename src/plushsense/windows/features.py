@@ -76,7 +76,7 @@ class Scaler:
 
     @classmethod
     def fit(cls, x: NDArray[np.integer[Any]]) -> Scaler:
-        """Fit a scaler to zero mean and unit variance in training windows (N, F, T); a constant channel gets scale 1."""
+        """Fit zero mean and unit variance to training windows (N, F, T); a constant channel gets the scale 1."""
         mean = np.asarray(np.mean(x, axis=(0, 2), dtype=np.float64))
         spread = np.empty_like(mean)
         for channel in range(x.shape[1]):
