@@ -39,7 +39,7 @@ class DecideSpec:
         sure: smoothed probability from which a class is in the conformal set of a step.
         known: smoothed highest logit below which a touch is no known gesture; None: every touch is one.
         least_s: how long a gesture or affect must be the candidate before its event begins (minimum duration).
-        switch_s: how long another candidate must last before it replaces the gesture of the event.
+        switch_s: how long another candidate must last before it ends the event and begins the next one.
         end_s: how long the gesture or affect must be below its threshold before the event ends.
         hold_s, rest_s: minimum duration of an event, and minimum time after it until the next begins (refractory time).
         wait_s: how long an event of the gate waits for the network to name a gesture.

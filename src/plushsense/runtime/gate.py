@@ -1,25 +1,24 @@
-"""The gate: threshold rules that notice an energetic event within a few samples, in whole numbers only.
+"""The gate: threshold rules that detect an energetic gesture within a few samples, in integers only.
 
-This module defines when a toy's gate fires; ``deploy/c/plushsense.c`` repeats it, in 32 bits. It reads the network's
-inputs, raw, one even sample at a time, and works from the first samples on, while the network is still warming.
+This module is the specification that ``deploy/c/plushsense.c`` implements, in 32 bits. The gate gets the raw inputs of
+the network, one even sample at a time. It works from the first samples on, before the network has filled its span.
 
-- Inputs are shifted down by a signal's ``shift`` bits and held within ± 2^20. A *signal* is made of one of them, or of
-  several: ``level`` is the input itself; ``jerk`` the sum over the inputs of the absolute change from ``lag`` samples
-  ago (0 while there are not so many), held within 2^20 again.
-- Its *baseline* is an exponential mean with the weight 2^-baseline, its *noise* that of the deviation from the
-  baseline with the weight 2^-noise; a deviation counts there with at most 4 times noise plus floor, so that one blow
-  does not raise the noise for long. Both begin with the signal's first value, and a noise of 0. They are kept with 8
-  more bits.
-- Its *size* is 16 times the deviation, without its sign, divided by noise plus ``floor`` and rounded down.
-- A *term* of a rule holds when the size was at least ``threshold`` for ``times`` samples in a row (``sign`` 1: above
-  the baseline only, -1: below only, 0: either way), and ``within`` samples longer.
-- A *rule* fires when all its terms hold. The first rule that fires is reported; then no rule fires for its ``deaf``
-  samples, while signals and terms are still updated.
+- Inputs are shifted right by the ``shift`` bits of a signal and clipped to ±2^20. A *signal* is computed from one or
+  several of them: a ``level`` is the input itself; a ``jerk`` is the sum over its inputs of the absolute change since
+  ``lag`` samples ago (0 while there are fewer samples), clipped to 2^20.
+- The *baseline* of a signal is its exponential mean with the weight 2^-baseline. Its *noise* is the exponential mean of
+  the absolute deviation from the baseline, with the weight 2^-noise; each deviation is limited to 4 · (noise +
+  ``floor``), so that one blow does not raise the noise for long. The initial baseline is the first value of the
+  signal, the initial noise is 0. Both are stored with 8 extra bits.
+- The *size* of a signal is ⌊16 · absolute deviation / (noise + ``floor``)⌋.
+- A *term* of a rule holds if the size was at least ``threshold`` for ``times`` samples in a row (``sign`` 1: above
+  the baseline only, -1: below only, 0: both), and for ``within`` further samples.
+- A *rule* fires when all its terms hold. The first such rule is reported; after it, no rule fires for ``deaf`` samples,
+  while signals and terms are still updated.
 
-A sample whose inputs all repeat the one before is not read (the toy hangs), nor is a suspect one (see
-`plushsense.runtime.health`); it only counts for ``deaf``. So a blow that holds a sensor at its end stop for a moment
-goes on counting after it. After `DOUBT` suspect samples in a row everything else begins anew: a sensor that
-jumps to its end stop and back is broken, not hit.
+Suspect samples (see `plushsense.runtime.health`) and samples with the same inputs as the one before (the toy hangs) are
+skipped, except that they count for ``deaf``. So terms continue after a blow that saturates a sensor for a moment. After
+`DOUBT` suspect samples in a row, all other state is reset: a sensor that jumps to its limit and back is broken, not hit.
 """
 
 from __future__ import annotations
@@ -35,13 +34,13 @@ EXTRA_BITS = 8
 THRESHOLD_BITS = 4
 NOISE_CLIP = 4
 DOUBT = 10
-MOST_SIZE = 2 * HELD << THRESHOLD_BITS  # of a deviation of 2^21 over a floor of 1
+MOST_SIZE = 2 * HELD << THRESHOLD_BITS  # a deviation of 2^21 divided by a floor of 1
 MOST_SIGNALS, MOST_RULES, MOST_TERMS, MOST_LAG = 32, 16, 8, 16
 
 
 @dataclass(frozen=True)
 class Signal:
-    """Signal of the gate: ``kind`` `LEVEL` or `JERK` of ``inputs``, and how its baseline and noise follow it."""
+    """A signal of the gate: ``kind`` (`LEVEL` or `JERK`) of ``inputs`` (indices), and its constants; see the module."""
 
     kind: int
     inputs: tuple[int, ...]
@@ -54,7 +53,7 @@ class Signal:
 
 @dataclass(frozen=True)
 class Term:
-    """``signal`` (an index) has a size of at least ``threshold``, a sixteenth of noise plus floor each."""
+    """A condition of a rule: the size of ``signal`` (an index) is at least ``threshold``; see the module."""
 
     signal: int
     threshold: int
@@ -64,9 +63,9 @@ class Term:
 
 @dataclass(frozen=True)
 class Rule:
-    """Rule of the gate: all ``terms`` hold within ``within`` samples.
+    """A rule of the gate, which fires when all ``terms`` hold within ``within`` samples.
 
-    It reports ``affect`` and ``gesture`` (a class index, 255: none).
+    It then reports ``affect`` (a code) and ``gesture`` (a class index; 255: none).
     """
 
     terms: tuple[Term, ...]
@@ -78,10 +77,10 @@ class Rule:
 
 @dataclass(frozen=True)
 class GateSettings:
-    """Signals and rules of `Gate`; none at all is a gate that never fires.
+    """Signals and rules of a `Gate`; without rules, it never fires.
 
     Raises:
-        BundleError: for a number that the toy could not hold, or a signal that there is not.
+        BundleError: for a number outside the range of the toy, or an unknown signal.
     """
 
     signals: tuple[Signal, ...] = ()
@@ -115,7 +114,7 @@ def _within(what: str, value: int, low: int, high: int) -> None:
 
 
 class Gate:
-    """Follows one stream of inputs; ``sizes`` and ``deviations`` are those of each signal at the last sample read."""
+    """The gate of one stream; ``sizes`` and ``deviations`` are those of each signal at the last sample not skipped."""
 
     def __init__(self, plan: GateSettings) -> None:
         self.plan = plan
@@ -131,13 +130,13 @@ class Gate:
         self.reset()
 
     def reset(self) -> None:
-        """Begin a new stream: after a gap, a clock reset, a fault."""
+        """Start a new stream, as after a gap, a clock reset or a sensor fault."""
         self._deaf = self._doubt = 0
         self._forget()
 
     def _forget(self) -> None:
         n = len(self.plan.signals)
-        self._past: list[list[int]] = []  # the newest last, as many as the longest lag needs
+        self._past: list[list[int]] = []  # earlier samples, newest last, as many as the longest lag
         self._baseline = [0] * n
         self._noise = [0] * n
         self.deviations, self.sizes = [0] * n, [0] * n
@@ -145,7 +144,7 @@ class Gate:
         self._holds = [[0] * len(rule.terms) for rule in self.plan.rules]
 
     def push(self, inputs: Sequence[int], suspect: bool = False) -> int:
-        """Read one sample's inputs (I,); return the index of the rule that fires, or -1."""
+        """Add the inputs (I,) of one sample; return the index of the rule that fires, or -1."""
         if not self._rules:
             return -1
         deaf = self._deaf > 0
@@ -171,7 +170,7 @@ class Gate:
         return fired
 
     def _follow(self, now: list[int]) -> None:
-        # Written out, and the usual case first: this runs for every sample of every toy.
+        # Optimised: clipping is inlined and the usual case comes first, as this runs for every sample.
         past, baseline, noise = self._past, self._baseline, self._noise
         for at, one, several, lag, shift, slow, slower, floor in self._signals:
             if lag == 0:

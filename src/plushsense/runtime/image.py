@@ -1,30 +1,28 @@
-"""Image of a deployed model: the bytes that the C library reads.
+"""Image of a deployed model: the binary format that the C library reads.
 
-All numbers are little-endian. Fixed head (16 bytes): ``PLSH``, u16 version, u16 0, u32 length of the whole, u32 CRC-32
-of all that follows the head. Then, one after the other:
+All numbers are little-endian. Head (16 bytes): ``PLSH``, u16 version, u16 0, u32 length of the whole image, u32 CRC-32
+of everything after the head. The following sections come in this order:
 
-- u8 layers, u8 measured channels, u8 inputs, u8 classes, u16 step, u16 blocks of the pooling, u32 span (samples),
-  u32 period and u32 gap of the clock in its own units, u32 milliseconds to units, u16 smoothing weight, u16
-  layout check (`layout_check`)
-- a measured channel: i32 lowest and i32 highest valid value
-- an input: u8 kind (0 a channel, 1 a magnitude), u8 n, n × u8 measured channels, then i32 offset, i32 bias,
+- u8 layers, u8 measured channels, u8 inputs, u8 classes, u16 step, u16 pooled steps, u32 span (samples), u32 period and
+  u32 gap in clock units, u32 clock units per millisecond, u16 smoothing weight, u16 layout checksum (`layout_check`)
+- for each measured channel: i32 lowest and i32 highest valid value
+- for each input: u8 kind (0 channel, 1 magnitude), u8 n, n × u8 measured channels, then i32 offset, i32 bias,
   u16 multiplier, u8 before, u8 after
-- a layer: u16 kernel, u16 dilation, u16 channels read, u16 filters; a filter: i32 bias, u16 multiplier, u8 before,
-  u8 after; then the weights, each as weight + 128, for every 4 filters (the last ones filled up), tap and 4 channels
-  (filled up): 4 filters × 4 channels
-- a class: i32 bias, u16 multiplier, u8 before, u8 after; then classes × features weights, each as weight + 128
-- a class: u8 affect (0 none, 1 positive, 2 neutral, 3 negative), with 4 added when it is idle
-- a class: its label in UTF-8 and a 0; then the model's title in UTF-8 and a 0
+- for each layer: u16 kernel, u16 dilation, u16 input channels, u16 filters; for each filter: i32 bias, u16 multiplier,
+  u8 before, u8 after; then the weights + 128 as u8, in blocks of 4 filters × 4 channels, ordered by group of 4 filters,
+  tap, and group of 4 channels (both padded to a multiple of 4)
+- for each class: i32 bias, u16 multiplier, u8 before, u8 after; then classes × features weights + 128 as u8
+- for each class: u8 affect (0 none, 1 positive, 2 neutral, 3 negative), plus 4 if the class is idle
+- for each class: its label in UTF-8 and a 0; then the title of the model in UTF-8 and a 0
 - events: u16 enter, leave, enter_affect, leave_affect, sure, i16 known, u16 least, switch, end, hold, rest, wait
-- health: u16 fault_ms, still_ms, recover_ms, u8 whether there are limits, u8 0; with limits, a measured channel: i32
-  low and i32 high
-- gate: u8 signals, u8 rules (without rules neither); a signal: u8 kind, u8 n, n × u8 inputs, u8 lag, u8 shift,
-  u8 baseline, u8 noise, u32 floor; a rule: u8 terms, u8 affect, u8 gesture, u8 within, u16 deaf; a term: u8 signal,
-  i8 sign, u8 times, u8 0, u32 threshold
+- health: u16 fault_ms, still_ms, recover_ms, u8 whether limits follow, u8 0; then, for each measured channel: i32 low,
+  i32 high
+- gate: u8 signals, u8 rules (both 0 without rules); for each signal: u8 kind, u8 n, n × u8 inputs, u8 lag, u8 shift,
+  u8 baseline, u8 noise, u32 floor; for each rule: u8 terms, u8 affect, u8 gesture, u8 within, u16 deaf; then for each
+  of its terms: u8 signal, i8 sign, u8 times, u8 0, u32 threshold
 
-The C library believes none of it unseen: it refuses an image in which a count, a scale or a setting is out of the
-ranges that `IntegerModel`, `plushsense.runtime.fixed` and the plans of `plushsense.runtime.decisions` accept, a
-section is not whole, or the span is not that of the layers.
+The C library validates all of it: it refuses an image with an incomplete section, a span that does not fit the layers,
+or a number outside the ranges of `IntegerModel`, `plushsense.runtime.fixed` and `plushsense.runtime.decisions`.
 """
 
 from __future__ import annotations
@@ -48,21 +46,21 @@ from plushsense.runtime.gate import JERK
 from plushsense.runtime.integer import IntegerNetwork
 
 MAGIC = b"PLSH"
-IMAGE_VERSION = 2  # 2: with the rules of events, gate and health
+IMAGE_VERSION = 2  # since 2 with the settings of events, gate and health
 HEAD_BYTES = 16
 IDLE_BIT = 4
-GROUP = 4  # filters computed together, and channels read together
-MOST_CLOCK_UNITS = 1 << 22  # of the gap and the period: interpolation then needs no more than 32 bits
+GROUP = 4  # number of filters, and of channels, in a block of weights
+MOST_CLOCK_UNITS = 1 << 22  # limit for the gap, so that interpolation needs no more than 32 bits
 
 
 @dataclass(frozen=True, eq=False)
 class IntegerModel:
-    """Deployed model: network, layout (clock, validity, inputs), gestures, rules and the weight of a new step.
+    """A model that can be deployed: integer network, layout, gestures and decision settings.
 
-    ``smoothing`` is in steps of 2^-15 (`plushsense.runtime.fixed.smoothing_weight`).
+    ``smoothing`` is the weight of a new step, in units of 2^-15 (`plushsense.runtime.fixed.smoothing_weight`).
 
     Raises:
-        BundleError: when the parts do not fit together, or the toy could not hold them.
+        BundleError: if the parts do not fit together, or exceed the limits of the toy.
     """
 
     network: IntegerNetwork
@@ -126,11 +124,11 @@ class IntegerModel:
 
     @property
     def _units_per_ms(self) -> int:
-        """The clock's unit is the largest part of a millisecond of which the period is a whole number."""
+        """Clock units per millisecond: the smallest number for which the period is a whole number of units."""
         return 1000 // math.gcd(1000, self.layout.period_us)
 
     def sections(self) -> list[tuple[str, bytes]]:
-        """Return what follows the head as (description, bytes) pairs."""
+        """Return the sections after the head as pairs of description and bytes."""
         arch, layout = self.network.arch, self.layout
         units_per_ms = self._units_per_ms
         sections = [
@@ -186,7 +184,7 @@ class IntegerModel:
         return sections + _rules(self.rules)
 
     def to_bytes(self) -> bytes:
-        """Return the image."""
+        """Return the bytes of the image."""
         body = b"".join(piece for _, piece in self.sections())
         return image_head(body) + body
 
@@ -217,18 +215,18 @@ def _rules(rules: Rules) -> list[tuple[str, bytes]]:
 
 
 def layout_check(layout: Layout) -> int:
-    """Return a 16-bit checksum of the order, names, units and steps of a frame's channels."""
+    """Return a 16-bit checksum of names, units and steps of the measured channels, in order."""
     channels = json.dumps([[c.name, c.unit, c.step] for c in layout.channels])
     return zlib.crc32(channels.encode()) & 0xFFFF
 
 
 def image_head(body: bytes) -> bytes:
-    """Return the 16 bytes that precede a body of an image."""
+    """Return the 16-byte head for the body of an image."""
     return MAGIC + struct.pack("<HHII", IMAGE_VERSION, 0, len(body) + HEAD_BYTES, zlib.crc32(body))
 
 
 def memory_bytes(model: IntegerModel) -> int:
-    """Return the bytes of memory that a toy needs beside its ``plush_toy``, as the C's ``plush_memory_bytes`` does."""
+    """Return the bytes that a toy needs besides its ``plush_toy`` struct; equal to ``plush_memory_bytes`` in C."""
     arch, channels = model.network.arch, len(model.layout.channels)
     features = arch.filters[-1]
     pieces = [4 * channels] * 3  # held, before, the sample being made
@@ -260,7 +258,7 @@ def _scales(bias: NDArray[np.int64], scale: Requantize | LogitScale) -> bytes:
 
 
 def grouped_weights(weights: NDArray[np.int8]) -> NDArray[np.uint8]:
-    """Return weights (F, C, K) as the toy reads them, each + 128 and filled up with 128: (F / 4, K, C / 4, 4, 4)."""
+    """Return weights (F, C, K) + 128 in the order of the image, (⌈F/4⌉, K, ⌈C/4⌉, 4, 4); the padding is 128."""
     f, c, k = weights.shape
     full = np.zeros((_filled(f), _filled(c), k), dtype=np.int16)
     full[:f, :c] = weights

@@ -1,6 +1,6 @@
-"""Read a whole stream through a model once, and replay any settings of gate and events over it.
+"""Compute the logits of a whole stream once, then replay gate and events with any settings.
 
-`trace_of` and `replay` drive the classes of `runtime.machine`; `TraceReplayer` gives the same updates faster.
+`trace_of` and `replay` use the classes of `runtime.machine`; `TraceReplayer` computes the same updates faster.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ from plushsense.runtime.machine import Break, FloatLogits, FrameReader, InputRow
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Even samples without a break.
+    """Evenly spaced samples of a stream without a break; times are since the first frame of the stream.
 
-    ``start_us`` the time of sample 0 since the stream's first frame, ``ends_us`` that at which it was over: of the last
-    frame, or of the one with which a fault began; ``inputs`` (T, I) raw; ``suspect`` (T,); ``logits`` (n, K) in steps
-    of 1/256, of every step from the one that fills the span.
+    ``start_us`` is the time of sample 0; ``ends_us`` is the time of the break that ended the part, or of the last frame
+    of the stream; ``inputs`` (T, I) are raw; ``suspect`` (T,) marks suspect samples; ``logits`` (n, K), in steps of
+    1/256, are those of every step from the first full span on.
     """
 
     start_us: int
@@ -53,9 +53,9 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """One stream as a model reads it; ``first_ms`` is the device time of the first frame, ``faults`` of its sensors.
+    """Inputs and logits of one stream. ``first_ms``: device time of the first frame; ``faults``: number of sensor faults.
 
-    Time is counted as `FrameReader` counts it: from the first frame, and over a reset of the clock it goes on.
+    Times are those of `FrameReader`: since the first frame, and continuing after a reset of the device clock.
     """
 
     arch: Arch
@@ -71,18 +71,18 @@ class Trace:
         return sum(len(p.inputs) for p in self.parts) * self.period_us / 1e6
 
     def step_times_us(self, part: Part) -> NDArray[np.int64]:
-        """Return the times (n,) of a part's answers."""
+        """Return the times (n,) of the logits of a part, in microseconds."""
         at = np.arange(len(part.logits)) * self.arch.step + self.arch.span - 1
         return part.start_us + at * self.period_us
 
 
 def trace_of(frames: Frames, model: Bundle | IntegerModel, health: HealthSettings | None = None) -> Trace:
-    """Read a whole stream through a model: its samples, and the network's logits, computed a part at once.
+    """Compute samples and logits of a whole stream, a part at a time.
 
     Args:
         frames: the whole stream, as recorded.
-        model: a bundle is read by the float network, an integer model by the deployed one.
-        health: when sensors are at fault; the model's own settings when left out.
+        model: a bundle, for the float network, or an integer model, for the deployed one.
+        health: settings of sensor health; by default those of the model.
     """
     network: LogitStream
     if isinstance(model, IntegerModel):
@@ -114,17 +114,17 @@ def trace_of(frames: Frames, model: Bundle | IntegerModel, health: HealthSetting
 
 @dataclass(frozen=True, eq=False)
 class Replayed:
-    """``updates`` of events; ``answers`` of every step with its time in microseconds."""
+    """Result of `replay`: ``updates`` of events, and the time in microseconds and answer of every step (``answers``)."""
 
     updates: tuple[Update, ...]
     answers: tuple[tuple[int, Answer], ...]
 
 
 def replay(trace: Trace, rules: Rules, smoothing: int) -> Replayed:
-    """Return the events and answers of a trace under other settings of gate and events; times in microseconds.
+    """Compute events and answers of a trace with other settings of gate and events; times in microseconds.
 
     Args:
-        smoothing: weight of a new step, in steps of 2^-15 (`fixed.smoothing_weight`).
+        smoothing: weight of a new step, in units of 2^-15 (`fixed.smoothing_weight`).
     """
     reader = SampleReader(_TracedLogits(trace), trace.gestures, rules, smoothing)
     moments = list(reader.read(_items(trace)))
@@ -143,14 +143,14 @@ def _items(trace: Trace) -> Iterator[Sample | Break]:
 
 
 class _TracedLogits:
-    """The logits of a trace as a `LogitStream`; each reset begins the next part."""
+    """The logits of a trace as a `LogitStream`; each reset selects the next part."""
 
     def __init__(self, trace: Trace) -> None:
         self.arch = trace.arch
         self._parts = iter([*(part.logits for part in trace.parts), np.empty((0, trace.arch.classes), dtype=np.int64)])
 
     def reset(self) -> None:
-        """Go to the next part."""
+        """Select the next part."""
         self._logits = next(self._parts)
         self._samples = 0
 
@@ -164,7 +164,7 @@ class _TracedLogits:
 
 
 def gate_hits(part: Part, plan: GateSettings) -> list[tuple[int, int]]:
-    """Return (sample, rule) of every firing of the gate in a part."""
+    """Return the sample index and rule index of every firing of the gate in a part."""
     if not plan.rules:
         return []
     gate = Gate(plan)
@@ -178,10 +178,10 @@ Hits = list[list[tuple[int, int]]]
 
 @dataclass(frozen=True, slots=True)
 class ReportedEvent:
-    """One event as it is reported, in seconds since the stream's first frame.
+    """A whole event; times are in seconds since the first frame of the stream.
 
-    ``gesture`` a class index, `NO_GESTURE` where none was ever named; ``named_s`` when it was named (without one, when
-    the event began); ``affect`` a code of `AFFECT_CODES`; ``source`` `CNN` or `GATE`.
+    ``gesture`` is a class index, or `NO_GESTURE` if none was named; ``named_s`` is the time at which it was named, else
+    that of the beginning; ``affect`` is a code of `AFFECT_CODES`; ``source`` is `CNN` or `GATE`.
     """
 
     start_s: float
@@ -194,10 +194,10 @@ class ReportedEvent:
 
 @dataclass(frozen=True, eq=False)
 class SmoothedPart:
-    """Smoothed numbers of a part.
+    """Smoothed values of the n steps of a part.
 
-    ``shares`` (n, K) in steps of 2^-15; ``best`` (n,) class by all bits; ``highest`` (n,) logit in steps of 1/256;
-    ``affect_shares`` (n, 4) the shares of each affect together, idle classes left out.
+    ``shares`` (n, K): probabilities in units of 2^-15; ``best`` (n,): most probable class, before rounding; ``highest``
+    (n,): highest logit in units of 1/256; ``affect_shares`` (n, 4): sum of the shares of each affect, without idle ones.
     """
 
     shares: Ints
@@ -207,10 +207,10 @@ class SmoothedPart:
 
 
 class TraceReplayer:
-    """Replays one trace under many settings, faster than `replay` and with the same updates.
+    """Replay one trace with many settings, with the same updates as `replay`, but faster.
 
-    Probabilities are computed once a trace and smoothed once a weight; the candidates of all steps are arrays; steps
-    without a candidate are skipped while no event is open.
+    Probabilities are computed once, and smoothed once for each weight; the candidates of all steps are computed as
+    arrays; steps without a candidate are skipped while no event is open.
     """
 
     def __init__(self, trace: Trace) -> None:
@@ -231,13 +231,13 @@ class TraceReplayer:
         ]
 
     def smoothed(self, weight: int) -> list[SmoothedPart]:
-        """Return the smoothed numbers of each part, from a cache."""
+        """Return the values of each part smoothed with ``weight``; they are cached."""
         if weight not in self._smoothed:
             self._smoothed[weight] = [self._smooth(rows, weight) for rows in self._probabilities]
         return self._smoothed[weight]
 
     def clear_cache(self) -> None:
-        """Drop the smoothed numbers: they take many times the memory of the trace."""
+        """Drop the cached smoothed values, which need many times the memory of the trace."""
         self._smoothed.clear()
 
     def _smooth(self, rows: Ints, weight: int) -> SmoothedPart:
@@ -253,13 +253,13 @@ class TraceReplayer:
         return SmoothedPart(shares[:, :-1], means[:, :-1].argmax(axis=1), shares[:, -1], totals)
 
     def hits(self, gate: GateSettings) -> Hits:
-        """Return (sample, rule) of every firing of a gate in each part, from a cache."""
+        """Return the `gate_hits` of each part; they are cached."""
         if gate not in self._hits:
             self._hits[gate] = [gate_hits(part, gate) for part in self.trace.parts]
         return self._hits[gate]
 
     def replay(self, rules: Rules, weight: int) -> list[Update]:
-        """Return the updates of `replay`, times in microseconds."""
+        """Return the same updates as `replay`, with times in microseconds."""
         machine = EventMachine(rules.events, weight, self.trace.gestures)
         updates: list[Update] = []
         for part, smoothed, hits in zip(self.trace.parts, self.smoothed(weight), self.hits(rules.gate), strict=True):
@@ -268,15 +268,15 @@ class TraceReplayer:
         return updates
 
     def updates(self, spec: DecideSpec) -> list[Update]:
-        """Return the updates of events under ``spec``, times in microseconds."""
+        """Return the updates of events with the settings ``spec``, times in microseconds."""
         return self.replay(spec.rules(self.step_s), smoothing_weight(spec.smoothing_s, self.step_s))
 
     def events(self, spec: DecideSpec) -> list[ReportedEvent]:
-        """Return the events under ``spec``."""
+        """Return the events with the settings ``spec``."""
         return reported_events(self.updates(spec))
 
     def _candidates(self, smoothed: SmoothedPart, settings: EventSettings) -> tuple[Ints, Ints]:
-        """Return the candidate of each step, as `EventMachine` has it: (n,) gesture or `NO_GESTURE`, (n,) affect."""
+        """Return gesture (n,) (or `NO_GESTURE`) and affect (n,) of the candidate of each step, as in `EventMachine`."""
         share = np.take_along_axis(smoothed.shares, smoothed.best[:, None], axis=1)[:, 0]
         known = (smoothed.highest >= settings.known) & ~self._idle[smoothed.best]
         sure = known & (share >= settings.enter)
@@ -305,7 +305,7 @@ class TraceReplayer:
         rows = list(zip(smoothed.best.tolist(), gestures.tolist(), affects.tolist(), strict=True))
         doubts: list[bool] = suspects.tolist()
         at = 0
-        # A firing comes before the step of its own sample.
+        # If the gate fires, it does so before the step of the same sample.
         for sample, rule in [*hits, (len(part.inputs), -1)]:
             stop = min(-((first - sample) // step), n) if rule >= 0 else n
             while at < stop:
@@ -326,7 +326,7 @@ class TraceReplayer:
 
 
 def reported_events(updates: Sequence[Update]) -> list[ReportedEvent]:
-    """Return whole events, times in seconds; one that has not ended ends with the last update."""
+    """Combine updates into whole events; an event that has not ended gets the time of the last update as its end."""
     begun: dict[int, Update] = {}
     named: dict[int, Update] = {}
     events = []

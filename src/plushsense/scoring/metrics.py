@@ -47,7 +47,7 @@ def confidences(logits: ArrayLike, smoothed: ArrayLike, highest: ArrayLike, sure
 class RiskCoverage:
     """Risk-coverage curve: error rate ``risk`` (n,) of the share ``coverage`` (n,) of the most confident answers.
 
-    ``area`` is the area under the curve (AURC), ``oracle`` that of a perfect confidence, ``random`` that of a random one.
+    ``area`` is the area under the curve (AURC), ``oracle`` that of a perfect confidence, ``random`` of a random one.
     """
 
     coverage: Floats
@@ -92,10 +92,7 @@ def _wrong(sure: Floats, good: NDArray[np.bool_]) -> Floats:
 
 
 def auroc(known: ArrayLike, unknown: ArrayLike) -> float:
-    """Return the area under the ROC curve: the probability that a score in ``known`` is above one in ``unknown``.
-
-    Ties count half. NaN if either is empty.
-    """
+    """Return the probability that a score in ``known`` is above one in ``unknown``, ties half; NaN if one is empty."""
     a, b = np.asarray(known, dtype=np.float64), np.sort(np.asarray(unknown, dtype=np.float64))
     if not len(a) or not len(b):
         return float("nan")
