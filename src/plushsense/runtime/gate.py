@@ -18,7 +18,7 @@ the network, one even sample at a time. It works from the first samples on, befo
 
 Suspect samples (see `plushsense.runtime.health`) and samples with the same inputs as the one before (the toy hangs) are
 skipped, except that they count for ``deaf``. So terms continue after a blow that saturates a sensor for a moment. After
-`DOUBT` suspect samples in a row, all other state is reset: a sensor that jumps to its limit and back is broken, not hit.
+`DOUBT` suspect samples in a row, the rest of the state is reset: a sensor that jumps to its limit and back is broken.
 """
 
 from __future__ import annotations

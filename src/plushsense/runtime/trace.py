@@ -53,7 +53,7 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """Inputs and logits of one stream. ``first_ms``: device time of the first frame; ``faults``: number of sensor faults.
+    """Inputs and logits of one stream. ``first_ms``: device time of the first frame; ``faults``: number of faults.
 
     Times are those of `FrameReader`: since the first frame, and continuing after a reset of the device clock.
     """
@@ -114,7 +114,7 @@ def trace_of(frames: Frames, model: Bundle | IntegerModel, health: HealthSetting
 
 @dataclass(frozen=True, eq=False)
 class Replayed:
-    """Result of `replay`: ``updates`` of events, and the time in microseconds and answer of every step (``answers``)."""
+    """Result of `replay`: ``updates`` of events, and ``answers`` with the time (microseconds) of each step."""
 
     updates: tuple[Update, ...]
     answers: tuple[tuple[int, Answer], ...]
@@ -197,7 +197,7 @@ class SmoothedPart:
     """Smoothed values of the n steps of a part.
 
     ``shares`` (n, K): probabilities in units of 2^-15; ``best`` (n,): most probable class, before rounding; ``highest``
-    (n,): highest logit in units of 1/256; ``affect_shares`` (n, 4): sum of the shares of each affect, without idle ones.
+    (n,): highest logit in units of 1/256; ``affect_shares`` (n, 4): sum of the shares of each affect, without idle.
     """
 
     shares: Ints

@@ -1,1 +1,1 @@
-"""Training of one network: schedule, augmentation, the training loop and its fast convolutions."""
+"""Train one network: schedule, augmentation, training loop and fast convolutions."""

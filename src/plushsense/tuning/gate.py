@@ -1,9 +1,9 @@
 """Fit the gate: choose signals, terms and thresholds that detect the energetic gestures of some people.
 
-Candidates are each input's level, each input's jerk and the jerk of all inputs of a kind, at several lags and floors;
-rules have one or two terms. The thresholds of a rule are chosen so that it fires at most so often an hour on everything
-that is not energetic; of the rules that then detect most, the quickest is taken. Further rules are added as long as
-they detect energetic recordings that the earlier ones miss.
+Candidates for terms are the level and the jerk of each input, and the jerk of all inputs of a kind at several lags, each
+with several floors. Rules have one or two terms. The thresholds of a rule limit its false alarms per hour on everything
+that is not energetic; of the rules that then detect the most, the fastest is chosen. Further rules are added as long as
+they detect enough energetic recordings that the earlier ones miss.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ from plushsense.runtime.gate import (
 from plushsense.tuning.gate_rules import BETWEEN, CALM, LEFT_OUT, FoundRule, Heights, Material, best_rule, material_of
 
 LEAD = 1200
-"""Samples read before a piece, in which a baseline settles."""
+"""Number of samples computed before a piece, in which the baseline settles."""
 PIECE = 4800
-_CELLS = 12_000  # pieces times signals that are computed together: more do not fit the cache
+_CELLS = 12_000  # number of pieces times signals computed together; more do not fit the cache
 
 
 def raw_signal(x: NDArray[np.int64], signal: Signal) -> NDArray[np.int64]:
-    """Return a signal (T,) of inputs (T, I) before its baseline."""
+    """Return the values (T,) of a signal, before its baseline is subtracted, from inputs (T, I)."""
     columns: NDArray[np.int64] = np.clip(x[:, list(signal.inputs)] >> signal.shift, -HELD, HELD)
     if signal.kind == LEVEL:
         return np.asarray(columns[:, 0])
@@ -55,11 +55,11 @@ def raw_signal(x: NDArray[np.int64], signal: Signal) -> NDArray[np.int64]:
 def signal_sizes(
     xs: Sequence[NDArray[np.int64]], signals: Sequence[Signal], deviations: bool = False
 ) -> list[NDArray[np.int32]]:
-    """Return the sizes of the signals, with the deviation's sign: an array (T, S) of each stretch (T, I).
+    """Return the sizes of the signals, with the sign of the deviation, as an array (T, S) for each stretch (T, I).
 
-    Computed as by `plushsense.runtime.gate.Gate`, with two differences that allow many pieces to be computed together:
-    each piece of a stretch begins `LEAD` samples early, and samples that repeat the one before count like others.
-    With ``deviations`` the deviations are returned instead.
+    They are those of `plushsense.runtime.gate.Gate`, with two differences that allow many pieces to be computed at once:
+    the baseline of a piece starts only `LEAD` samples before it, and samples that repeat the previous one are not
+    skipped. With ``deviations``, the deviations are returned instead.
     """
     out = [np.zeros((len(x), len(signals)), dtype=np.int32) for x in xs]
     pieces = [(n, at, max(0, at - LEAD)) for n, x in enumerate(xs) for at in range(0, len(x), PIECE)]
@@ -68,7 +68,7 @@ def signal_sizes(
     for first in range(0, len(pieces), per):
         some = pieces[first : first + per]
         stops = [min(at + PIECE, len(xs[n])) for n, at, _ in some]
-        # A jerk depends on samples before the piece.
+        # A jerk needs up to `MOST_LAG` earlier samples.
         block = np.zeros((stops[0] - some[0][2], len(some), len(signals)), dtype=np.int32)
         for column, ((n, _, begin), stop) in enumerate(zip(some, stops, strict=True)):
             back = max(0, begin - 16)
@@ -100,23 +100,24 @@ def _follow_block(block: NDArray[np.int32], signals: Sequence[Signal], deviation
 
 Ints32 = NDArray[np.int32]
 
-_TOGETHER = 6  # stretches with all candidates in memory at a time
-_MOST, _FLOORS = 24, 2  # candidates to keep, and how many of them may differ in their floor only
+_TOGETHER = 6  # number of stretches processed at once with all candidates, which limits memory
+_MOST, _FLOORS = 24, 2  # number of candidates to keep, and of those among them that may differ only in the floor
 
 
 @dataclass(frozen=True)
 class GateSpec:
-    """Settings of the fit of a gate; times in seconds.
+    """Settings for fitting a gate; times in seconds.
 
     Attributes:
-        false_alarms_per_hour: limit on what is not energetic.
-        lags_s: of jerk; floors: quantiles of a signal's deviation over all recorded data.
-        times_s: for how long a term must hold; within_s: for how long it then counts.
-        deaf_s: dead time after firing.
-        rules: most rules of one affect.
-        least: share of the energetic recordings that a first rule must detect, else there is no gate.
-        gain: share that a further rule must add, at least two recordings.
-        worth: time between recordings counts as calm, unless that costs this share of the recordings.
+        false_alarms_per_hour: limit for data that is not energetic.
+        lags_s: lags of jerks; floors: quantiles of the absolute deviation of a signal, used as its floors.
+        times_s: how long the size must reach the threshold; within_s: how long the term holds afterwards.
+        deaf_s: time after firing in which no rule fires.
+        baseline_s, noise_s: time constants of baseline and noise.
+        rules: largest number of rules for one affect.
+        least: share of the energetic recordings that the first rule must detect, else there are no rules.
+        gain: share that each further rule must add, at least two recordings.
+        worth: share of the recordings that must be lost before time between recordings is not counted as calm.
     """
 
     false_alarms_per_hour: float = 1.0
@@ -135,7 +136,7 @@ class GateSpec:
 
 @dataclass(frozen=True)
 class GateFit:
-    """Fitted ``plan``, and a ``report`` of what it was fitted on."""
+    """A fitted gate (``plan``), and a ``report`` with the data and results of the fit."""
 
     plan: GateSettings
     report: dict[str, Any] = field(default_factory=dict)
@@ -148,13 +149,13 @@ def fit_gate(
     *,
     false_alarms_per_hour: float = 1.0,
 ) -> GateFit:
-    """Fit a gate on the streams of ``subjects``, and on their recordings where there is no stream.
+    """Fit a gate on the streams of ``subjects``, and on their recordings that are in no stream.
 
-    Where there is nothing energetic to detect, the plan is empty and the report says why.
+    If there is nothing energetic to detect, or no rule is good enough, the plan has no rules and the report has a reason.
 
     Args:
-        gestures: the classes of the model beside the gate; they define which gestures are energetic, and their affect.
-        false_alarms_per_hour: limit on everything that is not energetic.
+        gestures: the classes of the model; they define which gestures are energetic, and their affect.
+        false_alarms_per_hour: limit for data that is not energetic.
     """
     spec = GateSpec(false_alarms_per_hour)
     figures = {"people": len(set(subjects)), "false_alarms_per_hour_allowed": spec.false_alarms_per_hour}
@@ -194,9 +195,9 @@ def fit_gate(
 
 
 def _rules_of(candidates: _Candidates, labels: list[str], spec: GateSpec) -> tuple[list[FoundRule], bool]:
-    """Return rules for some gestures, and whether the time between recordings was counted as calm.
+    """Return rules for the gestures ``labels``, and whether the time between recordings was counted as calm.
 
-    It is, unless that costs recall, as where people practised between their recordings.
+    It is, unless that costs recall, as when people practised between their recordings.
     """
     best: tuple[int, list[FoundRule], bool] = (-1, [], True)
     for believed in (True, False):
@@ -221,7 +222,7 @@ def _rules_of(candidates: _Candidates, labels: list[str], spec: GateSpec) -> tup
 
 
 class _Candidates:
-    """Candidates for terms, with their sizes in the material."""
+    """Candidates for terms (signal and sign), with their sizes in the material."""
 
     def __init__(self, layout: Layout, material: Material, spec: GateSpec) -> None:
         self.layout, self.material = layout, material
@@ -244,7 +245,7 @@ class _Candidates:
         return sizes
 
     def _lasting(self, sizes: Ints32) -> Ints32:
-        """Return sizes as a term counts them: the lowest of ``times``, then the highest of ``within``."""
+        """Return the largest threshold at which a term holds: minimum over ``times``, then maximum over ``within``."""
         lasting = sizes.copy()
         for back in range(1, self.times):
             lasting[back:] = np.minimum(lasting[back:], sizes[:-back])
@@ -255,7 +256,7 @@ class _Candidates:
         return highest
 
     def _floors(self, signals: list[Signal], spec: GateSpec) -> list[Signal]:
-        """Return each signal at each floor, held within the range of the gate."""
+        """Return each signal with each floor, clipped to the range of the gate."""
         longest = sorted(self._xs, key=len)[-12:]
         sample = np.abs(np.concatenate(signal_sizes([x[: 4 * PIECE] for x in longest], signals, deviations=True)))
         floors = np.percentile(sample, [100 * share for share in spec.floors], axis=0)
@@ -265,7 +266,7 @@ class _Candidates:
         return out
 
     def _signs(self, signals: list[Signal]) -> list[tuple[Signal, int]]:
-        """Return each signal with the sign in which the energetic recordings move its level; jerk has none."""
+        """Return each signal with the sign of its deviation in energetic recordings; 0 if unclear, and for jerks."""
         levels = [k for k, s in enumerate(signals) if s.kind == LEVEL]
         pieces, trials = [], []
         for stretch in self.material.stretches:
@@ -283,7 +284,7 @@ class _Candidates:
         return [(signal, sign[k]) for k, signal in enumerate(signals)]
 
     def _promising(self, candidates: list[tuple[Signal, int]], spec: GateSpec) -> list[int]:
-        """Return the candidates that separate calm and energetic samples best on their own."""
+        """Return the indices of the candidates that best separate calm and energetic samples on their own."""
         calm, rough = [], []
         for first in range(0, len(self._xs), _TOGETHER):
             some = self.material.stretches[first : first + _TOGETHER]
@@ -308,7 +309,7 @@ class _Candidates:
         return best
 
     def heights(self, labels: list[str], between: bool) -> tuple[Heights, float]:
-        """Return the sizes on which rules for ``labels`` are chosen, and the hours of calm samples among them."""
+        """Return the sizes from which rules for ``labels`` are chosen, and the hours of calm samples in them."""
         chosen = np.array([label in labels for _, label in self.material.trials])
         calm, chunks, rough, trials, delays = [], [], [], [], []
         first_chunk = 0
@@ -335,9 +336,9 @@ class _Candidates:
         return heights, sum(map(len, calm)) / self.layout.rate_hz / 3600
 
     def _apart(self) -> NDArray[np.bool_]:
-        """Return which candidates may be combined: of different sensors, if the layout has several kinds.
+        """Return which pairs of candidates may be combined: those without a common input, if there are several kinds.
 
-        So a broken sensor cannot fire the gate alone.
+        Thus a single broken sensor cannot fire a rule of two terms.
         """
         n = len(self.candidates)
         if len({c.kind for c in self.layout.channels}) == 1:
@@ -349,7 +350,7 @@ class _Candidates:
 def signals_of(layout: Layout, spec: GateSpec) -> list[Signal]:
     """Return the candidate signals of a layout.
 
-    Level and jerk of each input, and the jerk of all inputs of a kind, at every lag.
+    These are level and jerk of each input, the jerk at one lag, and the jerk of all inputs of a kind at every lag.
     """
     kinds = {c.name: c.kind for c in layout.channels}
     kinds |= {d.name: kinds[d.of[0]] for d in layout.derived}
@@ -366,10 +367,10 @@ def signals_of(layout: Layout, spec: GateSpec) -> list[Signal]:
 
 
 def measure_gate(plan: GateSettings, material: Material, layout: Layout) -> dict[str, Any]:
-    """Measure a gate on some people's material, by the integer `Gate` itself.
+    """Run the `Gate` on the material of some people; return a report as plain values.
 
-    The report has recall by gesture, false alarms an hour in calm recordings and between recordings, and the median
-    time from a recording's first sample to the first firing in it.
+    It has recall by gesture, false alarms per hour in calm recordings and between recordings, and the median time from
+    the first sample of a recording to the first firing in it.
     """
     first: dict[int, int] = {}
     wrong = {CALM: 0, BETWEEN: 0}

@@ -1,6 +1,6 @@
-"""Fast training: convolutions with far fewer multiplications than taps × positions, and a step without waste.
+"""Fast training on a CPU: convolutions with far fewer multiplications than taps × positions.
 
-``transform``: the matrices; ``plan``: the method of each layer, from its shape alone; ``conv``: the methods,
-and a thread pool for the chunks of a batch; ``net``: forward and backward pass, with normalisation folded into
-the next layer. `fit` uses it through ``training/engine``.
+``transform`` has the matrices of the fast convolutions; ``plan`` chooses the method of each layer by its shape;
+``conv`` implements the methods, and a thread pool for the chunks of a batch; ``net`` has the forward and backward pass,
+with normalisation folded into the next layer. ``training/fit`` uses them through ``training/engine``.
 """

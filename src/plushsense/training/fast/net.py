@@ -1,8 +1,8 @@
-"""A network with an explicit training step: forward and backward pass, without a separate normalisation pass.
+"""A network with an explicit forward and backward pass, in which normalisation needs no pass of its own.
 
-Batch normalisation is an affine map a·r + b of each channel. Without zero padding the map can be folded into the
+Batch normalisation is an affine map a·r + b of each channel. Without zero padding, the map can be folded into the
 weights of the next convolution, so that only r = ReLU(z) is stored; the gradients of a and b follow from the gradient
-of the folded weights. Large batches are processed in chunks.
+of the folded weights. Batches are processed in chunks of `CHUNK` windows.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from plushsense.training.fast.plan import CHUNK, plan_net
 
 MOMENTUM = 0.1
 
-# Writes the input of the windows [start, end) of the batch into a tensor (rows, windows, channels).
+# Function (tensor, start, end) that writes windows [start, end) of a batch into a tensor (rows, windows, channels).
 Fill = Callable[[Tensor, int, int], None]
 
 
 def can_train(arch: Arch) -> bool:
-    """Tell whether `FastNet` can train a network: batch normalisation, and no zero padding."""
+    """Return whether `FastNet` supports an architecture: batch normalisation and no zero padding."""
     return arch.norm == "batch" and arch.padding in ("mirror", "stream")
 
 
 @dataclass
 class _Layer:
-    """One block: its method, parameters (``w`` (taps, C, F)), running statistics, and indices of the mirrored rows."""
+    """A layer: method, parameters (``w`` is (taps, C, F)), running statistics, and indices of its mirrored rows."""
 
     way: Way
     w: Tensor
@@ -50,7 +50,7 @@ class _Layer:
 
 @dataclass
 class _Pass:
-    """Values of a layer's forward pass that its backward pass needs."""
+    """Values of the forward pass of a layer that the backward pass needs."""
 
     w: Tensor
     mean: Tensor
@@ -60,12 +60,12 @@ class _Pass:
 
 
 class FastNet:
-    """A trainable network; after `step` the ``parameters`` have gradients, which autograd does not track.
+    """A trainable network; `step` sets the gradients of its ``parameters`` without autograd.
 
     Args:
         net: a `Net` with the initial weights.
-        batch: windows in a batch, at most.
-        threads: for the chunks of a batch; the result does not depend on it.
+        batch: largest number of windows in a batch.
+        threads: number of threads for the chunks of a batch; it does not affect the result.
     """
 
     def __init__(self, net: Net, batch: int, threads: int = 1) -> None:
@@ -101,7 +101,7 @@ class FastNet:
 
     @torch.no_grad()
     def step(self, fill: Fill, y: Tensor) -> tuple[Tensor, Tensor]:
-        """Return mean loss and logits (N, K) of a batch; the gradients are then in ``grad`` of the parameters."""
+        """Compute mean loss and logits (N, K) of a batch with the classes ``y`` (N,), and set the gradients."""
         self._cut(len(y))
         passes, pooled = self._forward(fill)
         last = passes[-1]
@@ -118,7 +118,7 @@ class FastNet:
 
     @torch.no_grad()
     def logits(self, fill: Fill, windows: int) -> Tensor:
-        """Return the logits (N, K) with the running statistics."""
+        """Return the logits (N, K) of a number of windows, using the running statistics."""
         if not windows:
             return torch.zeros(0, self.arch.classes)
         self._cut(windows)
@@ -144,7 +144,7 @@ class FastNet:
         return torch.addmm(self._dense_bias, pooled * a + b, self._dense.t())
 
     def export_weights(self) -> dict[str, NDArray[np.float32]]:
-        """Return a copy of the weights, as ``models/reference`` and the bundle take them."""
+        """Return a copy of the weights, in the form of ``models/reference`` and of bundles."""
         named: dict[str, Tensor] = {"dense.weight": self._dense, "dense.bias": self._dense_bias}
         for i, layer in enumerate(self._layers):
             named |= {f"conv{i}.weight": layer.w.permute(2, 1, 0), f"conv{i}.bias": layer.bias}
@@ -155,7 +155,7 @@ class FastNet:
         }
 
     def close(self) -> None:
-        """End the threads."""
+        """Stop the threads."""
         self._threads.close()
 
     def _cut(self, windows: int) -> None:
@@ -166,7 +166,7 @@ class FastNet:
         return self._edges[i][1] - self._edges[i][0]
 
     def _folded(self, at: int, a: Tensor | None, b: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Return weights with the preceding normalisation folded in, in the form that the layer uses, and the bias."""
+        """Return the weights, in the form that the method needs, and the bias, with the normalisation before folded in."""
         layer = self._layers[at]
         w = layer.w if a is None else layer.w * a[None, :, None]
         bias = layer.bias if b is None else layer.bias + b @ layer.w.sum(0)
@@ -180,27 +180,27 @@ class FastNet:
         return x
 
     def _mirror(self, at: int, x: Tensor) -> None:
-        """Fill the mirrored rows before the input of layer ``at``."""
+        """Fill the mirrored rows at the start of the input of layer ``at``."""
         mirror, front = self._layers[at].mirror, self._layers[at].way.plan.front
         if mirror is not None:
             torch.index_select(x[front:], 0, mirror, out=x[:front])
 
     def _front(self, at: int) -> int:
-        """Return how many rows the next layer mirrors before the output of layer ``at``."""
+        """Return the number of mirrored rows that the next layer needs before the output of layer ``at``."""
         return self._layers[at + 1].way.plan.front if at + 1 < len(self._layers) else 0
 
     def _place(self, at: int, out: Tensor) -> Tensor:
-        """Return the part of the output buffer that layer ``at`` writes."""
+        """Return the part of the output buffer ``out`` to which layer ``at`` writes."""
         front = self._front(at)
         return out[front : front + self._layers[at].way.plan.writes]
 
     def _rows(self, at: int, out: Tensor) -> Tensor:
-        """Return the valid output rows of layer ``at`` in its buffer."""
+        """Return the valid output rows of layer ``at`` in the buffer ``out``."""
         front = self._front(at)
         return out[front : front + self._layers[at].way.plan.after]
 
     def _finish(self, at: int, out: Tensor) -> Tensor:
-        """Apply ReLU, clear the rows behind, fill the mirrored rows before; return the valid rows."""
+        """Apply ReLU to the valid rows of ``out``, clear those behind, fill the mirrored ones; return the valid rows."""
         rows = self._rows(at, out)
         rows.relu_()
         out[self._front(at) + len(rows) :].zero_()
@@ -209,7 +209,7 @@ class FastNet:
         return rows
 
     def _held(self, at: int, i: int) -> Tensor:
-        """Return the input buffer of layer ``at`` for a chunk; one beyond the last layer: its output."""
+        """Return the input buffer of layer ``at`` for chunk ``i``; for the number of layers, the output buffer."""
         width = self.arch.channels if at == 0 else self._layers[at - 1].way.plan.filters
         return self._shared.take(("x", at, i), self.plan.buffers[at], self._size(i), width)
 
@@ -223,7 +223,7 @@ class FastNet:
         )
 
     def _forward(self, fill: Fill) -> tuple[list[_Pass], Tensor]:
-        """Return what each layer keeps, and the mean over time of the last layer's output (N, F)."""
+        """Return the values that each layer keeps, and the output of the last layer averaged over time (N, F)."""
         chunks, windows = len(self._edges), self._edges[-1][1]
         self._threads.each(lambda i, lane, thread: self._input(fill, i, self._held(0, i)), chunks)
         passes: list[_Pass] = []
@@ -243,21 +243,21 @@ class FastNet:
         return passes, torch.cat(pooled)
 
     def _forward_chunk(self, at: int, w: Tensor, bias: Tensor, i: int, lane: int, thread: int) -> tuple[Tensor, Tensor]:
-        """Compute layer ``at`` for a chunk; return the sums of its output."""
+        """Compute layer ``at`` for chunk ``i``; return the `_sums` of its output."""
         space, out = self._scratch[thread], self._held(at + 1, i)
         x, spectrum = self._held(at, i), self._spectrum(at, i, thread)
         self._layers[at].way.forward(x, w, bias, self._place(at, out), space, spectrum)
         return self._sums(self._finish(at, out), space)
 
     def _sums(self, rows: Tensor, space: BufferPool) -> tuple[Tensor, Tensor]:
-        """Return sums over time (N, F), and sums of squares over time and windows (F,)."""
+        """Return the sums of ``rows`` over time (N, F), and the sums of squares over time and windows (F,)."""
         after, windows, width = rows.shape
         flat, ones = rows.view(after, windows * width), self._ones[:, :after]
         squares = torch.mul(flat, flat, out=space.take("squares", after, windows * width))
         return (ones @ flat).view(windows, width), (ones @ squares).view(windows, width).sum(0)
 
     def _backward(self, passes: list[_Pass], pooled: Tensor, slope: Tensor) -> None:
-        """Compute the gradients of all layers from ``slope`` (N, F), that of the last features."""
+        """Compute the gradients of all layers from ``slope`` (N, F), the gradient of the inputs of the dense layer."""
         chunks, windows = len(self._edges), self._edges[-1][1]
         da, db = (slope * pooled).sum(0), slope.sum(0)
         flat = slope * passes[-1].a / self._layers[-1].way.plan.after
@@ -267,7 +267,7 @@ class FastNet:
             inverse = (here.var + NORM_EPSILON).rsqrt()
             straight = da - here.mean * db
             layer.gain.grad, layer.shift.grad = straight * inverse, db.clone()
-            # dL/dr = (gradient from above) + alpha + beta · r: the part through the batch's mean and variance.
+            # dL/dr is the gradient from above plus alpha + beta · r, which accounts for the batch's mean and variance.
             beta = straight * layer.gain * inverse.pow(3) / -count
             alpha = -here.a * db / count - beta * here.mean
             totals: dict[int, Tensor] = {}
@@ -298,10 +298,10 @@ class FastNet:
         lane: int,
         thread: int,
     ) -> Tensor:
-        """Pass the gradient of a chunk back through layer ``at``; return the gradient of the bias.
+        """Propagate the gradient of chunk ``i`` back through layer ``at``; return the gradient of the bias.
 
-        ``above`` (N, F) is the gradient of the mean over time behind the last layer. The gradient of the weights is
-        added to the lane's tensor in ``totals``.
+        ``above`` (N, F), only for the last layer, is the gradient of each of its output rows. The gradient of the
+        weights is added to the tensor of ``lane`` in ``totals``.
         """
         layer, space, size = self._layers[at], self._scratch[thread], self._size(i)
         planned = layer.way.plan
@@ -329,12 +329,12 @@ class FastNet:
         return bias
 
     def _slope(self, at: int, i: int) -> Tensor:
-        """Return the gradient buffer of the input rows of layer ``at`` (needs, N, C); all layers share one a chunk."""
+        """Return the gradient buffer of the input of layer ``at`` (needs, N, C); all layers share one per chunk."""
         planned = self._layers[at].way.plan
         return self._shared.take(("slope", i), planned.needs, self._size(i), planned.reads)
 
     def _gradient(self, at: int, i: int) -> Tensor:
-        """Return the part of `_slope` for the rows that the preceding layer wrote."""
+        """Return the part of `_slope` that belongs to the output rows of the preceding layer."""
         planned = self._layers[at].way.plan
         return self._slope(at, i)[planned.front : planned.front + planned.before]
 
