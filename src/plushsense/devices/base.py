@@ -1,4 +1,4 @@
-"""The interface of an open toy: frames to iterate over, counters of faults, and closing."""
+"""Base classes of devices: an open toy with frames to read, counters of faults, and a method to close it."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from plushsense.core.layouts import Layout
 class Frame(NamedTuple):
     """A sample of all channels.
 
-    ``host_ms`` when it arrived (epoch), ``device_ms`` on the toy's own clock (the truth for rate and loss),
-    ``values`` (C,) in integer steps, in the order of ``layout.channels``.
+    ``host_ms`` is the time of arrival (milliseconds since 1970); ``device_ms`` is the time on the toy's clock, used for
+    rate and loss; ``values`` (C,) are in integer steps, in the order of ``layout.channels``.
     """
 
     host_ms: int
@@ -30,11 +30,11 @@ class Counters:
     """Numbers of received frames and of transmission faults.
 
     Attributes:
-        frames: whole frames.
-        lost: frames that the device clock says are missing.
-        malformed: lines that are no frame (wrong number of fields, not a number, too long, cut).
-        garbage: frames with a value outside its channel's valid range; kept, and counted in ``frames`` too.
-        reconnects: how often the connection was made again.
+        frames: complete frames.
+        lost: frames that are missing according to the device clock.
+        malformed: lines that are not a frame (wrong number of fields, not a number, too long, incomplete).
+        garbage: frames with a value outside its channel's valid range; they are kept and also counted in ``frames``.
+        reconnects: how often the connection was restored.
     """
 
     frames: int = 0
@@ -49,9 +49,9 @@ class Counters:
 
 
 class LossCounter:
-    """Count lost frames by the device clock: a step well above the running median period is a gap.
+    """Count lost frames by the device clock: a step of at least 1.5 times the running median means lost frames.
 
-    A clock that goes back, or advances by more than ``pause_ms``, was restarted or paused: nothing is counted.
+    If the clock goes back or advances by more than ``pause_ms``, it was reset or paused, and no frames are counted.
     """
 
     def __init__(self, span: int = 101, pause_ms: int = 10_000) -> None:
@@ -70,7 +70,7 @@ class LossCounter:
         if not 0 <= step <= self._pause_ms:
             return 0
         self._steps.append(step)
-        # A median of 101 steps changes slowly, so it is computed only now and then.
+        # The median of many steps changes slowly, so it is computed only every 10 frames.
         self._stale += 1
         if self._median <= 0.0 or self._stale >= 10 or len(self._steps) < 20:
             self._median = float(sorted(self._steps)[len(self._steps) // 2])
@@ -81,18 +81,18 @@ class LossCounter:
 
 
 class Device(ABC):
-    """An open toy. Use it as a context manager and iterate over it; or call `read` again and again.
+    """An open toy. Use it as a context manager and iterate over its frames, or call `read` repeatedly.
 
-    Iterating ends when the source has ended (a file, a connection that the other side closed in order) or
-    when `close` is called, also from another thread; a toy that went away raises DeviceError.
+    Iteration ends when the source ends (a file, or a connection that the other side closed properly) or when `close` is
+    called, even from another thread. A lost connection raises DeviceError.
 
     Attributes:
-        url: the URL that opened it.
+        url: the URL with which it was opened.
         layout: layout of the frames.
         counters: numbers of frames and faults so far.
-        wait_s: longest wait of `read`; 0 polls, for reading many toys in turn.
+        wait_s: longest wait of `read`; 0 does not wait, for reading many toys in turn.
         arrived_s: time at which the bytes of the last frames arrived, before they were parsed, by `time.perf_counter`;
-            for a replay or a virtual toy, the time at which the first of them was due. None where it is unknown.
+            for a replay or a virtual toy, the time at which the first of them was due. None if unknown.
     """
 
     def __init__(self, url: str, layout: Layout) -> None:
@@ -108,14 +108,14 @@ class Device(ABC):
         """Return the frames since the last call, waiting at most about ``wait_s``; return None at the end.
 
         Raises:
-            DeviceError: when the toy went away.
+            DeviceError: if the connection is lost.
         """
 
     def _shut(self) -> None:  # noqa: B027, RUF100
-        """Release the resources; called once."""
+        """Release resources; called only once."""
 
     def close(self) -> None:
-        """Close the device. Closing twice is harmless."""
+        """Close the device. Closing it again has no effect."""
         if not self.closed:
             self.closed = True
             self._shut()
@@ -140,15 +140,15 @@ class Device(ABC):
 
 
 def now_ms() -> int:
-    """Return the host time, milliseconds since 1970."""
+    """Return the host time in milliseconds since 1970."""
     return time.time_ns() // 1_000_000
 
 
 class Pacer:
-    """Pace a source by its own clock, ``speed`` times as fast; speed 0 never waits.
+    """Compute when the frames of a source are due, at ``speed`` times the pace of their clock; 0 means at once.
 
-    Times are computed from the start, so that errors do not add up. A gap in the clock of more than
-    ``longest_s``, or a clock that goes back, is not waited for.
+    Times are computed from the start, so that errors do not add up. There is no wait for a gap in the clock of more
+    than ``longest_s``, or for a clock that goes back.
     """
 
     def __init__(self, speed: float, longest_s: float = 2.0) -> None:
@@ -159,7 +159,7 @@ class Pacer:
         self._last: int | None = None
 
     def due_s(self, device_ms: int) -> float:
-        """Return the seconds until this moment of the device clock is due; 0 or less when it is due now."""
+        """Return the seconds until a frame with this device time is due; 0 or less if it is due now."""
         if self._speed <= 0.0:
             return 0.0
         if self._last is None:
@@ -172,10 +172,10 @@ class Pacer:
 
 
 class PacedDevice(Device):
-    """A source of existing frames (a file, a simulation), delivered at ``speed`` times the pace of their clock.
+    """A device whose frames come from a file or a simulation, delivered at ``speed`` times the pace of their clock.
 
     Args:
-        speed: 1 real time, 0 as fast as frames are taken.
+        speed: 1 for real time, 0 for as fast as they are read.
     """
 
     def __init__(self, url: str, layout: Layout, speed: float) -> None:
@@ -185,12 +185,12 @@ class PacedDevice(Device):
 
     @abstractmethod
     def _next_ms(self) -> int | None:
-        """Return the device time of the next item; None at the end."""
+        """Return the device time of the next frame; None at the end."""
 
     def _due(self, most: int) -> Iterator[int]:
-        """Yield the device times of the items that are due, at most ``most``; wait for the first about ``wait_s``.
+        """Yield the device times of at most ``most`` frames that are due; wait up to about ``wait_s`` for the first.
 
-        The caller takes the item before it asks for the next one.
+        The caller must advance to the next frame before it continues the iteration.
         """
         until = time.monotonic() + self.wait_s
         for n in range(most):

@@ -1,4 +1,4 @@
-"""Live loop: a device and a model run together, with decisions as they are made and a summary at the end."""
+"""Run a model on the frames of an open device, or of many: decisions as they are made, and a summary."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from plushsense.core.errors import ConfigError
 from plushsense.devices.base import Device, Frame
 from plushsense.runtime.classifier import Decision, StreamReader, check_layout
 
-_KEPT = 72_000  # latencies kept: the last hour at 20 decisions a second
+_KEPT = 72_000  # number of latencies kept: the last hour at 20 decisions per second
 SILENCE_S = 0.75
-"""Host time after which a device that sends no frame has no signal; wireless links stall for shorter."""
+"""Host time without frames after which there is no signal; wireless links stall for shorter times."""
 
 
 @dataclass(frozen=True)
@@ -24,18 +24,18 @@ class LiveSummary:
     """Summary of a live run.
 
     Attributes:
-        decisions: all of them; ``warming`` of these came without an answer.
+        decisions: number of decisions; ``warming`` is the number of those before the first full span, without answer.
         seconds: device time from the first frame to the newest.
-        wall_s: time on the host's clock.
-        decisions_per_s: decisions a second of device time.
-        restarts: gaps and clock resets after which everything began again.
-        invalid: values outside their valid range.
-        counters: of the device (frames, lost, malformed, garbage, reconnects).
+        wall_s: duration on the host's clock.
+        decisions_per_s: decisions per second of device time.
+        restarts: number of gaps and clock resets, after which all computations restart.
+        invalid: number of values outside their valid range.
+        counters: those of the device (frames, lost, malformed, garbage, reconnects).
         latency_ms: p50, p95 and p99 of the time from the arrival of the bytes, before they are parsed, to the decision,
-            over the last hour; a replay that does not wait hands over hundreds at once, and they stand in a queue.
-        late: decisions that came more than a step after the bytes.
-        events: how many began.
-        no_signal: how often no frame came, or the clock had a gap or was reset.
+            over the last hour. A replay at speed 0 delivers hundreds of frames at once, so it includes waiting.
+        late: number of decisions more than a step after their bytes.
+        events: number of events that began.
+        no_signal: number of times that no frame came, or the clock had a gap or was reset.
         faults: number of sensor faults.
     """
 
@@ -60,14 +60,14 @@ class LiveSummary:
 
 
 class LiveRun(Iterator[Decision]):
-    """Live run: iterate for decisions; `summary` gives its figures at any time.
+    """A live run: iterate over it for decisions; call `summary` for its figures at any time.
 
-    A device that sends no frame for ``silence_s`` gives one decision of the state ``no signal``, and its event ends; so
-    does an open event when the device ends.
+    If the device sends no frame for ``silence_s``, there is one decision with the state ``no signal``, which ends an
+    open event; the same happens if an event is open when the device ends.
 
     Attributes:
-        over: whether it came to its end.
-        latency_s: from the newest bytes that brought a decision to that decision; None before the first.
+        over: whether the run has ended.
+        latency_s: time from the arrival of the bytes to the decision, for the newest one; None before the first.
         latencies_s: the same for all decisions of the last hour.
     """
 
@@ -97,7 +97,7 @@ class LiveRun(Iterator[Decision]):
         return self._due.popleft()
 
     def poll(self) -> list[Decision]:
-        """Read the device once; return its decisions. `over` says whether that was the end."""
+        """Read the device once; return the decisions. Sets `over` at the end of the run."""
         frames = None if self.device.closed else self.device.read()
         now = time.perf_counter()
         if frames is None:
@@ -108,7 +108,7 @@ class LiveRun(Iterator[Decision]):
         arrived = self.device.arrived_s
         arrived = now if arrived is None else arrived
         decided = self._read(frames, arrived)
-        # Only now: what the reading of frames takes is not the toy's silence.
+        # Set after the computation, whose duration must not count as silence of the toy.
         self._last_frames_s, self._silent = time.perf_counter(), False
         return decided
 
@@ -143,7 +143,7 @@ class LiveRun(Iterator[Decision]):
         return decision
 
     def summary(self) -> LiveSummary:
-        """Return the figures so far."""
+        """Return the figures of the run so far."""
         seconds = self.classifier.time_s
         return LiveSummary(
             self._decisions,
@@ -163,7 +163,7 @@ class LiveRun(Iterator[Decision]):
 
 
 def percentiles_ms(latencies_s: Sequence[float]) -> dict[str, float | None]:
-    """Return p50, p95 and p99 in milliseconds; None where there is nothing."""
+    """Return p50, p95 and p99 in milliseconds; all are None without latencies."""
     if not latencies_s:
         return {"p50": None, "p95": None, "p99": None}
     p50, p95, p99 = (round(float(v) * 1000.0, 3) for v in np.percentile(latencies_s, (50, 95, 99)))
@@ -180,15 +180,15 @@ def run_live(
     """Run a model on an open device.
 
     Args:
-        device: an open one; closing it stays with the caller.
-        classifier: it begins a new stream.
-        seconds: stop after so much device time (so that a replay at any speed ends at the same place), or
-            when the device has sent nothing for so long; None runs until the device ends.
-        silence_s: host time without a frame after which there is no signal.
+        device: an open device; the caller closes it.
+        classifier: the model; it is reset.
+        seconds: device time after which the run stops (so a replay ends at the same place at any speed). The run also
+            stops if the device sends nothing for this time. None: run until the device ends.
+        silence_s: host time without frames after which there is no signal.
 
     Raises:
-        ConfigError: when the device's channels are not those of the model, or ``seconds`` is not positive.
-        DeviceError: while iterating, when the toy went away.
+        ConfigError: if the channels of the device are not those of the model, or ``seconds`` is not positive.
+        DeviceError: while iterating, if the connection is lost.
     """
     if seconds is not None and not seconds > 0:
         raise ConfigError(f"seconds is {seconds!r}; give a positive duration, or leave it out to run until the end.")
@@ -197,7 +197,7 @@ def run_live(
     return LiveRun(device, classifier, seconds, silence_s)
 
 
-_PAUSE_S = 0.001  # when no toy had anything to say; a frame at 100 Hz comes every 10 ms
+_PAUSE_S = 0.001  # pause after a round without frames; at 100 Hz a frame comes every 10 ms
 
 
 @dataclass(frozen=True)
@@ -205,9 +205,10 @@ class ManySummary:
     """Summary of a run of many toys.
 
     Attributes:
-        toys: how many; ``decisions`` of all of them, ``late`` of these came more than a step after their bytes.
-        wall_s: host time; ``cpu_s`` what this process computed in it, ``busy`` the share.
-        latency_ms: p50, p95, p99 and max from the arrival of the bytes to the decision, over all toys.
+        toys: number of toys.
+        decisions: number of decisions for all toys; ``late`` is the number of those more than a step after their bytes.
+        wall_s: duration on the host's clock; ``cpu_s`` is the processor time of this process.
+        latency_ms: p50, p95, p99 and max of the time from the arrival of the bytes to the decision, over all toys.
     """
 
     toys: int
@@ -219,7 +220,7 @@ class ManySummary:
 
     @property
     def busy(self) -> float:
-        """Share of one core."""
+        """Processor time divided by duration: the number of cores in use."""
         return self.cpu_s / self.wall_s if self.wall_s > 0 else 0.0
 
     def to_dict(self) -> dict[str, Any]:
@@ -229,9 +230,9 @@ class ManySummary:
 
 
 class ManyRun(Iterator[tuple[int, Decision]]):
-    """Run of many toys: iterate for (number of the toy, decision); a toy that has ended is left out.
+    """A run of many toys: iterate over it for pairs of toy index and decision. Toys that have ended are skipped.
 
-    `runs` holds each toy's own run.
+    ``runs`` are the runs of the single toys.
     """
 
     def __init__(self, runs: Sequence[LiveRun]) -> None:
@@ -273,12 +274,12 @@ def run_many(toys: Sequence[tuple[Device, StreamReader]], *, seconds: float | No
     """Run a model on each of many open devices, in one thread.
 
     Args:
-        toys: devices, which are then read without waiting, each with a classifier of its own.
-        seconds: as of `plushsense.live.loop.run_live`, for each.
+        toys: open devices (their ``wait_s`` is set to 0), each with a classifier of its own.
+        seconds: as in `run_live`, for each toy.
 
     Raises:
-        ConfigError: for a classifier that two toys share, and as `run` does.
-        DeviceError: while iterating, when a toy went away; open devices with ``reconnect`` to wait for it.
+        ConfigError: if two toys share a classifier, and as in `run_live`.
+        DeviceError: while iterating, if a connection is lost; devices opened with ``reconnect`` wait for the toy.
     """
     if len({id(classifier) for _, classifier in toys}) < len(toys):
         raise ConfigError("Two toys share a classifier, which follows one stream: make one for each.")

@@ -1,4 +1,4 @@
-"""Reactions of a toy to events: profiles as data, and the rules for when an event is answered."""
+"""Reactions of a toy to events: profiles with rules, and the `Reactor` that applies them to a stream."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ _SOUND = re.compile(r"[A-Za-z0-9_-]{0,40}")
 
 @dataclass(frozen=True)
 class ReactionRule:
-    """Reaction to one affect or one gesture.
+    """A rule for the reaction to events of one affect or one gesture.
 
     Attributes:
-        affect, gesture: one of the two; a gesture's line holds in place of its affect's.
-        eyes: of `EYES`.
-        sound: the name of a sound that the toy knows; empty: none.
-        seconds: for how long eyes and sound last.
-        refractory_s: after this answer, nothing of the same affect is answered for so long.
-        quiet_s: after this answer, nothing of another affect is answered for so long; for what shall stay dark.
-        when: ``begun``, as soon as the affect is sure; ``named``, as soon as the gesture is; ``ended``.
+        affect, gesture: one of the two is set; the rule of a gesture takes precedence over that of its affect.
+        eyes: one of `EYES`.
+        sound: name of a sound stored in the toy; empty: none.
+        seconds: duration of eyes and sound.
+        refractory_s: time after the reaction in which events of the same affect get no reaction.
+        quiet_s: time after the reaction in which events of other affects get none, as when the eyes shall stay off.
+        when: react when the event has ``begun`` (its affect is sure), is ``named`` (its gesture is), or has ``ended``.
     """
 
     affect: str = ""
@@ -67,22 +67,22 @@ class ReactionRule:
 
 @dataclass(frozen=True)
 class Reactions:
-    """Profile of reactions; what has no rule is not answered."""
+    """A profile of reactions; events without a rule get no reaction."""
 
     name: str
     lines: tuple[ReactionRule, ...]
     title: str = ""
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values, ready for JSON; `from_dict` makes the same profile of them."""
+        """Return plain values, ready for JSON and `from_dict`."""
         return {"name": self.name, "title": self.title, "reactions": [asdict(line) for line in self.lines]}
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any], where: str = "reactions") -> Reactions:
-        """Return a profile from plain values, as a TOML file has them.
+        """Create a profile from plain values, as in a TOML file; ``where`` names it in messages.
 
         Raises:
-            ConfigError: for an unknown key, a value that does not fit, or two lines for the same.
+            ConfigError: for an unknown key, an invalid value, or two rules for one affect or gesture.
         """
         profile = load_table(table, _ReactionsFile, where, ConfigError)
         lines = profile.reactions
@@ -93,7 +93,7 @@ class Reactions:
         return cls(profile.name, lines, profile.title)
 
     def answer(self, affect: str, gesture: str | None) -> ReactionRule | None:
-        """Return the rule for an event; a gesture's takes precedence over its affect's."""
+        """Return the rule for an event, preferably that of its gesture; None if there is none."""
         if gesture is not None:
             plain = plain_label(gesture)
             for line in self.lines:
@@ -104,7 +104,7 @@ class Reactions:
 
 @dataclass(frozen=True)
 class _ReactionsFile:
-    """The keys of a profile in a file."""
+    """Keys of a profile in a TOML file."""
 
     reactions: tuple[ReactionRule, ...]
     name: str = "own"
@@ -117,13 +117,13 @@ def reaction_names() -> tuple[str, ...]:
 
 
 def load_reactions(name_or_path: str | Path, gestures: GestureSet | None = None) -> Reactions:
-    """Return a built-in profile by name, or one of the user's own by the path of its TOML file.
+    """Load a built-in profile by its name, or any other by the path of its TOML file.
 
     Args:
-        gestures: what the model knows; a line for another gesture is refused, since it would never apply.
+        gestures: gestures of the model; a rule for another gesture is refused, since it would never apply.
 
     Raises:
-        ConfigError: for an unknown name or key, or a value that does not fit.
+        ConfigError: for an unknown name, key or gesture, or an invalid value.
     """
     table, source = read_named(name_or_path, "reactions", "reactions", ConfigError)
     where = f"reactions '{source}'"
@@ -139,10 +139,10 @@ def load_reactions(name_or_path: str | Path, gestures: GestureSet | None = None)
 
 @dataclass(frozen=True, slots=True)
 class Reaction:
-    """Reaction of the toy from ``t_s`` on for ``seconds``, in place of what it did before.
+    """A reaction of the toy that starts at ``t_s``, lasts ``seconds``, and replaces an earlier one.
 
-    ``eyes`` off and no sound: it stops. ``number``, ``affect`` and ``gesture`` are those of the event that is
-    answered.
+    With ``eyes`` off and no sound, it only stops the earlier one. ``number``, ``affect`` and ``gesture`` are those of
+    the event.
     """
 
     t_s: float
@@ -159,22 +159,22 @@ class Reaction:
 
 
 class Reactor:
-    """Answers the events of one stream: an event at most once, and not within a refractory or quiet time."""
+    """Reactions to the events of one stream: at most one per event, none within a refractory or quiet time."""
 
     def __init__(self, profile: Reactions) -> None:
         self.profile = profile
         self.reset()
 
     def reset(self) -> None:
-        """Begin a new stream."""
+        """Start a new stream."""
         self._answered = 0
         self._refractory: dict[str, float] = {}
         self._quiet, self._quiet_of = -math.inf, ""
 
     def push(self, reported: Decision | Iterable[GestureEvent]) -> list[Reaction]:
-        """Return the reactions to a decision, or to events in the order in which they came; mostly none.
+        """Return the reactions, usually none, to the events of a decision, or to events in order of time.
 
-        An event that ended because the signal went away is not answered: nobody did anything.
+        There is none to the end of an event that ended because the signal was lost, since nobody did anything.
         """
         if not isinstance(reported, Decision):
             return [r for event in reported if (r := self._react(event)) is not None]
@@ -190,7 +190,7 @@ class Reactor:
         line = self.profile.answer(event.affect, event.gesture)
         if line is None or event.number <= self._answered or not _due(line, event):
             return None
-        # A reaction that is refused now is not made up for later: it would no longer fit the event.
+        # A reaction that is suppressed now does not follow later, when it would no longer fit the event.
         self._answered = event.number
         if event.t_s < self._refractory.get(event.affect, -math.inf):
             return None
@@ -203,8 +203,8 @@ class Reactor:
 
 
 def _due(line: ReactionRule, event: GestureEvent) -> bool:
-    """Return whether a rule answers this change; a gesture that is known at once is named when it begins."""
+    """Return whether a rule reacts to this change; an event that begins with a gesture is named at once."""
     if line.when == "named":
         return event.what != "ended" and event.gesture is not None
-    # The line of a gesture that is named later: its beginning has passed, its name is the first chance.
+    # The rule of a gesture can only be found once the event is named, which may be after it has begun.
     return event.what == line.when or (line.when == "begun" and bool(line.gesture) and event.what == "named")

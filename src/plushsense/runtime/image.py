@@ -50,7 +50,7 @@ IMAGE_VERSION = 2  # since 2 with the settings of events, gate and health
 HEAD_BYTES = 16
 IDLE_BIT = 4
 GROUP = 4  # number of filters, and of channels, in a block of weights
-MOST_CLOCK_UNITS = 1 << 22  # limit for the gap, so that interpolation needs no more than 32 bits
+MOST_CLOCK_UNITS = 1 << 22  # limit for gap and period of the clock: interpolation then needs at most 32 bits
 
 
 @dataclass(frozen=True, eq=False)

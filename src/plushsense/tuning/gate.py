@@ -1,7 +1,7 @@
 """Fit the gate: choose signals, terms and thresholds that detect the energetic gestures of some people.
 
-Candidates for terms are the level and the jerk of each input, and the jerk of all inputs of a kind at several lags, each
-with several floors. Rules have one or two terms. The thresholds of a rule limit its false alarms per hour on everything
+Candidates for terms are level and jerk of each input, and the jerk of all inputs of a kind at several lags, each with
+several floors. Rules have one or two terms. The thresholds of a rule limit its false alarms per hour on everything
 that is not energetic; of the rules that then detect the most, the fastest is chosen. Further rules are added as long as
 they detect enough energetic recordings that the earlier ones miss.
 """
@@ -57,7 +57,7 @@ def signal_sizes(
 ) -> list[NDArray[np.int32]]:
     """Return the sizes of the signals, with the sign of the deviation, as an array (T, S) for each stretch (T, I).
 
-    They are those of `plushsense.runtime.gate.Gate`, with two differences that allow many pieces to be computed at once:
+    They are those of `plushsense.runtime.gate.Gate`, with two differences that allow computing many pieces at once:
     the baseline of a piece starts only `LEAD` samples before it, and samples that repeat the previous one are not
     skipped. With ``deviations``, the deviations are returned instead.
     """
@@ -151,7 +151,7 @@ def fit_gate(
 ) -> GateFit:
     """Fit a gate on the streams of ``subjects``, and on their recordings that are in no stream.
 
-    If there is nothing energetic to detect, or no rule is good enough, the plan has no rules and the report has a reason.
+    If there is nothing energetic to detect or no rule is good enough, the plan has no rules; the report says why.
 
     Args:
         gestures: the classes of the model; they define which gestures are energetic, and their affect.

@@ -166,7 +166,7 @@ class FastNet:
         return self._edges[i][1] - self._edges[i][0]
 
     def _folded(self, at: int, a: Tensor | None, b: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Return the weights, in the form that the method needs, and the bias, with the normalisation before folded in."""
+        """Return weights, in the form that the method needs, and bias, with the preceding normalisation folded in."""
         layer = self._layers[at]
         w = layer.w if a is None else layer.w * a[None, :, None]
         bias = layer.bias if b is None else layer.bias + b @ layer.w.sum(0)
@@ -200,7 +200,7 @@ class FastNet:
         return out[front : front + self._layers[at].way.plan.after]
 
     def _finish(self, at: int, out: Tensor) -> Tensor:
-        """Apply ReLU to the valid rows of ``out``, clear those behind, fill the mirrored ones; return the valid rows."""
+        """Apply ReLU to the valid rows of ``out``, clear those behind, fill mirrored ones; return the valid rows."""
         rows = self._rows(at, out)
         rows.relu_()
         out[self._front(at) + len(rows) :].zero_()
