@@ -1,4 +1,4 @@
-"""Toys that send lines over a serial port (a cable, or a Bluetooth driver's port; through pyserial) or over TCP."""
+"""Toys that send lines over a serial port (of a cable or a Bluetooth driver; with pyserial) or over TCP."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from plushsense.devices.wire import LineParser
 
 BAUD = 115_200
 
-# SerialException is an OSError; a port that vanishes while it is opened or read raises one of the others.
+# SerialException is an OSError; a port that disappears while it is opened or read raises one of the others.
 _FAULTS: tuple[type[Exception], ...] = (OSError, TypeError, ValueError)
 if sys.platform != "win32":
     import termios
@@ -30,7 +30,7 @@ if sys.platform != "win32":
 
 
 def serial_ports() -> list[tuple[str, str]]:
-    """Return name and description of each serial port of this computer."""
+    """Return names and descriptions of the serial ports of this computer."""
     return sorted((str(p.device), str(p.description or "")) for p in list_ports.comports())
 
 
@@ -42,12 +42,12 @@ def search_serial(_: float) -> DeviceListing:
 
 
 class SerialDevice(Device):
-    """Frames from a serial port. A toy that is unplugged raises DeviceError."""
+    """A toy on a serial port. Reading raises DeviceError after it is unplugged."""
 
     def __init__(self, url: str, layout: Layout, port: str, baud: int = BAUD) -> None:
         super().__init__(url, layout)
         try:
-            # Two readers would each get a part of the bytes, so a second one is refused (Windows always does).
+            # Two readers would each get only part of the bytes, so a second one is refused (Windows always does so).
             alone = True if os.name == "posix" else None
             self._port = pyserial.Serial(port, baud, timeout=0.1, exclusive=alone)
         except _FAULTS as cause:
@@ -55,13 +55,13 @@ class SerialDevice(Device):
         self._parser = LineParser(layout, self.counters, joining=True)
 
     def read(self) -> list[Frame] | None:
-        """Return the received frames, waiting at most 0.1 s, or not at all with a ``wait_s`` of 0."""
+        """Return the received frames, waiting at most 0.1 s, or not at all if ``wait_s`` is 0."""
         try:
             waiting = self._port.in_waiting
             if not waiting and self.wait_s <= 0.0:
                 return []
             data = self._port.read(max(1, min(waiting, 65536)))
-        except _FAULTS as cause:  # pyserial also trips over its own closed port
+        except _FAULTS as cause:  # pyserial raises various errors for a port closed by another thread
             if self.closed:
                 return None
             self._parser.finish()
@@ -109,11 +109,11 @@ def open_serial(address: DeviceAddress, layout: Layout) -> SerialDevice:
 
 CONNECT_S = 5.0
 _KEEPALIVE = {"TCP_KEEPIDLE": 3, "TCP_KEEPALIVE": 3, "TCP_KEEPINTVL": 1, "TCP_KEEPCNT": 3}
-"""Seconds of silence, seconds between probes, number of probes; macOS calls the first TCP_KEEPALIVE."""
+"""Seconds of silence (TCP_KEEPALIVE on macOS), seconds between probes, number of probes."""
 
 
 class TcpDevice(Device):
-    """Frames from a TCP connection. One closed in order ends the frames; a broken one raises DeviceError."""
+    """A toy on a TCP connection. A proper close ends the frames; a broken connection raises DeviceError."""
 
     def __init__(self, url: str, layout: Layout, host: str, port: int) -> None:
         super().__init__(url, layout)
@@ -133,7 +133,7 @@ class TcpDevice(Device):
         self._parser = LineParser(layout, self.counters)
 
     def read(self) -> list[Frame] | None:
-        """Return the received frames, waiting at most ``wait_s``; return None when the other side closed in order."""
+        """Return the received frames, waiting at most ``wait_s``; return None after the other side has closed."""
         try:
             self._socket.settimeout(self.wait_s)
             data = self._socket.recv(65536)
@@ -142,7 +142,7 @@ class TcpDevice(Device):
         except OSError as cause:
             if self.closed:
                 return None
-            if isinstance(cause, TimeoutError) and cause.errno is None:  # ours; the network's has a number
+            if isinstance(cause, TimeoutError) and cause.errno is None:  # our own timeout; one of the network has an error number
                 return []
             self._parser.finish()
             raise DeviceError(f"'{self.url}' went away: {cause.strerror or cause}.") from None

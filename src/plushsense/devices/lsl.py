@@ -1,4 +1,4 @@
-"""Receive and publish toys and other sensors by the lab streaming layer (LSL, through pylsl)."""
+"""Receive and publish frames of toys and other sensors with the lab streaming layer (LSL, with pylsl)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from plushsense.devices.virtual.stream import PerformedGesture, VirtualDevice
 
 FIND_S = 5.0
 KEYS = {"name": "name", "type": "type", "source": "source_id"}
-"""Search keys of a URL, and the stream property that each stands for."""
+"""Search keys of a URL, and the LSL stream property for each."""
 
 _LIMIT = 2**53
 _BACK_MS = 1000
@@ -36,8 +36,8 @@ def load_pylsl() -> ModuleType:
     """Import pylsl and turn off liblsl's messages on standard error, unless the user has configured liblsl.
 
     Raises:
-        MissingExtraError: without the package.
-        DeviceError: when it finds no liblsl.
+        MissingExtraError: if pylsl is not installed.
+        DeviceError: if pylsl does not find liblsl.
     """
     with _lock:
         try:
@@ -54,20 +54,20 @@ def load_pylsl() -> ModuleType:
 
 @dataclass(frozen=True)
 class LslColumns:
-    """The indices of the layout's channels in a sample, and of the device clock (None without one)."""
+    """Indices of the layout's channels in an LSL sample, and of the device clock (None if the stream has none)."""
 
     channels: tuple[int, ...]
     clock: int | None = None
 
 
 def match_columns(layout: Layout, labels: list[str] | None, width: int, what: str) -> LslColumns:
-    """Match a stream's columns to the layout by label, or by position when no label is the layout's.
+    """Match the columns of a stream to a layout by label, or by position if no label is a channel of the layout.
 
-    By position fits a stream as wide as the layout's channels or as its wire. Case and outer spaces of labels do not
-    count, and a stream may carry more than the layout asks for.
+    Labels are compared without case and surrounding spaces; the stream may have further columns. By position, the
+    stream must have exactly the channels of the layout, or the fields of its wire format.
 
     Raises:
-        DeviceError: for a stream that does not fit, in one sentence.
+        DeviceError: if the stream does not fit; ``what`` names it in the message.
     """
     texts = [label.strip().casefold() for label in labels or ()]
     known = [name.casefold() for name in layout.names]
@@ -96,13 +96,12 @@ def match_columns(layout: Layout, labels: list[str] | None, width: int, what: st
 
 
 class LslDevice(Device):
-    """Frames from an LSL stream. One whose source is gone raises DeviceError.
+    """A device that receives an LSL stream. Reading raises DeviceError when the source is gone.
 
-    ``device_ms`` is the stream's channel of that name where there is one (the toy's own clock; `LslOutlet` sends it).
-    Else it is the LSL time stamp, which counts on the sender's clock, in whole milliseconds; a stamp up to 1 s earlier
-    than the one before takes that one's time, so that the clock does not run back; a larger step back is a restart.
-    Values are as sent, in integer steps of the layout; a sample with a value that is not finite, or not whole where the
-    step is 1, is counted as malformed.
+    ``device_ms`` is the channel of that name, if there is one (the toy's own clock, which `LslOutlet` sends). Else it is
+    the LSL time stamp, from the sender's clock, in whole milliseconds. A time stamp up to 1 s earlier than the previous
+    one is replaced by that, so that the clock does not go back; a larger step back is a restart. Values are converted
+    to integer steps. A sample with a value that is not finite, or is a fraction for a step of 1, counts as malformed.
     """
 
     def __init__(self, url: str, layout: Layout, key: str, value: str, find_s: float = FIND_S) -> None:
@@ -117,7 +116,7 @@ class LslDevice(Device):
         found = self._find(key, value, find_s)
         if found.channel_format() == self._pylsl.cf_string:
             raise DeviceError(f"'{url}' is a stream of texts; a toy sends numbers: name another stream.")
-        # Without recovery by liblsl: ReconnectingDevice handles a stream that ends and comes back.
+        # liblsl must not recover lost streams, since ReconnectingDevice does that.
         self._inlet: Any = self._pylsl.StreamInlet(found, recover=False)
         try:
             labels = stream_labels(self._inlet.info(timeout=FIND_S))
@@ -128,14 +127,14 @@ class LslDevice(Device):
                 f"'{url}' is announced but does not answer: is its program still running, and no firewall between?"
             ) from None
         if found.channel_format() == self._pylsl.cf_float32 and self._columns.clock is not None:
-            # A float32 holds milliseconds exactly for less than five hours only.
+            # A float32 is exact for less than five hours of milliseconds.
             self._columns = LslColumns(self._columns.channels)
 
     def _find(self, key: str, value: str, find_s: float) -> Any:
         mark = '"' if "'" in value else "'"
         predicate = f"{KEYS[key]}={mark}{value}{mark}"
         found = self._pylsl.resolve_bypred(predicate, 1, find_s)
-        if found:  # and whether it is the only one
+        if found:  # search for a second one, since it must be unique
             found = {s.uid(): s for s in (*found, *self._pylsl.resolve_bypred(predicate, 2, 0.3))}
         if len(found) == 1:
             return next(iter(found.values()))
@@ -228,7 +227,7 @@ def name_url(name: str) -> str:
 
 
 def stream_url(info: Any, *, unique_name: bool = True) -> str:
-    """Return the URL that opens a stream: by name where that is unique, else by its source."""
+    """Return the URL that opens a stream: by its name if that is unique, else by its source."""
     source = info.source_id()
     return name_url(info.name()) if unique_name or not source else f"lsl://source:{quote(source)}"
 
@@ -268,18 +267,18 @@ STREAM_TYPE = "Touch"
 _DRIFT = 200e-6
 _FAR_S = 10.0
 _LINGER_S = 0.25
-"""Time for readers to take the last samples: they are lost when the stream ends."""
+"""Time for readers to get the last samples, which are lost when the stream ends."""
 
 
 class LslOutlet:
-    """A published stream: the layout's channels by name, in their units, and ``device_ms``, the toy's own clock.
+    """A published LSL stream with the layout's channels, in their units, and ``device_ms``, the toy's own clock.
 
-    Doubles carry every value exactly (integers to 2⁵³). Time stamps are the device clock laid on LSL's: the smallest
-    delay seen is taken for the delay, and it may grow by 200 ppm, so that they are even and follow a slow drift.
+    Values are doubles, which are exact (integers to 2⁵³). Time stamps are the device clock plus an offset to LSL's
+    clock: the smallest seen, which may grow by 200 ppm. So they are evenly spaced and follow a slow drift.
 
     Raises:
         ConfigError: for an empty name.
-        MissingExtraError: without pylsl.
+        MissingExtraError: if pylsl is not installed.
     """
 
     def __init__(self, layout: Layout, name: str) -> None:
@@ -313,13 +312,13 @@ class LslOutlet:
         return name_url(self.name)
 
     def push(self, frames: Sequence[Frame]) -> None:
-        """Publish new frames: the last one with the current time, the others by the toy's clock."""
+        """Publish frames that have just arrived, with time stamps from the toy's clock."""
         now = self._pylsl.local_clock()
         begin = 0
         for end in range(1, len(frames) + 1):
             if end < len(frames) and frames[end].device_ms >= frames[end - 1].device_ms:
                 continue
-            run, begin = frames[begin:end], end  # up to the end, or to a clock that began anew
+            run, begin = frames[begin:end], end  # frames up to a reset of the clock, or to the end
             self._update_delay(run[0].device_ms, run[-1].device_ms, now)
             for frame in run:
                 self._last_stamp = max(self._last_stamp, self._delay_s + frame.device_ms / 1000.0)
@@ -330,7 +329,7 @@ class LslOutlet:
                 self._outlet.push_sample([*values, float(frame.device_ms)], self._last_stamp)
 
     def _update_delay(self, first_ms: int, last_ms: int, now: float) -> None:
-        """Update the delay between LSL's clock and the toy's by a run of frames, the last of which came now."""
+        """Update the offset of LSL's clock to the toy's with a run of frames, the last of which arrived ``now``."""
         delay, before_ms = now - last_ms / 1000.0, self._last_ms
         self._last_ms = last_ms
         if before_ms is None or first_ms < before_ms or delay - self._delay_s > _FAR_S:
@@ -352,11 +351,11 @@ class LslOutlet:
 
 
 def forward(device: Device, outlet: LslOutlet, stop: threading.Event | None = None) -> int:
-    """Publish a device's frames until it ends or ``stop`` is set; return their number.
+    """Publish the frames of a device until it ends or ``stop`` is set; return their number.
 
     Raises:
-        ConfigError: when the device's channels are not the outlet's.
-        DeviceError: when the toy went away (one opened with ``reconnect=True`` is waited for).
+        ConfigError: if the channels of the device are not those of the outlet.
+        DeviceError: if the connection is lost (devices opened with ``reconnect=True`` wait for the toy).
     """
     if device.layout.channels != outlet.layout.channels:
         raise ConfigError(
@@ -379,7 +378,7 @@ def serve_lsl(name: str, server: ToyServer) -> ToyCounters:
     Lines that the toy loses or corrupts are missing from the stream.
 
     Raises:
-        ConfigError: for a speed of 0: a stream has no reader who would hold it back.
+        ConfigError: for a speed of 0, since no reader of an LSL stream limits its speed.
     """
     if not server.speed > 0.0:
         raise ConfigError(f"The toy's speed on LSL is {server.speed:g}; it must be above 0.")

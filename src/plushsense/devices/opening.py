@@ -1,4 +1,4 @@
-"""Open devices by URL, and search for those that are there: serial ports, Bluetooth, LSL streams, the virtual toy."""
+"""Open devices by URL, and search for available ones: serial ports, Bluetooth, LSL streams, the virtual toy."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ SCHEMES: dict[str, str] = {
     "replay": "plushsense.devices.replay:open_replay",
     "virtual": "plushsense.devices.virtual.stream:open_virtual",
 }
-"""Scheme to ``module:function``; the function takes (address, layout) and returns the open `Device`."""
+"""For each scheme, ``module:function`` of a function (address, layout) that returns the open `Device`."""
 
 SEARCHES: dict[str, str] = {
     "Serial ports": "plushsense.devices.bytestreams:search_serial",
     "Bluetooth": "plushsense.devices.ble:search_bluetooth",
     "LSL": "plushsense.devices.lsl:search_streams",
 }
-"""Transport to ``module:function``; the function takes the seconds to search for and returns a `DeviceListing`."""
+"""For each transport, ``module:function`` of a function (seconds to search) that returns a `DeviceListing`."""
 
 EXAMPLES = (
     "serial:///dev/ttyUSB0?baud=115200, serial://COM3, ble://AA:BB:CC:DD:EE:FF, ble://name:PlushName, tcp://host:port, "
@@ -45,7 +45,7 @@ EXAMPLES = (
 
 @dataclass
 class DeviceAddress:
-    """The parts of a device URL: ``place`` is between ``scheme://`` and ``?``, ``query`` holds the settings."""
+    """The parts of a device URL: ``place`` is between ``scheme://`` and ``?``, ``query`` has the settings after it."""
 
     url: str
     scheme: str
@@ -53,7 +53,7 @@ class DeviceAddress:
     query: dict[str, str] = field(default_factory=dict)
 
     def check_keys(self, known: Iterable[str]) -> None:
-        """Refuse settings that the scheme does not know, with the nearest known one."""
+        """Raise ConfigError for a setting that is not in ``known``, with the nearest one that is."""
         accepted = ("layout", *known)
         for key in self.query:
             if key not in accepted:
@@ -63,7 +63,7 @@ class DeviceAddress:
                 )
 
     def whole(self, key: str, default: int, low: int = 0, high: int = 2**31 - 1) -> int:
-        """Return a setting that is a whole number."""
+        """Return a setting as a whole number from ``low`` to ``high``; raise ConfigError if it is not one."""
         text = self.query.get(key)
         if text is None:
             return default
@@ -72,7 +72,7 @@ class DeviceAddress:
         return int(text)
 
     def number(self, key: str, default: float, low: float = 0.0, high: float = 1e6) -> float:
-        """Return a setting that is a number."""
+        """Return a setting as a number from ``low`` to ``high``; raise ConfigError if it is not one."""
         text = self.query.get(key)
         if text is None:
             return default
@@ -86,10 +86,10 @@ class DeviceAddress:
 
 
 def parse_url(url: str) -> DeviceAddress:
-    """Parse a device URL. A path without a scheme is a replay; so is a Windows path like ``C:\\x.csv``.
+    """Parse a device URL. A path without a scheme, such as ``x.csv`` or ``C:\\x.csv``, means a replay.
 
     Raises:
-        ConfigError: for an unknown scheme or a setting that is no ``key=value``.
+        ConfigError: for an unknown scheme, or a setting that is not ``key=value`` or is repeated.
     """
     text = os.fspath(url).strip()
     if not text:
@@ -127,7 +127,7 @@ def _split_query(rest: str, url: str) -> tuple[str, dict[str, str]]:
     return place, query
 
 
-# Schemes whose data end; a device of any other scheme can only disconnect.
+# Schemes whose data can end; a device of any other scheme can only disconnect.
 _ENDING = ("replay", "virtual")
 
 
@@ -142,17 +142,17 @@ def open_device(
 
     ``serial:///dev/ttyUSB0?baud=115200``, ``serial://COM3``, ``ble://AA:BB:CC:DD:EE:FF``, ``ble://name:PlushName``,
     ``tcp://host:port``, ``lsl://NAME``, ``replay:///path/stream.csv?speed=1``, ``virtual://?person=7&seed=1&speed=1``;
-    a bare path is a replay. ``?layout=`` goes on any of them and wins over the argument; the default is plush-15.
+    a path alone is a replay. A setting ``layout`` in the URL overrides the argument; the default is plush-15.
 
     Args:
         layout: a layout, its name or the path of its file.
-        reconnect: give a `ReconnectingDevice`: a toy that went away is opened again, and the gap is kept.
-        reconnect_s: how long to wait for it then, seconds; None: for ever.
+        reconnect: return a `ReconnectingDevice`, which restores a lost connection and records the gap.
+        reconnect_s: longest time to wait for the toy in a gap, in seconds; None: no limit.
 
     Raises:
         ConfigError: for a scheme or setting that is unknown or out of range.
         LayoutError: for an unknown layout.
-        DeviceError: for a port, host, stream or file that is not there.
+        DeviceError: for a port, host, stream or file that does not exist or cannot be opened.
         MissingExtraError: for a scheme whose optional package is not installed.
     """
     address = parse_url(os.fspath(url))
@@ -177,7 +177,7 @@ _GRACE_S = 2.0
 
 @dataclass(frozen=True)
 class DeviceInfo:
-    """A possible toy: ``url`` opens it, ``kind`` is serial, ble, lsl or virtual."""
+    """A device that may be a toy; ``url`` opens it, ``kind`` is serial, ble, lsl or virtual."""
 
     url: str
     kind: str
@@ -187,7 +187,7 @@ class DeviceInfo:
 
 @dataclass
 class DeviceListing:
-    """The devices found, and a sentence for each kind of device that could not be searched."""
+    """The devices found, and notes for the user, such as why a transport could not be searched."""
 
     devices: list[DeviceInfo] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -200,11 +200,11 @@ class DeviceListing:
 def list_devices(scan_s: float = SCAN_S) -> DeviceListing:
     """Search for toys on all transports at once, for ``scan_s`` seconds.
 
-    Bluetooth devices are listed when they advertise the Nordic UART service or have a name like a toy's; all LSL
-    streams are. A missing package or adapter is a note, not an error.
+    All serial ports and LSL streams are listed, and Bluetooth devices that advertise the Nordic UART service or have a
+    name like a toy's. A missing package or adapter gives a note, not an error.
 
     Raises:
-        ConfigError: for a time that is not above 0 and at most 600 s.
+        ConfigError: if ``scan_s`` is not above 0 and at most 600.
     """
     if not 0.0 < scan_s <= 600.0:
         raise ConfigError(f"The time to look for toys is {scan_s:g} s; accepted is above 0 to 600.")

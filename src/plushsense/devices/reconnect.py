@@ -1,4 +1,4 @@
-"""Reconnect to a toy that was unplugged, switched off or out of reach, and record the gap."""
+"""Reconnect to a toy after it was unplugged, switched off or out of reach, and record the gap."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ class ConnectionGap:
     """A time without connection, from the last frame before it to the first one after.
 
     Attributes:
-        host_ms_begin: of the last frame before; when it went away, if there was none.
-        host_ms_end: of the first frame after; None while it lasts.
+        host_ms_begin: host time of the last frame before; if there was none, of the loss of the connection.
+        host_ms_end: host time of the first frame after; None while the gap lasts.
         device_ms_before: the toy's clock at the last frame before; None if there was none.
-        device_ms_after: the toy's clock at the first frame after: it goes on after a pulled cable and begins anew
-            after a restart. None while the gap lasts.
+        device_ms_after: the toy's clock at the first frame after; None while the gap lasts. It has restarted if the toy
+            was switched off, but not if only the cable was unplugged.
         reason: what went wrong, in one sentence.
     """
 
@@ -42,23 +42,22 @@ class ConnectionGap:
 
 
 class ReconnectingDevice(Device):
-    """Frames of a toy that is reopened, with a try every 0.5 s, whenever the connection is lost.
+    """A device that reopens its toy when the connection is lost, trying every 0.5 s.
 
-    Counters go on over all connections; ``lost`` counts within each of them, and what a gap swallowed is in ``gaps``.
-    While the toy is away `read` returns no frames, each time after about ``wait_s``.
+    Counters continue over all connections; ``lost`` does not include frames lost in ``gaps``. While the toy is not
+    connected, `read` waits about ``wait_s`` and returns no frames.
 
     Args:
-        url: for messages.
-        layout: of the frames.
-        open_inner: opens the toy; the first failure raises, later ones are tried again.
-        for_s: how long to wait for the toy before DeviceError; None: for ever.
-        ends: whether the end of the inner frames is the end (a file); else it counts as going away (a server that
-            closed the connection).
+        url: URL for messages.
+        layout: layout of the frames.
+        open_inner: function that opens the toy. Its first failure is raised; later it is tried again.
+        for_s: longest time to wait for the toy, after which DeviceError is raised; None: no limit.
+        ends: whether the device ends with its inner device (a file); else that counts as a lost connection (a server).
 
     Attributes:
         state: "connected" or "waiting".
-        gaps: all so far; the last one is open (``host_ms_end`` None) until a frame has come.
-        inner: the open device behind this one; None while waiting.
+        gaps: all gaps so far; ``host_ms_end`` of the last one is None until a frame has arrived.
+        inner: the current inner device; None while waiting.
     """
 
     def __init__(
@@ -86,10 +85,10 @@ class ReconnectingDevice(Device):
         self._count()
 
     def read(self) -> list[Frame] | None:
-        """Return the received frames, waiting at most about ``wait_s``; an empty list while the toy is away.
+        """Return the received frames, waiting at most about ``wait_s``; none while the toy is not connected.
 
         Raises:
-            DeviceError: when it did not come back within ``for_s``.
+            DeviceError: if the toy could not be reopened within ``for_s``.
         """
         if self.closed:
             return None
@@ -126,7 +125,7 @@ class ReconnectingDevice(Device):
     def _lost(self, inner: Device, reason: str) -> list[Frame]:
         self._count()
         self._before = Counters(**self.counters.to_dict())
-        # Disconnected again before a frame came: the same gap goes on, and the next try is delayed.
+        # Disconnected again before a frame arrived: the gap continues, and the next try is delayed.
         again = bool(self.gaps) and self.gaps[-1].host_ms_end is None
         if not again:
             last = self._last

@@ -18,9 +18,9 @@ _BLOCK = 500
 
 
 class ReplayDevice(PacedDevice):
-    """Frames of a file, at the pace of the device clock (``speed`` 1), faster, or without waiting (0).
+    """A device that replays a file at ``speed`` times the pace of its device clock, or without waiting (0).
 
-    ``host_ms`` is the one in the file where there is one. ``warnings`` are those of the file.
+    ``host_ms`` of the frames is from the file, or the current time if it has none. ``warnings`` are from reading it.
     """
 
     def __init__(self, url: str, layout: Layout, path: Path, speed: float = 1.0) -> None:
@@ -56,13 +56,13 @@ class ReplayDevice(PacedDevice):
 
 
 def _path(place: str) -> Path:
-    """Return the path in a URL: ``/C:/x.csv`` is a Windows path, ``%20`` a space unless it is in the file's name."""
+    """Return the path in a URL: ``/C:/x.csv`` becomes a Windows path; ``%20`` a space, unless such a file exists."""
     text = place[1:] if re.match(r"/[A-Za-z]:[\\/]", place) else place
     return Path(text if Path(text).exists() else unquote(text)).expanduser()
 
 
 def open_replay(address: DeviceAddress, layout: Layout) -> ReplayDevice:
-    """Open ``replay:///path?speed=1``; a folder stands for the stream in it."""
+    """Open ``replay:///path?speed=1``; for a folder, replay the stream in it."""
     address.check_keys(("speed",))
     speed = address.number("speed", 1.0)
     path = _path(address.place)

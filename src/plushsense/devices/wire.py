@@ -1,6 +1,6 @@
-"""Parse and format the wire format: integers separated by spaces, one frame a line.
+"""Parse and format the wire format: numbers separated by spaces, one frame per line.
 
-Any input is accepted: noise, incomplete and endless lines are counted, and memory stays bounded.
+Any input is accepted: noise, incomplete lines and lines without end are counted, and memory stays bounded.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _LONGEST_DELAY_MS = 2**31
 class ParsedLine:
     """A parsed frame: ``device_ms``, and ``values`` (C,) in integer steps, in layout order.
 
-    ``garbage`` marks a value outside its channel's valid range: kept as it came.
+    ``garbage`` is whether a value is outside its channel's valid range; such values are kept unchanged.
     """
 
     device_ms: int
@@ -32,18 +32,18 @@ class ParsedLine:
 
 
 class LineParser:
-    """Parse a stream of bytes to frames.
+    """Parse a stream of bytes into frames.
 
-    Fields are separated by any run of spaces, tabs, commas or semicolons, lines by ``\\n``, ``\\r`` or both. Where a
-    layout's wire has no ``device_ms`` the delays are added up (a lost line then leaves no trace in the clock); one
-    above 2³¹ ms is noise.
-    Channels with a step of 1 take integers only, others decimals too. Empty lines are ignored.
+    Fields are separated by any number of spaces, tabs, commas or semicolons, lines by ``\\n``, ``\\r`` or both. If the
+    layout's wire has no ``device_ms``, the clock is the sum of the delays, so lost lines do not show in it; a line with
+    a delay above 2³¹ ms is malformed. Values of channels with a step of 1 must be integers; others may be decimals.
+    Empty lines are ignored.
 
     Args:
         layout: the layout of the lines.
         counters: the counters to update; new ones by default.
-        joining: reading begins in the middle of a line (a serial port): what comes before the first line end is
-            dropped, and counted as malformed unless it happens to be a whole frame.
+        joining: whether reading may begin in the middle of a line (a serial port). Then the first line is dropped, and
+            counted as malformed unless it is a whole frame.
     """
 
     def __init__(self, layout: Layout, counters: Counters | None = None, *, joining: bool = False) -> None:
@@ -92,7 +92,7 @@ class LineParser:
         return [Frame(host_ms, line.device_ms, line.values) for line in self.feed(data)]
 
     def finish(self) -> None:
-        """Count an unfinished last line as malformed, at the end of the source."""
+        """Count an incomplete last line as malformed; call this at the end of the source."""
         if self._pending.translate(_SEPARATORS).strip() and not self._skipping:
             self.counters.malformed += 1
         self._pending.clear()
@@ -146,7 +146,7 @@ class LineParser:
         return ParsedLine(device_ms, values, garbage)
 
     def _numbers(self, fields: list[bytes], line: bytes) -> list[int] | None:
-        """Return all fields as integers (channels in steps, clocks in ms), or None for a line that is no frame."""
+        """Return all fields as integers (channels in steps, clocks in ms); None if the line is not a frame."""
         if len(fields) != self._fields:
             return None
         if self._plain is not None and self._plain.match(line) is not None:
@@ -188,7 +188,7 @@ def _steps(field: bytes, step: float) -> int | None:
 
 
 def format_line(layout: Layout, values: Sequence[int], device_ms: int, delay_ms: int) -> bytes:
-    """Format a frame as the toy sends it: ``values`` (C,) in integer steps, layout order; ended by a line feed."""
+    """Format a frame as the toy sends it, with a line feed; ``values`` (C,) are in integer steps, in layout order."""
     fields = []
     for name in layout.wire:
         if name == DEVICE_MS:
