@@ -1,4 +1,4 @@
-"""Bluetooth Low Energy toys: the wire format in the notifications of a UART-like service (through bleak)."""
+"""Bluetooth Low Energy toys, which send the wire format in notifications of a UART-like service (with bleak)."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ class BleTarget:
     """The device to connect to and the characteristic to read.
 
     Attributes:
-        name: advertised name; or
-        address: the system's address: six bytes, on macOS a UUID.
+        name: advertised name, if it is searched by name.
+        address: address, if it is searched by address: six bytes, or a UUID on macOS.
         service: UUID of the service.
-        tx: UUID of the notifying characteristic; None: the service's only one.
-        find_s: longest search, seconds.
+        tx: UUID of the notifying characteristic; None: the only one of the service.
+        find_s: longest duration of the search, in seconds.
     """
 
     name: str | None = None
@@ -53,7 +53,7 @@ class BleTarget:
 
 @dataclass(frozen=True)
 class BleBackends:
-    """Client and scanner classes of bleak; None: the platform's."""
+    """Client and scanner backend classes of bleak; None: those of the platform."""
 
     client: type[Any] | None = None
     scanner: type[Any] | None = None
@@ -74,7 +74,7 @@ _loops: list[asyncio.AbstractEventLoop] = []
 
 
 def bluetooth_loop() -> asyncio.AbstractEventLoop:
-    """Return the event loop shared by all Bluetooth devices: bleak keeps its system connection in it."""
+    """Return the event loop shared by all Bluetooth devices; bleak ties its connection to the system to it."""
     with _started:
         if not _loops:
             loop = asyncio.new_event_loop()
@@ -84,10 +84,10 @@ def bluetooth_loop() -> asyncio.AbstractEventLoop:
 
 
 class BleDevice(Device):
-    """Frames from the notifications of a Bluetooth toy. One that disconnects raises DeviceError.
+    """A Bluetooth toy that sends notifications. Reading raises DeviceError after it has disconnected.
 
     bleak runs in the event loop of another thread (`bluetooth_loop`), which queues the notifications for `read`.
-    Notifications split lines anywhere; the first line may be incomplete, as on a serial port.
+    Notifications may end within a line; the first line may be incomplete, as on a serial port.
     """
 
     def __init__(self, url: str, layout: Layout, target: BleTarget, backends: BleBackends | None = None) -> None:
@@ -104,7 +104,7 @@ class BleDevice(Device):
         try:
             opened.result()
         except BaseException:
-            self.close()  # also when the user has stopped waiting
+            self.close()  # also for KeyboardInterrupt
             raise
 
     def read(self) -> list[Frame] | None:
@@ -119,7 +119,7 @@ class BleDevice(Device):
             if received is None:
                 if self.closed:
                     return None
-                self._received.put(None)  # for the next call, when frames came before the end
+                self._received.put(None)  # so that the next call raises, if this one has frames to return
                 if frames:
                     return frames
                 self._parser.finish()
@@ -145,7 +145,7 @@ class BleDevice(Device):
             self._over.set()
 
     async def _work(self, opened: Future[None]) -> None:
-        """Find, connect and receive, until the toy disconnects or `close` is called."""
+        """Find the toy, connect and receive, until it disconnects or `close` is called."""
         self._over = over = asyncio.Event()
         if self.closed:
             over.set()
@@ -192,7 +192,7 @@ class BleDevice(Device):
                 await asyncio.wait_for(client.disconnect(), 3.0)
 
     async def _find(self) -> Any:
-        """Scan for the device; connecting to an address without a scan is not reliable (bleak's manual)."""
+        """Scan for the device, since connecting to an address without a scan is unreliable (see bleak's manual)."""
         target = self._target
         device_found: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
         names: dict[str, str] = {}
@@ -240,11 +240,11 @@ class BleDevice(Device):
 
 
 def scan(seconds: float, backends: BleBackends | None = None) -> list[BleAdvertisement]:
-    """Return the devices that advertise within a number of seconds, the strongest signal first.
+    """Return the devices that advertise within ``seconds``, the strongest signal first.
 
     Raises:
-        DeviceError: when Bluetooth cannot be used, in one sentence.
-        MissingExtraError: without bleak.
+        DeviceError: if Bluetooth cannot be used.
+        MissingExtraError: if bleak is not installed.
     """
     bleak = need("bleak", extra="ble")
     seen: dict[str, BleAdvertisement] = {}
@@ -288,7 +288,7 @@ def _scanner(bleak: ModuleType, backends: BleBackends, advertised: Callable[[Any
 
 
 def in_words(cause: Exception) -> str:
-    """Describe an error of bleak or the system below it, without a full stop at the end."""
+    """Describe an error of bleak or of the system in words, without a full stop at the end."""
     reason = str(getattr(getattr(cause, "reason", None), "name", ""))
     text = " ".join(" ".join(str(part) for part in cause.args).split()) or type(cause).__name__
     low = text.lower()

@@ -142,7 +142,7 @@ class TcpDevice(Device):
         except OSError as cause:
             if self.closed:
                 return None
-            if isinstance(cause, TimeoutError) and cause.errno is None:  # our own timeout; one of the network has an error number
+            if isinstance(cause, TimeoutError) and cause.errno is None:  # our timeout; others have a number
                 return []
             self._parser.finish()
             raise DeviceError(f"'{self.url}' went away: {cause.strerror or cause}.") from None

@@ -98,7 +98,7 @@ def match_columns(layout: Layout, labels: list[str] | None, width: int, what: st
 class LslDevice(Device):
     """A device that receives an LSL stream. Reading raises DeviceError when the source is gone.
 
-    ``device_ms`` is the channel of that name, if there is one (the toy's own clock, which `LslOutlet` sends). Else it is
+    ``device_ms`` is the channel of that name, if there is one (the toy's own clock; `LslOutlet` sends it). Else it is
     the LSL time stamp, from the sender's clock, in whole milliseconds. A time stamp up to 1 s earlier than the previous
     one is replaced by that, so that the clock does not go back; a larger step back is a restart. Values are converted
     to integer steps. A sample with a value that is not finite, or is a fraction for a step of 1, counts as malformed.

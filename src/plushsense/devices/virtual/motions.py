@@ -1,4 +1,4 @@
-"""Simulate the paper's 17 gestures of one person as pressure and acceleration over time."""
+"""Simulate the 17 gestures of the paper, made by one person, as pressure and acceleration over time."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _NEIGHBOURS = (
 
 
 def wander(rng: np.random.Generator, n: int, low_hz: float, high_hz: float, parts: int = 5) -> Floats:
-    """Return a smooth random signal (n,) of about unit variance between two frequencies."""
+    """Return a smooth random signal (n,) of about unit variance, with frequencies from ``low_hz`` to ``high_hz``."""
     hz = low_hz * (high_hz / low_hz) ** rng.random(parts)
     phase = 2 * math.pi * rng.random(parts)
     t = np.arange(n) / RATE_HZ
@@ -41,11 +41,11 @@ class Canvas:
     """Pressure on the toy and its movement over ``n`` samples, before the sensors measure them.
 
     Attributes:
-        press: (n, 9) touch on each electrode of `ZONES`, 1 is a firm adult palm.
-        near: (n,) how near a hand is, 0 to 1, for the proximity electrode.
+        press: (n, 9) pressure on each electrode of `ZONES`; 1 is that of a firm adult palm.
+        near: (n,) nearness of a hand, 0 to 1, for the proximity electrode.
         shake: (n, 3) acceleration without gravity, in g.
-        down: (n, 3) direction of gravity, of length 1.
-        struck: samples of the impact or jerk of rough gestures.
+        down: (n, 3) direction of gravity, a unit vector.
+        struck: indices of the samples in which a rough gesture hits or jerks the toy.
     """
 
     def __init__(self, n: int, down: Floats) -> None:
@@ -59,9 +59,9 @@ class Canvas:
         return len(self.near)
 
     def touch(self, start: int, place: Floats, press: Floats, width: float, world: World) -> None:
-        """Add a contact that moves along the back: place and pressure (m,) from sample ``start`` on.
+        """Add a contact that moves along the back, with ``place`` and ``press`` (m,) from sample ``start`` on.
 
-        An electrode answers by distance; a wide contact covers more of it.
+        The signal of an electrode depends on its distance to the contact, and on the width of both.
         """
         stop = min(len(self), start + len(press))
         place, press = place[: stop - start], press[: stop - start]
@@ -90,12 +90,12 @@ class Canvas:
 
 @dataclass(frozen=True)
 class Climate:
-    """Humidity of one session: a level, and a slow drift that is a fixed function of time.
+    """Conditions of one session: humidity, with a slow drift that is a fixed function of time, and sensor errors.
 
     Attributes:
-        level: offset of the session, in units of ``World.humidity_session``.
-        electrode: (9,) each electrode's own relative offset in this session.
-        waves: (k, 3) amplitude, hertz, phase of the drift.
+        level: offset of the humidity, in units of ``World.humidity_session``.
+        electrode: (9,) relative offset of each electrode in this session.
+        waves: (k, 3) amplitude, frequency in hertz, and phase of each part of the drift.
         axis: (3,) gain of each accelerometer axis.
     """
 
@@ -106,7 +106,7 @@ class Climate:
 
     @classmethod
     def draw(cls, rng: np.random.Generator, world: World, spread: float = 1.0) -> Climate:
-        """Draw the humidity of a session; ``spread`` widens level and drift."""
+        """Draw the conditions of a session; ``spread`` scales level and drift of the humidity."""
         periods_s = np.array([1900.0, 700.0, 260.0, 95.0]) * (0.7 + 0.6 * rng.random(4))
         share = np.array([0.75, 0.5, 0.3, 0.15])
         return cls(
@@ -117,7 +117,7 @@ class Climate:
         )
 
     def humidity(self, seconds: Floats, world: World) -> Floats:
-        """Return the relative change of the baselines at these times, (n,)."""
+        """Return the relative change of the baselines (n,) at the times ``seconds`` (n,)."""
         amplitude, hz, phase = self.waves.T
         drift = (amplitude * np.sin(2 * math.pi * seconds[:, None] * hz + phase)).sum(axis=1)
         return np.asarray(world.humidity_session * self.level + world.humidity_drift * drift)
@@ -138,10 +138,10 @@ def sense(
     rng: np.random.Generator,
     world: World,
 ) -> NDArray[np.int64]:
-    """Return the sensors' readings of a canvas, (n, 13) raw integers in the order of `CHANNELS`.
+    """Return the sensor readings of a canvas, (n, 13) raw integers in the order of `CHANNELS`.
 
-    ``first`` is the sample number of the canvas in its session (for the drift), ``coupling`` how well this person's
-    skin is sensed.
+    ``first`` is the number of the first sample in the session (for the drift); ``coupling`` is the person's strength of
+    electrical coupling to the electrodes.
     """
     n = len(canvas)
     humidity = climate.humidity((first + np.arange(n)) / RATE_HZ, world)
@@ -175,11 +175,11 @@ class RepetitionPlan:
     """The timing of one repetition of a gesture, in samples from the start of its episode.
 
     Attributes:
-        record_start, record_stop: part that a recorder started and stopped by hand would hold.
+        record_start, record_stop: start and stop of a recording that is started and stopped by hand.
         at, n: first sample and number of samples of the movement.
         lap: whether a toy "in the hands" lies on the lap.
-        steadied: whether the other hand lies on a toy on the table.
-        light_grip: firmness of the grip in these two cases.
+        steadied: whether the other hand steadies a toy on the table.
+        light_grip: strength of the grip in these two cases.
     """
 
     record_start: int
@@ -200,23 +200,23 @@ class Hands:
     _rng: np.random.Generator
 
     def upright(self) -> Floats:
-        """Draw how the toy stands on the table: direction of gravity, (3,)."""
+        """Draw the direction of gravity (3,) for the toy standing on the table."""
         return np.asarray(_UPRIGHT + 0.06 * self._rng.standard_normal(3))
 
     def light(self) -> float:
-        """Draw the strength of a light grip: of a hand that steadies the toy, or of a toy on the lap."""
+        """Draw the strength of a light grip, as of a hand that steadies the toy or holds it on the lap."""
         median, spread = self._world.light_grip
         return median * math.exp(spread * self._rng.standard_normal())
 
     def approach(self, canvas: Canvas, plan: RepetitionPlan) -> None:
-        """Add the working hand's approach before the touch and its withdrawal after it."""
+        """Add the approach of the hand before the touch, and its withdrawal after it."""
         n = len(canvas)
         near = ramp(n, plan.at - samples(APPROACH_S), samples(APPROACH_S))
         near *= 1.0 - ramp(n, plan.at + plan.n, samples(LEAVE_S))
         canvas.near += 0.8 * self._who.hand * near
 
     def steady(self, canvas: Canvas, plan: RepetitionPlan) -> None:
-        """Add the other hand, which lies on the toy on the table."""
+        """Add the other hand, which steadies the toy on the table."""
         n = len(canvas)
         early = samples(0.5 * self._rng.random())
         level = ramp(n, plan.record_start - early, 40) * (1.0 - ramp(n, plan.record_stop, 40))
@@ -226,7 +226,7 @@ class Hands:
     def hold(self, canvas: Canvas, pick: int, put: int, plans: list[RepetitionPlan], share: float) -> Floats:
         """Lift the toy from the table, hold it (sometimes on the lap) and put it down again.
 
-        ``share`` weakens the grip, as when one hand is busy. Returns how the toy stands afterwards, (3,).
+        ``share`` weakens the grip, as when one hand is busy. Returns the direction of gravity (3,) afterwards.
         """
         rng, who, world = self._rng, self._who, self._world
         n = len(canvas)
@@ -272,10 +272,10 @@ class Performance:
     """One performance of a gesture by a person.
 
     Attributes:
-        family: the gesture without its number, such as "Tail tap".
+        family: label of the gesture without its number, such as "Tail tap".
         in_hands: whether the toy is held in the hands.
         at, n: first sample of the movement in the canvas, and number of samples.
-        force, tempo: relative to what is usual for this person.
+        force, tempo: force, and tempo relative to what is usual for this person.
         shift: offset of the place along the toy's back, in addition to the person's own.
     """
 
@@ -290,13 +290,13 @@ class Performance:
 
 
 def _edges(n: int, rise_s: float = 0.12) -> Floats:
-    """Return a window (n,) that rises from 0 to 1 within ``rise_s`` and falls again at the end."""
+    """Return an envelope (n,) that rises from 0 to 1 within ``rise_s`` and falls again at the end."""
     length = max(1, min(n // 3, round(rise_s * RATE_HZ)))
     return ramp(n, 0, length) * (1.0 - ramp(n, n - length, length))
 
 
 def _cycles(rng: np.random.Generator, n: int, hz: float, jitter: float) -> Floats:
-    """Return the running phase in cycles, (n,); the length of each cycle varies by a relative ``jitter``."""
+    """Return the phase in cycles (n,) at about ``hz``; the length of each cycle varies by the relative ``jitter``."""
     count = int(n / RATE_HZ * hz * 2) + 4
     lengths = RATE_HZ / hz * np.exp(jitter * rng.standard_normal(count))
     ends = np.concatenate(([0.0], np.cumsum(lengths)))
@@ -378,7 +378,7 @@ def _hit(canvas: Canvas, trial: Performance, rng: np.random.Generator, world: Wo
     t = np.arange(trial.n) - at
     press = np.where((t >= 0) & (t < contact), 1.0, 0.0) * world.hit_press * trial.force
     press = np.where(t >= contact, world.hit_press * trial.force * np.exp(-(t - contact) / 5.0), press)
-    if rng.random() < 0.3:  # some leave the hand there for a while
+    if rng.random() < 0.3:  # some people leave the hand there for a while
         press = press + 0.25 * trial.force * ((t >= contact) & (t < contact + 40))
     place = np.full(trial.n, _place(trial, world.hit_place))
     canvas.touch(trial.at, place, press, world.palm_width * who.hand, world)
@@ -433,7 +433,7 @@ MOTIONS: dict[str, tuple[str, Motion]] = {
     "Hold strong": ("hold_s", _hug),
     "Hold in hands": ("hold_s", lambda c, t, r, w: None),  # the session simulates the grip
 }
-"""The field of `World` that has a family's duration, and the function that simulates it."""
+"""For each family, the field of `World` with its duration, and the function that simulates it."""
 
 AT_REST = "At rest"
 

@@ -1,4 +1,4 @@
-"""Serve the virtual toy to other programs, on a pseudo terminal or a local TCP port."""
+"""Offer the virtual toy to other programs, on a pseudo terminal or a local TCP port."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from plushsense.devices.virtual.stream import PerformedGesture, Prompts, ToySpec
 
 HOST = "127.0.0.1"
 _STALL_S = 0.5
-"""After this time without reading, lines are dropped, as on a real serial line."""
+"""Time after which lines are dropped if nobody reads them, as on a real serial line."""
 _FAST_STALL_S = 10.0
-"""The same for a toy faster than real time, which has to wait for a reader that writes a file."""
+"""The same for a toy faster than real time, which must wait for readers that are slowed by writing a file."""
 _FAST_QUEUE = 512
-"""Most unread bytes of such a toy on a pseudo terminal; the system's buffers would hold seconds of data."""
+"""Limit of unread bytes of such a toy on a pseudo terminal, whose buffer would hold seconds of data."""
 
 
 @dataclass
 class ToyCounters:
-    """Numbers of lines sent, lines dropped for want of a reader, gestures begun, connections accepted."""
+    """Numbers of lines sent, lines dropped because nobody read them, gestures begun, and connections accepted."""
 
     sent: int = 0
     dropped: int = 0
@@ -37,7 +37,7 @@ class ToyCounters:
 
 @dataclass
 class _Outlet:
-    """Non-blocking output that waits for a slow reader, drops lines without one, and never sends part of a line."""
+    """Non-blocking output that waits for a slow reader, and drops whole lines if there is none."""
 
     write: Callable[[bytes], int]
     fileno: int
@@ -47,7 +47,7 @@ class _Outlet:
     _rest: bytes = b""
 
     def send(self, data: bytes, stop: threading.Event) -> bool:
-        """Send lines; False when they were dropped. OSError when the reader's end is gone."""
+        """Send lines; return False if some were dropped. Raise OSError if the reader has closed the connection."""
         whole = self._rest + data
         pending = whole
         deadline = time.monotonic() + (0.0 if self.absent else self.stall_s)
@@ -79,18 +79,18 @@ def _ignore(_: object) -> None:
 
 @dataclass
 class ToyServer:
-    """Server of the virtual toy: its settings, and functions to call.
+    """A server for the virtual toy, with settings and callbacks.
 
     Attributes:
-        spec: which toy; the default is person 1.
-        layout: of the lines.
-        speed: 1 real time, 0 as fast as the reader takes it (the toy then waits for a reader).
-        seconds: of device time after which it ends; 0: never.
+        spec: settings of the toy; the default is person 1.
+        layout: layout of the lines.
+        speed: 1 for real time, 0 for as fast as the reader accepts lines (then the toy waits for a reader).
+        seconds: device time after which the toy ends; 0: never.
         on_ready: called with the URL when the toy can be opened.
         on_performed: called with each gesture as it begins.
-        on_sent: called with the lines that were sent, without the dropped ones.
-        prompts: gestures for the person to make; None: random gestures.
-        stop: ends the toy when it is set.
+        on_sent: called with the lines that were sent, without dropped ones.
+        prompts: source of gestures that the person shall make; None: the gestures of ``spec``, or random ones.
+        stop: event that ends the toy when it is set.
     """
 
     spec: ToySpec = field(default_factory=ToySpec)
@@ -104,13 +104,13 @@ class ToyServer:
     stop: threading.Event = field(default_factory=threading.Event)
 
     def serve_tcp(self, port: int) -> ToyCounters:
-        """Serve on ``127.0.0.1:port`` (0: a free one), to one reader after another, until `stop` is set.
+        """Serve on ``127.0.0.1:port`` (0: any free port), to one reader at a time, until `stop` is set.
 
-        The toy goes on while nobody listens, as a real one does.
+        Unless ``speed`` is 0, the toy continues while nobody is connected, as a real one does.
 
         Raises:
-            DeviceError: when the port is taken or not allowed.
-            ConfigError: for a layout that the virtual toy does not speak.
+            DeviceError: if the port is in use or not allowed.
+            ConfigError: for an invalid port or speed, or a layout that the virtual toy does not support.
         """
         if not 0 <= port <= 65535:
             raise ConfigError(f"The port is {port}; a whole number from 0 (a free one) to 65535 is accepted.")
@@ -148,7 +148,7 @@ class ToyServer:
                     return False
                 try:
                     return outlet.send(data, self.stop)
-                except OSError:  # the reader has gone: the next one may come
+                except OSError:  # the reader has disconnected: accept the next one
                     client.close()
                     client = outlet = None
                     return False
@@ -163,12 +163,12 @@ class ToyServer:
     def serve_pty(self) -> ToyCounters:
         """Serve on a pseudo terminal that looks like a serial port, until `stop` is set. Linux and macOS.
 
-        Speed 0 is not for a port that nobody may be reading. A toy faster than real time waits up to 10 s for a slow
-        reader, so that its speed causes no losses.
+        A speed of 0 is refused, since perhaps nobody reads the port. A toy faster than real time waits up to 10 s for a
+        slow reader, so that its speed causes no losses.
 
         Raises:
             DeviceError: on Windows, which has no pseudo terminals.
-            ConfigError: for a speed of 0, or a layout that the virtual toy does not speak.
+            ConfigError: for a speed of 0, or a layout that the virtual toy does not support.
         """
         if sys.platform == "win32":
             raise DeviceError("Windows has no pseudo terminals: serve the toy over TCP instead (toy --tcp PORT).")

@@ -1,7 +1,7 @@
 """Simulate a person's session with the toy: waiting, picking it up, gestures, putting it down, and the sensor signals.
 
-A session consists of episodes. Each begins and ends with the toy on the table and no hand near, so that any number of
-them can be joined; samples, device clock and humidity drift continue from one to the next.
+A session is a sequence of episodes. Each begins and ends with the toy on the table and no hand near, so that episodes
+can be joined in any order; sample numbers, device clock and humidity drift continue from one to the next.
 """
 
 from __future__ import annotations
@@ -57,8 +57,8 @@ _POSTURES = np.array([(0, 0, 1.0), (0, 0, -1.0), (0, 1.0, 0.1), (0, -1.0, 0.1), 
 class GestureMark:
     """A performed gesture, in samples of the session.
 
-    The hand works from ``start`` to ``stop``; a recorder started and stopped by hand holds ``record_start`` to
-    ``record_stop``. ``struck`` is the time of a rough gesture's impact or jerk; None for any other gesture.
+    The movement lasts from ``start`` to ``stop``; a recording that is started and stopped by hand, from ``record_start``
+    to ``record_stop``. ``struck`` is the sample of the impact or jerk of a rough gesture; None for other gestures.
     """
 
     label: str
@@ -73,8 +73,8 @@ class GestureMark:
 class Episode:
     """A section of a session.
 
-    ``first`` is its first sample number; ``values`` (n, 13) are raw, in the order of `CHANNELS`; ``device_ms`` (n,);
-    ``delay_ms`` (n,); ``marks`` are the gestures performed in it.
+    ``first`` is the number of its first sample; ``values`` (n, 13) are raw, in the order of `CHANNELS`; ``device_ms`` and
+    ``delay_ms`` (n,) are device clock and time since the previous frame; ``marks`` are the gestures performed in it.
     """
 
     first: int
@@ -92,10 +92,10 @@ class VirtualSession:
     """A person's session with the toy. The same person, seed and number give the same session.
 
     Args:
-        person: who; None for recordings of nobody (somebody turns the toy over and goes away).
-        seed: of the population and everything in it.
-        number: which session of this person.
-        wait_s: seconds between two gestures (low, high); the default is the recorder's countdown.
+        person: the person; None for recordings of the toy at rest (somebody turns the toy over and goes away).
+        seed: seed of the population and of all random numbers.
+        number: number of the session of this person.
+        wait_s: time between two gestures (low, high); by default a little longer than the recorder's countdown.
     """
 
     person: Person | None
@@ -119,7 +119,7 @@ class VirtualSession:
     # Episodes -------------------------------------------------------------------------------------------------
 
     def perform(self, label: str, repetitions: int = 1) -> Episode:
-        """Perform a gesture of plush-18 a number of times; "At rest" turns the toy over and leaves it alone."""
+        """Perform a gesture of plush-18 ``repetitions`` times; "At rest" turns the toy over and leaves it alone."""
         check_gesture(label)
         if label == AT_REST:
             return self._rest(repetitions)
@@ -171,7 +171,7 @@ class VirtualSession:
         return self._sense(Canvas(max(1, samples(seconds)), self._down), ())
 
     def handle(self) -> Episode:
-        """Lift the toy, turn it and put it down, which is no gesture."""
+        """Lift the toy, turn it and put it down, without any gesture."""
         n_hold = samples(0.6 + 1.2 * self._rng.random())
         start = samples(0.4)
         put = start + samples(PICK_S) + n_hold
@@ -180,7 +180,7 @@ class VirtualSession:
         return self._sense(canvas, ())
 
     def play(self, gestures: Iterable[str] | None = None) -> Iterator[Episode]:
-        """Yield episodes without end: idle, sometimes handling, and random gestures, or ``gestures`` in turn."""
+        """Yield endless episodes: idle time, sometimes handling, and the ``gestures`` in turn, or random ones."""
         script = tuple(gestures or ())
         turn = 0
         while True:
@@ -212,7 +212,7 @@ class VirtualSession:
         return RepetitionPlan(record_start, at, n, at + n + samples(stop), lap, steadied, self._hands.light())
 
     def _rest(self, repetitions: int) -> Episode:
-        """Lay the toy down in another way each time, and leave it."""
+        """Lay the toy down in a random posture each time, and leave it alone."""
         rng, world = self._rng, self.world
         pieces, marks = [], []
         for _ in range(repetitions):
@@ -231,7 +231,7 @@ class VirtualSession:
         )
 
     def _lay(self, posture: Floats) -> Episode:
-        """Lift the toy and lay it down with gravity along ``posture``."""
+        """Lift the toy and lay it down, so that gravity is about along ``posture``."""
         start = samples(0.3)
         put = start + samples(1.4)
         canvas = Canvas(put + samples(PUT_S + 0.6), self._down)

@@ -1,4 +1,4 @@
-"""The virtual toy as lines in the wire format, some of them lost or corrupted, and as a device (``virtual://``)."""
+"""The virtual toy as lines in the wire format, some lost or corrupted, and as a device (``virtual://``)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from plushsense.devices.wire import LineParser
 
 @dataclass(frozen=True)
 class Prompt:
-    """A gesture to perform, and when its recording begins on the toy's clock (ms); None: as soon as possible."""
+    """A gesture to perform, and the toy's clock (ms) at the start of its recording; None: as soon as possible."""
 
     label: str
     begin_ms: int | None = None
@@ -33,10 +33,10 @@ Prompts = Callable[[], Prompt | None]
 
 
 class LogPrompts:
-    """Read prompts from a session's log (``session.jsonl``) while a recorder writes it, from now on.
+    """Read new prompts from a session's log (``session.jsonl``) while a recorder writes it.
 
-    Nothing is sent to the toy itself, since a real one would not know the bytes. The file need not exist yet.
-    A prompt is a ``countdown`` event with ``gesture``, ``device_ms`` and ``countdown_s``.
+    They are not sent to the toy, since a real one would not understand them. The file need not exist yet. A prompt is a
+    ``countdown`` event with ``gesture``, ``device_ms`` and ``countdown_s``.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -82,7 +82,7 @@ _LEAD_S = 0.6
 
 @dataclass(frozen=True)
 class PerformedGesture:
-    """A performed gesture: its label, and begin and end on the device clock."""
+    """A performed gesture: its label, and the device clock at its start and end."""
 
     label: str
     start_ms: int
@@ -95,7 +95,7 @@ class PerformedGesture:
 
 @dataclass(frozen=True)
 class ToyLine:
-    """A line as the toy sends it: its bytes (empty when lost), its time, and the gesture that begins with it."""
+    """A line that the toy sends: its bytes (empty if lost), its time, and the gesture that begins with it."""
 
     data: bytes
     device_ms: int
@@ -107,10 +107,10 @@ class ToySpec:
     """Settings of a virtual toy: its person and what it performs.
 
     Attributes:
-        person, seed, session: the same numbers give the same bytes.
-        lost, garbled: share of the lines, 0 to 1; None is the world's own.
-        glitch: share of the frames in which an electrode reads nonsense; None is the world's own.
-        gestures: performed over and over in this order; none: all of the paper's at random.
+        person, seed, session: numbers of the person, population and session; equal ones give equal bytes.
+        lost, garbled: shares of lines that are lost or corrupted, 0 to 0.9; None: those of ``world``.
+        glitch: share of frames in which an electrode has a nonsensical value; None: that of ``world``.
+        gestures: gestures to perform repeatedly in this order; if empty, random ones of the paper.
     """
 
     person: int = 1
@@ -137,7 +137,7 @@ def channel_columns(layout: Layout) -> list[int]:
     """Return the index of each channel of the layout among the channels of the virtual toy.
 
     Raises:
-        ConfigError: for a layout with other sensors than the plush toy's.
+        ConfigError: for a layout with sensors that the virtual toy does not have.
     """
     columns = []
     for name in layout.names:
@@ -152,7 +152,7 @@ def channel_columns(layout: Layout) -> list[int]:
 
 
 def _garble(line: bytes, rng: np.random.Generator) -> bytes:
-    """Corrupt a line so that it is no valid frame: cut it, add noise, or join it to the next."""
+    """Corrupt a line so that it is not a valid frame: cut it, insert noise, or join it to the next line."""
     at = int(rng.integers(1, max(2, len(line) - 1)))
     kind = int(rng.integers(3))
     if kind == 0:
@@ -164,9 +164,9 @@ def _garble(line: bytes, rng: np.random.Generator) -> bytes:
 
 
 class ToyStream:
-    """Iterate over the endless lines of a virtual toy.
+    """The endless lines of a virtual toy.
 
-    With ``prompts`` (set before the first line) its person performs what they ask for; else random gestures.
+    With ``prompts`` (set before the first line), its person performs the prompted gestures; else those of ``spec``.
     """
 
     def __init__(self, spec: ToySpec, layout: Layout, prompts: Prompts | None = None) -> None:
@@ -180,13 +180,13 @@ class ToyStream:
         self._rng = np.random.default_rng([spec.seed, spec.person, spec.session, 0x10])
 
     def __iter__(self) -> Iterator[ToyLine]:
-        # Checked here since a recorder may set the prompts after it has opened the toy.
+        # Checked only here, since a recorder may set the prompts after it has opened the toy.
         episodes = self._session.play(self.spec.gestures) if self.prompts is None else self._prompted(self.prompts)
         for episode in episodes:
             yield from self._lines(episode)
 
     def _prompted(self, prompts: Prompts) -> Iterator[Episode]:
-        """Yield idle episodes until a prompt comes, then its gesture, timed to the beginning of the recording."""
+        """Yield idle episodes until there is a prompt, then its gesture, timed to the start of the recording."""
         session = self._session
         while True:
             prompt = prompts()
@@ -228,14 +228,14 @@ _BLOCK = 200
 
 
 class VirtualDevice(PacedDevice):
-    """A virtual toy in this process, with the same bytes and the same parser as a real one.
+    """A virtual toy in this process, with the same wire format and parser as a real one.
 
-    ``performed`` lists the gestures that its person made; ``on_performed`` is called with each. ``first_ms`` is the
-    device clock at the first line, from which a live run counts its times; None before it.
+    ``performed`` are the gestures that its person has made; ``on_performed`` is called with each. ``first_ms`` is the
+    device clock at the first line, from which a live run counts its times; None before that.
 
     Args:
-        speed: 1 real time, 0 as fast as frames are taken.
-        seconds: of device time after which the frames end; 0: never.
+        speed: 1 for real time, 0 for as fast as frames are read.
+        seconds: device time after which the frames end; 0: never.
     """
 
     def __init__(self, url: str, layout: Layout, spec: ToySpec, speed: float = 1.0, seconds: float = 0.0) -> None:
@@ -252,10 +252,10 @@ class VirtualDevice(PacedDevice):
         self._next: ToyLine | None = None
 
     def play_ahead(self) -> None:
-        """Compute all lines now, so that reading is as fast as with a real toy. It needs ``seconds``.
+        """Compute all lines now, so that reading is as fast as with a real toy.
 
         Raises:
-            ConfigError: for a toy without an end.
+            ConfigError: if ``seconds`` is 0, as the toy then has no end.
         """
         if not self._seconds:
             raise ConfigError(f"'{self.url}' has no end to play ahead to: give it seconds=.")
@@ -267,11 +267,11 @@ class VirtualDevice(PacedDevice):
         self._lines = iter(lines)
 
     def follow(self, prompts: Prompts | None = None) -> None:
-        """Make the person do only what ``prompts`` or `perform` ask for; call it before the first `read`."""
+        """Let the person make only gestures of ``prompts``, or by default of `perform`; call it before the first `read`."""
         self._stream.prompts = prompts or self._next_prompt
 
     def perform(self, label: str, begin_ms: int | None = None) -> None:
-        """Make the person perform a gesture that begins when the toy's clock is ``begin_ms``."""
+        """Prompt a gesture whose recording begins when the toy's clock is ``begin_ms``; call `follow` first."""
         self._prompt = Prompt(label, begin_ms)
 
     def _next_prompt(self) -> Prompt | None:

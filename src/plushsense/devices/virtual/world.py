@@ -1,7 +1,7 @@
-"""The constants that set the difficulty of the virtual toy: toy, environment, people and gestures.
+"""The constants of the virtual toy, its environment, people and gestures, which determine how difficult it is.
 
-Frozen: `tests/devices/test_virtual_frozen.py` holds a hash of these numbers, so that scores on the
-virtual toy stay comparable. A score on it says nothing about a real toy.
+They are frozen, so that scores on the virtual toy stay comparable: `tests/devices/test_virtual_frozen.py` checks their
+hash. Such scores do not predict scores on a real toy.
 
 Units: seconds, hertz, g (gravity), counts (raw integers of the toy). Places run along the toy's back,
 0 at the nose and 1 at the end of the tail. Pairs are (mean, spread) unless a comment says (low, high).
@@ -29,12 +29,12 @@ Nine = tuple[float, float, float, float, float, float, float, float, float]
 
 @dataclass(frozen=True)
 class World:
-    """The virtual toy's world. The defaults are the frozen difficulty."""
+    """The constants of the simulation. The defaults are the frozen ones."""
 
     # The toy. One value an electrode, in the order of ZONES.
     baseline: Nine = (820.0, 460.0, 540.0, 610.0, 380.0, 310.0, 450.0, 760.0, 690.0)
     gain: Nine = (3600.0, 2300.0, 3100.0, 2700.0, 2600.0, 1700.0, 2400.0, 4200.0, 3900.0)
-    # Limbs, proximity and belly have no place on the back: reach 0.
+    # Limbs, proximity and belly have no place along the back, so their reach is 0.
     place: Nine = (0.0, 0.24, 0.17, 0.36, 0.0, 0.02, 0.93, 0.62, 0.0)
     reach: Nine = (0.0, 0.06, 0.08, 0.08, 0.0, 0.05, 0.08, 0.15, 0.0)
     all_share: float = 0.30  # cap_all = this share of the sum of the electrodes
@@ -50,7 +50,7 @@ class World:
     humidity_drift: float = 0.05  # within a session, over minutes
     humidity_electrode: float = 0.08  # each electrode's own share
     humidity_gain: float = 0.18  # sensitivity, relative, at one unit of humidity_session
-    rest_humidity: float = 1.3  # nobody's recordings were made on more kinds of days
+    rest_humidity: float = 1.3  # factor for recordings without a person, made on more varied days
 
     # The people.
     hand_child: Pair = (0.72, 0.06)
@@ -59,7 +59,7 @@ class World:
     force_log: float = 0.26
     coupling_log: float = 0.22
     tempo_log: float = 0.18
-    place_person: float = 0.040  # a person's own idea of where a gesture belongs
+    place_person: float = 0.040  # spread between people of the place of a gesture
     place_trial: float = 0.014
     force_trial_log: float = 0.15
     tempo_trial_log: float = 0.10
@@ -90,7 +90,7 @@ class World:
     hit_shake_g: Pair = (1.5, 0.30)  # median, log spread
     pull_shake_g: Pair = (0.70, 0.35)
 
-    # Table or hands: what tells 1 from 2, and what blurs it.
+    # Toy on the table (gestures "... 1") or in the hands ("... 2"): the differences, and what reduces them.
     grip: Pair = (0.62, 0.28)  # median, log spread of a person's grip
     grip_tail: float = 0.75  # one hand holds while the other works at the tail
     lap: Pair = (0.08, 0.70)  # low, high over people: how often "in hands" is on the lap
@@ -137,7 +137,7 @@ PLACES = (
     *("Tail scratch", "Tail tap", "Tail hit", "Tail pull"),
 )
 GROUPS = ("child", "teen", "adult")
-# 8 kindergarten children, 9 teenagers, 8 adults of 25 (section 3.2 of the paper).
+# Cumulative shares; the 25 people were 8 kindergarten children, 9 teenagers, 8 adults (section 3.2 of the paper).
 GROUP_SHARE = (8 / 25, 17 / 25)
 
 
@@ -146,9 +146,9 @@ class Person:
     """A simulated person. Sizes and forces are relative to an average adult; rates in hertz.
 
     Attributes:
-        place: where this person puts each of `PLACES`, as an offset along the toy's back.
-        scratch_lift, tap_dwell: style; a lifted scratch and a dwelling tap look alike.
-        lap, steadies: chance that "in hands" is on the lap, that a toy on the table is steadied.
+        place: this person's offset along the toy's back for each gesture family of `PLACES`.
+        scratch_lift, tap_dwell: style; a scratch with lifting and a tap with dwelling are alike.
+        lap, steadies: probability that a toy "in hands" is on the lap, and that one on the table is steadied.
         grip_belly, grip_limbs, grip_back, grip_neck: where the holding hand lies.
     """
 
@@ -184,7 +184,7 @@ class Person:
 
 
 def draw_person(number: int, seed: int = 1, world: World = WORLD) -> Person:
-    """Draw the person with this number from the population of this seed; always the same person."""
+    """Draw the person with this ``number`` from the population of this ``seed``; deterministic."""
     rng = np.random.default_rng([abs(int(seed)), abs(int(number)), 0x5EED])
     share = rng.random()
     group = GROUPS[0] if share < GROUP_SHARE[0] else GROUPS[1] if share < GROUP_SHARE[1] else GROUPS[2]
