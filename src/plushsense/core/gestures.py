@@ -57,8 +57,7 @@ class Gesture:
 class GestureSet:
     """An ordered set of gestures; the position of a gesture is its class index.
 
-    In a TOML file it has the keys ``name`` and ``gestures``, a list of tables with the attributes of `Gesture` as keys.
-    ``inferred`` marks a set that was made from the labels of recordings (`infer`).
+    A TOML file has ``name`` and ``gestures``, tables with the keys of `Gesture`. ``inferred``: made by `infer`.
     """
 
     name: str

@@ -205,8 +205,7 @@ class ManySummary:
     """Summary of a run of many toys.
 
     Attributes:
-        toys: number of toys.
-        decisions: number of decisions for all toys; ``late`` is the number of those more than a step after their bytes.
+        toys: number of toys; ``decisions`` and ``late`` are summed over them, as in `LiveSummary`.
         wall_s: duration on the host's clock; ``cpu_s`` is the processor time of this process.
         latency_ms: p50, p95, p99 and max of the time from the arrival of the bytes to the decision, over all toys.
     """

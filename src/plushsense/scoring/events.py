@@ -237,8 +237,7 @@ class ErrorCosts:
     The cost of an event is the lowest over the truths to whose time it belongs: 0 for the first event of the right
     gesture; ``again`` for each further one; ``family`` for another gesture of the same family, or if only the affect
     was reported and is right; ``confused`` for another family of the same affect, or if an affect is unknown;
-    ``affect`` for another affect. It is ``outside`` if there is no such truth. A truth without any event costs
-    ``missed``.
+    ``affect`` for another affect. It is ``outside`` without such a truth. A truth without any event costs ``missed``.
     """
 
     again: float = 0.5

@@ -1,7 +1,6 @@
 """Compute the inputs of a network: derived channels and scaling; also statistics of windows.
 
-Raw values are first resampled to even samples (`plushsense.windows.clock`), then derived channels are computed, all in
-integers; last, each channel is scaled to floats.
+Raw values are resampled (`plushsense.windows.clock`), then channels derived, both in integers, then scaled to floats.
 """
 
 from __future__ import annotations

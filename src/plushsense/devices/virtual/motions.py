@@ -275,7 +275,7 @@ class Performance:
         family: label of the gesture without its number, such as "Tail tap".
         in_hands: whether the toy is held in the hands.
         at, n: first sample of the movement in the canvas, and number of samples.
-        force, tempo: force, and tempo relative to what is usual for this person.
+        force, tempo: force relative to an average adult; tempo relative to what is usual for this person.
         shift: offset of the place along the toy's back, in addition to the person's own.
     """
 

@@ -57,8 +57,8 @@ _POSTURES = np.array([(0, 0, 1.0), (0, 0, -1.0), (0, 1.0, 0.1), (0, -1.0, 0.1), 
 class GestureMark:
     """A performed gesture, in samples of the session.
 
-    The movement lasts from ``start`` to ``stop``; a recording that is started and stopped by hand, from ``record_start``
-    to ``record_stop``. ``struck`` is the sample of the impact or jerk of a rough gesture; None for other gestures.
+    The movement lasts from ``start`` to ``stop``; a recording started and stopped by hand, from ``record_start`` to
+    ``record_stop``. ``struck`` is the sample of the impact or jerk of a rough gesture; None for other gestures.
     """
 
     label: str
@@ -73,8 +73,8 @@ class GestureMark:
 class Episode:
     """A section of a session.
 
-    ``first`` is the number of its first sample; ``values`` (n, 13) are raw, in the order of `CHANNELS`; ``device_ms`` and
-    ``delay_ms`` (n,) are device clock and time since the previous frame; ``marks`` are the gestures performed in it.
+    ``first`` is the number of its first sample; ``values`` (n, 13) are raw, in the order of `CHANNELS`;
+    ``device_ms``, ``delay_ms`` (n,) are device clock and time since the previous frame; ``marks`` are the gestures performed in it.
     """
 
     first: int

@@ -267,7 +267,7 @@ class VirtualDevice(PacedDevice):
         self._lines = iter(lines)
 
     def follow(self, prompts: Prompts | None = None) -> None:
-        """Let the person make only gestures of ``prompts``, or by default of `perform`; call it before the first `read`."""
+        """Let the person make only gestures of ``prompts``, by default of `perform`; call it before any `read`."""
         self._stream.prompts = prompts or self._next_prompt
 
     def perform(self, label: str, begin_ms: int | None = None) -> None:
