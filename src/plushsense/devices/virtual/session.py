@@ -74,7 +74,7 @@ class Episode:
     """A section of a session.
 
     ``first`` is the number of its first sample; ``values`` (n, 13) are raw, in the order of `CHANNELS`;
-    ``device_ms``, ``delay_ms`` (n,) are device clock and time since the previous frame; ``marks`` are the gestures performed in it.
+    ``device_ms``, ``delay_ms`` (n,) are device clock and time since the frame before; ``marks`` are the gestures in it.
     """
 
     first: int
