@@ -128,10 +128,7 @@ def append_marks(folder: Path, marks: Iterable[Mark]) -> None:
 def read_marks(folder: Path) -> dict[str, MarkState]:
     """Return the state of each marked recording.
 
-    A line that is not JSON, probably cut off by a crash, is skipped.
-
-    Raises:
-        DatasetError: for a line of JSON that is not a valid mark.
+    A line that is not JSON (cut off by a crash) is skipped; raise DatasetError for JSON that is not a valid mark.
     """
     return MarksFollower(folder).states()
 

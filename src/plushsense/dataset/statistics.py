@@ -62,7 +62,7 @@ def duration_table(dataset: Dataset, by: str | None = None) -> list[Duration]:
 
     Args:
         dataset: the data set.
-        by: the column of subjects.csv to group by: age_group, gender or a user-defined one; ``subject`` for each person.
+        by: the column of subjects.csv to group by (age_group, gender or a user-defined one), or ``subject``.
 
     Raises:
         DatasetError: for a column that subjects.csv does not have.

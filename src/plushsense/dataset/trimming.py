@@ -88,11 +88,7 @@ class Trim:
 
 @dataclass(frozen=True)
 class AcceptedTrims:
-    """Ids of recordings by the result of accepting their suggestions.
-
-    ``marked`` got a mark, ``already`` had the same one, ``not_visible`` have no onset that is visible and confident
-    enough, ``kept_by_hand`` keep the trim that a person set.
-    """
+    """Ids of recordings by the result of accepting: marked, marked before, no sure onset, trimmed by hand."""
 
     marked: tuple[str, ...] = ()
     already: tuple[str, ...] = ()
@@ -139,10 +135,7 @@ def _before(dataset: Dataset, info: RecordingInfo) -> Frames | None:
 
 
 def row_times_s(frames: Frames) -> NDArray[np.float64]:
-    """Return the device time in seconds since the first row, of each row and of the end, (T + 1,).
-
-    A clock reset counts as no time.
-    """
+    """Return the device time in s since the first row, of each row and of the end, (T + 1,); clock resets are 0 s."""
     steps = np.maximum(np.diff(frames.device_ms), 0)
     usual = float(np.median(steps)) if len(steps) else 0.0
     return np.concatenate([[0.0], np.cumsum(steps), [float(steps.sum()) + usual]]) / 1000.0
