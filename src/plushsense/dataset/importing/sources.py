@@ -379,8 +379,7 @@ def _find(place: Path, head: SessionHead, files: list[Path]) -> Iterator[SourceF
 
 
 def people_of(sessions: Sessions) -> tuple[list[PersonInfo], list[str]]:
-    """Return the people of the sessions, with the latest value of each field, and a note for each value that changed.
-    """
+    """Return the people of the sessions, with the latest value of each field, and a note for each changed value."""
     people: dict[str, PersonInfo] = {}
     notes = []
     heads = sorted((h for h in sessions.values() if isinstance(h, SessionHead)), key=lambda h: h.started_ms)
