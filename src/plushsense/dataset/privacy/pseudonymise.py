@@ -281,7 +281,7 @@ class _Pseudonymisation:
         return self._words(person) if match_code(person, self.people) else None
 
     def _renamed(self, identity: str) -> str:
-        """Return the new id of a recording, stream or person; "" for the data set."""
+        """Return the new id of a recording or stream; "" for the data set."""
         if not identity:
             return ""
         for kind in (RECORDINGS, STREAMS):
