@@ -59,8 +59,6 @@ def backup(dataset: str | Path, file: str | Path, progress: Progress | None = No
     """Write a data set into one new zip file, and read the zip again to verify it.
 
     Args:
-        dataset: the folder of the data set.
-        file: the zip file to create.
         progress: called with (bytes done, number of bytes); the second half is the verification.
 
     Raises:

@@ -84,9 +84,7 @@ def suggest(frames: Frames, layout: Layout, before: Frames | None = None, spec: 
 
     Args:
         frames: the whole recording, untrimmed.
-        layout: the layout of its channels.
         before: about `CONTEXT_S` of the stream just before it; rows before a gap are not used.
-        spec: the settings of the method.
     """
     n = len(frames)
     nothing = Suggestion(0, n, False, False, 0.0, 0.0, 1.0, "too short")

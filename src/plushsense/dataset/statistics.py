@@ -61,7 +61,6 @@ def duration_table(dataset: Dataset, by: str | None = None) -> list[Duration]:
     Seconds are rows divided by the measured rate of the recording; recordings without a rate (one row) are left out.
 
     Args:
-        dataset: the data set.
         by: the column of subjects.csv to group by (age_group, gender or a user-defined one), or ``subject``.
 
     Raises:

@@ -259,15 +259,13 @@ def decide_trims(
     """Suggest trims, and write marks for the given decisions.
 
     Args:
-        dataset: the data set or its folder.
         only: id or pattern of the recordings to suggest trims for; by default all that are not excluded.
         accept: ids or patterns of the recordings whose suggestion is accepted.
         above: least confidence to accept, 0 to 1; without ``accept``, suggestions for all of ``only`` are accepted.
         keep: (id, from, to) in seconds to set by hand; None for the start or end of the recording.
         undo: ids or patterns of the recordings whose trim is undone.
         offset: whether to accept suggested ends, too.
-        who: the name for the marks, by default the login name.
-        why: the reason for the marks.
+        who, why: name (by default the login name) and reason for the marks.
         progress: called with (recordings done, number of recordings).
 
     Raises:

@@ -375,7 +375,6 @@ def session_head(request: SessionRequest, folder: Path, fresh: bool, layout: Lay
     """Return the head of the requested session; for a continued session, settings not requested are empty.
 
     Args:
-        folder: the session's folder.
         fresh: whether the session is new.
         layout: the layout of the open toy.
         software: name and version of the recording program.

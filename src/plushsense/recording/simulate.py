@@ -146,7 +146,7 @@ def simulate(
     layout: Layout | str = "plush-15",
     world: World = WORLD,
 ) -> SimulationSummary:
-    """Write a simulated data set; by default as the paper's: 25 people × 17 gestures × 3 + 51 at rest = 1326 recordings.
+    """Write a simulated data set, by default as the paper's: 25 people × 17 gestures × 3, and 51 at rest (1326).
 
     Args:
         out: a new or empty folder; the folders of people are ``P01`` …, that of the toy at rest ``none``.
@@ -156,7 +156,6 @@ def simulate(
         at_rest: number of recordings without a person; by default gestures × repetitions, as in the paper.
         gestures: a subset of the 17, in class order.
         layout: the layout of the files: plush-15, plush-14 or accel-3.
-        world: the parameters of the simulation.
 
     Raises:
         ConfigError: for a number out of range or an unknown gesture.

@@ -286,10 +286,7 @@ def extend_gestures(given: GestureSet | None, dataset: Dataset) -> GestureSet:
 def merge_people(
     there: Mapping[str, PersonInfo], sessions: Iterable[PersonInfo], file: Mapping[str, PersonInfo], subjects: set[str]
 ) -> tuple[list[PersonInfo], list[str]]:
-    """Merge the people's table with ``sessions``, which fill gaps, and the user's ``file``, which overrides both.
-
-    Returns the people, and notes on values and people that were left out.
-    """
+    """Merge the people ``there`` with ``sessions``, which fill gaps, and the user's ``file``, which overrides both."""
     keys = ("age_group", "gender", "consent")
     people, notes = dict(there), []
     for info in sessions:

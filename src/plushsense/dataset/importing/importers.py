@@ -109,7 +109,6 @@ def _new_marks(folder: Path, set_aside: Mapping[str, str]) -> list[Mark]:
     """Return marks for recordings that the recorder has discarded or kept since; marks of people take precedence.
 
     Args:
-        folder: the data set.
         set_aside: by recording id, the reason why the recorder discarded it, "" if it did not.
     """
     last: dict[str, tuple[str, str]] = {}

@@ -117,8 +117,7 @@ def plan_removal(dataset: str | Path, subject: str) -> RemovalPlan:
     """Return what `forget` would remove, without changing anything.
 
     Raises:
-        DatasetError: if ``subject`` is not in the data set and cannot have been removed from it, the removal of another
-            person was interrupted, or raw files of other people are missing.
+        DatasetError: if ``subject`` is unknown, another removal was interrupted, or files of other people are missing.
     """
     folder = Path(dataset)
     DatasetHead.read(folder)

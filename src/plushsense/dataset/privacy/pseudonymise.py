@@ -102,8 +102,6 @@ def pseudonymise(
     """Create a pseudonymised copy of a data set at ``out``; the original is not changed.
 
     Args:
-        dataset: the folder of the original.
-        out: the new folder.
         key: the key file ``original,code,shift_s``, outside of both data sets. An existing one is extended, so that a
             person keeps the code of an earlier run.
         words: additional words to replace everywhere by ``[name]``, such as first names.
@@ -380,7 +378,6 @@ def find_traces(
     """Find original codes, words, times and dates that are still in ``folder``; yield (file, text) for each.
 
     Args:
-        folder: the copy to search.
         originals: the original codes, which must not be folders of people.
         names: patterns of the words that no file may contain.
         times: every time in the original files, in ms since 1970.

@@ -148,9 +148,7 @@ def validate_package(
     """Validate a package (a folder or a zip).
 
     Args:
-        package: the path of the folder or zip.
         thorough: whether slow validators read every row of the streams, instead of the first `STREAM_ROWS`.
-        progress: called with the name of the stage, the work done and its total.
 
     Raises:
         DatasetError: if ``package`` is no package.

@@ -92,7 +92,6 @@ def shift_of(subject: str, firsts: list[int], device: bool, key: bytes) -> Shift
     """Return the time shift of one person.
 
     Args:
-        subject: the person's code.
         firsts: the first wall-clock time of each of the person's files.
         device: whether the device clock is a wall clock too.
         key: the secret from which the new time is derived; the same key gives the same shift.
@@ -111,9 +110,7 @@ _NOT_A_CODE = re.compile(r"[-+]?[\d.]+(e\d+)?|na|n/a|null|none|nan|inf(inity)?|t
 
 @dataclass(frozen=True)
 class PublishOptions:
-    """Options of publishing: whether to include streams and excluded recordings, additional ``columns`` of the people's
-    table, and the ``key`` from which the time shifts are derived.
-    """
+    """What to include (streams, excluded recordings, ``columns`` of the people's table), and the key of the shifts."""
 
     streams: bool = True
     excluded: bool = False

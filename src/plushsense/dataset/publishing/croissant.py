@@ -142,9 +142,6 @@ def compare_records(
     """Load every record set, compare it with the files, and return the number of compared records of each.
 
     Args:
-        mlcroissant: the imported module.
-        root: the folder of the package.
-        dataset: the data set in it.
         stream_rows: number of rows to compare from the beginning of each stream; None for all.
         report: called with a file and its problem.
     """
