@@ -113,10 +113,7 @@ class Estimate:
 
 
 def estimate(core: Core, instructions: int, flash_bytes: int, samples: int, step_ms: float) -> Estimate:
-    """Estimate the time of a step.
-
-    For cores with a serial flash, the upper bound adds reading ``flash_bytes`` (code and data) for each of ``samples``.
-    """
+    """Estimate the time of a step; a serial flash adds reading ``flash_bytes`` per sample to the upper bound."""
     low = instructions * core.cycles_low / core.mhz / 1000
     high = instructions * core.cycles_high / core.mhz / 1000
     if core.flash_mb_s is not None:
@@ -326,10 +323,7 @@ def _needs(target: str, file: Path) -> tuple[str, ...]:
 
 
 def _stack_usage(file: Path) -> dict[str, int]:
-    """Read the stack frame of each function from the compiler's report, largest first.
-
-    Raises BadInput for a frame of dynamic size.
-    """
+    """Read each function's stack frame from the compiler's report, largest first; raise BadInput for a dynamic one."""
     frames: dict[str, int] = {}
     for line in file.read_text().splitlines() if file.is_file() else ():
         place, size, kind = line.split("\t")

@@ -28,7 +28,7 @@ class Examination:
 
     ``rows_named`` is the number of rows in the file's name (None if there is none), ``usual_rows`` the median number
     over the recordings of the gesture, ``first_row`` the row of the file at which ``frames`` begin. ``malformed``
-    counts unreadable lines of the file, ``cut`` is whether its last line is incomplete, ``stream`` whether it is one.
+    counts unreadable lines of the file, ``cut`` is whether its last line is incomplete, ``stream`` if it is a stream.
     """
 
     frames: Frames
