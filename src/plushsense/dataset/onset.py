@@ -29,7 +29,7 @@ from plushsense.core.recorder_csv import Frames
 Floats: TypeAlias = NDArray[np.float64]
 
 CONTEXT_S = 2.5
-"""Seconds of the stream before a recording that count as rest: the countdown of 3 s without the key press before it."""
+"""Seconds of the stream before a recording that count as rest: the countdown of 3 s without the key press at first."""
 
 _CONTACT = ("capacitive", "proximity")
 

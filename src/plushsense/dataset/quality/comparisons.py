@@ -250,7 +250,7 @@ def no_onset(w: DatasetSummary) -> Iterator[Issue]:
 
 
 def bursts(activity: np.ndarray, quiet_blocks: int) -> list[tuple[int, int]]:
-    """Return the stretches (first, last + 1) of active blocks that more than ``quiet_blocks`` still blocks separate.
+    """Return the stretches (first, last + 1) of active blocks that at least ``quiet_blocks`` still blocks separate.
 
     Stretches much weaker than the strongest are left out, since the toy was only put down or a key pressed.
     """
