@@ -209,7 +209,7 @@ def summarise(folds: Sequence[FoldAnswers], coverage: float, known_share: float)
 
 
 def _against(folds: Sequence[FoldAnswers], known_share: float) -> dict[str, Any]:
-    """Return the AUROC of known against unknown gestures by confidence, and the shares on each side of the threshold."""
+    """Return the AUROC of known against unknown gestures by confidence, and the shares that the threshold separates."""
     auc: dict[str, list[float]] = {}
     passed, caught, count = [], [], 0
     for t in folds:
@@ -291,7 +291,7 @@ FIGURE, TABLE = "risk-coverage.png", "abstaining.json"
 
 @dataclass(frozen=True)
 class _AnswerWork:
-    """The work of one job: train on a fold without a label ("": with all), and return the answers on the test people."""
+    """The work of one job: train on a fold without a label ("" for none), and return the answers on its test people."""
 
     dataset: str
     arch: Arch

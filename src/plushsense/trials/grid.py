@@ -89,7 +89,7 @@ class GridSpec:
         return WindowSpec(window_s=self.window_s, step_s=self.step_s, context=self.context)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON; without ``augment`` if it is None, so that the ids of old grids do not change."""
+        """Return plain values for JSON; ``augment`` is left out if None, so that ids of old grids do not change."""
         return {key: value for key, value in asdict(self).items() if key != "augment" or value is not None}
 
 

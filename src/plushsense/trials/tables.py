@@ -344,7 +344,7 @@ class Tables:
         return polars.concat(parts) if parts else _frame(polars, [], _CURVE_COLUMNS)
 
     def _with_confusions(self, best: Sequence[Mapping[str, Any]]) -> list[PlannedTrial]:
-        """Return the trials whose confusions are stored: the best ones, those of each filter set, the paper's network."""
+        """Return the trials whose confusions are stored: the best, the best of each filter set, the paper's network."""
         picked = [row["trial"] for row in best[:BEST]]
         seen: set[str] = set()
         for row in best:
