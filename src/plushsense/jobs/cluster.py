@@ -1,8 +1,7 @@
 """Run jobs as Ray tasks on a cluster. This is the only module that imports Ray (extra ``cluster``).
 
-The driver (the process that starts the run) stores the results, because nodes may not share its file system. Ray
-repeats the tasks of a lost node. Messages of jobs pass through a small actor on the driver's node about twice a second;
-some of them may be lost.
+The driver (the process that starts the run) stores the results, as nodes may not share its file system. Ray repeats the
+tasks of a lost node. An actor on the driver's node passes on messages of jobs, of which some may be lost.
 """
 
 from __future__ import annotations
@@ -256,11 +255,7 @@ _unpacked: tuple[str, Any, Any] | None = None
 
 
 def _task(run: str, expected: str, packed: list[Any], board: Any, job: str, task: Any) -> tuple[str, bytes]:
-    """Run one job on a node.
-
-    Returns ("done", result), ("failed", exception of the job) or ("lost", reason why no job can run on this node); the
-    second value is pickled.
-    """
+    """Run one job on a node; return ("done", result), ("failed", exception) or, if no job can run, ("lost", error)."""
     global _unpacked
     ray = need("ray", extra="cluster")
     if expected != _version():

@@ -1,7 +1,7 @@
 """Run jobs in several processes of this machine, which are spawned on every operating system.
 
 A worker saves its result in the journal before it reports it, so that a run killed at any moment can be continued. If
-the parent process ends, a worker ends at its next message. A worker that dies is replaced, and its job is started again.
+the parent process ends, a worker ends at its next message. A worker that dies is replaced, and its job started again.
 """
 
 from __future__ import annotations
@@ -60,7 +60,6 @@ def run_jobs(
     """Run all jobs whose results are not in the journal yet. All callbacks are called in the caller's thread.
 
     Args:
-        jobs: the jobs, each with its own id.
         work: called as ``work(shared, task, report)`` for each job; picklable unless it runs in this process.
         shared: passed to every job, and sent to each process once. A job must not change it.
         workers: number of processes; 1 runs the jobs in this process. A cluster uses all of its processors instead.
