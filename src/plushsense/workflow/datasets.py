@@ -166,7 +166,7 @@ def publish_dataset(
 
     Args:
         out: a new or empty folder.
-        licence, contact, consent: an SPDX name, "Name <mail>", and a statement; required if ``dataset.toml`` lacks them.
+        licence, contact, consent: an SPDX name, "Name <mail>", a statement; required if ``dataset.toml`` lacks them.
         save: also write these into the data set's ``dataset.toml``.
         streams: also publish the streams of whole sessions, with everything between the gestures.
         excluded: also publish excluded recordings, marked as such.

@@ -78,7 +78,7 @@ def people_of(groups: ArrayLike | None, n: int) -> NDArray[np.str_]:
 
 
 def watching_of(people: NDArray[np.str_], seed: int) -> NDArray[np.bool_]:
-    """Return a mask (N,) of the windows of the validation people, by whom training is stopped; none of one person."""
+    """Return a mask (N,) of the windows of the people held out for early stopping; all False if there is one person."""
     names = np.unique(people)
     if len(names) < 2:
         return np.zeros(len(people), dtype=bool)
