@@ -360,8 +360,8 @@ def abstaining(
     Args:
         split: by whole people: "by-subject:5", "leave-one-subject-out".
         withhold: also train without each gesture in turn, and measure whether it is recognised as unknown.
-        coverage: coverage for which the conformal sets of classes are fitted.
-        known_share: share of known gestures that the threshold between known and unknown shall let pass.
+        coverage: share of gestures for which the fitted conformal set of classes should contain the true one.
+        known_share: share of the known gestures that should lie above the threshold for unknown ones.
         out: a folder for ``abstaining.json`` and the figure.
         progress: called when a training is done.
 
