@@ -360,7 +360,7 @@ def abstaining(
     Args:
         split: by whole people: "by-subject:5", "leave-one-subject-out".
         withhold: also train without each gesture in turn, and measure whether it is recognised as unknown.
-        coverage: share of gestures for which the fitted conformal set of classes should contain the true one.
+        coverage: share of steps for which the fitted conformal set of classes should contain the true one.
         known_share: share of the known gestures that should lie above the threshold for unknown ones.
         out: a folder for ``abstaining.json`` and the figure.
         progress: called when a training is done.
