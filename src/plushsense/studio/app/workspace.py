@@ -160,7 +160,7 @@ class Workspace:
         return place
 
     def free_name(self, kind: str, name: str, *suffixes: str, separator: str = "-", taken: Collection[str] = ()) -> str:
-        """Return ``name``; add a number if it is in ``taken`` or exists in ``folder / kind`` with one of ``suffixes``."""
+        """Return ``name``, numbered if it is in ``taken`` or exists in ``folder / kind`` with one of ``suffixes``."""
         free, number = name, 2
         while free in taken or any((self.folder / kind / f"{free}{s}").exists() for s in suffixes or ("",)):
             free, number = f"{name}{separator}{number}", number + 1
@@ -201,7 +201,7 @@ class ChangeSignal:
     def subscribe(
         self, callback: Callable[[], Any], loop: asyncio.AbstractEventLoop | None = None
     ) -> Callable[[], None]:
-        """Call ``callback`` in ``loop`` (by default the running one) after each `notify`; return a function to unsubscribe.
+        """Call ``callback`` in ``loop`` (by default the running one) after each `notify`; return the unsubscriber.
 
         Notifications that arrive before the callback runs are merged into one call. Pages use
         `plushsense.studio.app.shell.on_change`, which unsubscribes when the page is closed.
