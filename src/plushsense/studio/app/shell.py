@@ -143,7 +143,7 @@ class Page:
 
 
 def visitor() -> tuple[Words, bool | None]:
-    """Return the texts in the visitor's language and the colour scheme: dark (True), light (False) or automatic (None)."""
+    """Return the texts in the visitor's language and the colour scheme: True dark, False light, None the system's."""
     request = context.client.request
     cookies = request.cookies if request is not None else {}
     accepted = request.headers.get("accept-language", "") if request is not None else ""

@@ -23,12 +23,8 @@ KEPT_S = 60.0
 
 
 class Samples(NamedTuple):
-    """Samples of a stream.
-
-    Attributes:
-        seconds: shape (N,), time by the clock of the toy since its first sample.
-        values: shape (N, C), integer sensor values of the C channels.
-        end: position in the stream after the last of these samples.
+    """Samples of a stream: ``seconds`` (N,) by the toy's clock since its first sample, ``values`` (N, C) of the C
+    channels as integers, and ``end``, the position in the stream after the last of these samples.
     """
 
     seconds: NDArray[np.float64]

@@ -32,7 +32,7 @@ _ENOUGH = 51
 class DatasetEntry:
     """Summary of a data set. ``refused`` is the error message if it cannot be read; later fields are then empty.
 
-    ``files`` are the file names of the recordings. A name contains the time of recording, so equal names mean equal data.
+    ``files`` are the file names of the recordings; a name contains the time of recording and so identifies it.
     """
 
     path: Path

@@ -39,7 +39,7 @@ PROTOCOL = "live"
 
 @dataclass(frozen=True)
 class Label:
-    """A labelled part of a clip, saved as a recording: rows ``first`` (inclusive) to ``last`` (exclusive) of the stream."""
+    """A labelled part of a clip, saved as a recording: stream rows ``first`` (inclusive) to ``last`` (exclusive)."""
 
     file: str
     gesture: str
