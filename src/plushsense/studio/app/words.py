@@ -14,7 +14,7 @@ LANGUAGES = {"en": "English", "lv": "Latviešu"}
 
 
 class Words:
-    """Texts in one language; ``words("record.start", n=3)`` is ``start`` of table ``[record]`` with ``{n}`` replaced."""
+    """Texts in one language: ``words("record.start", n=3)`` is ``start`` of ``[record]``, where ``{n}`` becomes 3."""
 
     def __init__(self, language: str) -> None:
         self.language = language if language in LANGUAGES else next(iter(LANGUAGES))

@@ -35,7 +35,7 @@ class RecordingFilter:
     """Conditions that a recording must meet to be listed; "" means no condition.
 
     ``state``: one of `STATES`, `TO_DO` or `DONE`. ``severity``: minimum severity of the worst finding not accepted, or
-    `NO_FINDING`. ``check``: a check with a finding, accepted or not. ``text``: part of the id or of a finding's message.
+    `NO_FINDING`. ``check``: a check with a finding, accepted or not. ``text``: part of the id or a finding's message.
     """
 
     person: str = ""

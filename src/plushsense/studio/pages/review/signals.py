@@ -190,7 +190,7 @@ def trimmed_curve(identity: str, shape: DeviationShape, start_s: float, stop_s: 
 
 @dataclass(frozen=True)
 class GestureOverlay:
-    """Recordings of a gesture on a common time axis ``x`` (G,); ``curves`` (R, G) has a row for each of R recordings."""
+    """Recordings of a gesture on a common time axis ``x`` (G,); ``curves`` (R, G) has one row per recording."""
 
     drawn: tuple[DeviationCurve, ...]
     x: NDArray[np.float64]
@@ -231,7 +231,7 @@ FULL = 1000
 _BATCH = 25
 # Minimum time between two notifications of progress.
 _NOTIFY_S = 0.3
-# Pauses after each recording, so that other threads can run; the long one applies if a page was used in the last _BUSY_S.
+# Pauses after each recording, so that other threads can run; longer for `_BUSY_S` after a page was used.
 _PAUSE_S = 0.0005
 _LONG_PAUSE_S = 0.015
 _BUSY_S = 1.5

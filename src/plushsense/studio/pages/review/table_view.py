@@ -49,7 +49,7 @@ def finding_text(words: Words, finding: Finding) -> str:
 
 
 def finding_button(desk: ReviewController, finding: Finding, recording: str = "") -> ui.button:
-    """Add a button that accepts a finding, or reopens an accepted one; it works only while ``recording`` is displayed."""
+    """Add a button that accepts or reopens a finding; with ``recording``, it works only while that is displayed."""
 
     async def reopen() -> None:
         await desk.decide(recording or desk.current, lambda: desk.review.reopen_finding(desk.visit, finding, desk.name))
