@@ -396,7 +396,7 @@ _SAMPLES = 100_000
 def run_verify(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Verify the export ``place`` on ``targets``, by default on all that are available.
 
-    With ``dataset``, its recordings are used as input; with ``faults``, the test itself is tested with faulty variants
+    Input is from recordings of ``dataset`` if given, else generated; with ``faults``, the test is checked on mutants
     of the code; with ``trust``, C files that differ from those of PlushSense are compiled and run, too.
     """
     folder = Path(spec["place"])
