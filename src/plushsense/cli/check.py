@@ -106,7 +106,7 @@ def overview(result: CheckReport) -> Iterator[str]:
 
 
 def _by_person(findings: Sequence[Finding], lines: int) -> Iterator[str]:
-    """Format findings as about ``lines`` lines; if there are more findings, combine those of each person in one line."""
+    """Format findings as about ``lines`` lines; if there are more, combine those of each person in one line."""
     by_person: dict[str, list[Finding]] = {}
     for f in findings:
         by_person.setdefault(f.subject, []).append(f)

@@ -1,4 +1,4 @@
-"""Implement ``plushsense protocol --model BUNDLE [--people 5] [--out DIR]``, or with ``--dataset DS`` or ``--session DIR``."""
+"""Implement ``plushsense protocol --model BUNDLE [--people 5 | --dataset DS | --session DIR] [--out DIR]``."""
 
 from __future__ import annotations
 

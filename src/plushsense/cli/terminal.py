@@ -288,7 +288,7 @@ class Screen:
     """Display of a recorder on standard error: redrawn in place on a terminal, otherwise one line per change."""
 
     def __init__(self, recorder: Recorder, title: str, notices: Sequence[str] = ()) -> None:
-        """Prepare the screen; ``notices`` stay visible on a terminal."""
+        """Prepare the screen; on a terminal, ``notices`` are displayed below ``title``."""
         self._title = title
         self._notices = notices
         self._terminal = sys.stderr.isatty()

@@ -1,4 +1,4 @@
-"""Implement ``plushsense trim DATASET [--only GLOB] [--accept GLOB | --accept-above 0.8] [--set ID FROM:TO] [--undo GLOB]``."""
+"""Implement ``plushsense trim DATASET [--only GLOB] [--accept GLOB] [--set ID FROM:TO] [--undo GLOB]``."""
 
 from __future__ import annotations
 

@@ -396,8 +396,8 @@ _SAMPLES = 100_000
 def run_verify(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Verify the export ``place`` on ``targets``, by default on all that are available.
 
-    Input is from recordings of ``dataset`` if given, else generated; with ``faults``, the test is checked on mutants
-    of the code; with ``trust``, C files that differ from those of PlushSense are compiled and run, too.
+    The input is recordings of ``dataset`` if given, else generated data. With ``faults``, check that mutants of the
+    code are detected. With ``trust``, also compile and run C files that differ from those PlushSense writes.
     """
     folder = Path(spec["place"])
     digest = folder_digest(folder)

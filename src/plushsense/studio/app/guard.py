@@ -1,4 +1,4 @@
-"""Control access to the studio: allow local requests and browsers with a one-time token; block foreign content.
+"""Control access to the studio: admit local requests or those with a one-time token; forbid content from elsewhere.
 
 `Guard` wraps the whole application, including NiceGUI's own routes and its websocket. `limited_protocol` limits the
 number of open connections and the time a request may take to arrive, because each connection uses a file descriptor
@@ -131,7 +131,7 @@ class Visitors:
 
 
 class Guard:
-    """ASGI middleware that rejects browsers not in `Visitors`, limits request bodies and sets security headers."""
+    """ASGI middleware that rejects browsers not admitted by `Visitors`, limits bodies and sets security headers."""
 
     def __init__(self, app: App, visitors: Visitors) -> None:
         self._app, self._visitors = app, visitors

@@ -115,7 +115,7 @@ class Jobs:
         return job
 
     def resume(self, identity: str) -> StudioJob:
-        """Start a job that has ended again with the same spec; the task continues from what it has stored."""
+        """Restart a job that has ended, with the same spec; the task continues from what it has stored."""
         job = self.get(identity)
         with self._lock:
             if job.state == RUNNING:

@@ -110,7 +110,7 @@ _CSS = Path(__file__).with_name("studio.css")
 
 @dataclass
 class Page:
-    """An open page: its workspace, its texts, and the place for messages."""
+    """An open page: its workspace, its texts, and the place where messages appear."""
 
     workspace: Workspace
     name: str

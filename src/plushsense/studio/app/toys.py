@@ -101,7 +101,7 @@ class TappedDevice(Device):
 
     @property
     def inner(self) -> Device:
-        """The innermost device."""
+        """The device that reads the toy, without the wrapper that reconnects."""
         return getattr(self.device, "inner", self.device)
 
     @property

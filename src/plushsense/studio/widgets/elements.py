@@ -247,7 +247,7 @@ def own_picture(home: Path, label: str) -> str:
 
 
 class WorkPanel:
-    """Panel of the running jobs of some tasks, with progress and stop buttons, and of the last job if it failed.
+    """Panel of the running jobs of some tasks, with stop buttons, and of the last job if it failed or was stopped.
 
     Args:
         tasks: the tasks whose jobs are displayed.

@@ -105,7 +105,7 @@ class NextStep:
 
     Attributes:
         key: key of the texts of the step and of its button, without prefix and suffix.
-        page: page that the button opens; "" if it starts an action instead.
+        page: page that the button opens; "" if there is no button or it starts an action.
         values: values to fill into the text.
     """
 

@@ -63,7 +63,7 @@ class DatasetSection:
             self._rows = ui.column().classes("w-full ps-small-gap")
 
     def fill(self, summary: WorkspaceSummary) -> None:
-        """Display the data sets."""
+        """Replace the displayed data sets by those of ``summary``."""
         self._rows.clear()
         with self._rows:
             if not summary.datasets:

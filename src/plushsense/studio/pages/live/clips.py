@@ -257,7 +257,7 @@ class Clips:
         threading.Thread(target=self.end, args=(running,), daemon=True).start()
 
     def _open(self, reader: LiveReader, device: TappedDevice, bundle: Bundle, subject: str) -> _Running:
-        """Create the session of a new clip; the caller holds the lock."""
+        """Create the session of a new clip; the caller must hold the lock."""
         person = self._workspace.inside(self._workspace.recordings / check_subject(subject.strip()))
         choice = reader.choice
         head = SessionHead(

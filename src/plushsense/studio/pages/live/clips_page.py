@@ -27,7 +27,7 @@ _START, _END = "#009E73", "#D55E00"
 
 
 def show(page: Page, reader: LiveReader) -> None:
-    """Build the part of the page below the live view."""
+    """Build the section for clips, which is below the live view."""
     clips = page.workspace.part(Clips)
     words = page.words
     with section(words("live.hard")):

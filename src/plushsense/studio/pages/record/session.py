@@ -199,7 +199,7 @@ class ConnectionAlert(Element, component="connection.js"):
 
 
 def show_session(page: Page, controller: RecordController, session: ActiveSession) -> None:
-    """Build the page of a session."""
+    """Build the page of a session and update it until it is closed."""
     view = _View(page, controller, session)
     on_change(controller.changed, view.draw)
     ui.timer(_DRAW_S, view.tick, immediate=False)

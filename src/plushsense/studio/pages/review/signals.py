@@ -172,7 +172,7 @@ def _plain(column: NDArray[np.float64]) -> list[float | None]:
 
 @dataclass(frozen=True)
 class DeviationCurve:
-    """A recording in an overlay: deviations ``size`` (N,), evenly spaced over ``seconds``, and checks that flag it."""
+    """A recording in an overlay: deviations ``size`` (N,), evenly spaced over ``seconds``; ``why`` names its flags."""
 
     recording: str
     seconds: float
