@@ -101,7 +101,7 @@ class TappedDevice(Device):
 
     @property
     def inner(self) -> Device:
-        """The device that reads the toy, without the wrapper that reconnects."""
+        """The device that reads the toy, without the wrapper that reconnects; None while that is reconnecting."""
         return getattr(self.device, "inner", self.device)
 
     @property
